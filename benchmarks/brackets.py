@@ -38,6 +38,7 @@ from simulator import (
     exposure_ratio,
 )
 from simulator.networks.noise_module import SIZES
+from simulator.noise.noise_level_function import noise_variance
 from simulator.raw.image import PLANES
 
 #: The first is static, the second moves.
@@ -168,7 +169,7 @@ def transition_rows(
 ) -> list[Row]:
     """Simulated and real frame of one transition, beside the baselines that bound the figures."""
     target, bare = pair.target.settings, CameraSimulator(device="cpu")
-    real, noise = pair.target.data.numpy(), pair.target.noise
+    real = pair.target.data.numpy()
     known = {"exposure only": bare.prepare(pair.source), **denoised}
     found: dict[str, tuple[torch.Tensor, float]] = {
         "simulated": timed_result(
@@ -185,9 +186,9 @@ def transition_rows(
     shift = phase_cross_correlation(*greens, upsample_factor=20)[0]
     whole = round(float(shift[0])), round(float(shift[1]))
     ratio = exposure_ratio(pair.source.settings, target)
-    source_variance = ratio**2 * variance(pair.source.data.numpy(), pair.source.noise)
-    target_variance = variance(real, noise)
-    top_up = np.maximum(source_variance, variance(exposed.numpy(), pair.source.noise))
+    source_variance = ratio**2 * noise_variance(pair.source.data, pair.source.noise)
+    target_variance = noise_variance(pair.target.data, pair.target.noise)
+    top_up = torch.maximum(source_variance, noise_variance(exposed, pair.source.noise))
     usable = np.broadcast_to(~pair.masked, real.shape)
     limits = {"simulated": top_up + target_variance}
     head = {"kind": "transition", "scene": pair.scene, "source_ms": pair.source_ms}
@@ -201,16 +202,10 @@ def transition_rows(
         ):
             scores = compare(image.numpy(), real, pair, moved)
             limit = limits.get(variant, source_variance + target_variance)
-            scores["psnr_noise_limit_db"] = _decibel(limit[usable].mean())
+            scores["psnr_noise_limit_db"] = _decibel(limit.numpy()[usable].mean(dtype=np.float64))
             name = variant + ", registered" * (moved is whole)
             rows.append({**head, "variant": name, **scores, "ms": ms})
     return rows
-
-
-def variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
-    """Noise variance of (4, H, W) `signal` under `nlf`."""
-    shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
-    return read + shot * np.maximum(signal, 0.0)
 
 
 def compare(

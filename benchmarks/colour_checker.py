@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.stats import linregress
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
@@ -169,7 +170,10 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
     unclipped = linear_srgb_to_lab(linear * scale)
     error = deltaE_ciede2000(shown, lab)
     error_unclipped = deltaE_ciede2000(unclipped, lab)
-    even = unclipped_at_published_luminance(linear, lab)
+    # Each patch scaled to its published Y, which leaves errors of hue and chroma only: uneven
+    # light, vignetting and the camera's linearity drop out; veiling glare does not.
+    luminance = lab_to_luminance(linear_srgb_to_lab(linear))
+    even = linear_srgb_to_lab(linear * (lab_to_luminance(lab) / luminance)[:, None])
     error_even = deltaE_ciede2000(even, lab)
     rows = []
     for k, i in enumerate(order):
@@ -180,15 +184,6 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
         row |= {"lab_measured": shown[k].round(2), "lab_published": lab[k]}
         rows.append(rounded(row | {"linear_srgb": linear[k] * scale, "exposure_scale": scale}))
     return rows
-
-
-def unclipped_at_published_luminance(linear: np.ndarray, lab: np.ndarray) -> np.ndarray:
-    """Lab of `linear` with each patch scaled to its published Y: leaves hue and chroma errors only.
-
-    Uneven light, vignetting and the camera's linearity drop out; veiling glare does not.
-    """
-    luminance = lab_to_luminance(linear_srgb_to_lab(linear))
-    return linear_srgb_to_lab(linear * (lab_to_luminance(lab) / luminance)[:, None])
 
 
 def paper_range(raw: RawImage) -> Row:
@@ -218,11 +213,11 @@ def linearity(raw: RawImage, chart: Chart) -> list[Row]:
 
 def summary(rows: list[Row]) -> Row:
     """Mean, median and maximum of dE2000 over `rows`."""
-    names = ("", "_without_gamut_clip", "_at_published_luminance")
-    errors, *others = (np.array([row[f"delta_e_2000{name}"] for row in rows]) for name in names)
-    found: Row = {"patches": len(rows), "mean": errors.mean(), "median": np.median(errors)}
-    found |= {"max": errors.max(), "worst": rows[int(errors.argmax())]["patch"]}
-    found |= {f"mean{name}": own.mean() for name, own in zip(names[1:], others, strict=True)}
+    frame = pd.DataFrame(rows).set_index("patch").filter(like="delta_e")
+    errors, means = frame["delta_e_2000"], frame.mean()
+    found: Row = {"patches": len(rows), "mean": errors.mean(), "median": errors.median()}
+    found |= {"max": errors.max(), "worst": errors.idxmax()}
+    found |= {f"mean{name.removeprefix('delta_e_2000')}": means[name] for name in frame.columns[1:]}
     return {k: round(float(v), 2) if isinstance(v, float) else v for k, v in found.items()}
 
 

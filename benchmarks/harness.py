@@ -120,14 +120,12 @@ class Report:
         rows: Rows of the result file.
         tables: What stands between the marks ``<!-- NAME -->`` and ``<!-- end -->`` of the page, by
             name: Markdown of `table` and `pivot`. All else on a page is written by hand.
-        page: Blocks of the Markdown page below its heading; none for no page.
         meta: Entries of the result file besides its origin.
         figures: Pictures by file name beside the page (``"throughput.png"``), or by path.
     """
 
     rows: Sequence[Row]
     tables: Mapping[str, str] = field(default_factory=dict)
-    page: Sequence[str] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
     figures: Mapping[str | Path, Figure] = field(default_factory=dict)
 
@@ -197,10 +195,6 @@ def write_report(
         files["page"] = write_atomically(
             out / f"{stem}.md", filled_page(stem, title, tables, report.figures)
         )
-    if report.page:
-        blocks = [f"# {title}", origin(meta), *report.page]
-        text = "\n\n".join(block.strip() for block in blocks if block.strip()) + "\n"
-        files["page"] = write_atomically(out / f"{stem}.md", text)
     return files
 
 

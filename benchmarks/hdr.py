@@ -202,7 +202,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     pictures: dict[str, Any] = {"picture": lambda row: row["method"]}
     errors: dict[str, Any] = {"light": lambda row: row["method"]}
     for (iso, level, method), own in groups:
-        key, mean = f"ISO {iso} {level}", means[METHODS[method]]
+        key, mean = f"ISO {iso} {level}", means[METHODS[str(method)]]
         for name in ("psnr", "ssim", "radiance_ev"):
             mean[f"{key} {name}"] = own[name].mean()
         mean[f"{key} scenes"] = len(own)

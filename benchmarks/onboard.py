@@ -152,7 +152,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     less = [row for name in AGENTS for row in results[f"smaller {name}"]]
     for row in rows:
         row["speedup"] = row["us_torch"] / row["us_onnx"]
-    columns = {
+    columns: dict[str, Any] = {
         "agent": "{policy}",
         "file [MB]": lambda row: f"{row['bytes'] / 1e6:.2f}",
         "same decisions": "{same} of {decisions}",

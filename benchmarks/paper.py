@@ -9,12 +9,11 @@ training that was stopped continues. Published numbers are of another split of t
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,21 +106,16 @@ def parts(
     if weights is None:
         names = dict.fromkeys(TRAINED)
     else:
-        card = _checked(load_modules(weights)[1], weights)
+        card = load_modules(weights)[1]
+        if card["preset"] not in ("compact", "paper", "ncs"):
+            wrong = f"`weights` (={str(weights)!r}) must be of all three modules"
+            raise ValueError(f"{wrong}, not {card['preset']!r}")
         names, depends = {str(weights.resolve()): None}, depends | {"weights": card["sha256"]}
     longer = {"depends": depends, "timeout": LONGEST}
     return [
         Part(name, measure, {"name": name, **arguments}, **longer)  # type: ignore[arg-type]
         for name in (*names, "compact")
     ]
-
-
-def _checked(card: dict[str, Any], weights: Path) -> dict[str, Any]:
-    if card["preset"] not in ("compact", "paper", "ncs"):
-        raise ValueError(
-            f"`weights` (={str(weights)!r}) must be of all three modules, not {card['preset']!r}"
-        )
-    return card
 
 
 def _digest(folder: Path) -> str:
@@ -189,40 +183,36 @@ def cases(held_out: list[CapturedSequence], seed: int, quick: bool) -> Iterator[
         pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), count, replace=False))]
     for pair in pairs:
         sequence = held_out[pair.sequence]
-        raws = (_middle(sequence.captures[i].read(), size) for i in (pair.source, pair.target))
-        yield Case(sequence.name, *raws)
-
-
-def _middle(raw: RawImage, size: int) -> RawImage:
-    top, left = (max(n - size, 0) // 2 for n in raw.data.shape[1:])
-    data = raw.data[:, top : top + size, left : left + size]
-    return RawImage(data, raw.settings, raw.camera, raw.nlf, raw.white_balance)
+        middles = []
+        for raw in (sequence.captures[i].read() for i in (pair.source, pair.target)):
+            top, left = (max(n - size, 0) // 2 for n in raw.data.shape[1:])
+            middle = raw.data[:, top : top + size, left : left + size]
+            middles.append(replace(raw, data=middle))
+        yield Case(sequence.name, *middles)
 
 
 def _methods(
     modules: nn.ModuleDict, preset: str, weights: str | Path
 ) -> Callable[[Case], dict[str, Tensor]]:
     """Maps a case to the estimate of each stage."""
-    if "baseline" in modules:
-        return functools.partial(_baseline, modules["baseline"], preset.upper())
     # The w and b of our own weights are those of a body that did not take these pictures.
-    simulator = CameraSimulator.from_pretrained(
-        weights, device="auto", body_correction=preset != "compact", cache=None
-    )
-    return functools.partial(_stages, simulator)
+    simulator = None
+    if "baseline" not in modules:
+        simulator = CameraSimulator.from_pretrained(
+            weights, device="auto", body_correction=preset != "compact", cache=None
+        )
 
+    @torch.no_grad()
+    def estimate(case: Case) -> dict[str, Tensor]:
+        if simulator is None:
+            settings = case.source.settings, case.target.settings
+            parameters = torch.tensor([[v for s in settings for v in settings_parameters(s)]])
+            return {preset.upper(): modules["baseline"](case.source.data[None], parameters)[0]}
+        stages = simulator.stages(case.source, case.target.settings)
+        images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
+        return {name: image.cpu() for name, image in images.items()}
 
-def _stages(simulator: CameraSimulator, case: Case) -> dict[str, Tensor]:
-    stages = simulator.stages(case.source, case.target.settings)
-    images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
-    return {name: image.cpu() for name, image in images.items()}
-
-
-@torch.no_grad()
-def _baseline(network: nn.Module, name: str, case: Case) -> dict[str, Tensor]:
-    settings = case.source.settings, case.target.settings
-    parameters = torch.tensor([[v for s in settings for v in settings_parameters(s)]])
-    return {name: network(case.source.data[None], parameters)[0]}
+    return estimate
 
 
 def _scores(estimate: Tensor, case: Case) -> Row:
@@ -266,12 +256,12 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()],
             {"published, of the authors' own split": "{camera}", "PSNR [dB] / SSIM": "{text}"},
         ),
-        "networks": table(times, columns),
+        "networks": table(times.to_dict("records"), columns),
     }
     return Report([*means, *rows], tables, figures={"paper.png": _picture(means)})
 
 
-def _label(row: Row) -> str:
+def _label(row: Mapping[str, Any]) -> str:
     return row["method"] if row["preset"] in ("pc", "dl") else f"{row['method']} `{row['preset']}`"
 
 

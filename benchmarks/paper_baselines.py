@@ -166,8 +166,10 @@ class GeneratedConvolution(nn.Module):
         if self.upsample:
             x = F.conv_transpose2d(x, kernels, stride=2, padding=1, groups=batch)
         else:
-            spread = {"padding": self.dilation, "dilation": self.dilation}
-            x = F.conv2d(x, kernels, stride=self.stride, groups=batch, **spread)
+            stride, dilation = self.stride, self.dilation
+            x = F.conv2d(
+                x, kernels, None, stride, padding=dilation, dilation=dilation, groups=batch
+            )
         return x.reshape(batch, -1, *x.shape[-2:])
 
 

@@ -304,7 +304,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     regrets = frame.loc[frame["method"] == "simulated", "oracle_regret"]
     regret = {"mean": regrets.mean(), "upper": regrets.quantile(0.75), "most": regrets.max()}
     heads: dict[str, Any] = {"scenes": "{source}", "method": _title}
-    each = {"scene": "{scene}", "from": "{source_state}", "states": "{states}"}
+    each: dict[str, Any] = {"scene": "{scene}", "from": "{source_state}", "states": "{states}"}
     each |= {"known": "{known_share:.1%}", "method": _title, **_COLUMNS}
     del each["same oracle"]
     tables = {
@@ -319,8 +319,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     return Report(rows, tables)
 
 
-def _title(row: Row) -> str:
-    return METHODS.get(row["method"], row["method"])
+def _title(row: Mapping[str, Any]) -> str:
+    return METHODS.get(row["method"], str(row["method"]))
 
 
 BENCHMARK = Benchmark(

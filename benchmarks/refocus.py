@@ -177,7 +177,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     frame, means = pd.DataFrame(rows), []
     frame["method"] = pd.Categorical(frame["method"], list(METHODS))
     for (method, iso), own in frame.groupby(["method", "iso"], observed=True):
-        mean: Row = {"method": METHODS[method], "iso": iso, "seconds": own["seconds"].median()}
+        mean: Row = {"method": METHODS[str(method)], "iso": iso, "seconds": own["seconds"].median()}
         for f_number, scores in own.groupby("f_number")[["psnr", "edge_psnr"]].mean().iterrows():
             mean |= {f"{name} {f_number:g}": float(value) for name, value in scores.items()}
         means.append(mean)

@@ -143,12 +143,12 @@ def gain(seed: int) -> list[Row]:
         for name, scores in _scores(native, states, camera, seeded).items():
             found.setdefault(name, []).append(scores.astype(np.float64))
     rows = []
-    for name, scores in found.items():
-        low, high = np.array(scores).T
+    for name, pairs in found.items():
+        low, high = np.array(pairs).T
         change = high - low
         row: Row = {"scorer": name, "low_gain": low.mean(), "high_gain": high.mean()}
         row |= {"change": change.mean(), "change_sd": change.std()}
-        rows.append(row | {"rises": (change > _EQUAL).mean(), "num_scenes": len(scores)})
+        rows.append(row | {"rises": (change > _EQUAL).mean(), "num_scenes": len(pairs)})
     return [rounded(row) for row in rows]
 
 

@@ -35,7 +35,7 @@ BLOCKS, STEP_EV = 4, 0.1
 #: that are measured on the capture.
 RULES = 2
 #: Kinds of policies whose names have a file's or folder's path behind the colon.
-_WITH_FILES = ("ppo", "regression", "bracket", "recorded")
+_WITH_FILES = ("ppo", "regression", "recorded")
 COLUMNS = (
     *("task", "policy", "observation", "author", "date", "score", "ci95_low", "ci95_high"),
     *("procedural", "real", "regret", "ev_within_third", "frames_to_converge", "converged"),

@@ -49,13 +49,7 @@ Detect = Callable[[Tensor, int], list[Features]]
 
 
 class Condition(NamedTuple):
-    """How a pair is taken.
-
-    Args:
-        gap: Between the exposures [EV].
-        kind: Where it lies, `AROUND` or `BELOW`.
-        iso: ISO speed of both.
-    """
+    """How a pair is taken: gap between the exposures [EV], where it lies, and ISO of both."""
 
     gap: float
     kind: str

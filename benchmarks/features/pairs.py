@@ -110,15 +110,10 @@ def crop_homography(
     turn: float,
     jitter: float,
 ) -> np.ndarray:
-    """(3, 3) from a picture to a crop of `size` pixels a side around `centre`.
+    """(3, 3) from a picture to a crop of `size` pixels a side around `centre` (x, y).
 
-    Args:
-        rng: Draws it.
-        centre: x and y in the picture.
-        size: Of the crop.
-        scale: Largest factor of its scale, either way.
-        turn: Largest rotation [degree].
-        jitter: Largest shift of a corner, in sides of the crop.
+    Drawn: a factor of up to `scale` either way, a rotation of up to `turn` degrees, and shifts of
+    the corners of up to `jitter` sides of the crop.
     """
     half = 0.5 * size * scale ** rng.uniform(-1.0, 1.0)
     angle = np.radians(rng.uniform(-turn, turn))

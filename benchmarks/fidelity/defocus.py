@@ -120,7 +120,7 @@ def equal_exposure(reference: CameraSettings, iso: float, f_number: float) -> Ca
 
 def _pixel_classes(diameter: Tensor, white: Tensor) -> dict[str, Tensor]:
     """The pixels (H, W) of each of `CLASSES`, away from white (H, W) ones and from the frame."""
-    clear = ~_grown(white, CLIP_MARGIN)
+    clear = ~torch.from_numpy(maximum_filter(white.numpy(), 2 * CLIP_MARGIN + 1))
     for axis in (0, 1):
         clear.narrow(axis, 0, BORDER).fill_(False)
         clear.narrow(axis, clear.shape[axis] - BORDER, BORDER).fill_(False)
@@ -128,10 +128,6 @@ def _pixel_classes(diameter: Tensor, white: Tensor) -> dict[str, Tensor]:
         name: clear & (diameter >= low) & (diameter < high)
         for name, (low, high, _) in CLASSES.items()
     }
-
-
-def _grown(mask: Tensor, margin: int) -> Tensor:
-    return torch.from_numpy(maximum_filter(mask.numpy(), 2 * margin + 1))
 
 
 # -- errors ---------------------------------------------------------------------------------------
@@ -144,12 +140,8 @@ def _denoised(simulator: CameraSimulator, source: RawImage) -> tuple[Tensor, Ten
     if simulator.noise.preset == "paper":
         exposed = exposed.clamp(0.0, 1.0)
     shot, read = (torch.tensor([v]) for v in (source.noise.shot, source.noise.read))
-    return simulator.noise(exposed, shot, read), _deviation(exposed, source)
-
-
-def _deviation(image: Tensor, source: RawImage) -> Tensor:
-    shot, read = (torch.tensor([v]) for v in (source.noise.shot, source.noise.read))
-    return variance_map(smoothed(image), shot, read).sqrt()
+    deviation = variance_map(smoothed(exposed), shot, read).sqrt()
+    return simulator.noise(exposed, shot, read), deviation
 
 
 @dataclass

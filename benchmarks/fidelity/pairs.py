@@ -66,9 +66,14 @@ class Case:
     blur: float
 
     @property
+    def stops(self) -> int:
+        """By how many steps the aperture opens."""
+        return self.source.settings.aperture_stop - self.target.settings.aperture_stop
+
+    @property
     def opens(self) -> bool:
         """Whether the aperture opens."""
-        return self.source.settings.aperture_stop > self.target.settings.aperture_stop
+        return self.stops > 0
 
     @property
     def cleaner(self) -> bool:
@@ -78,10 +83,6 @@ class Case:
         exposed = camera.nlf(self.source.settings.iso).exposed(ratio)
         wanted = camera.nlf(self.target.settings.iso)
         return bool(noise_variance(mean, wanted).mean() < noise_variance(mean, exposed).mean())
-
-
-def _stop(settings: CameraSettings) -> int:
-    return settings.aperture_stop
 
 
 #: Groups of which every pair is in exactly one: where the average margin comes from.
@@ -97,8 +98,8 @@ GROUPS: dict[str, Callable[[Case], bool]] = {
     "all": lambda c: True,
     "target noisier than the source": lambda c: not c.cleaner,
     "target cleaner than the source": lambda c: c.cleaner,
-    "aperture closes": lambda c: _stop(c.source.settings) < _stop(c.target.settings),
-    "same aperture": lambda c: _stop(c.source.settings) == _stop(c.target.settings),
+    "aperture closes": lambda c: c.stops < 0,
+    "same aperture": lambda c: c.stops == 0,
     "aperture opens": lambda c: c.opens,
     **PARTITION,
     "source saturated in > 1 %": lambda c: float(c.source.saturated.float().mean()) > SATURATED,
@@ -136,7 +137,7 @@ def _pairs_of(
     return [
         p
         for p in pairs
-        if [_stop(sequences[p.sequence].settings[i]) for i in (p.source, p.target)] == wanted
+        if [sequences[p.sequence].settings[i].aperture_stop for i in (p.source, p.target)] == wanted
     ]
 
 
@@ -238,13 +239,8 @@ def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str, mix: str) -
         subjects = [case.group for case, _ in chosen]
         for method in chosen[0][1]:
             name, preset, corrected = method
-            head: Row = {
-                "part": "pairs",
-                "camera": camera,
-                "mix": mix,
-                "group": group,
-                "method": name,
-            }
+            head: Row = {"part": "pairs", "camera": camera, "mix": mix, "group": group}
+            head["method"] = name
             head |= {"preset": preset, "body_correction": corrected, "pairs": len(chosen)}
             row = head | {"source_groups": len(set(subjects))}
             for field in ("noisy_db", "noisy_ssim", "mean_db", "mean_ssim"):

@@ -120,12 +120,12 @@ def _held() -> float:
 # -- raws and the fit ------------------------------------------------------------------------------
 
 
-def noisy_raw(height: int, width: int, settings: CameraSettings | None = None) -> RawImage:
-    """A raw of any size as a Nikon Z6 records it, by default at ISO 400: mirrored dead leaves.
+def noisy_raw(height: int, width: int) -> RawImage:
+    """A raw of any size as a Nikon Z6 records it at ISO 400: mirrored dead leaves.
 
     In focus on the left of each tile, out of focus on the right.
     """
-    settings = settings or CameraSettings(400, 1 / 64, 8.0)
+    settings = CameraSettings(400, 1 / 64, 8.0)
     camera, rng = get_camera(CAMERA), np.random.default_rng(0)
     red, green, blue = dead_leaves(rng, _TILE)
     tile = torch.from_numpy(np.stack([red * 0.5, green, green, blue * 0.6]))  # a sensor's, roughly

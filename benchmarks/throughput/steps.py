@@ -224,18 +224,11 @@ def _rows(cases: Sequence[Case], threads: int, size: int) -> list[Row]:
     rows = []
     for case in cases:
         low, middle, high = quartiles(case.seconds)
-        rows.append(
-            {
-                "case": case.name,
-                "num_envs": case.num_envs,
-                "observation": case.observation,
-                "steps_per_second": 1.0 / middle,
-                "ratio_to_kernel": ratio(case, KERNEL[case.noise]),
-                "ratio_to_lookup": ratio(case, LOOKUP),
-                "spread": (high - low) / middle,
-                "error_codes": case.error,
-                "size": size,
-                "threads": threads,
-            }
-        )
+        row: Row = {"case": case.name, "num_envs": case.num_envs, "observation": case.observation}
+        row |= {
+            "steps_per_second": 1.0 / middle,
+            "ratio_to_kernel": ratio(case, KERNEL[case.noise]),
+        }
+        row |= {"ratio_to_lookup": ratio(case, LOOKUP), "spread": (high - low) / middle}
+        rows.append(row | {"error_codes": case.error, "size": size, "threads": threads})
     return rows

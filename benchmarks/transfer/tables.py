@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 from scipy.stats import rankdata, spearmanr
 
 from ae_env.options import EnvOptions
@@ -22,7 +23,6 @@ from ae_env.scenes.scene import Crop
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.cli.console import progress_bars
 from agents.evaluation.intervals import difference_interval, score_interval
-from agents.evaluation.metrics import group_means
 from agents.rollouts import RolloutPlan, make_envs
 from benchmarks.harness import FinishedParts, Row
 from benchmarks.transfer.worlds import (
@@ -70,57 +70,31 @@ def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) ->
 def _measure(
     plan: TransferPlan, part: TableSet, crop: Crop, iso: int, seed: int
 ) -> list[list[Measured]]:
-    return Predictions(plan, part, crop, seed=seed).at(iso, part.evs)
-
-
-class Predictions:
-    """Held-out scenes with their true tables, and what simulators make of photographs of them.
-
-    Args:
-        plan: Names the scenes.
-        part: The scorer, how many scenes, and the simulators.
-        crop: See `TableSet`.
-        seed: Of motion and defocus, and of the photographs.
-    """
-
-    def __init__(self, plan: TransferPlan, part: TableSet, crop: Crop, *, seed: int = 0) -> None:
-        options = EnvOptions(scorer=part.scorer, resolution=RESOLUTION)
-        self.seed, self.scenes = seed, held_out(plan, part.scenes, crop)
-        self._tables = ScoreTables(
-            options.make_grid(), options.make_camera(), options.make_scorer()
-        )
-        self._moves = drawn_moves(self.scenes, seed)
-        self._true = [self._table(i, scene) for i, scene in enumerate(self.scenes)]
-        self._simulators: dict[str, SceneNetworks | None] = {}
-        for name in filter(has_weights, part.simulators):
-            given = simulator_argument(name)
-            self._simulators[name] = None if given is None else SceneNetworks(given, cache=False)
-
-    def _table(self, index: int, scene: Scene) -> ScoreTable:
-        return self._tables.table(scene, **self._moves[index])
-
-    def at(self, iso: float, evs: Sequence[float]) -> list[list[Measured]]:
-        """What is measured of every scene and simulator: a list for each source exposure."""
-        return [
-            [m for i in range(len(self.scenes)) for m in self._measured(i, iso, ev)] for ev in evs
-        ]
-
-    def _measured(self, index: int, iso: float, ev: float) -> list[Measured]:
-        scene, true = self.scenes[index], self._true[index]
-        taken = simulate_source_raw(scene, seed=self.seed, iso=iso, ev=ev)
-        saturated = taken.prepared.saturated_share
-        found = []
-        for name, networks in self._simulators.items():
-            began = time.perf_counter()
-            table = self._table(index, _simulated(networks, taken))
-            row: Measured = {"simulator": name, "group": scene.group, "saturated": saturated}
-            row["ms"] = 1000.0 * (time.perf_counter() - began)
-            found.append(row | errors(table, true, self._tables.scorer.totals))
-        return found
-
-
-def _simulated(networks: SceneNetworks | None, taken: Scene) -> Scene:
-    return taken if networks is None else networks.denoised(taken)
+    """What is measured of every scene and simulator: a list for each source exposure."""
+    options = EnvOptions(scorer=part.scorer, resolution=RESOLUTION)
+    scorer = options.make_scorer()
+    tables = ScoreTables(options.make_grid(), options.make_camera(), scorer)
+    scenes = held_out(plan, part.scenes, crop)
+    moves = drawn_moves(scenes, seed)
+    true = [tables.table(scene, **own) for scene, own in zip(scenes, moves, strict=True)]
+    simulators: dict[str, SceneNetworks | None] = {}
+    for name in filter(has_weights, part.simulators):
+        given = simulator_argument(name)
+        simulators[name] = None if given is None else SceneNetworks(given, cache=False)
+    found: list[list[Measured]] = []
+    for ev in part.evs:
+        found.append([])
+        for scene, own, right in zip(scenes, moves, true, strict=True):
+            taken = simulate_source_raw(scene, seed=seed, iso=iso, ev=ev)
+            for name, networks in simulators.items():
+                began = time.perf_counter()
+                clean = taken if networks is None else networks.denoised(taken)
+                table = tables.table(clean, **own)
+                row: Measured = {"ms": 1000.0 * (time.perf_counter() - began)}
+                row |= {"simulator": name, "group": scene.group}
+                row["saturated"] = taken.prepared.saturated_share
+                found[-1].append(row | errors(table, right, scorer.totals))
+    return found
 
 
 def drawn_moves(scenes: Sequence[Scene], seed: int) -> list[dict[str, Any]]:
@@ -174,38 +148,24 @@ def _spearman(first: np.ndarray, second: np.ndarray) -> float:
 
 def summary(measured: Sequence[Measured]) -> list[Row]:
     """A row for each simulator: means over source groups, and paired differences to EXP."""
-    names = list(dict.fromkeys(m["simulator"] for m in measured))
-    by_name = {name: [m for m in measured if m["simulator"] == name] for name in names}
-    return [_summary(name, by_name) for name in names]
-
-
-def _summary(name: str, by_name: Mapping[str, Sequence[Measured]]) -> Row:
-    own, exp = by_name[name], by_name.get(EXP)
-    groups = np.array([m["group"] for m in own])
-    row: Row = {"simulator": name, "num_scenes": len(own), "num_groups": len(set(groups))}
-    for measure in MEASURES:
-        row |= _mean_and_gain(measure, own, None if name == EXP else exp, groups)
-    row["terms"] = {
-        term: _mean(lambda m, t=term: m["terms"][t], own, groups) for term in own[0]["terms"]
-    }
-    row["worst_term"] = max(row["terms"], key=row["terms"].__getitem__)
-    row["saturated"] = _mean(lambda m: m["saturated"], own, groups)
-    return row | {"ms": float(np.median([m["ms"] for m in own]))}
-
-
-def _mean_and_gain(
-    measure: str, own: Sequence[Measured], exp: Sequence[Measured] | None, groups: np.ndarray
-) -> Row:
-    values = group_means(np.array([m[measure] for m in own]), groups)
-    alike = np.ones(len(values))
-    mean = score_interval(values, alike)
-    row: Row = {measure: mean.value, f"{measure}_ci95": mean.pair}
-    if exp is not None:
-        other = group_means(np.array([m[measure] for m in exp]), groups)
-        difference = difference_interval(values, other, alike)
-        row |= {f"{measure}_to_exp": difference.value, f"{measure}_to_exp_ci95": difference.pair}
-    return row
-
-
-def _mean(of: Callable[..., float], own: Sequence[Measured], groups: np.ndarray) -> float:
-    return float(group_means(np.array([of(m) for m in own]), groups).mean())
+    frame, terms = pd.DataFrame(measured), list(measured[0]["terms"])
+    for term in terms:
+        frame[f"term {term}"] = [m["terms"][term] for m in measured]
+    own = [*MEASURES, "saturated", *(f"term {term}" for term in terms)]
+    means = frame.groupby(["simulator", "group"])[own].mean()
+    rows: list[Row] = []
+    for name, scenes in frame.groupby("simulator", sort=False):
+        values, alike = means.loc[name], np.ones(scenes["group"].nunique())
+        row: Row = {"simulator": name, "num_scenes": len(scenes), "num_groups": len(alike)}
+        for measure in MEASURES:
+            mean = score_interval(values[measure].to_numpy(), alike)
+            row |= {measure: mean.value, f"{measure}_ci95": mean.pair}
+            if name != EXP and EXP in means.index:
+                exp = means.loc[EXP][measure].to_numpy()
+                gain = difference_interval(values[measure].to_numpy(), exp, alike)
+                row |= {f"{measure}_to_exp": gain.value, f"{measure}_to_exp_ci95": gain.pair}
+        row["terms"] = {term: float(values[f"term {term}"].mean()) for term in terms}
+        row["worst_term"] = max(terms, key=row["terms"].__getitem__)
+        row["saturated"] = float(values["saturated"].mean())
+        rows.append(row | {"ms": float(scenes["ms"].median())})
+    return rows

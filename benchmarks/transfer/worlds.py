@@ -20,15 +20,10 @@ from simulator import CameraProfile
 HIGH_ISO = (1600.0, 6400.0)
 #: Packed pixels a side, of every training and every table.
 RESOLUTION = 64
-#: Simulators by name: the environment's argument. EXP has no network: exposure ratio and noise
-#: level function only. `PAPER` is none of them: its weights have a path.
-SIMULATORS: dict[str, str | None] = {
-    "EXP": None,
-    "nano": "nano",
-    "compact": "compact",
-    "large": "large",
-}
+#: EXP has no network: exposure ratio and noise level function only. The weights of `PAPER` do not
+#: come with the package.
 TRUTH, EXP, PAPER = "truth", "EXP", "paper"
+SIMULATORS = (EXP, "nano", "compact", "large", PAPER)
 #: Bundled scenes and views of real places together.
 BOTH = "both"
 
@@ -71,8 +66,7 @@ class World:
     """What an agent is trained in.
 
     Args:
-        simulator: ``"truth"``, or what simulates from one raw of each scene: a name of
-            `SIMULATORS`, or ``"paper"``.
+        simulator: ``"truth"``, or what simulates from one raw of each scene, of `SIMULATORS`.
         high_iso: Whether those raws are of ISO 1600 to 6400, instead of 100 to 6400.
     """
 
@@ -106,7 +100,7 @@ def simulator_argument(name: str) -> str | None:
         FileNotFoundError: If it needs weights that were not trained.
     """
     if name != PAPER:
-        return SIMULATORS[name]
+        return None if name == EXP else name
     found = weights(PAPER)
     if found is None:
         raise FileNotFoundError(
@@ -155,7 +149,7 @@ class TableSet:
 
     scorer: str = "balanced"
     scenes: int = 32
-    simulators: tuple[str, ...] = (*SIMULATORS, PAPER)
+    simulators: tuple[str, ...] = SIMULATORS
     isos: tuple[int, ...] = (100, 400, 1600, 6400)
     evs: tuple[int, ...] = (-3, -1, 0, 1, 3)
     crops: tuple[Crop, ...] = ("box", "native")

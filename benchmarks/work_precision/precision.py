@@ -47,33 +47,20 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         _captured(method, small.raw(seed), small.states(1), seed)
     for index, trial in enumerate(chosen):
         _one_trial(records, methods, trial, trial.states(count), seed + 1000 * index, index)
-    floor = records.pop(REFERENCE)
+    floor = _median(records.pop(REFERENCE)["noise"])
     rows: list[Row] = []
     for method in methods:
         own = records[method.key]
         low, middle, high = quartiles(own["ms"])
-        rows.append(
-            {
-                "part": "precision",
-                "method": method.name,
-                "height": height,
-                "width": width,
-                "dtype": method.dtype,
-                "tolerance": method.tolerance,
-                "mode": method.mode,
-                "ms_per_state": middle,
-                "ms_spread": (high - low) / 2,
-                "ms_per_sweep": len(GRID) * middle,
-                "psnr_db": float(np.mean(own["psnr"])),
-                "psnr_db_10_percent": float(np.quantile(own["psnr"], 0.1)),
-                "psnr_db_90_percent": float(np.quantile(own["psnr"], 0.9)),
-                "relative_rmse": float(np.mean(own["rmse"])),
-                "noise_variance_error": _median(own["noise"]),
-                "noise_variance_floor": _median(floor["noise"]),
-                "scenes": len(chosen),
-                "states_per_scene": count,
-            }
-        )
+        row: Row = {"part": "precision", "method": method.name, "height": height, "width": width}
+        row |= {"dtype": method.dtype, "tolerance": method.tolerance, "mode": method.mode}
+        row |= {"ms_per_state": middle, "ms_spread": (high - low) / 2}
+        row |= {"ms_per_sweep": len(GRID) * middle, "psnr_db": float(np.mean(own["psnr"]))}
+        for percent in (10, 90):
+            row[f"psnr_db_{percent}_percent"] = float(np.quantile(own["psnr"], percent / 100))
+        row |= {"relative_rmse": float(np.mean(own["rmse"]))}
+        row |= {"noise_variance_error": _median(own["noise"]), "noise_variance_floor": floor}
+        rows.append(row | {"scenes": len(chosen), "states_per_scene": count})
     points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
     for row, best in zip(rows, pareto_front(points), strict=True):
         row["pareto"] = best
@@ -148,11 +135,9 @@ def mean_error(expected: Tensor, mean: Tensor, camera: CameraProfile) -> dict[st
 def noise_ratios(
     captures: tuple[Tensor, Tensor], mean: Tensor, nlf: NoiseLevelFunction, camera: CameraProfile
 ) -> list[float]:
-    """Variance of the noise over the noise level function's, at every level of the signal.
+    """Variance of the noise over the noise level function's, at every level with enough pixels.
 
-
-    Returns:
-        One number per level with enough pixels; of pixels that are clear of both clips.
+    Of pixels that are clear of both clips.
     """
     wanted = noise_variance(mean, nlf)
     margin = _CLEAR * wanted.sqrt()

@@ -9,8 +9,11 @@ from ae_env.scenes import Scene, load_scenes
 from simulator import get_camera
 
 
-def load(spec: object, split: str = "all", resolution: int | None = 16) -> list[Scene]:
-    camera = get_camera("nikon_z6")
+def load(
+    spec: object, split: str = "all", resolution: int | None = 16, **options: object
+) -> list[Scene]:
+    """Scenes of `spec`, which is a path where there are `options`."""
+    camera, spec = get_camera("nikon_z6"), {"path": spec, **options} if options else spec
     return load_scenes(spec, split, camera=camera, resolution=resolution)  # type: ignore[arg-type]
 
 

@@ -1,21 +1,39 @@
-"""Bundled scenes: statistics, splits, determinism, cache."""
+"""Bundled scenes: statistics, splits, depth, cache, and what is drawn on demand."""
 
 import logging
+import pickle
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.bundled import procedural_groups
+from ae_env.scenes.bundled import (
+    DrawnScenes,
+    SceneGroup,
+    add_layout,
+    bundled_scenes,
+    procedural_groups,
+)
+from ae_env.scenes.load import _LOADED
+from ae_env.scenes.measured_depth import depth_scenes
+from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
+from simulator.radiance import depth
+from simulator.radiance.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
 from simulator.utils.cache import disk_cache
+from tests.ae_env.environments import assert_equal
+from tests.ae_env.scorer_images import make_scene
 
 CAMERA = get_camera("nikon_z6")
+
+
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
@@ -41,9 +59,13 @@ def test_dead_leaves_have_the_spectrum_of_nature() -> None:
     """Field 1987, Ruderman 1997: the power of natural pictures falls about as f**-2."""
     slopes = [slope(dead_leaves(np.random.default_rng(i), 256)[1]) for i in range(8)]
     assert np.mean(slopes) == pytest.approx(-2.0, abs=0.25)
+    # A value of the first release: the bundled scenes must not change.
+    picture = dead_leaves(np.random.default_rng(7), 48)
+    mean = [0.15036413232802362, 0.16999628065968864, 0.15176365238261902]
+    np.testing.assert_allclose(picture.mean(axis=(1, 2), dtype=float), mean, rtol=1e-5)
 
 
-def test_split_has_enough_groups_and_half_of_them_are_hard(unseen: list[Scene]) -> None:
+def test_splits_share_no_group_and_half_of_their_groups_are_hard(unseen: list[Scene]) -> None:
     groups = {scene.group: scene.hard for scene in unseen}
     assert len(groups) >= 90
     assert 0.4 <= np.mean(list(groups.values())) <= 0.6
@@ -54,13 +76,10 @@ def test_split_has_enough_groups_and_half_of_them_are_hard(unseen: list[Scene]) 
         assert scene.light.min() >= 0
         assert scene.median_speed == (1.0 if scene.kind == "motion" else 0.125)
     assert len({scene.scene_id for scene in unseen}) == len(unseen)
-
-
-def test_splits_share_no_group(unseen: list[Scene]) -> None:
     train = {f"{kind}-{index:03d}" for kind, index in procedural_groups("train", "large")}
     train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
     assert len(train) >= 195
-    assert not train & {scene.group for scene in unseen}
+    assert not train & groups.keys()
 
 
 def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> None:
@@ -112,8 +131,14 @@ def test_drawing_depends_on_the_generator_alone() -> None:
         assert first.illuminance == second.illuminance
         assert not np.array_equal(first.light, other.light)
         assert first.light.dtype == np.float32
-    with pytest.raises(ValueError, match="did you mean 'night'"):
-        draw("nights", np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    for call, arguments, message in (
+        (draw, ("nights",), "did you mean 'night'"),
+        (draw_depth, (32, "fron"), r"`focus`.*did you mean 'front'"),
+        (draw_depth, (8,), "`size`"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call(*([*arguments, rng] if call is draw else [rng, *arguments]))
 
 
 def test_unprocess_inverts_tone_and_gamma() -> None:
@@ -164,3 +189,179 @@ def test_cached_scenes_equal_fresh_ones(
         assert all(torch.equal(a.light, b.light) for a, b in zip(fresh, again, strict=True))
     load()
     assert not caplog.records
+
+
+PITCH = 11.88e-6  # packed pixels of the Nikon Z6
+
+
+def drawn_depth(seed: int, size: int = 48, focus: str = "middle") -> DepthDrawing:
+    return draw_depth(np.random.default_rng(seed), size, focus)
+
+
+def test_a_thing_hides_what_is_farther_and_nothing_else() -> None:
+    ramp = np.repeat(np.linspace(-4.0, 4.0, 48, dtype=np.float32)[None], 48, axis=0)
+    visible = 0
+    for seed in range(12):
+        blur, surface = ramp.copy(), np.zeros((48, 48), int)
+        depth._put_thing(np.random.default_rng(seed), blur, surface, 1, 0.0)
+        seen = surface == 1
+        assert (blur[seen] < ramp[seen]).all()  # larger is farther
+        np.testing.assert_array_equal(blur[~seen], ramp[~seen])
+        assert not seen[ramp < -2.0].any()  # no thing is slanted by more than 1.8 pixels
+        visible += seen.any()
+    assert visible >= 6
+
+
+def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:
+    """c = f^2 / (N (s - f)) |z - s| / z with f = 50 mm and N = 11, by hand."""
+    for seed, focus in enumerate(FOCUSES * 2):
+        picture = drawn_depth(seed, focus=focus)
+        distance, z = lens_and_depth(picture.blur, picture.far, PITCH)
+        z = z.astype(float)
+        c = 0.05**2 / (11.0 * (distance - 0.05)) * (z - distance) / z / PITCH
+        np.testing.assert_allclose(c, picture.blur, atol=2e-4)
+        assert 0.5 < z.min() <= z.max() <= 51.0
+        assert 1.0 / z.max() == pytest.approx(picture.far, rel=1e-4)
+
+
+def test_what_is_in_focus() -> None:
+    for seed in range(8):
+        everything, front, back = (
+            drawn_depth(seed, focus=focus).blur for focus in ("everything", "front", "back")
+        )
+        assert np.abs(everything).max() <= 0.3 + 1e-6
+        # Slants and floating leaves reach at most 1.8 pixels past the level of the thing.
+        assert front.min() > -2.0
+        assert back.max() < 2.0
+        for blur in (front, back):
+            assert np.abs(blur).max() <= 7.0
+
+
+def test_draped_pictures_are_laid_out() -> None:
+    """Most are focused on the nearest thing, and none without a subject that can be seen."""
+    scenes = [make_scene(np.ones((4, 40, 48)), 100.0, scene_id=f"{i}") for i in range(60)]
+    layouts = [add_layout(scene).layout for scene in scenes]
+    in_focus = 0
+    for layout in layouts:
+        assert layout is not None
+        assert layout.subject is not None
+        assert layout.defocus.shape == layout.subject.shape == (40, 48)
+        assert float(layout.defocus.max()) > 0.7  # the cut may miss the largest
+        in_focus += float(layout.defocus[layout.subject].median()) < 0.2
+    assert 0.6 * len(layouts) < in_focus < 0.95 * len(layouts)
+    shares = [float(layout.subject.float().mean()) for layout in layouts]
+    assert min(shares) > 0.0
+    assert 0.05 < np.mean(shares) < 0.5
+
+
+def test_layouts_depend_on_the_name_alone() -> None:
+    """One scene has one layout at every resolution: the finer, averaged."""
+    light = np.random.default_rng(0).random((4, 128, 128))
+    fine = add_layout(make_scene(light, 100.0, scene_id="a"))
+    again = add_layout(make_scene(light * 0.5, 200.0, scene_id="a"))
+    other = add_layout(make_scene(light, 100.0, scene_id="b"))
+    small = add_layout(make_scene(light[:, :64, :64], 100.0, scene_id="a"))
+    resized = fine.resized(64).layout
+    assert None not in (fine.layout, again.layout, other.layout, small.layout, resized)
+    assert torch.equal(fine.layout.defocus, again.layout.defocus)
+    assert not torch.equal(fine.layout.defocus, other.layout.defocus)
+    torch.testing.assert_close(resized.defocus, small.layout.defocus)
+
+
+def test_scenes_with_measured_depth_have_its_layout() -> None:
+    front, middle, *_ = depth_scenes(CAMERA)
+    for scene in (front, middle):
+        assert scene.layout is not None
+        assert scene.layout.defocus.shape == scene.light.shape[1:]
+        assert scene.layout.subject is not None
+        assert scene.resized(64).layout is not None
+    assert front.scene_id == "motorcycle-front"
+    assert float(front.layout.defocus.max()) > 0.9
+
+
+@pytest.fixture
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    _LOADED.clear()
+    yield
+    _LOADED.clear()
+
+
+def made(names: list[str]) -> Callable[[], list[Scene]]:
+    def make() -> list[Scene]:
+        made_now.append(names)
+        light = torch.full((4, 36, 36), 0.1 * len(made_now))
+        reference = next(iter(load_scenes("bundled:small", "test", camera=CAMERA))).reference
+        return [Scene.from_array(light, reference, CAMERA, scene_id=name) for name in names]
+
+    return make
+
+
+made_now: list[list[str]] = []
+
+
+@pytest.mark.usefixtures("empty_cache")
+@pytest.mark.parametrize("part", ["night", "photograph"])
+def test_drawn_one_by_one_they_are_those_drawn_together(part: str, monkeypatch) -> None:
+    together = load_scenes(f"bundled:{part}", "test", camera=CAMERA, resolution=36)
+    request = SceneRequest("test", CAMERA, 36)
+    loaded = bundled_scenes(request, part=part)
+    monkeypatch.setenv("AE_ENV_CACHE", "/dev/null/none")  # nothing is stored, nothing is found
+    drawn = bundled_scenes(request, part=part)
+    assert loaded.loaded == list(range(len(together)))
+    assert drawn.loaded != loaded.loaded
+    assert list(drawn.scene_ids) == [scene.scene_id for scene in together]
+    for index in np.random.default_rng(0).permutation(len(drawn)).tolist():
+        for one in (drawn[index], loaded[index]):
+            assert one.scene_id == together[index].scene_id
+            assert one.content == together[index].content
+            assert one.reference == together[index].reference
+            assert one.ev100 == together[index].ev100
+        assert drawn[index] is drawn[index]
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_no_more_are_drawn_than_are_asked_for_and_the_last_one_stores_them() -> None:
+    made_now.clear()
+    groups = [["a"], ["b", "c"], ["d"]]
+    scenes = DrawnScenes("some", [SceneGroup(g, made(g)) for g in groups], "0" * 64)
+    assert made_now == [["a"]]  # what cannot be drawn must fail at once
+    assert (len(scenes), scenes.scene_ids) == (4, ("a", "b", "c", "d"))
+    assert scenes[-2].scene_id == "c"
+    assert [scene.scene_id for scene in scenes[:3]] == ["a", "b", "c"]
+    assert made_now == [["a"], ["b", "c"]]
+    assert disk_cache().get("0" * 64) is None
+    with pytest.raises(IndexError):
+        scenes[4]
+    copied = pickle.loads(pickle.dumps(scenes))
+    assert made_now == [["a"], ["b", "c"], ["d"]]
+    assert disk_cache().get("0" * 64) is not None
+    for one, other in zip(scenes, copied, strict=True):
+        assert one.scene_id == other.scene_id
+        assert one.content == other.content
+    assert len(made_now) == 3
+
+
+@pytest.mark.usefixtures("empty_cache")
+@pytest.mark.parametrize("name", ["AutoExposure-v0", "ExposureBracket-v0"])
+def test_episodes_do_not_depend_on_when_scenes_are_drawn(name: str) -> None:
+    """Which scene an episode shows, too: the draw must not wait for what is drawn."""
+
+    def episodes() -> list[tuple[object, ...]]:
+        _LOADED.clear()
+        envs = gym.make_vec(
+            f"ae_env/{name}", num_envs=3, scenes="bundled:spot_light", split="test", resolution=36
+        )
+        core = envs.unwrapped.core  # type: ignore[attr-defined]
+        loaded.append(len(core.scenes.loaded))
+        found: list[tuple[object, ...]] = [envs.reset(seed=5)]
+        found += [envs.step(np.full(3, action)) for action in range(0, 21, 3)]
+        unpickled = pickle.loads(pickle.dumps(core))
+        assert_equal(unpickled.episodes.columns(), core.episodes.columns())
+        return found
+
+    loaded: list[int] = []
+    first = episodes()
+    load_scenes("bundled:spot_light", "test", camera=CAMERA, resolution=36)  # draws and stores all
+    assert_equal(first, episodes())
+    assert loaded[0] < loaded[1] == 10

@@ -48,13 +48,10 @@ def panorama(light) -> np.ndarray:
     return np.repeat(grey[None], 3, axis=0).astype(np.float32)
 
 
-@pytest.mark.parametrize(("azimuth", "pitch"), [(0, 90), (17, 0), (-120, 35), (0, -90)])
-def test_an_even_sky_all_around_gives_pi_times_its_luminance(azimuth: float, pitch: float) -> None:
+def test_an_even_sky_gives_pi_times_its_luminance_and_a_dome_half_of_it_to_a_wall():
     even = panorama(lambda lon, lat: 2.0 + 0.0 * lat + 0.0 * lon)
-    assert incident_light(even, azimuth, pitch) == pytest.approx(2.0 * math.pi, rel=1e-4)
-
-
-def test_a_dome_above_gives_half_of_that_to_a_wall():
+    for azimuth, pitch in ((0, 90), (17, 0), (-120, 35), (0, -90)):
+        assert incident_light(even, azimuth, pitch) == pytest.approx(2.0 * math.pi, rel=1e-4)
     dome = panorama(lambda lon, lat: (lat > 0) + 0.0 * lon)
     assert incident_light(dome, 0, 90) == pytest.approx(math.pi, rel=1e-3)
     for azimuth in (0, 45, 180):
@@ -96,17 +93,18 @@ def an_asset(tmp_path, monkeypatch):
     return make
 
 
-def test_a_white_wall_under_an_even_sky_is_white_at_the_incident_light(an_asset):
-    """Even light all around: a view of it is as bright as a white surface that it lights, at every
-    level of the light."""
+def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
+    """A view of it is as bright as a white surface that it lights; each view has its own level."""
     even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
-    for scene in asset_views(an_asset(even), CAMERA, size=32, views=3):
-        green = scene.light[1:3].mean().item()
-        assert green == pytest.approx(WHITE_SIGNAL, rel=0.01)
-        low, high = ILLUMINANCE["overcast"]
-        assert low <= scene.illuminance <= high
-        assert scene.sampled
-        assert scene.box_factor == 1
+    views = list(asset_views(an_asset(even), CAMERA, size=16, views=50))
+    for scene in views:
+        assert scene.light[1:3].mean().item() == pytest.approx(WHITE_SIGNAL, rel=0.01)
+        assert (scene.sampled, scene.box_factor) == (True, 1)
+    low, high = np.log(ILLUMINANCE["overcast"])
+    levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
+    assert 0 <= levels.min() < levels.max() <= 1
+    assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
+    assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
 
 
 def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch):
@@ -120,15 +118,6 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
     order = np.argsort(lux)
     assert lux[order[-1]] / lux[order[0]] == pytest.approx(20, rel=0.3)
     assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
-
-
-def test_each_view_has_a_level_of_its_own(an_asset):
-    even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
-    views = asset_views(an_asset(even), CAMERA, size=16, views=50)
-    low, high = np.log(ILLUMINANCE["overcast"])
-    levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
-    assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
-    assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
 
 
 def test_the_seed_draws_views_and_level(an_asset):
@@ -243,28 +232,28 @@ def test_a_download_fetches_what_is_missing(server, tmp_path):
     assert seen[-1][:2] == (total, total)
     assert download(url=url, progress=None) == []
     assert len(asked) == 3
+    with pytest.raises(ValueError, match="`url`"):
+        download(url="ftp://a", progress=None)
 
 
 @pytest.mark.parametrize("fault", ["error", "truncated", "other", "slow"])
-def test_a_broken_answer_is_asked_for_again(server, tmp_path, fault: str) -> None:
-    url, faults, asked = server
-    faults["map_1"] = [fault]
-    assert len(download(url=url, timeout=0.5, progress=None)) == 3
-    assert asked == ["map_0", "map_1", "map_1", "map_2"]
-    assert stored(tmp_path)["map_1_1k.hdr"] == CONTENT["map_1"]
-
-
-@pytest.mark.parametrize("fault", ["error", "truncated", "other"])
-def test_what_stays_broken_is_said_and_nothing_is_lost(
+def test_a_broken_answer_is_asked_for_again_and_what_stays_broken_is_said(
     server, tmp_path, monkeypatch, fault: str
 ) -> None:
-    monkeypatch.setattr("time.sleep", lambda seconds: None)
-    url, faults, _ = server
-    faults["map_1"] = [fault] * 3
-    with pytest.raises(ConnectionError, match=r"map_1_1k.hdr cannot be fetched: .*what is there"):
-        download(url=url, progress=None)
-    assert set(stored(tmp_path)) == {"map_0_1k.hdr"}  # no half of a file either
-    assert len(download(url=url, progress=None)) == 2
+    url, faults, asked = server
+    if fault != "slow":
+        monkeypatch.setattr("time.sleep", lambda seconds: None)
+        faults["map_1"] = [fault] * 3
+        with pytest.raises(
+            ConnectionError, match=r"map_1_1k.hdr cannot be fetched: .*what is there"
+        ):
+            download(url=url, progress=None)
+        assert set(stored(tmp_path)) == {"map_0_1k.hdr"}  # no half of a file either
+        asked.clear()
+    faults["map_1"] = [fault]
+    download(url=url, timeout=0.5, progress=None)
+    assert asked[-3:] == ["map_1", "map_1", "map_2"]
+    assert stored(tmp_path)["map_1_1k.hdr"] == CONTENT["map_1"]
 
 
 def test_a_damaged_file_of_the_right_length_is_fetched_again(server, tmp_path):
@@ -275,11 +264,6 @@ def test_a_damaged_file_of_the_right_length_is_fetched_again(server, tmp_path):
     assert download(url=url, progress=None) == [damaged]
     assert asked[3:] == ["map_1"]
     assert stored(tmp_path) == {f"{name}_1k.hdr": content for name, content in CONTENT.items()}
-
-
-def test_an_address_must_be_one():
-    with pytest.raises(ValueError, match=r"`url` \(='ftp://a'\) must begin with http"):
-        download(url="ftp://a", progress=None)
 
 
 def test_a_proxy_is_honoured(server, monkeypatch):

@@ -1,4 +1,4 @@
-"""Scenes of real captures: their pixels, the light that they tell together, and bad input."""
+"""Scenes of real captures: which file is which state, their pixels and light, bad input."""
 
 import logging
 import shutil
@@ -11,8 +11,14 @@ from PIL import Image
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import load_scenes
-from ae_env.scenes.recorded import RecordedOptions
-from simulator import exposure_ratio, get_camera, read_raw
+from ae_env.scenes.recorded import (
+    RecordedOptions,
+    index_recorded,
+    recorded_grid,
+    settings_in_name,
+    state_of,
+)
+from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
 from simulator.reference.camera import ReferenceCamera
 from tests.ae_env.recorded_files import (
@@ -34,7 +40,7 @@ def load(spec: object, resolution: int | None = None, **options: object):
 
 def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
     write_raws(tmp_path / "desk")
-    (scene,) = load(f"recorded:{tmp_path}")
+    (scene,) = load(f"recorded:{tmp_path}?iso=50")  # what the files state comes first
     assert scene.allowed.all()
     assert (scene.kind, scene.group, scene.sequence) == ("recorded", "desk", "")
     for state in range(len(GRID)):
@@ -115,49 +121,31 @@ def test_states_without_a_capture_are_forbidden_and_said(
     torch.testing.assert_close(a.recorded[1], capture(GRID[6]).data)
 
 
-def test_frames_of_a_video_follow_each_other(tmp_path: Path) -> None:
-    write_video(tmp_path, frames=11, times=("1-1000s", "1-60s"))
-    scenes = load({"recorded": tmp_path, "iso": 400, "f_number": 4})
-    assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]
-    assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
-
-
-def _cut(folder: Path) -> None:
-    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:300])
 
 
-def _cut_raw(folder: Path) -> None:
+def _cut_raw(path: Path) -> None:
+    folder = path.parents[3]
     shutil.rmtree(folder / "l1")
     write_raws(folder)
     (folder / "IMG_0003.dng").write_bytes((folder / "IMG_0003.dng").read_bytes()[:4000])
 
 
-def _twice(folder: Path) -> None:
-    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
-    shutil.copy(path, path.with_suffix(".png"))
-
-
-def _other_size(folder: Path) -> None:
-    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+def _other_size(path: Path) -> None:
     with Image.open(path) as picture:
         picture.resize((44, 40)).save(path)
 
 
-def _sixteen_bits(folder: Path) -> None:
-    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+def _sixteen_bits(path: Path) -> None:
     path.unlink()
     Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
 
 
-def _no_table(folder: Path) -> None:
-    (folder / "grid-options-2x2x2.csv").unlink()
-
-
-def _one_state(folder: Path) -> None:
-    for path in (folder / "l1").iterdir():
-        if path.name != "param_3":
-            shutil.rmtree(path)
+def _one_state(path: Path) -> None:
+    for folder in path.parents[2].iterdir():
+        if folder.name != "param_3":
+            shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize(
@@ -165,24 +153,24 @@ def _one_state(folder: Path) -> None:
     [
         (_cut, r"recorded file '.*param_3.*val_1.JPEG' cannot be read: "),
         (_cut_raw, r"recorded file '.*IMG_0003.dng' cannot be read: .*truncated"),
-        (_twice, r"'l1/n00000001/val_1' must have one file for each state, but .* are both ISO"),
-        (_other_size, r"val_1.JPEG' \(\(40, 44\) packed pixels\) must be of the size of .*, \(40,"),
-        (_no_table, r"val_0.JPEG' does not state its iso and exposure_time and f_number: name it"),
+        (
+            lambda path: shutil.copy(path, path.with_suffix(".png")),
+            r"'l1/n00000001/val_1' must have",
+        ),
+        (_other_size, r"val_1.JPEG' \(\(40, 44\) packed"),
+        (lambda path: path.parents[3].joinpath("grid-options-2x2x2.csv").unlink(), "val_0.JPEG"),
         (_sixteen_bits, r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
+        (None, r"val_0, ISO 100, 1/1000 s, f/4' \(40 x 40 packed\) must"),
         (_one_state, r"\(1 of 1 captures in the grid, .*param_3.*\) must have two states or more"),
     ],
 )
 def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: str) -> None:
     write_states(tmp_path)
-    spoil(tmp_path)
+    if spoil:
+        spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
     with pytest.raises(ValueError, match=message) as error:
-        load(f"recorded:{tmp_path}")
+        load(f"recorded:{tmp_path}", resolution=None if spoil else 64)
     assert "\n" not in str(error.value)
-
-
-def test_settings_can_stand_behind_the_folder() -> None:
-    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
-    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
 
 
 @pytest.mark.parametrize(
@@ -191,19 +179,126 @@ def test_settings_can_stand_behind_the_folder() -> None:
         ("recorded:", r"`scenes\['recorded'\]` \(=''\) must be the path of a folder"),
         ({"recorded": 3}, r"`scenes\['recorded'\]` \(=3\) must be the path"),
         ({"recorded": "a", "isos": 3}, r"did you mean 'iso'"),
-        ({"recorded": "a", "iso": -3}, r"`iso` \(=-3\) must be"),
         ("recorded:a?iso=-3", r"`iso` \(=-3.0\) must be"),
         ("recorded:a?iso=fast", r"f_number=4: 'iso=fast' is no setting"),
-        ("recorded:a?isos=3", r"did you mean 'iso'"),
-        ("recorded:/no/such", r"`scenes` \(='recorded:/no/such'\) must name an existing folder"),
     ],
 )
 def test_bad_options(spec: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load(spec)
+    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
 
 
-def test_a_frame_smaller_than_asked_is_named(tmp_path: Path) -> None:
-    write_raws(tmp_path / "desk", tuple(GRID)[:2])
-    with pytest.raises(ValueError, match=r"'desk, ISO 100, 1/1000 s, f/4' \(40 x 40 packed\) must"):
-        load(f"recorded:{tmp_path}", resolution=64)
+def touch(folder: Path, *names: str) -> Path:
+    """Files whose names say everything: nothing in them is read."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "rest"),
+    [
+        ("iso100_1-125s_f4", (100, 1 / 125, 4), ""),
+        ("desk_ISO-1600_0.5s_F5.6", (1600, 0.5, 5.6), "desk"),
+        ("f2.8 iso50 8ms", (50, 0.008, 2.8), ""),
+        ("250us", (None, 0.00025, None), ""),
+        ("15s", (None, 15, None), ""),
+        # An underscore parts words: it is no fraction's bar after one.
+        ("frame_0007_0.5s_iso100_f4", (100, 0.5, 4), "frame_0007"),
+        ("frame_0007_8s", (None, 8, None), "frame_0007"),
+        ("frame_1_8s", (None, 8, None), "frame_1"),
+        ("frame-1-8s", (None, 8, None), "frame-1"),
+        ("IMG_0001_2s_f4", (None, 2, 4), "IMG_0001"),
+        ("f4_0.5s_iso100", (100, 0.5, 4), ""),
+        ("f4_1s_iso100", (100, 1, 4), ""),
+        ("100iso_1-125s", (100, 1 / 125, None), ""),
+        # Not settings: a class of ImageNet, a picture of it, words that begin with f or iso.
+        ("n01443537", (None, None, None), "n01443537"),
+        ("ILSVRC2012_val_00000293", (None, None, None), "ILSVRC2012_val_00000293"),
+        ("isolated_scene2_from_3steps", (None, None, None), "isolated_scene2_from_3steps"),
+        ("param_12", (None, None, None), "param_12"),
+    ],
+)
+def test_settings_in_names(name: str, settings: tuple[float | None, ...], rest: str) -> None:
+    names = ("iso", "exposure_time", "f_number")
+    expected = {k: v for k, v in zip(names, settings, strict=True) if v is not None}
+    found, left = settings_in_name(name)
+    assert found == pytest.approx(expected)
+    assert left == rest
+
+
+def test_imagenet_es(tmp_path: Path) -> None:
+    grid = ExposureGrid((200, 12800), (1 / 1250, 0.4), (5, 13))
+    write_states(tmp_path, seeds=(3,), grid=grid)
+    shutil.copytree(tmp_path / "l1", tmp_path / "l5")
+    files = index_recorded(tmp_path, {})
+    assert [f.scene for f in files] == [f"l{i}/n00000003/val_3" for i in (1, 5) for _ in range(8)]
+    # Both lights of a picture stay on one side of a split.
+    assert {f.group for f in files} == {"n00000003/val_3"}
+    assert recorded_grid(files) == grid
+    by_folder = {f.path.parts[-3]: f.settings for f in files}
+    assert by_folder == {f"param_{i + 1}": s for i, s in enumerate(grid)}
+
+
+def test_video_stacks(tmp_path: Path) -> None:
+    write_video(tmp_path, frames=11, times=("1-1000s", "1-60s"))
+    scenes = load({"recorded": tmp_path, "iso": 400, "f_number": 4})
+    assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]
+    assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
+    # Frames in the files' names are the same.
+    flat = touch(tmp_path / "flat", *(f"v/frame_{i}_1-{t}s.png" for i in (9, 10) for t in (8, 15)))
+    files = index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
+    assert [(f.sequence, f.frame) for f in files] == [("v", 9), ("v", 9), ("v", 10), ("v", 10)]
+
+
+def test_a_table_and_exif_complete_each_other(tmp_path: Path) -> None:
+    for number, settings in enumerate(GRID):
+        write_picture(tmp_path / "a" / f"{number}.jpg", settings, exif=("exposure_time", "iso"))
+    rows = [f"{number}.jpg,f{settings.f_number:g}" for number, settings in enumerate(GRID)]
+    (tmp_path / "a" / "settings.csv").write_text("\n".join(["file,aperture", *rows]))
+    files = index_recorded(tmp_path, {})
+    assert [f.scene for f in files] == ["a"] * 8
+    assert recorded_grid(files) == GRID
+
+
+def test_nominal_and_exact_values_are_one_state() -> None:
+    grid = ExposureGrid((100,), (1 / 128, 1 / 64), (2.8, 5.6))
+    assert state_of(CameraSettings(100, 1 / 125, 5.6569), grid) == 1
+    assert state_of(CameraSettings(100, 1 / 60, 5.6), grid) is None  # 6.7 % off
+    assert state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("a,b\n1,2", r"columns \['a', 'b'\]\) must have the column file"),
+        ("file,iso\nx,many", r"settings.csv', line 2: 'many' must be a number"),
+        ("file,iso\nx,1\ny,1/0", r"settings.csv', line 3: '1/0' must be a number"),
+        ("idx,iso\nfirst,100", r"settings.csv', line 2: 'first' must be a number"),
+        ("file,iso\nx,100\nx,200", r"settings.csv' must have one row for 'x': two say"),
+        ("file,iso\n\udcff,100", r"settings.csv' must be a CSV file in UTF-8"),
+    ],
+)
+def test_wrong_tables(tmp_path: Path, table: str, message: str) -> None:
+    (tmp_path / "settings.csv").write_text(table, errors="surrogateescape")
+    with pytest.raises(ValueError, match=message):
+        index_recorded(tmp_path, {})
+
+
+def test_files_that_are_no_state(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"'recorded:.*none'\) must name an existing folder"):
+        index_recorded(tmp_path / "none", {})
+    with pytest.raises(ValueError, match=r"must hold captures: raws \(.*pictures \("):
+        index_recorded(touch(tmp_path / "a", "read_me.txt", ".hidden/iso1_1s_f1.png"), {})
+    with pytest.raises(ValueError, match=r"x.png' does not state its iso and f_number: name it"):
+        index_recorded(touch(tmp_path / "b", "1-8s/x.png"), {})
+    with pytest.raises(ValueError, match=r"f0.png': `f_number` \(=0.0\) must be"):
+        index_recorded(touch(tmp_path / "c", "iso100_1-8s_f0.png"), {})
+    with pytest.raises(ValueError, match=r"file '.*a.dng': `path` \(='a.dng'\) must be a"):
+        index_recorded(touch(tmp_path / "d", "a.dng"), {})
+    names = [f"iso{i}_1-{i}s_f{i / 100}.png" for i in range(100, 1800, 100)]
+    with pytest.raises(ValueError, match=r"17 ISO speeds.*4913 combinations; at most 4096"):
+        recorded_grid(index_recorded(touch(tmp_path / "e", *names), {}))

@@ -69,11 +69,8 @@ def test_unknown_light_is_anchored_to_the_mean() -> None:
     assert scene.light[1].mean().item() == pytest.approx(0.12, rel=1e-5)
     assert -scene.reference.log2_exposure == pytest.approx(7.5)
     assert scene.ev100 == pytest.approx(7.5, abs=1e-5)
-
-
-def test_a_sun_does_not_decide_the_anchor() -> None:
     rgb = np.ones((3, 10, 10), np.float32)
-    rgb[:, 0, 0] = 1e6  # one pixel in a hundred: clipped it counts 1, the others share 0.11
+    rgb[:, 0, 0] = 1e6  # a sun, one pixel in a hundred: clipped it counts 1, the others share 0.11
     scene = radiance_scene(rgb, PLAIN)
     assert scene.light[1, 5, 5].item() == pytest.approx((0.12 * 100 - 1) / 99, rel=1e-5)
 
@@ -120,7 +117,6 @@ def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
     ("name", "value"),
     [
         ("illuminance", 0.0),
-        ("illuminance", "500"),
         ("white_balance", (1.0, -1.0, 1.0)),
         ("median_speed", -1.0),
         ("box_factor", 0),
@@ -140,8 +136,6 @@ def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
 def test_invalid_fields_are_named(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=f"`{name}`"):
         array_scene(torch.ones(4, 2, 2), **{name: value})
-    with pytest.raises(ValueError, match="`camera`"):
-        Scene.from_array(torch.ones(4, 2, 2), CAMERA_SETTINGS, "nikon_z6", scene_id="a")  # type: ignore[arg-type]
 
 
 ONES = torch.ones(4, 8, 4)
@@ -153,6 +147,7 @@ ONES = torch.ones(4, 8, 4)
         (lambda: array_scene(ONES).resized(5), r"`resolution` \(=5\)"),
         (lambda: array_scene(ONES).resized(0), r"`resolution` \(=0\)"),
         (lambda: array_scene(ONES).resized(2, crop="centre"), "`crop`"),
+        (lambda: Scene.from_array(ONES, CAMERA_SETTINGS, "nikon_z6", scene_id="a"), "`camera`"),
         (lambda: radiance_scene(np.full((3, 2, 2), np.nan)), "`rgb`"),
         (lambda: radiance_scene(np.zeros((3, 2, 2), np.uint8)), "uint8"),
         (lambda: radiance_scene(np.zeros((3, 2, 2))), "no exposure brings its mean"),
@@ -171,9 +166,7 @@ def test_content_is_that_of_the_tensors() -> None:
     assert {s.content for s in same} == {scene.content}
     others = [
         array_scene(light * 2.0),
-        array_scene(light.reshape(4, 8, 6)),
         array_scene(light, denoised=light),
-        array_scene(light, denoised=light * 0.9),
         array_scene(light, defocus_map=light[0]),
     ]
     assert len({s.content for s in [scene, *others]}) == 1 + len(others)

@@ -29,11 +29,8 @@ def test_shapes(size: int, sensors: bool) -> None:
     assert torch.isfinite(values).all()
     values.sum().backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in features.parameters())
-
-
-def test_other_observations_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`.*must be a uint8 image"):
-        ExposureFeatures(space(36, dtype=np.float32))
+    with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`"):
+        ExposureFeatures(space(size, dtype=np.float32))
 
 
 def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> None:

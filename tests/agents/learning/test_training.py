@@ -90,7 +90,7 @@ def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str
 
 
 def test_bad_values_from_python() -> None:
-    with pytest.raises(ValueError, match=r"training.seed \(=4294967296\)"):
+    with pytest.raises(ValueError, match="seed"):
         tiny("ppo").with_seed(2**32)
     with pytest.raises(ValueError, match="must be a JSON value"):
         training.AgentConfig(agent="regression", environment={"scenes": Path("raws")})

@@ -114,27 +114,20 @@ def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> Non
     assert sibling(agent, ".safetensors").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"isos": (50, 200)}, "trained with isos from 100 to 6400, the environment has 50 to 200"),
-        ({"exposure_times": (0.01, 1.0)}, "exposure_times from 0.001 to 0.5.* has 0.01 to 1"),
-        ({"f_numbers": (4.0, 16.0)}, "trained with f_numbers from 4 to 11.* has 4 to 16"),
-    ],
-)
-def test_a_grid_beyond_the_trained_range(
-    agent: Path, context: PolicyContext, values: dict[str, Any], message: str
-) -> None:
+def test_another_grid_or_observation_than_the_trained(agent: Path, context: PolicyContext) -> None:
     inside = {"isos": (100, 200), "exposure_times": (0.01, 0.1), "f_numbers": (4.0, 8.0)}
-    grid = ExposureGrid(**{**inside, **values})
-    with pytest.raises(ValueError, match=message):
-        make_policy(f"regression:{agent}", replace(context, grid=grid))
-
-
-def test_other_observation(agent: Path, context: PolicyContext) -> None:
     space = gym.spaces.Dict({n: context.observation_space[n] for n in ("raw", "settings")})
-    with pytest.raises(ValueError, match="trained with sensors = True, the environment has False"):
-        make_policy(f"regression:{agent}", replace(context, observation_space=space))
+    for changes, message in (
+        ({"isos": (50, 200)}, "isos from 100 to 6400, the environment has 50 to 200"),
+        ({"exposure_times": (0.01, 1.0)}, "exposure_times from 0.001 to 0.5.* has 0.01 to 1"),
+        ({"f_numbers": (4.0, 16.0)}, "f_numbers from 4 to 11.* has 4 to 16"),
+        (None, "sensors = True, the environment has False"),
+    ):
+        other = (
+            {"grid": ExposureGrid(**inside | changes)} if changes else {"observation_space": space}
+        )
+        with pytest.raises(ValueError, match=message):
+            make_policy(f"regression:{agent}", replace(context, **other))
     with pytest.raises(ValueError, match="either `weights` or `network`"):
         RegressionPolicy(context)
 

@@ -11,7 +11,7 @@ from agents.policy_names import METERS, make_policy
 GREY = np.ones((64, 64))
 
 
-@pytest.mark.parametrize("name", ["average", "centre_weighted", "spot"])
+@pytest.mark.parametrize("name", ["average", "centre_weighted", "spot", "skewness"])
 def test_a_grey_card_reads_the_incident_ev(context, photograph, name):
     states = [int(np.argmin(np.abs(context.grid.ev100 - ev))) for ev in (7.0, 8.0, 9.0, 10.0)]
     reading = make_meter(name, context.camera)(photograph(GREY, 9.0, states))
@@ -143,12 +143,6 @@ def test_blown_highlights_read_brighter_than_they_show(context, photograph):
     step = 3.0 * (0.51 + 0.49 * share)
     ev = context.grid.ev100[state]
     assert reading.ev100[0] == pytest.approx(ev + math.log2(1.0 / 0.9) + step, abs=0.02)
-
-
-def test_skewness_reads_the_incident_ev_of_a_grey_card(context, photograph):
-    states = [context.grid.nearest(ev) for ev in (8.0, 9.0, 10.0)]
-    reading = make_meter("skewness", context.camera)(photograph(GREY, 9.0, states))
-    np.testing.assert_allclose(reading.ev100, 9.0, atol=0.06)
 
 
 def test_skewness_balances_two_levels_about_mid_grey(context, photograph):

@@ -22,7 +22,7 @@ from simulator.training.data import (
 )
 from tests.simulator.training.scenes import REFERENCE, scene
 
-Z6 = get_camera("nikon_z6")
+Z6, CANON = get_camera("nikon_z6"), get_camera("canon_70d")
 DARK = CameraSettings(6400, 1 / 2048, 5.6)
 LIGHT = CameraSettings(100, 1 / 16, 4)
 
@@ -59,11 +59,11 @@ def test_sequences_are_drawn_by_seed_and_index():
     assert first[0].settings != first[1].settings
     assert first[0].settings != other[0].settings
     assert [s.scene.scene_id for s in first] == ["a", "b"]
-    with pytest.raises(ValueError, match=r"scene 'a': `illuminance` must be known"):
+    with pytest.raises(ValueError, match="`illuminance`"):
         draw_sequences([replace(scene(), illuminance=None)], Z6, 0)
-    with pytest.raises(ValueError, match=r"must hold a pair for stage 'aperture'"):
+    with pytest.raises(ValueError, match="stage 'aperture'"):
         ReferencePairs([], ReferenceCamera(Z6), "aperture")
-    with pytest.raises(ValueError, match=r"`crop` \(=33\) must not exceed the 32 x 32 pixels"):
+    with pytest.raises(ValueError, match="`crop`"):
         pairs().batch(0, 1, 33)
 
 
@@ -131,9 +131,6 @@ def test_defocus_is_the_thin_lens_at_the_sources_aperture():
     np.testing.assert_allclose(batch.defocus.amax((1, 2)), expected, rtol=1e-4)
     assert not batch.defocus.amin((1, 2)).any()
     assert ((batch.defocus > 0).float().mean((1, 2)) == 0.5).all()
-
-
-Z6, CANON = get_camera("nikon_z6"), get_camera("canon_70d")
 
 
 def picture(*size: int, seed: int = 0, **named: object) -> DetailPicture:
@@ -224,16 +221,13 @@ def test_a_recorded_mosaic_serves_only_where_it_is_quiet() -> None:
     assert not bool((clean.shot >= 16 * 2e-6 * level).all())  # the rule did leave some out
 
 
-def test_pictures_that_are_none() -> None:
-    with pytest.raises(ValueError, match=r"`light` \(shape \(2, 8, 8\)\) of 'a' must be \(3, H, W"):
+def test_pictures_and_crops_that_are_none() -> None:
+    with pytest.raises(ValueError, match=r"`light`.* of 'a'"):
         picture(2, 8, 8)
     for pictures, bodies in (([], [Z6]), ([flat()], [])):
-        with pytest.raises(ValueError, match="`pictures` and `cameras` must not be empty"):
+        with pytest.raises(ValueError, match="`pictures` and `cameras`"):
             DetailCrops(pictures, bodies)
-
-
-def test_a_crop_that_no_picture_holds() -> None:
     crops = DetailCrops([flat(side=40), picture(3, 96, 100)], [Z6])
     assert crops.batch(0, 2, 48).noisy.shape == (2, 4, 48, 48)
-    with pytest.raises(ValueError, match=r"`crop` \(=49\) must not exceed the largest picture, 48"):
+    with pytest.raises(ValueError, match="`crop`"):
         crops.batch(0, 1, 49)

@@ -71,6 +71,9 @@ def test_exposure_is_the_mean_error_of_what_is_not_over_exposed():
     assert loss(data)["loss"].item() == pytest.approx(0.01, rel=1e-4)
     data.source[:] = 1.0
     assert loss(data)["loss"].item() == 0.0  # not NaN
+    baseline = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
+    values = baseline(batch(noise=False))  # source 0.2, compared with the sample, 0.41
+    assert values["loss"].item() == pytest.approx(0.21, rel=1e-5)
 
 
 def test_the_noise_goes_with_the_exposure():
@@ -81,12 +84,6 @@ def test_the_noise_goes_with_the_exposure():
     torch.testing.assert_close(shot, torch.full((2, 4), 3 * SHOT))
     torch.testing.assert_close(read, torch.full((2, 4), 9 * READ))
     assert not exposed.requires_grad | shot.requires_grad
-
-
-def test_a_baseline_is_compared_with_the_sample():
-    loss = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
-    values = loss(batch(noise=False))  # source 0.2, sample 0.41
-    assert values["loss"].item() == pytest.approx(0.21, rel=1e-5)
 
 
 @pytest.mark.parametrize("level", [0.01, 0.3])

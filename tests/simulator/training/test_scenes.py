@@ -43,17 +43,14 @@ def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
     return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
 
 
-def test_no_source_is_in_two_splits(scenes: dict[str, list[ReferenceScene]]) -> None:
+def test_splits_are_apart_and_scenes_the_same_however_many(
+    scenes: dict[str, list[ReferenceScene]],
+) -> None:
     groups = [{s.group for s in scenes[split]} for split in SPLITS]
     assert all(groups)
     assert sum(map(len, groups)) == len(set().union(*groups))
     ids = [s.scene_id for split in SPLITS for s in scenes[split]]
     assert len(ids) == len(set(ids))
-
-
-def test_scenes_are_reproducible_and_more_of_them_keep_the_first(
-    scenes: dict[str, list[ReferenceScene]],
-) -> None:
     fewer = reference_scenes("test", CAMERA, number=5, size=48)[:5]
     for scene, again in zip(scenes["test"], fewer, strict=False):
         assert (scene.scene_id, scene.lens) == (again.scene_id, again.lens)
@@ -190,9 +187,6 @@ def test_softness_is_that_of_edges() -> None:
     assert _edge_ratio(smooth) == pytest.approx(0.25, abs=0.01)
 
 
-SPLITS = ("train", "validation", "test")
-
-
 def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
     return {s: detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}  # type: ignore[arg-type]
 
@@ -227,10 +221,7 @@ def test_groups_of_files_stay_together(tmp_path: Path) -> None:
     assert len({p.group for p in pictures["train"]}) > len({p.group for p in pictures["test"]}) > 1
     assert [p.name for p in pictures["train"] if p.kind == "radiance"] == ["bridge"]
     assert [p.name for p in pictures["test"] if p.kind == "radiance"] == ["venice"]
-
-
-def test_shares_of_the_splits() -> None:
-    """62, 8 and 30 percent of 2,000 groups, within four standard errors."""
+    # 62, 8 and 30 percent of 2,000 groups, within four standard errors.
     drawn = [detail_split(f"group{i}") for i in range(2000)]
     for split, share in zip(SPLITS, (0.62, 0.08, 0.30), strict=True):
         error = 4 * (share * (1 - share) / 2000) ** 0.5

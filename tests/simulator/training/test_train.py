@@ -1,19 +1,27 @@
+"""Training in stages: configurations, cards, budgets, stops and resumes, calibration."""
+
+from __future__ import annotations
+
 import itertools
 import json
 import math
 import sys
 from collections import Counter
+from collections.abc import Callable
 from collections.abc import Sequence as SequenceOf
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 from simulator import CameraSettings, get_camera
+from simulator.capture.statistics import Residual
+from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
 from simulator.reference.camera import (
     DRAPED,
@@ -24,11 +32,13 @@ from simulator.reference.camera import (
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import train
-from simulator.training.data import DetailPicture, ReferencePairs, draw_sequences
+from simulator.training.data import DetailCrops, DetailPicture, ReferencePairs, draw_sequences
 from simulator.training.train import (
     Clock,
     SimulatorConfig,
     StageConfig,
+    calibrate,
+    load_config,
     make_accelerator,
     train_and_save,
     train_stage,
@@ -134,16 +144,12 @@ def test_baselines_in_any_precision_and_their_logs(tmp_path):
     assert entry.step == 2
 
 
-def test_a_noise_module_alone_needs_no_scenes(tmp_path):
-    file = save(tmp_path, "nano", scenes=lambda *_: pytest.fail("it asked for scenes"))
-    modules, card = load_modules(file)
-    assert list(modules) == list(card["stages"]) == ["noise"]
-    assert modules["noise"].residual.to_card() == card["residual"]
-
-
-def test_a_training_goes_on_from_other_weights(tmp_path):
-    first = save(tmp_path, "nano")
+def test_a_noise_module_alone_and_a_training_from_its_weights(tmp_path):
+    # A noise module alone needs no scenes.
+    first = save(tmp_path, "nano", scenes=lambda *_: pytest.fail("it asked for scenes"))
     weights, card = load_modules(first)
+    assert list(weights) == list(card["stages"]) == ["noise"]
+    assert weights["noise"].residual.to_card() == card["residual"]
     still = {**STAGE, "steps": 1, "learning_rate": 1e-12}
     (tmp_path / "on").mkdir()
     again, later = load_modules(save(tmp_path / "on", "nano", start=str(first), noise=still))
@@ -325,3 +331,123 @@ def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
     for one in itertools.chain(*splits.values()):
         assert (one.size, one.sampled) == ((32, 32), True)
         assert one.illuminance is not None
+
+
+STAGES = "exposure: {steps: 2}\nnoise: {steps: 3}\naperture: {minutes: 0.5, crop: 128}\n"
+
+
+COMPACT = f"preset: compact\n{STAGES}"
+
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "simulator"
+
+
+def load_text(folder: Path, text: str) -> SimulatorConfig:
+    (folder / "a.yaml").write_text(text)
+    return load_config(folder / "a.yaml")
+
+
+def test_stages_in_order_with_their_defaults(tmp_path):
+    config = load_text(tmp_path, COMPACT)
+    assert list(config.stages()) == ["noise", "exposure", "aperture"]
+    assert (config.noise.average, config.card()["noise"]["average"]) == (0.0, 0.0)
+    assert (config.noise.steps, config.noise.minutes, config.noise.batch) == (3, None, 8)
+    assert (config.aperture.steps, config.aperture.minutes) == (None, 0.5)
+    for preset, stage in (("pc", "baseline"), ("nano", "noise"), ("large", "noise")):
+        assert list(load_text(tmp_path, f"preset: {preset}\n{stage}: {{steps: 1}}").stages()) == [
+            stage
+        ]
+
+
+@pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda f: f.name)
+def test_shipped_configurations_are_valid(file):
+    assert load_config(file).preset == file.stem
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"preset: compact\nnoize: {{steps: 1}}\n{STAGES}", "noize"),
+        (COMPACT.replace("{steps: 3}", "{stesp: 3}"), "noise.stesp"),
+        (COMPACT.replace("steps: 3", "steps: 3, minutes: 1"), "exactly one"),
+        (COMPACT.replace("{steps: 3}", "{batch: 3}"), "exactly one"),
+        (COMPACT.replace("128", "257"), "`aperture.crop` (=257) must not"),
+        (COMPACT.replace("steps: 3", "steps: 3, average: 1"), "noise.average (=1)"),
+        (COMPACT.replace("compact", "nano"), "`exposure` must be left out for preset 'nano'"),
+        (COMPACT.replace("128", "8"), "aperture.crop (=8)"),
+        (COMPACT.replace("compact", "pc"), "`noise` must be left out for preset 'pc'"),
+        ("preset: pc", "`baseline` must be given for preset 'pc'"),
+        (f"{COMPACT}baseline: {{steps: 1}}", "`baseline` must be left out"),
+        (COMPACT.replace("compact", "tiny"), "preset (='tiny')"),
+        (f"{COMPACT}camera: nikon_z7", "nikon_z6"),
+    ],
+)
+def test_errors_name_the_entry(tmp_path, text, message):
+    with pytest.raises(ValueError) as caught:
+        load_text(tmp_path, text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_later_stage_does_not_change_what_an_earlier_one_is():
+    """Else a checkpoint was lost when the aperture's budget is raised; the noise stage, which has
+    pictures of its own, depends on nothing else but the seed."""
+    plain, longer = config(), config(aperture={**STAGE, "steps": 9})
+    for stage, equal in (("noise", True), ("exposure", True), ("aperture", False), (None, False)):
+        assert (plain.card(stage) == longer.card(stage)) is equal
+    for changes in {"body": 2}, {"scenes": {"size": 512}}, {"exposure": {**STAGE, "steps": 3}}:
+        assert config(**changes).card("exposure") != plain.card("exposure"), changes
+        assert config(**changes).card("noise") == plain.card("noise"), changes
+    for changes in {"seed": 1}, {"noise": {**STAGE, "steps": 3}}, {"precision": "bfloat16"}:
+        assert config(**changes).card("noise") != plain.card("noise"), changes
+
+
+Z6 = get_camera("nikon_z6")
+
+
+class Known(NoiseModule):
+    """Leaves a share of the noise's deviation on a flat field, and shifts it by another."""
+
+    def __init__(self, left: float, shift: Callable[[int], float]) -> None:
+        super().__init__("nano")
+        self.left, self.shift, self.calls = left, shift, 0
+
+    def forward(self, noisy: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        mean = noisy.mean(dim=(0, 2, 3), keepdim=True).expand_as(noisy)
+        sigma = variance_map(mean, shot, read).sqrt()
+        self.calls += 1
+        return mean + self.left * (noisy - mean) + self.shift(self.calls) * sigma
+
+
+@pytest.fixture
+def larger_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simulator.training.train._SIDE", 32)
+    monkeypatch.setattr("simulator.training.train._CROPS", 64)
+
+
+def calibrated(left: float, shift: Callable[[int], float]) -> Residual:
+    picture = DetailPicture("a", "a", "mosaic", torch.full((4, 64, 64), 0.5))
+    return calibrate(Known(left, shift), DetailCrops([picture], [Z6]))
+
+
+@pytest.mark.usefixtures("larger_calibration")
+@pytest.mark.parametrize(("left", "shift"), [(0.5, 0.0), (0.0, 0.3), (0.8, -0.2)])
+def test_noise_that_is_left_and_a_shift(left: float, shift: float) -> None:
+    """Squares of the two shares; single crops are as all of them are."""
+    residual = calibrated(left, lambda _: shift)
+    assert residual.wiener_error[0] == 0.0
+    seen = residual.wiener_error <= 0.006
+    np.testing.assert_allclose(residual.variance[seen], left**2, rtol=0.03, atol=1e-3)
+    np.testing.assert_allclose(residual.bias[seen], shift**2, rtol=0.05, atol=2e-3)
+    assert 1.0 <= residual.spread < 1.05
+    assert Residual.from_card(residual.to_card()).spread == pytest.approx(residual.spread, abs=1e-3)
+
+
+@pytest.mark.usefixtures("larger_calibration")
+def test_the_bound_holds_for_nine_crops_of_ten() -> None:
+    """The second half of 64 crops is worse: half of it by three times, a twentieth by nine."""
+    residual = calibrated(
+        0.0, lambda call: 0.1 if call <= 32 or call % 2 else 0.9 if call % 20 == 0 else 0.3
+    )
+    assert residual.bias[0] == pytest.approx(0.01, rel=0.1)
+    assert residual.spread == pytest.approx(3.0, rel=0.05)

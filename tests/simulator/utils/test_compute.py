@@ -19,15 +19,12 @@ def add(a: int, b: int) -> int:
     return a + b
 
 
-def test_kernels_run_without_the_lock_and_are_cached():
+def test_kernels_run_without_the_lock_and_are_cached_where_they_can(monkeypatch, caplog):
     compiled = kernel(fastmath=True)(add)
     assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
     assert compiled(1, 2) == 3
     assert {"nogil": True, "fastmath": True}.items() <= compiled.targetoptions.items()
     assert compiled.stats.cache_path is not None
-
-
-def test_they_run_where_nothing_can_be_cached(monkeypatch, caplog):
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     with caplog.at_level(logging.INFO, "simulator.utils.compute"):
         assert kernel()(add)(1, 2) == 3

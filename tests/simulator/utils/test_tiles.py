@@ -20,11 +20,27 @@ def mean_of_neighbours(*images: Tensor) -> Tensor:
     return total * (1 + rows) + torch.arange(total.shape[-1]) % 4
 
 
-@pytest.mark.parametrize("size", [(1, 1), (12, 16), (16, 17), (17, 16), (40, 41), (5, 93), (93, 5)])
-def test_tiles_of_a_function_of_neighbourhood_and_phase(size):
+def patches(height: int, width: int) -> Tensor:
+    """Two corners and a pixel in between."""
+    needed = torch.zeros(height, width, dtype=torch.bool)
+    needed[:9, :21] = needed[-5:, -30:] = True
+    needed[height // 2, width // 3] = True
+    return needed
+
+
+@pytest.mark.parametrize(
+    "size", [(1, 1), (12, 16), (16, 17), (40, 41), (5, 93), (93, 5), (61, 203), (200, 130)]
+)
+@pytest.mark.parametrize("tile", [12, 64, 512])
+def test_tiles_of_a_function_of_neighbourhood_and_phase(size, tile):
+    """Everywhere; and where only some pixels are needed, the fallback elsewhere."""
     image, other = frame(*size), frame(*size, seed=1)
-    tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=12)
-    torch.testing.assert_close(tiled, mean_of_neighbours(image, other), rtol=0, atol=1e-6)
+    whole, needed = mean_of_neighbours(image, other), patches(*size)
+    tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=tile)
+    torch.testing.assert_close(tiled, whole, rtol=0, atol=1e-6)
+    options = {"tile": tile, "needed": needed, "fallback": -image}
+    some = in_tiles(mean_of_neighbours, image, other, halo=4, **options)
+    torch.testing.assert_close(some, torch.where(needed, whole, -image), rtol=0, atol=1e-6)
     assert torch.equal(in_tiles(lambda x: x.sum(1), image, halo=4, tile=8), image.sum(1))
 
 
@@ -72,23 +88,6 @@ def test_the_halo_covers_what_the_networks_see(size):
     tile = (..., *2 * [slice(top - halo, bottom + halo)])
     alone = network(image[tile])[..., halo:-halo, halo:-halo]
     torch.testing.assert_close(alone, found[0], rtol=0, atol=1e-4)
-
-
-def patches(height: int, width: int) -> Tensor:
-    """Two corners and a pixel in between."""
-    needed = torch.zeros(height, width, dtype=torch.bool)
-    needed[:9, :21] = needed[-5:, -30:] = True
-    needed[height // 2, width // 3] = True
-    return needed
-
-
-@pytest.mark.parametrize("size", [(16, 16), (1, 90), (90, 1), (61, 203), (200, 130)])
-@pytest.mark.parametrize("tile", [16, 64, 512])
-def test_where_it_is_needed_it_is_what_it_is_without(size, tile):
-    image, needed = frame(*size), patches(*size)
-    expected = torch.where(needed, mean_of_neighbours(image), -image)
-    tiled = in_tiles(mean_of_neighbours, image, halo=4, tile=tile, needed=needed, fallback=-image)
-    torch.testing.assert_close(tiled, expected, rtol=0, atol=1e-6)
 
 
 def test_what_is_not_needed_is_not_computed():

@@ -1,3 +1,5 @@
+"""What is kept on a disk: results in a cache, and the state of a training."""
+
 import copy
 import errno
 import multiprocessing
@@ -14,9 +16,13 @@ import torch
 from safetensors.torch import load_file, save
 
 from simulator.utils import cache as cache_module
+from simulator.utils import checkpoint
 from simulator.utils.cache import LruCache, Store, cache_dir, cache_key, content_digest
+from simulator.utils.checkpoint import Checkpoint
 
 KEYS = [cache_key("denoised", i) for i in range(64)]
+
+
 VALUES = {
     "light": torch.randn(1, 4, 5, 3).to(memory_format=torch.channels_last),
     "parts": torch.tensor([0.1, float("nan"), -0.0], dtype=torch.float64),
@@ -238,3 +244,81 @@ def test_processes_share_a_folder(tmp_path, caplog):
     assert not caplog.records
     assert not list(tmp_path.rglob("*.tmp"))
     assert sum(size for _, size in Store(tmp_path).usage().values()) <= 60_000
+
+
+def made(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
+    return Checkpoint(path, identity, lambda: {"step": 7, **values})
+
+
+def test_it_saves_when_it_is_due_and_at_the_end(tmp_path, monkeypatch):
+    path, now = tmp_path / "run", 100.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    own = made(path)
+    for seconds, due in ((checkpoint.INTERVAL, False), (1.0, True), (0.0, False)):
+        now += seconds
+        own.save_when_due()
+        assert path.exists() == due
+        path.unlink(missing_ok=True)
+    with own:  # at the end
+        assert not path.exists()
+    assert path.exists()
+    path.unlink()
+    with made(None) as nowhere, Checkpoint(path, "a", dict, writes=False) as silent:
+        assert nowhere.load() is silent.load() is None
+    assert not path.exists()
+
+
+def test_a_full_disk_stops_no_training(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "run"
+    made(path, step=1).save()
+    error = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr("simulator.utils.files.os.replace", Mock(side_effect=error))
+    made(path, step=2).save()
+    assert "not saved" in caplog.text
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert made(path).load() == {"step": 1}
+
+
+@pytest.mark.parametrize(
+    ("error", "kept"), [(KeyboardInterrupt, True), (SystemExit, True), (ValueError, False)]
+)
+def test_what_ends_a_training_decides_whether_its_state_is_kept(error, kept, tmp_path):
+    with pytest.raises(error), made(tmp_path / "run"):
+        raise error
+    assert (tmp_path / "run").exists() == kept
+
+
+class Harm:
+    """Would run code on unpickling."""
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (Path("harmed"),)
+
+
+def test_damaged_or_foreign(tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "run"
+    made(path, weight=torch.ones(1000)).save()
+    good, files = path.read_bytes(), []
+    middle = len(good) // 2  # the weights are by far the largest part
+    flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+    for content in ([1, 2], {"identity": Harm()}):
+        torch.save(content, path)
+        files.append(path.read_bytes())
+    foreign = save({"weight": torch.zeros(2)})
+    for damaged in (good[:-50], b"not a checkpoint at all", b"", foreign, flipped, *files):
+        path.write_bytes(damaged)
+        caplog.clear()
+        assert made(path).load() is None
+        assert f"{path} is damaged, training restarts" in caplog.text
+    assert not (tmp_path / "harmed").exists()
+
+
+def test_another_training_or_version(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "run"
+    made(path, {"seed": 0}).save()
+    assert made(path, {"seed": 0}).load() == {"step": 7}
+    assert made(path, {"seed": 1}).load() is None
+    monkeypatch.setattr(checkpoint, "package_version", lambda: "77")
+    assert made(path, {"seed": 0}).load() is None
+    assert caplog.text.count("training restarts") == 2

@@ -22,9 +22,7 @@ def _write(file: Path, text: str) -> Path:
         ("/a/b.py/mine.py:Mine", ("/a/b.py/mine.py", "Mine")),
         ("C:\\a b\\mine.py:Mine", ("C:\\a b\\mine.py", "Mine")),
         ("mine.py:", ("mine.py", "")),
-        ("my.pyramid:Mine", None),
         ("noise", None),
-        ("", None),
     ],
 )
 def test_names_of_files(name: str, parts: tuple[str, str] | None) -> None:

@@ -1,0 +1,255 @@
+"""PPO and regression: they learn, the seed decides, a stopped training goes on."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from agents.learning.networks import Session
+from agents.learning.ppo import PPOPolicy, PPOTraining, train_ppo
+from agents.learning.regression import (
+    RegressionPolicy,
+    RegressionTraining,
+    Replay,
+    train_regression,
+)
+from agents.learning.weights import describe_agent, save_agent
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
+
+TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
+
+
+@pytest.mark.slow
+def test_it_learns(make_tiny_envs) -> None:
+    rewards: list[float] = []
+    training = PPOTraining(
+        total_timesteps=2048, n_steps=8, batch_size=64, n_epochs=4, width=32, learning_rate=3e-3
+    )
+    # Always sharp: short times and small apertures gain nothing, low ISO does.
+    envs = make_tiny_envs(num_envs=16, motion="none", depth="far")
+    train_ppo(
+        envs, training, Session(progress=lambda d, t, values: rewards.append(values["reward"]))
+    )
+    assert rewards[-1] > rewards[15] + 0.1
+
+
+def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path) -> None:
+    envs = make_tiny_envs(num_envs=6)
+    context = PolicyContext.from_envs(envs)
+    training = TRAINING.model_copy(update={"total_timesteps": 24, "batch_size": 12})
+    network = train_ppo(envs, training)
+    save_agent(tmp_path / "ppo", "ppo", network, describe_agent(network.width, context, {}))
+    loaded = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
+    assert isinstance(loaded, PPOPolicy)
+    ours = PPOPolicy(context, network=network)
+    # The three extractors of SB3's policy are one again.
+    extractor = loaded.network.features_extractor
+    assert loaded.network.pi_features_extractor is extractor
+    rng = np.random.default_rng(0)
+    observations, _ = envs.reset(seed=9)
+    for policy in (ours, loaded):
+        policy.reset(6)
+    for _ in range(5):
+        chosen = ours.act(observations)
+        assert chosen.dtype == np.int64
+        assert np.array_equal(chosen, loaded.act(observations))
+        # SB3's own deterministic prediction is the same.
+        assert np.array_equal(chosen, network.predict(observations, deterministic=True)[0])
+        masks = rng.random((6, 64)) < 0.3
+        masks[:, 5] = True
+        allowed = loaded.act(observations, masks)
+        assert masks[np.arange(6), allowed].all()
+        observations, *_ = envs.step(chosen)
+
+
+def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
+    path = tmp_path / "ppo.checkpoint"
+
+    def stop(done: int, total: int, values: dict[str, float]) -> None:
+        if done == 56:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_ppo(make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=stop))
+    half = torch.load(path, weights_only=True)["state"]
+    assert half["timesteps"] == 48  # the last complete update of 4 x 4 frames before frame 56
+    seen: list[int] = []
+    network = train_ppo(
+        make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=lambda *a: seen.append(a[0]))
+    )
+    assert seen == list(range(52, 97, 4))
+    # The learning rate falls over the whole training, it does not start at its top again.
+    optimizer = network.optimizer
+    assert optimizer.param_groups[0]["lr"] < 0.3 * TRAINING.learning_rate
+    # 6 updates of 2 epochs of 2 batches: Adam goes on counting, so its moments were restored.
+    assert {float(s["step"]) for s in optimizer.state_dict()["state"].values()} == {24.0}
+    end, weights = torch.load(path, weights_only=True)["state"], network.state_dict()
+    assert all(torch.equal(end["policy"][k], v) for k, v in weights.items())
+    assert any(not torch.equal(half["policy"][k], v) for k, v in weights.items())
+
+
+def test_it_learns_from_statistics_and_says_so(make_tiny_envs, tmp_path: Path) -> None:
+    envs = make_tiny_envs(num_envs=6, observation="statistics")
+    context = PolicyContext.from_envs(envs)
+    training = TRAINING.model_copy(update={"total_timesteps": 24, "batch_size": 12})
+    network = train_ppo(envs, training)
+    save_agent(tmp_path / "ppo", "ppo", network, describe_agent(network.width, context, {}))
+    policy = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
+    policy.reset(6)
+    observations, _ = envs.reset(seed=9)
+    assert envs.action_space.contains(policy.act(observations))
+    with pytest.raises(ValueError, match=r"resolution = \[4, 12, 16\]"):
+        make_policy(f"ppo:{tmp_path / 'ppo'}", PolicyContext.from_envs(make_tiny_envs()))
+
+
+class Stub(nn.Module):
+    def __init__(self, frames: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        super().__init__()
+        self.anchor = nn.Parameter(torch.zeros(()))
+        self.frames = list(frames)
+
+    def forward(self, codes, settings, sensors):
+        scores, log_variance = self.frames.pop(0)
+        return torch.from_numpy(scores), torch.from_numpy(log_variance)
+
+
+@pytest.fixture
+def frame(photograph):
+    return photograph(np.ones((64, 64)), 8.0, [0, 1])
+
+
+def test_predictions_are_weighted_by_their_precision(context: PolicyContext, frame) -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.random((3, 2, 64))
+    variance = np.exp(rng.uniform(-6, 0, (3, 2, 64)))
+    stub = Stub(list(zip(scores, np.log(variance), strict=True)))
+    policy = RegressionPolicy(context, network=stub)
+    policy.reset(2)
+    for t in range(3):
+        # The minimum-variance mean of independent estimates (inverse-variance weights).
+        weights = 1.0 / variance[: t + 1]
+        best = np.average(scores[: t + 1], axis=0, weights=weights)
+        masks = rng.random((2, 64)) < 0.5
+        masks[0, best[0].argmax()] = False  # even the best may be forbidden
+        best = np.where(masks, best, -1.0)
+        assert policy.act(frame, masks).tolist() == best.argmax(axis=1).tolist()
+
+
+SURE = np.full((2, 64), -2.0)
+
+
+def best_at(state: int, score: float) -> tuple[np.ndarray, np.ndarray]:
+    """A prediction for two cameras, and its log variance."""
+    scores = np.full((2, 64), 0.1)
+    scores[:, state] = score
+    return scores, SURE
+
+
+def test_episodes_do_not_mix(context: PolicyContext, frame) -> None:
+    frames = [best_at(3, 0.9), best_at(9, 0.8), best_at(9, 0.8)]
+    policy = RegressionPolicy(context, network=Stub(frames))
+    policy.reset(2)
+    assert policy.act(frame).tolist() == [3, 3]
+    policy.forget(np.array([False, True]))
+    assert policy.act(frame).tolist() == [3, 9]  # 0.5 * (0.9 + 0.1) against 0.5 * (0.8 + 0.1)
+    policy.reset(2)
+    assert policy.act(frame).tolist() == [9, 9]
+
+
+def test_frames_of_other_light_are_forgotten(context: PolicyContext, photograph) -> None:
+    """The first camera's light falls by a stop; the second's stays, at other settings."""
+    policy = RegressionPolicy(context, network=Stub([best_at(3, 0.9), best_at(9, 0.8)]))
+    policy.reset(2)
+    ev100 = context.grid.ev100
+    near, far = (int(np.abs(ev100 - ev).argmin()) for ev in (8.0, 9.0))  # neither clips
+    assert policy.act(photograph(np.ones((64, 64)), 8.0, [near, near])).tolist() == [3, 3]
+    darker = photograph(np.full((64, 64), 0.5), 8.0, [near])
+    same = photograph(np.ones((64, 64)), 8.0, [far])
+    frames = {name: np.concatenate([darker[name], same[name]]) for name in same}
+    assert policy.act(frames).tolist() == [9, 3]
+
+
+REGRESSION = RegressionTraining(frames=160, width=16, seed=5)
+
+
+def test_training_lowers_the_loss(make_tiny_envs) -> None:
+    losses = []
+    train_regression(
+        make_tiny_envs(num_envs=8),
+        RegressionTraining(frames=480, width=32),
+        Session(progress=lambda done, total, values: losses.append((done, total, values["mse"]))),
+    )
+    assert [(done, total) for done, total, _ in losses] == [(n, 480) for n in range(8, 481, 8)]
+    begin, end = (np.mean([v for _, _, v in part]) for part in (losses[:10], losses[-20:]))
+    assert end < 0.6 * begin
+
+
+@pytest.mark.parametrize(
+    ("train", "training"),
+    [
+        (train_regression, RegressionTraining(frames=32, width=16)),
+        (train_ppo, TRAINING.model_copy(update={"total_timesteps": 32})),
+    ],
+)
+def test_the_seed_alone_decides_and_progress_is_complete(
+    train: Callable[..., nn.Module], training: Any, make_tiny_envs
+) -> None:
+    seen: list[tuple[int, int, dict[str, float]]] = []
+
+    def weights(seed: int) -> dict[str, torch.Tensor]:
+        session = Session(progress=lambda *a: seen.append(a))
+        seeded = training.model_copy(update={"seed": seed})
+        return train(make_tiny_envs(), seeded, session).state_dict()
+
+    first = weights(1)
+    torch.rand(3), np.random.rand(3)  # noqa: NPY002
+    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    again = weights(1)
+    after = torch.random.get_rng_state(), np.random.get_state()[1]  # noqa: NPY002
+    if train is train_regression:  # Stable-Baselines3 seeds them itself
+        assert all(np.array_equal(*pair) for pair in zip(before, after, strict=True))
+    other = weights(2)
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert any(not torch.equal(first[name], other[name]) for name in first)
+    assert [(done, total) for done, total, _ in seen] == [(n, 32) for n in range(4, 33, 4)] * 3
+    assert all(0.0 <= values.get("reward", 0.0) <= 1.0 for _, _, values in seen)
+
+
+def test_a_stopped_regression_goes_on(make_tiny_envs, tmp_path: Path) -> None:
+    path = tmp_path / "regression.checkpoint"
+
+    def stop(done: int, total: int, values: dict[str, float]) -> None:
+        if done == 100:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_regression(make_tiny_envs(), REGRESSION, Session(checkpoint=path, progress=stop))
+    half = torch.load(path, weights_only=True)["state"]
+    assert half["step"] == 25
+    seen: list[int] = []
+    network = train_regression(
+        make_tiny_envs(),
+        REGRESSION,
+        Session(checkpoint=path, progress=lambda *a: seen.append(a[0])),
+    )
+    assert seen == list(range(104, 161, 4))
+    end = torch.load(path, weights_only=True)["state"]
+    assert end["schedule"]["last_epoch"] == end["step"] == 40
+    assert all(float(s["step"]) == 40 for s in end["optimizer"]["state"].values())
+    assert all(torch.equal(v, end["network"][name]) for name, v in network.state_dict().items())
+
+
+@pytest.mark.parametrize("memory", [1, 4, 10])
+def test_replay_memory_is_bounded(memory: int) -> None:
+    replay = Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
+    for step in range(12):
+        new = {"raw": np.full((4, 4, 2, 2), step, np.uint8), "settings": np.zeros((4, 3))}
+        batch, target = replay.batch(new, np.full((4, 64), float(step)))
+        assert (batch["raw"][:4] == step).all()
+        assert (batch["raw"][:, 0, 0, 0] == target[:, 0]).all()  # frames keep their own scores
+    assert len(replay.memory) == max(1, memory // 4)
