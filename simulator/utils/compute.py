@@ -252,8 +252,8 @@ def progress_bar(title: str, total: int, *, done: int = 0) -> Iterator[Callable[
     Yields:
         A function that counts a step; several threads may call it.
     """
-    stream = sys.stderr
-    if not total or stream is None or stream is not sys.__stderr__ or not stream.isatty():
+    own = sys.__stderr__
+    if not total or own is None or sys.stderr is not own or not own.isatty():
         yield lambda: None
         return
     from rich.console import Console
