@@ -614,7 +614,7 @@ def test_every_module_runs_for_every_transition(
 def test_raws_prepared_scenes_and_scenes_run_alike(compact: CameraSimulator) -> None:
     source, target = full_raw(), TARGETS[3]
     prepared = compact.prepare(source, image_speed=0.5, defocus=2.0)
-    scene = SimpleNamespace(prepared=replace(prepared, denoised=()))
+    scene = SimpleNamespace(prepared=replace(prepared, denoised_lights=()))
     given = {"image_speed": 0.5, "defocus": 2.0}
     frames = [
         compact.simulate(source, target, tolerance=None, **given).data,
