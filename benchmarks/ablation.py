@@ -8,15 +8,25 @@ from __future__ import annotations
 
 import runpy
 import tempfile
+import time
 from collections import deque
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agents.learning.training import LearningCurve, load_curve
+from agents.evaluation.jobs import run_plan
+from agents.evaluation.plan import load_plan
+from agents.evaluation.result import overall_ranking
+from agents.learning.training import (
+    AgentConfig,
+    LearningCurve,
+    load_config,
+    load_curve,
+    train_agent,
+)
 from agents.report.plots import learning_figure
-from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, table
+from benchmarks.harness import RUNS, Part, Report, Row, benchmark, table
 from benchmarks.isolated import ROOT
 from simulator.utils.files import sibling
 
@@ -41,13 +51,6 @@ LIGHTS, SCENES = ("shadows", "clouds", "pans"), 40
 
 def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     """Trains a variant, unless its file is there, and judges it."""
-    import time
-
-    from agents.evaluation.jobs import run_plan
-    from agents.evaluation.plan import load_plan
-    from agents.evaluation.result import overall_ranking
-    from agents.learning.training import AgentConfig, load_config, train_agent
-
     training, environment = VARIANTS.get(variant, ({}, {}))
     name = "".join(c if c.isalnum() else "-" for c in variant)
     out = RUNS.parent / "bench_ablation" / f"{name}-{frames}-{seed}"
@@ -56,16 +59,8 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     if variant == RECURRENT:
         policy = _train_recurrent(out, frames, seed)
     else:
-        base = load_config(CONFIG)
         changed = {"total_timesteps": frames, "seed": seed, **training}
-        config = AgentConfig.model_validate(
-            {
-                **base.model_dump(),
-                "environment": {**base.environment, **environment},
-                "training": {**base.training, **changed},
-            }
-        )
-        train_agent(config, out)
+        train_agent(changed_config(load_config(CONFIG), environment, changed), out)
         policy = f"ppo:{out}"
     seconds = time.perf_counter() - begun
     plan = load_plan("video")
@@ -79,14 +74,18 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
         results = run_plan(plan, folder)
     (rank,) = overall_ranking(results)
     gains = {light: results[light].group_gains(rank.policy) for light in LIGHTS}
-    return {
-        "variant": variant,
-        "score": rank.score.value,
-        "ci95": rank.score.pair,
-        "by_light": {k: float(g.mean(axis=0).sum() / s.sum()) for k, (g, s) in gains.items()},
-        "training_s": seconds,
-        "curve": load_curve(sibling(out, ".csv")),
-    }
+    row: Row = {"variant": variant, "score": rank.score.value, "ci95": rank.score.pair}
+    row["by_light"] = {k: float(g.mean(axis=0).sum() / s.sum()) for k, (g, s) in gains.items()}
+    return row | {"training_s": seconds, "curve": load_curve(sibling(out, ".csv"))}
+
+
+def changed_config(
+    config: AgentConfig, environment: dict[str, Any], training: dict[str, Any]
+) -> AgentConfig:
+    """A configuration with other options of its environment and other hyperparameters."""
+    changed = {"environment": environment, "training": training}
+    parts = {name: {**getattr(config, name), **own} for name, own in changed.items()}
+    return AgentConfig.model_validate({**config.model_dump(), **parts})
 
 
 def _train_recurrent(out: Path, frames: int, seed: int) -> str:
@@ -105,44 +104,20 @@ def _train_recurrent(out: Path, frames: int, seed: int) -> str:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each variant."""
     frames, scenes = (QUICK_FRAMES, 16) if quick else (FRAMES, SCENES)
-    return [
-        Part(
-            variant,
-            measure,
-            {"variant": variant, "frames": frames, "seed": seed, "scenes": scenes},
-            threads=1,
-        )
-        for variant in (*VARIANTS, RECURRENT)
-    ]
+    given = {"frames": frames, "seed": seed, "scenes": scenes}
+    variants = (*VARIANTS, RECURRENT)
+    return [Part(name, measure, {"variant": name, **given}, threads=1) for name in variants]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the rows of all variants."""
-    rows: list[Row] = list(results.values())
-    columns: dict[str, Any] = {
-        "variant": "{variant}",
-        "score": "{score:.3f}",
-        "95 % interval": "{ci95[0]:.3f} to {ci95[1]:.3f}",
-        **{light: f"{{by_light[{light}]:.3f}}" for light in LIGHTS},
-        "minutes to train": lambda row: f"{row['training_s'] / 60.0:.0f}",
-    }
+    rows: list[Row] = [row | {"minutes": row["training_s"] / 60} for row in results.values()]
+    columns = {"variant": "{variant}", "score": "{score:.3f}", "95 % interval": "{ci95:.3f}"}
+    columns |= {light: f"{{by_light[{light}]:.3f}}" for light in LIGHTS}
+    tables = {"variants": table(rows, columns | {"minutes to train": "{minutes:.0f}"})}
+    picture = learning_figure({row["variant"]: row.pop("curve") for row in rows})
     frames = QUICK_FRAMES if meta["quick"] else FRAMES
-    picture = learning_figure({row["variant"]: row["curve"] for row in rows})
-    kept = [{k: v for k, v in row.items() if k != "curve"} for row in rows]
-    tables = {"variants": table(rows, columns)}
-    return Report(kept, tables, meta={"frames": frames}, figures={"ablation.png": picture})
+    return Report(rows, tables, meta={"frames": frames}, figures={"ablation.png": picture})
 
 
-BENCHMARK = Benchmark(
-    name="ablation",
-    title="What PPO needs in moving light",
-    parts=parts,
-    report=report,
-    code=(
-        *("ae_env/episodes", "ae_env/lighting", "agents/learning"),
-        *("benchmarks/ablation", "examples/recurrent_ppo"),
-    ),
-)
-run = BENCHMARK.run
+run = benchmark("ablation", parts, report)

@@ -22,6 +22,7 @@ from agents.policy import PolicyContext
 from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
 from agents.report.evaluation import write_report
 from agents.rollouts import make_envs
+from benchmarks.ablation import changed_config
 from benchmarks.isolated import ROOT
 
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}
@@ -45,23 +46,21 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     jobs: dict[str, list[TrainingJob]] = {}
     folder = ROOT / "runs" / ("bench_agents_quick" if quick else "bench_agents")
     for name, path in CONFIGS.items():
-        config = load_config(path)
-        if quick:
-            config = config.model_copy(update={"training": {**config.training, **QUICK[name]}})
+        config = changed_config(load_config(path), {}, QUICK[name] if quick else {})
         jobs[name] = [
             TrainingJob(f"{name}, seed {s}", config.with_seed(s), folder / f"{name}-{s}")
             for s in SEEDS
         ]
     began = time.perf_counter()
     _train(jobs)
-    seconds = time.perf_counter() - began
+    meta: dict[str, Any] = {"training_seeds": list(SEEDS)}
+    meta["training"] = {name: own[0].config.card() for name, own in jobs.items()}
+    meta["training_seconds_this_run"] = time.perf_counter() - began
 
-    sets = SETS[:1] if quick else SETS
     envs = make_envs({"split": "test", "resolution": 64}, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
-    programs = [program for program in PROGRAMS if program != "M"]
-    meters = [f"{meter}:{program}" for meter in CLASSIC_METERS for program in programs]
-    names = ["random", "best_fixed", *(meters if not quick else meters[:1])]
+    meters = [f"{meter}:{p}" for meter in CLASSIC_METERS for p in PROGRAMS if p != "M"]
+    names = ["random", "best_fixed", *(meters[:1] if quick else meters)]
     policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
     with progress_bars() as progress:
         with progress("light meters learn their programs") as task:  # on the agents' scenes
@@ -70,31 +69,16 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
         for name, own in jobs.items():
             policies[name] = [make_policy(f"{name}:{job.out}", context) for job in own]
         policies["oracle"] = make_policy("oracle", context)
-        for scenes in sets:
+        for scenes in SETS[:1] if quick else SETS:
+            given: dict[str, Any] = {"episodes_per_scene": 1 if quick else EPISODES, "seed": seed}
             test = {"scenes": scenes, "split": "test", "resolution": 64}
             with progress(f"evaluation on {scenes}") as task:
-                result = evaluate(
-                    policies,
-                    test,
-                    episodes_per_scene=1 if quick else EPISODES,
-                    seed=seed,
-                    other_scorers=OTHER_SCORERS,
-                    progress=task,
-                )
-            print_files(
-                write_report(
-                    result,
-                    out / "agents" / scenes,
-                    command="ae-env bench agents" + (" --quick" if quick else ""),
-                    source=scenes,
-                    split="test",
-                    extra_meta={
-                        "training_seeds": list(SEEDS),
-                        "training": {name: own[0].config.card() for name, own in jobs.items()},
-                        "training_seconds_this_run": seconds,
-                    },
-                )
-            )
+                given |= {"other_scorers": OTHER_SCORERS, "progress": task}
+                result = evaluate(policies, test, **given)
+            written: dict[str, Any] = {"source": scenes, "split": "test", "extra_meta": meta}
+            command = "ae-env bench agents" + " --quick" * quick
+            files = write_report(result, out / "agents" / scenes, command=command, **written)
+            print_files(files)
 
 
 def _train(jobs: dict[str, list[TrainingJob]]) -> None:

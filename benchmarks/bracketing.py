@@ -12,12 +12,17 @@ from functools import partial
 from itertools import product
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from agents.bracketing.policies import BINS, Planner, bin_of, run_brackets
 from agents.evaluation.intervals import difference_interval
-from benchmarks.harness import Benchmark, Part, Report, Row, table
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
+from benchmarks.harness import Part, Report, Row, benchmark, panels, table
 from simulator.utils.files import data_folder as data_root
 
 #: Policies, and what a page calls them.
@@ -43,8 +48,6 @@ NAMES = ("quality", "log_error", "unseen", "frames", "seconds")
 
 def known_light(context: Any, envs: Any) -> Any:
     """The planner with the light and the speed of the episodes of `envs`."""
-    from agents.bracketing.policies import BINS, Planner, bin_of
-
     base = envs.unwrapped
 
     class Known(Planner):
@@ -63,132 +66,84 @@ def known_light(context: Any, envs: Any) -> Any:
 
 def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None) -> Row:
     """What `policy` reaches: means of each source group."""
-    import gymnasium as gym
-
-    import ae_env  # noqa: F401  (registers the environment)
-    from agents.bracketing.policies import run_brackets
-    from agents.policy import PolicyContext
-    from agents.policy_names import make_policy
-
-    make = partial(
+    make: Any = partial(
         gym.make_vec,
-        "ae_env/ExposureBracket-v0",
+        "ae_env:ae_env/ExposureBracket-v0",
         num_envs=32,
         scenes=scenes,
         budget=budget,
         autoreset_mode="DISABLED",
     )
-    found: dict[str, list[list[float]]] = {name: [] for name in NAMES}
-    fitted = {}
+    row: Row = {"scenes": scenes, "budget": budget, "policy": policy}
     with closing(make(split="test")) as envs:
         context = PolicyContext.from_envs(envs)
-        one = known_light(context, envs) if policy == "known" else make_policy(policy, context)
+        one: Any = known_light(context, envs) if policy == "known" else make_policy(policy, context)
         if policy == BASELINE:
             with closing(make(split="train")) as train:
                 one.fit(train, seed)
-            fitted = {"headroom": one.headroom, "longest": one.longest}
-        result = run_brackets(one, envs, count=EPISODES, seed=seed, most=most)
-        groups = sorted(set(result["group"].tolist()))
-        for key in NAMES:
-            found[key].append([float(result[key][result["group"] == g].mean()) for g in groups])
-    return {"scenes": scenes, "budget": budget, "policy": policy, "groups": groups} | found | fitted
+            row |= {"headroom": one.headroom, "longest": one.longest}
+        frame = pd.DataFrame(run_brackets(one, envs, count=EPISODES, seed=seed, most=most))
+    means = frame.groupby("group")[list(NAMES)].mean()
+    return row | {"groups": means.index.tolist()} | {name: [means[name].tolist()] for name in NAMES}
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each set of scenes, budget and policy."""
-    sets = SETS if data_root() is not None else SETS[:1]
-    most = QUICK_SCENES if quick else None
-    return [
-        Part(
-            f"{scenes}, {budget} s, {policy}",
-            measure,
-            {"scenes": scenes, "budget": budget, "policy": policy, "seed": seed, "most": most},
-            threads=1,
-        )
-        for scenes, budget, policy in product(sets, BUDGETS, POLICIES)
-    ]
+    sets, found = SETS if data_root() is not None else SETS[:1], []
+    given = {"seed": seed, "most": QUICK_SCENES if quick else None}
+    for scenes, budget, policy in product(sets, BUDGETS, POLICIES):
+        arguments = {"scenes": scenes, "budget": budget, "policy": policy, **given}
+        found.append(Part(f"{scenes}, {budget} s, {policy}", measure, arguments, threads=1))
+    return found
 
 
 def rows_of(results: dict[str, Any]) -> list[Row]:
     """A row for each part: means, intervals, and the difference to `BASELINE`."""
-    rows = []
-    for result in results.values():
-        base = next(
-            r["quality"]
-            for r in results.values()
-            if r["policy"] == BASELINE and all(r[k] == result[k] for k in ("scenes", "budget"))
-        )
+    rows, own = [], {(r["scenes"], r["budget"], r["policy"]): r for r in results.values()}
+    for (scenes, budget, policy), result in own.items():
         quality, span = np.array(result["quality"]), np.ones(len(result["groups"]))
-        interval = difference_interval(quality, np.zeros_like(quality[:1]), span)
-        difference = difference_interval(quality, np.array(base), span)
-        row = {name: result[name] for name in ("scenes", "budget", "policy")}
+        row: Row = {"scenes": scenes, "budget": budget, "policy": policy, "name": POLICIES[policy]}
         row |= {name: float(np.mean(result[name])) for name in NAMES}
         row |= {name: result[name] for name in ("headroom", "longest") if name in result}
+        interval = difference_interval(quality, np.zeros_like(quality[:1]), span)
         row |= {"ci95": interval.pair, "num_groups": len(span), "ms": 1e3 * row.pop("seconds")}
-        if result["policy"] != BASELINE:
-            low, high = difference.pair or (None, None)
-            row |= {"to_baseline": difference.value, "to_low": low, "to_high": high}
+        if policy != BASELINE:
+            base = np.array(own[scenes, budget, BASELINE]["quality"])
+            difference = difference_interval(quality, base, span)
+            row |= {"to_baseline": difference.value, "to_ci95": difference.pair}
         rows.append(row | {"each": np.sort(1.0 - quality.mean(axis=0)).tolist()})
     return rows
 
 
 def distributions(rows: Sequence[Row]) -> Figure:
     """Share of the source groups whose loss of quality is below a value."""
-    figure = Figure(figsize=(10, 3.4), layout="constrained")
-    cases = sorted({(row["scenes"], row["budget"]) for row in rows}, reverse=True)
-    shown = [case for case in cases if case[1] == BUDGETS[-1]]
-    for axis, (scenes, budget) in zip(
-        np.atleast_1d(figure.subplots(1, len(shown), sharey=True)), shown, strict=True
-    ):
-        for row in rows:
-            if (row["scenes"], row["budget"]) == (scenes, budget):
-                share = (np.arange(len(row["each"])) + 1.0) / len(row["each"])
-                style = {"c": "k", "ls": ":"} if row["policy"] == "known" else {}
-                axis.step(row["each"], share, label=POLICIES[row["policy"]], **style)
-        axis.set_title(f"{scenes}, {budget:g} s", fontsize=9)
-        axis.set(xscale="log", xlabel="1 - quality (left is better)")
-    axis.set_ylabel("")
-    figure.axes[0].set_ylabel("share of the source groups")
-    figure.legend(loc="outside right upper", fontsize=8)
-    return figure
+    curves = []
+    for row in (row for row in rows if row["budget"] == BUDGETS[-1]):
+        count, known = len(row["each"]), row["policy"] == "known"
+        style = {"drawstyle": "steps-pre"} | ({"c": "k", "ls": ":"} if known else {})
+        curve: Row = {"panel": f"{row['scenes']}, {row['budget']:g} s", "label": row["name"]}
+        y = (np.arange(count) + 1.0) / count
+        curves.append(curve | {"x": row["each"], "y": y, "style": style})
+    labels = {"xlabel": "1 - quality (left is better)", "ylabel": "share of the source groups"}
+    return panels(curves, width=5.0, xscale="log", **labels)
+
+
+_COLUMNS = """policy = {name} | quality = {quality:.4f} | 95 % interval = {ci95:.4f} |
+minus Hasinoff = {to_baseline:+.4f} ({to_ci95:+.4f}) | error [EV] = {log_error:.4f} |
+unseen = {unseen:.2%} | frames = {frames:.2f} | ms per decision = {ms:.2f}"""
+_FITTED = """scenes = {scenes}, {budget:g} s | looks above white by = {headroom:g} EV |
+longest exposure = {longest:.3g} s"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the rows of all parts."""
-    rows = rows_of(results)
-    each = [{name: value for name, value in row.items() if name != "each"} for row in rows]
-    return Report(each, tables_of(rows), figures={"bracketing.png": distributions(rows)})
-
-
-def tables_of(rows: Sequence[Row]) -> dict[str, str]:
     """A table for each set of scenes and budget, and one of what was fitted to each."""
-    columns: dict[str, Any] = {
-        "policy": lambda row: POLICIES[row["policy"]],
-        "quality": "{quality:.4f}",
-        "95 % interval": "{ci95[0]:.4f} to {ci95[1]:.4f}",
-        "minus Hasinoff": "{to_baseline:+.4f} ({to_low:+.4f} to {to_high:+.4f})",
-        "error [EV]": "{log_error:.4f}",
-        "unseen": "{unseen:.2%}",
-        "frames": "{frames:.2f}",
-        "ms per decision": "{ms:.2f}",
-    }
-    fitted_columns = {
-        "scenes": "{scenes}, {budget:g} s",
-        "looks above white by": "{headroom:g} EV",
-        "longest exposure": "{longest:.3g} s",
-    }
-    tables = {"fitted": table((row for row in rows if "headroom" in row), fitted_columns)}
+    rows = rows_of(results)
+    tables = {"fitted": table((row for row in rows if "headroom" in row), _FITTED)}
     for scenes, budget in product(SETS, BUDGETS):
         own = [row for row in rows if (row["scenes"], row["budget"]) == (scenes, budget)]
-        tables[f"{scenes}-{1e3 * budget:.0f}ms"] = table(own, columns)
-    return tables
+        tables[f"{scenes}-{1e3 * budget:.0f}ms"] = table(own, _COLUMNS)
+    short = [{name: value for name, value in row.items() if name != "each"} for row in rows]
+    return Report(short, tables, figures={"bracketing.png": distributions(rows)})
 
 
-BENCHMARK = Benchmark(
-    name="bracketing",
-    title="Frames for a merged picture",
-    parts=parts,
-    report=report,
-    code=("ae_env", "agents/bracketing", "benchmarks/bracketing"),
-)
-run = BENCHMARK.run
+run = benchmark("bracketing", parts, report)

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 from skimage.io import imread
+from skimage.measure import block_reduce
 from skimage.metrics import structural_similarity
 from skimage.registration import phase_cross_correlation
 
 from benchmarks.denoising import behind_anscombe, non_local_means
-from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, pivot, table
+from benchmarks.harness import Part, Report, Row, benchmark, data_folder, pivot, table
 from benchmarks.isolated import timed
 from simulator import (
     BayerPattern,
@@ -73,12 +74,6 @@ class Pair:
         """(H, W) pixels saturated in the source: what they would show when darker is unknown."""
         saturated = (self.source.data >= UNSATURATED_BELOW).any(dim=0).numpy()
         return saturated if self.target_ms < self.source_ms else np.zeros_like(saturated)
-
-    @property
-    def brighter(self) -> np.ndarray:
-        """(4, H, W) real frame with the longer exposure."""
-        raw = self.target if self.target_ms > self.source_ms else self.source
-        return raw.data.numpy()
 
 
 def settings(milliseconds: float) -> CameraSettings:
@@ -131,33 +126,30 @@ def ratio_rows(scene: str, frames: dict[int, RawImage]) -> list[Row]:
         nominal = exposure_ratio(settings(shorter), settings(longer))
         x, y = (_blocks(frames[t].data.numpy()) for t in (shorter, longer))
         peak = _blocks(frames[longer].data.numpy(), np.max)
-        for top in (LINEAR_BELOW, UNSATURATED_BELOW):
-            level = (nominal * x + y) / 2
-            use = (level > 0.02) & (level < top) & (peak < UNSATURATED_BELOW)
-            for plane, name in enumerate(PLANES):
-                a, b = x[plane][use[plane]], y[plane][use[plane]]
-                row = {"kind": "ratio", "scene": scene, "source_ms": shorter, "target_ms": longer}
-                row |= {"plane": name, "levels": [0.02, top], "blocks": len(a), "nominal": nominal}
-                row |= {"median": float(np.median(b / a))}
-                rows.append(row | {"least_squares": float(a @ b / (a @ a))})
+        level = (nominal * x + y) / 2
+        for top, (plane, name) in itertools.product(
+            (LINEAR_BELOW, UNSATURATED_BELOW), enumerate(PLANES)
+        ):
+            use = ((level > 0.02) & (level < top) & (peak < UNSATURATED_BELOW))[plane]
+            a, b = x[plane][use], y[plane][use]
+            row: Row = {"kind": "ratio", "scene": scene, "source_ms": shorter, "target_ms": longer}
+            row |= {"plane": name, "levels": [0.02, top], "blocks": len(a), "nominal": nominal}
+            row |= {"median": float(np.median(b / a)), "least_squares": float(a @ b / (a @ a))}
+            rows.append(row)
     return rows
 
 
 def _blocks(data: np.ndarray, reduce: Any = np.mean) -> np.ndarray:
-    planes, height, width = data.shape
-    h, w = height // BLOCK, width // BLOCK
-    cut = data[:, : h * BLOCK, : w * BLOCK].astype(np.float64)
-    return reduce(cut.reshape(planes, h, BLOCK, w, BLOCK), axis=(2, 4))
+    height, width = (n - n % BLOCK for n in data.shape[1:])
+    return block_reduce(data[:, :height, :width].astype(np.float64), (1, BLOCK, BLOCK), reduce)
 
 
 def denoised_scenes(source: RawImage) -> dict[str, PreparedScene]:
     """`source` without its noise, by method: each size of the family, and non-local means."""
-    found = {
-        f"exposure of denoised, {name}": CameraSimulator.from_pretrained(
-            name, device="cpu"
-        ).prepare(source, tolerance=0.0)
-        for name in SIZES
-    }
+    found = {}
+    for name in SIZES:
+        simulator = CameraSimulator.from_pretrained(name, device="cpu")
+        found[f"exposure of denoised, {name}"] = simulator.prepare(source, tolerance=0.0)
     light = behind_anscombe(non_local_means)(source.data, source.noise)
     none = NoiseLevelFunction.zero()
     found["exposure of VST + NLM"] = PreparedScene(light, source.settings, source.camera, none)
@@ -169,78 +161,68 @@ def transition_rows(
 ) -> list[Row]:
     """Simulated and real frame of one transition, beside the baselines that bound the figures."""
     target, bare = pair.target.settings, CameraSimulator(device="cpu")
-    real = pair.target.data.numpy()
-    known = {"exposure only": bare.prepare(pair.source), **denoised}
-    found: dict[str, tuple[torch.Tensor, float]] = {
-        "simulated": timed_result(
-            lambda: bare.simulate(pair.source, target, seed=seed).data, repeats
-        ),
-        **{
-            name: timed_result(lambda p=own: p.expected(target).clamp(0.0, 1.0), repeats)  # type: ignore[misc]
-            for name, own in known.items()
-        },
-    }
+    real, source = pair.target.data.numpy(), pair.source
+    calls = {"simulated": lambda: bare.simulate(source, target, seed=seed).data}
+    for name, own in {"exposure only": bare.prepare(source), **denoised}.items():
+        calls[name] = lambda own=own: own.expected(target).clamp(0.0, 1.0)  # type: ignore[misc]
+    found = {name: timed_result(call, repeats) for name, call in calls.items()}
     exposed = found["exposure only"][0]
     # Rows and columns [packed pixel] by which the simulation must move to lie on the real frame.
     greens = (np.sqrt(np.clip(frame[1], 0.0, 1.0)) for frame in (real, exposed.numpy()))
     shift = phase_cross_correlation(*greens, upsample_factor=20)[0]
     whole = round(float(shift[0])), round(float(shift[1]))
-    ratio = exposure_ratio(pair.source.settings, target)
-    source_variance = ratio**2 * noise_variance(pair.source.data, pair.source.noise)
+    ratio = exposure_ratio(source.settings, target)
+    own_variance = ratio**2 * noise_variance(source.data, source.noise)
     target_variance = noise_variance(pair.target.data, pair.target.noise)
-    top_up = torch.maximum(source_variance, noise_variance(exposed, pair.source.noise))
+    top_up = torch.maximum(own_variance, noise_variance(exposed, source.noise))
     usable = np.broadcast_to(~pair.masked, real.shape)
-    limits = {"simulated": top_up + target_variance}
-    head = {"kind": "transition", "scene": pair.scene, "source_ms": pair.source_ms}
+    head: Row = {"kind": "transition", "scene": pair.scene, "source_ms": pair.source_ms}
     head |= {"target_ms": pair.target_ms, "masked_share": float(pair.masked.mean())}
     head |= {"seconds_apart": pair.seconds_apart, "image_shift": shift.tolist()}
     rows = []
     for variant, (image, ms) in found.items():
         # Not registered, a blurred frame would be nearer to the real one than a sharp one.
-        for moved in {"simulated": ((0, 0),), "exposure only": ((0, 0), whole)}.get(
-            variant, (whole,)
-        ):
-            scores = compare(image.numpy(), real, pair, moved)
-            limit = limits.get(variant, source_variance + target_variance)
-            scores["psnr_noise_limit_db"] = _decibel(limit.numpy()[usable].mean(dtype=np.float64))
+        moves = {"simulated": ((0, 0),), "exposure only": ((0, 0), whole)}.get(variant, (whole,))
+        noise = target_variance + (top_up if variant == "simulated" else own_variance)
+        limit = _decibel(noise.numpy()[usable].mean(dtype=np.float64))
+        for moved in moves:
             name = variant + ", registered" * (moved is whole)
-            rows.append({**head, "variant": name, **scores, "ms": ms})
+            row = {**head, "variant": name, **compare(image.numpy(), real, pair, moved)}
+            rows.append(row | {"psnr_noise_limit_db": limit, "ms": ms})
     return rows
 
 
-def compare(
-    image: np.ndarray, real: np.ndarray, pair: Pair, moved: tuple[int, int]
-) -> dict[str, Any]:
+def compare(image: np.ndarray, real: np.ndarray, pair: Pair, moved: tuple[int, int]) -> Row:
     """PSNR, SSIM and relative RMSE over the unmasked pixels, `image` rolled by `moved` first."""
-    border = max(map(abs, moved))
-    image = np.roll(image, moved, axis=(1, 2))
-    masked = np.roll(pair.masked, moved, axis=(0, 1))
-    inside = np.zeros_like(masked)
-    inside[border : masked.shape[0] - border, border : masked.shape[1] - border] = True
-    use = np.broadcast_to(inside & ~masked, real.shape)
-    linear = use & (pair.brighter < LINEAR_BELOW)
-    square = (image.astype(np.float64) - real) ** 2
+    image = np.roll(image, moved, axis=(1, 2)).astype(np.float64)
+    real = real.astype(np.float64)
+    inside = ~np.roll(pair.masked, moved, axis=(0, 1))
+    if border := max(map(abs, moved)):
+        inside[:border], inside[-border:], inside[:, :border], inside[:, -border:] = (False,) * 4
+    use = np.broadcast_to(inside, real.shape)
+    longer = pair.target if pair.target_ms > pair.source_ms else pair.source
+    linear = use & (longer.data.numpy() < LINEAR_BELOW)
+    square = (image - real) ** 2
+    options: Any = {"data_range": 1.0, "channel_axis": 0, "gaussian_weights": True, "sigma": 1.5}
     _, similarity = structural_similarity(
-        image.astype(np.float64),
-        real.astype(np.float64),
-        data_range=1.0,
-        channel_axis=0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
+        image, real, use_sample_covariance=False, full=True, **options
     )
-    error, power = square[use].mean(), (real[use].astype(np.float64) ** 2).mean()
-    scores = {"psnr_db": _decibel(error), "ssim": float(similarity[use].mean())}
+    error, power = square[use].mean(), (real[use] ** 2).mean()
+    scores: Row = {"psnr_db": _decibel(error), "ssim": float(similarity[use].mean())}
     scores |= {"psnr_linear_range_db": _decibel(square[linear].mean())}
     scores |= {"relative_rmse": float(np.sqrt(error / power))}
-    return scores | {"texture_ratio": _texture(image, use) / _texture(real, use)}
+    ours, theirs = (texture(torch.from_numpy(x), torch.from_numpy(inside)) for x in (image, real))
+    return scores | {"texture_ratio": ours / theirs}
 
 
-def _texture(image: np.ndarray, use: np.ndarray) -> float:
-    """Mean square of the diagonal difference of 2 x 2 neighbours: noise, and detail alike."""
-    a, b, c, d = image[:, :-1, :-1], image[:, 1:, :-1], image[:, :-1, 1:], image[:, 1:, 1:]
-    return float((((a - b - c + d) / 2)[use[:, 1:, 1:]] ** 2).mean(dtype=np.float64))
+def texture(image: torch.Tensor, use: torch.Tensor) -> float:
+    """Mean square of the diagonal difference of 2 x 2 neighbours, all of them in `use` (H, W).
+
+    That is noise, and detail alike.
+    """
+    a, b, c, d = (image[:, i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
+    inside = use[:-1, :-1] & use[1:, :-1] & use[:-1, 1:] & use[1:, 1:]
+    return float(((a - b - c + d) / 2.0)[:, inside].square().mean()) if inside.any() else 0.0
 
 
 def _decibel(mean_square: float) -> float | None:
@@ -268,48 +250,31 @@ def measure(scene: str, repeats: int, seed: int) -> dict[str, Any]:
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each scene; only the static one, each simulation timed once, if `quick`."""
     data_folder("boreal_brackets")  # raises before any work
-    repeats = 1 if quick else REPEATS
-    return [
-        Part(scene, measure, {"scene": scene, "repeats": repeats, "seed": seed}, threads=1)
-        for scene in SCENES[: 1 if quick else None]
-    ]
+    given = {"repeats": 1 if quick else REPEATS, "seed": seed}
+    scenes = SCENES[: 1 if quick else None]
+    return [Part(scene, measure, {"scene": scene, **given}, threads=1) for scene in scenes]
+
+
+_COLUMNS = f"""transition = {{source_ms}} to {{target_ms}} ms: {{variant}} |
+PSNR [dB] = {{psnr_db:.2f}} | noise limit [dB] = {{psnr_noise_limit_db:.2f}} |
+PSNR below {LINEAR_BELOW} [dB] = {{psnr_linear_range_db:.2f}} | SSIM = {{ssim:.4f}} |
+relative RMSE = {{relative_rmse:.4f}} | texture ratio = {{texture_ratio:.3f}} | ms = {{ms:.1f}} |
+masked = {{masked_share:.2%}} | shift = {{image_shift[0]:.2f}}, {{image_shift[1]:.2f}} |
+s apart = {{seconds_apart:.3f}}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by scene."""
     rows = [row for own in results.values() for row in own["rows"]]
     estimates = {scene: own["estimates"] for scene, own in results.items()}
     more: dict[str, Any] = {"blind_nlf_of_green": {"exposure_ms": list(TIMES_MS), **estimates}}
     more["frame"] = next(iter(results.values()))["frame"]
-    ratios = pivot(
-        (row for row in rows if row["kind"] == "ratio"),
-        line=("scene, frames, levels", "{scene}, {source_ms} to {target_ms} ms, {levels}"),
-        columns="{plane}",
-        contents={"": "{median:.3f} ({least_squares:.3f})"},
-    )
-    transitions = [row for row in rows if row["kind"] == "transition"]
-    tables = {s: table((r for r in transitions if r["scene"] == s), _COLUMNS) for s in SCENES}
-    return Report(rows, {"ratios": ratios, **tables}, meta=more)
+    ratios = (row for row in rows if row["kind"] == "ratio")
+    line = "scene, frames, levels = {scene}, {source_ms} to {target_ms} ms, {levels}"
+    found = {"ratios": pivot(ratios, line, "{plane}", "{median:.3f} ({least_squares:.3f})")}
+    for scene in SCENES:
+        own = (row for row in rows if (row["kind"], row["scene"]) == ("transition", scene))
+        found[scene] = table(own, _COLUMNS)
+    return Report(rows, found, meta=more)
 
 
-_COLUMNS: dict[str, Any] = {
-    "transition": "{source_ms} to {target_ms} ms: {variant}",
-    "PSNR [dB]": "{psnr_db:.2f}",
-    "noise limit [dB]": "{psnr_noise_limit_db:.2f}",
-    f"PSNR below {LINEAR_BELOW} [dB]": "{psnr_linear_range_db:.2f}",
-    "SSIM": "{ssim:.4f}",
-    "relative RMSE": "{relative_rmse:.4f}",
-    "texture ratio": "{texture_ratio:.3f}",
-    "ms": "{ms:.1f}",
-    "masked": "{masked_share:.2%}",
-    "shift": "{image_shift[0]:.2f}, {image_shift[1]:.2f}",
-    "s apart": "{seconds_apart:.3f}",
-}
-BENCHMARK = Benchmark(
-    name="brackets",
-    title="Real brackets against the exposure step",
-    parts=parts,
-    report=report,
-    code=("simulator", "benchmarks/brackets", "benchmarks/denoising"),
-)
-run = BENCHMARK.run
+run = benchmark("brackets", parts, report)

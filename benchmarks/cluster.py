@@ -12,7 +12,7 @@ import torch
 
 from agents.score_shards import ShardPlan
 from agents.score_shards import run as make_shards
-from benchmarks.harness import Benchmark, Part, Report, Row, table
+from benchmarks.harness import Part, Report, Row, benchmark, table
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 #: Raws, their height and width [packed pixel], and how many of them are a shard.
@@ -42,42 +42,28 @@ def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One process, and Ray with one and two workers."""
     return [
         Part(f"{on}-{n}", measure, {"on": on, "workers": n, "seed": seed, "quick": quick})
         for on, n in (("local", 1), ("ray", 1), ("ray", 2))
     ]
 
 
+_COLUMNS = """on = {on}, workers: {workers} | raws = {files} | time [s] = {seconds:.1f} |
+raws / s = {rate:.1f} | times one process = {speedup:.2f} |
+of it no shard was made [s] = {overhead:.1f} | raws / s without that = {steady_rate:.1f} |
+core hours for a million raws = {core_hours:.1f}"""
+
+
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report; overhead is the time in which no shard was being made."""
+    """Overhead is the time in which no shard was being made; a core hour is one of a worker."""
     rows: list[Row] = list(results.values())
-    alone = rows[0]["seconds"]
     for row in rows:
         row["rate"] = row["files"] / row["seconds"]
-        row["speedup"] = alone / row["seconds"]
+        row["speedup"] = rows[0]["seconds"] / row["seconds"]
         row["overhead"] = row["seconds"] - row["busy"] / row["workers"]
         row["steady_rate"] = row["workers"] * row["files"] / row["busy"]
-        # One core for each worker.
         row["core_hours"] = 1e6 * row["busy"] / row["files"] / 3600
-    columns = {
-        "on": "{on}, workers: {workers}",
-        "raws": "{files}",
-        "time [s]": "{seconds:.1f}",
-        "raws / s": "{rate:.1f}",
-        "times one process": "{speedup:.2f}",
-        "of it no shard was made [s]": "{overhead:.1f}",
-        "raws / s without that": "{steady_rate:.1f}",
-        "core hours for a million raws": "{core_hours:.1f}",
-    }
-    return Report(rows, {"runs": table(rows, columns)})
+    return Report(rows, {"runs": table(rows, _COLUMNS)})
 
 
-BENCHMARK = Benchmark(
-    name="cluster",
-    title="Score tables on Ray",
-    parts=parts,
-    report=report,
-    code=("agents/score_shards", "benchmarks/cluster"),
-)
-run = BENCHMARK.run
+run = benchmark("cluster", parts, report)

@@ -9,6 +9,7 @@ Every patch is averaged on the packed raw, brought to the chart's exposure by on
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ import torch
 from scipy.stats import linregress
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
-from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, pivot, rounded, table
+from ae_env.scorers.measures import srgb_decode
+from benchmarks.harness import Part, Report, Row, benchmark, data_folder, pivot, rounded, table
 from simulator import RawImage, develop, read_raw
 from simulator.raw.develop import XYZ_FROM_SRGB, srgb_from_camera
 
@@ -61,57 +63,43 @@ BRADFORD = np.array(
 
 @dataclass(frozen=True)
 class Chart:
-    """Where the patches lie: centres of 4 corner patches on the packed visible area, (x, y).
+    """Where the patches lie on the packed visible area.
 
     Args:
-        top_left: Centre of the patch in row `rows[0]`, column `columns[0]`; then clockwise.
-        top_right: Row `rows[0]`, column `columns[1]`.
-        bottom_right: Row `rows[1]`, column `columns[1]`.
-        bottom_left: Row `rows[1]`, column `columns[0]`.
+        corners: Centres (x, y) of the 4 corner patches, clockwise from the top left.
         rows: First and last row of the chart (0 to 3) that is wholly in the picture.
         columns: First and last column (0 to 5); dark skin is row 0, column 0.
     """
 
-    top_left: tuple[float, float]
-    top_right: tuple[float, float]
-    bottom_right: tuple[float, float]
-    bottom_left: tuple[float, float]
+    corners: tuple[tuple[float, float], ...]
     rows: tuple[int, int] = (0, 3)
     columns: tuple[int, int] = (0, 5)
 
     def patches(self) -> dict[int, tuple[float, float, float]]:
         """Index of each patch to (x, y, half side of the square that is averaged)."""
         down, across = self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
-        corners = np.array([self.top_left, self.top_right, self.bottom_right, self.bottom_left])
-        half = 0.22 * np.linalg.norm(corners[1] - corners[0]) / across
-        found = {}
-        for i in range(down + 1):
-            for j in range(across + 1):
-                v, u = i / down, j / across
-                weights = np.array([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])
-                x, y = weights @ corners
-                found[6 * (self.rows[0] + i) + self.columns[0] + j] = (x, y, float(half))
+        corners, found = np.array(self.corners, float), {}
+        half = float(0.22 * np.linalg.norm(corners[1] - corners[0]) / across)
+        for i, j in product(range(down + 1), range(across + 1)):
+            v, u = i / down, j / across
+            x, y = np.array([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v]) @ corners
+            found[6 * (self.rows[0] + i) + self.columns[0] + j] = (x, y, half)
         return found
 
 
 #: All three show the chart upright; two are close-ups that cut it off.
 FILES = {
-    "CRW_0101.CRW": Chart((177, 165), (955, 161), (957, 622), (184, 626)),
-    "CRW_0104.CRW": Chart((188, 165), (981, 161), (982, 553), (190, 558), (1, 3), (1, 5)),
-    "CRW_0105.CRW": Chart((355, 269), (923, 270), (923, 550), (356, 552), (2, 3), (3, 5)),
+    "CRW_0101.CRW": Chart(((177, 165), (955, 161), (957, 622), (184, 626))),
+    "CRW_0104.CRW": Chart(((188, 165), (981, 161), (982, 553), (190, 558)), (1, 3), (1, 5)),
+    "CRW_0105.CRW": Chart(((355, 269), (923, 270), (923, 550), (356, 552)), (2, 3), (3, 5)),
 }
-
-
-def bradford(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Matrix that adapts XYZ from white `source` to white `target`."""
-    gains = (BRADFORD @ target) / (BRADFORD @ source)
-    return np.linalg.inv(BRADFORD) @ np.diag(gains) @ BRADFORD
 
 
 def linear_srgb_to_lab(linear: np.ndarray) -> np.ndarray:
     """Linear sRGB (N, 3) to CIE L*a*b* under D50, Bradford-adapted from sRGB's D65."""
     matrix = np.array(XYZ_FROM_SRGB)
-    to_d50 = bradford(matrix.sum(axis=1), D50) @ matrix
+    gains = (BRADFORD @ D50) / (BRADFORD @ matrix.sum(axis=1))
+    to_d50 = np.linalg.inv(BRADFORD) @ np.diag(gains) @ BRADFORD @ matrix
     # scikit-image's own white, so that white is L* 100, a* 0, b* 0 to the last digit.
     white = lab2xyz(np.array([100.0, 0.0, 0.0]), illuminant="D50")
     return xyz2lab(linear @ to_d50.T / D50 * white, illuminant="D50")
@@ -121,11 +109,6 @@ def lab_to_luminance(lab: np.ndarray) -> np.ndarray:
     """CIE Y of L*, 1 for L* = 100."""
     lightness = (lab[..., 0] + 16) / 116
     return np.where(lab[..., 0] > 8, lightness**3, lab[..., 0] / 903.2963)
-
-
-def decode_srgb(encoded: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, sRGB values to linear light."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
@@ -147,8 +130,7 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
     """One row per patch, for one file and white balance (``"camera"`` or ``"chart"``)."""
     means = patch_means(raw, chart)
     order = sorted(means)
-    planes = np.stack([means[i] for i in order])  # (N, 4)
-    lab = PUBLISHED[order]
+    planes, lab = np.stack([means[i] for i in order]), PUBLISHED[order]  # (N, 4), (N, 3)
     gains = np.array(raw.white_balance)
     if white_balance == "chart":
         r, g1, g2, b = means[GREY]
@@ -160,27 +142,26 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
 
     neutral = [k for k, i in enumerate(order) if i >= 18]
     measured = (linear @ np.array(XYZ_FROM_SRGB)[1])[neutral]
-    published = lab_to_luminance(lab[neutral])
-    scale = float(published @ measured / (measured @ measured))
+    scale = float(lab_to_luminance(lab[neutral]) @ measured / (measured @ measured))
 
     packed = torch.from_numpy(planes * scale).float().T.reshape(1, 4, -1, 1)
     encoded = develop(packed, tuple(gains), raw.camera.colour_matrix, tone="linear")
-    developed = decode_srgb(encoded[0, :, :, 0].T.double().numpy())
-    shown = linear_srgb_to_lab(developed)
-    unclipped = linear_srgb_to_lab(linear * scale)
-    error = deltaE_ciede2000(shown, lab)
-    error_unclipped = deltaE_ciede2000(unclipped, lab)
+    shown = linear_srgb_to_lab(srgb_decode(encoded[0, :, :, 0].T.double()).numpy())
     # Each patch scaled to its published Y, which leaves errors of hue and chroma only: uneven
     # light, vignetting and the camera's linearity drop out; veiling glare does not.
     luminance = lab_to_luminance(linear_srgb_to_lab(linear))
-    even = linear_srgb_to_lab(linear * (lab_to_luminance(lab) / luminance)[:, None])
-    error_even = deltaE_ciede2000(even, lab)
+    even = linear * (lab_to_luminance(lab) / luminance)[:, None]
+    errors = {
+        "delta_e_2000": deltaE_ciede2000(shown, lab),
+        "delta_e_2000_without_gamut_clip": deltaE_ciede2000(
+            linear_srgb_to_lab(linear * scale), lab
+        ),
+        "delta_e_2000_at_published_luminance": deltaE_ciede2000(linear_srgb_to_lab(even), lab),
+    }
     rows = []
     for k, i in enumerate(order):
         row: Row = {"file": raw.metadata["path"], "white_balance": white_balance}
-        row |= {"patch": NAMES[i], "delta_e_2000": error[k]}
-        row |= {"delta_e_2000_without_gamut_clip": error_unclipped[k]}
-        row |= {"delta_e_2000_at_published_luminance": error_even[k]}
+        row |= {"patch": NAMES[i]} | {name: error[k] for name, error in errors.items()}
         row |= {"lab_measured": shown[k].round(2), "lab_published": lab[k]}
         rows.append(rounded(row | {"linear_srgb": linear[k] * scale, "exposure_scale": scale}))
     return rows
@@ -196,10 +177,9 @@ def paper_range(raw: RawImage) -> Row:
 
 def linearity(raw: RawImage, chart: Chart) -> list[Row]:
     """Per channel: how straight the neutral row's raw values lie over the published luminance."""
-    means = patch_means(raw, chart)
+    means, rows = patch_means(raw, chart), []
     order = [i for i in sorted(means) if i >= 18]
     published = lab_to_luminance(PUBLISHED[order])
-    rows = []
     for name, planes in (("R", [0]), ("G", [1, 2]), ("B", [3])):
         values = np.array([means[i][planes].mean() for i in order])
         fit = linregress(published, values)
@@ -230,51 +210,32 @@ def measure_file(file: str) -> dict[str, Any]:
         rows += own
         summaries.append({"file": file, "white_balance": white_balance} | summary(own))
     whole = chart.rows == (0, 3) and chart.columns == (0, 5)  # the close-ups show little paper
-    lines = linearity(raw, chart)
-    paper = paper_range(raw) if whole else None
-    return {"rows": rows, "summary": summaries, "linearity": lines, "paper": paper}
+    paper = [{"file": file, **paper_range(raw)}] if whole else []
+    return {"rows": rows, "summary": summaries, "linearity": linearity(raw, chart), "paper": paper}
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each raw; only the first if `quick`."""
     data_folder("canon_crw_cc0")  # raises before any work
-    files = list(FILES)[: 1 if quick else None]
-    return [Part(file, measure_file, {"file": file}) for file in files]
+    return [
+        Part(file, measure_file, {"file": file}) for file in list(FILES)[: 1 if quick else None]
+    ]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by file."""
-    rows = [row for own in results.values() for row in own["rows"]]
-    summaries = [row for own in results.values() for row in own["summary"]]
-    lines = [row for own in results.values() for row in own["linearity"]]
-    paper = {file: own["paper"] for file, own in results.items() if own["paper"]}
-    more = {"summary": summaries, "linearity": lines, "paper": paper}
-    first = (row for row in rows if row["file"] == next(iter(FILES)))
-    patches = pivot(
-        first,
-        line=("patch", "{patch}"),
-        columns="{white_balance}",
-        contents={
-            "published": lambda row: " ".join(map(str, row["lab_published"])),
-            "measured": lambda row: " ".join(map(str, row["lab_measured"])),
-            "dE2000": "{delta_e_2000:.2f}",
-        },
-    )
-    tables = {"patches": patches, "charts": _plain_table(summaries)}
-    tables["linearity"] = _plain_table(lines)
-    tables["paper"] = _plain_table([{"file": file, **ends} for file, ends in paper.items()])
-    return Report(rows, tables, meta=more)
+    keys = ("rows", "summary", "linearity", "paper")
+    found: dict[str, list[Row]] = {k: [r for own in results.values() for r in own[k]] for k in keys}
+    shown = [
+        row | {name: " ".join(map(str, row[f"lab_{name}"])) for name in ("published", "measured")}
+        for row in found["rows"]
+        if row["file"] == next(iter(FILES))
+    ]
+    contents = "published = {published} | measured = {measured} | dE2000 = {delta_e_2000:.2f}"
+    tables = {"patches": pivot(shown, "patch = {patch}", "{white_balance}", contents)}
+    for name, key in (("charts", "summary"), ("linearity", "linearity"), ("paper", "paper")):
+        columns = {title.replace("_", " "): f"{{{title}}}" for title in found[key][0]}
+        tables[name] = table(found[key], columns)
+    return Report(found.pop("rows"), tables, meta=found)
 
 
-def _plain_table(rows: list[Row]) -> str:
-    return table(rows, {key.replace("_", " "): f"{{{key}}}" for key in rows[0]})
-
-
-BENCHMARK = Benchmark(
-    name="colour_checker",
-    title="Colour accuracy on real raws of a ColorChecker",
-    parts=parts,
-    report=report,
-    code=("simulator", "benchmarks/colour_checker"),
-)
-run = BENCHMARK.run
+run = benchmark("colour_checker", parts, report)

@@ -15,13 +15,12 @@ import numpy as np
 import pandas as pd
 import torch
 from scipy.optimize import nnls
-from scipy.stats import spearmanr
 
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.measures import luma_of
 from agents.cli.console import console
-from benchmarks.harness import Benchmark, Part, Report, Row, pivot, table
+from benchmarks.harness import Part, Report, Row, benchmark, interval, pivot, table
 from simulator import develop, exposure_ratio, get_camera
 from simulator.optics.blur import disc_blur
 from simulator.raw.develop import GREY_CARD_SIGNAL
@@ -34,19 +33,16 @@ TRAINING_SCENES, TEST_SCENES = 60, 24
 UNSIGNED, SIGNED = np.linspace(0.0, 1.0, 11), np.linspace(-1.0, 1.0, 21)
 NUM_KNOTS = 9
 RESAMPLES = 2000
+#: Severities (L,) at which each defect is rendered.
+LEVELS = {name: SIGNED if name == "saturation" else UNSIGNED for name in DEFECTS}
 #: What severity 1 is.
 EXPOSURE_EV, CARD_NOISE, GAIN_STOPS, AIRLIGHT, DISC_PX = 4.0, 0.5, 1.0, 0.8, 8.0
 _TINTS = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 
 
-def levels(defect: str) -> np.ndarray:
-    """Severities (L,) at which `defect` is rendered."""
-    return SIGNED if defect == "saturation" else UNSIGNED
-
-
 def render(scene: Scene, defect: str, generator: torch.Generator) -> torch.Tensor:
-    """sRGB (L, 3, H, W) of `scene` with `defect` at its `levels`."""
-    severities = torch.from_numpy(levels(defect)).float()[:, None, None, None]
+    """sRGB (L, 3, H, W) of `scene` with `defect` at its `LEVELS`."""
+    severities = torch.from_numpy(LEVELS[defect]).float()[:, None, None, None]
     proper = reference_settings(scene.ev100)
     light = scene.light * float(exposure_ratio(scene.reference, proper))
     gains = torch.tensor(scene.white_balance)
@@ -109,7 +105,7 @@ def fit(scenes: list[Scene], seed: int) -> dict[str, list[list[float]]]:
     for defect in DEFECTS:
         names = ["over_exposure", "under_exposure"] if defect == "exposure" else [defect]
         signs = signs_of(scenes, defect, names, seed)
-        rendered = np.broadcast_to(levels(defect), signs[names[0]].shape)
+        rendered = np.broadcast_to(LEVELS[defect], signs[names[0]].shape)
         if defect != "exposure":
             maps[defect] = fit_map(signs[defect].ravel(), rendered.ravel())
             continue
@@ -137,37 +133,27 @@ def severities_of(scenes: list[Scene], defect: str, seed: int) -> dict[str, np.n
 def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str, seed: int) -> Row:
     """How well the severity of its own defect is read, over ``"all"`` scenes or a part of them."""
     chosen = [which == "all" or s.hard == (which == "hard") for s in scenes]
-    rendered = np.broadcast_to(levels(defect), estimated.shape)[chosen]
-    values = estimated[chosen]
-    groups = np.array([scene.group for scene in scenes])[chosen]
+    rendered = np.broadcast_to(LEVELS[defect], estimated.shape)[chosen]
+    values, groups = estimated[chosen], np.array([scene.group for scene in scenes])[chosen]
     errors = pd.Series(np.abs(values - rendered).mean(axis=1)).groupby(groups).mean().to_numpy()
-    guesses = np.abs(rendered - np.median(levels(defect))).mean()
-    draws = np.random.default_rng(seed).integers(len(errors), size=(RESAMPLES, len(errors)))
-    within = [_spearman(v, r) for v, r in zip(values, rendered, strict=True)]
+    frame, truth = pd.DataFrame(values.T), pd.Series(LEVELS[defect])
+    within = frame.corrwith(truth, method="spearman").fillna(0.0)  # 0 where nothing varies
+    over_all = pd.Series(values.ravel()).corr(pd.Series(rendered.ravel()), method="spearman")
     row: Row = {"part": "own", "measure": f"analytic_{defect}", "scenes": which}
     row |= {"resolution": scenes[0].light.shape[-1], "num_scenes": len(values)}
-    row |= {"num_groups": len(errors), "spearman": _spearman(values.ravel(), rendered.ravel())}
-    row |= {"spearman_within_scene": float(np.mean(within)), "mae": float(errors.mean())}
-    row |= {"mae_ci95": np.quantile(errors[draws].mean(axis=1), [0.025, 0.975]).tolist()}
-    return row | {"mae_of_a_constant": float(guesses)}
-
-
-def _spearman(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's coefficient; 0 where one of the two does not vary."""
-    if np.ptp(first) < 1e-12 or np.ptp(second) < 1e-12:
-        return 0.0
-    return float(spearmanr(first, second).statistic)
+    row |= {"num_groups": len(errors), "spearman": over_all, "mae": float(errors.mean())}
+    row |= {"spearman_within_scene": within.mean(), "mae_ci95": interval(errors, seed, RESAMPLES)}
+    constant = np.abs(rendered - np.median(LEVELS[defect])).mean()
+    return row | {"mae_of_a_constant": float(constant)}
 
 
 def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:
     """Mean |severity| that each measure gives with and without `defect` at its worst."""
-    clean = int(np.flatnonzero(levels(defect) == 0.0)[0])
-    ends = {"": -1} | ({"too weak": 0} if defect == "saturation" else {})
-    rows = []
-    for end, last in ends.items():
+    clean, rows = int(np.flatnonzero(LEVELS[defect] == 0.0)[0]), []
+    for end, last in (("", -1), *([(" (too weak)", 0)] if defect == "saturation" else [])):
         for measure, values in estimated.items():
             means = np.abs(values).mean(axis=0)
-            row: Row = {"part": "cross_talk", "defect": f"{defect}{f' ({end})' * bool(end)}"}
+            row: Row = {"part": "cross_talk", "defect": f"{defect}{end}"}
             row |= {"measure": f"analytic_{measure}", "clean": float(means[clean])}
             row |= {"at_severity_1": float(means[last])}
             rows.append(row | {"change": float(means[last] - means[clean])})
@@ -188,11 +174,10 @@ def scenes_of(split: str, resolution: int, per_kind: int, quick: bool) -> list[S
 
 def parts(seed: int, quick: bool) -> list[Part]:
     """The maps are fitted in one part, and the constants in use tested in others."""
-    found = [Part("maps", fitted, {"seed": seed, "quick": quick})]
-    for resolution in (RESOLUTION, OTHER_RESOLUTION):
-        arguments = {"resolution": resolution, "seed": seed, "quick": quick}
-        found.append(Part(f"test {resolution}", tested, arguments))
-    return found
+    given = {"seed": seed, "quick": quick}
+    sizes = (RESOLUTION, OTHER_RESOLUTION)
+    tests = [Part(f"test {n}", tested, {"resolution": n, **given}) for n in sizes]
+    return [Part("maps", fitted, given), *tests]
 
 
 def fitted(seed: int, quick: bool) -> dict[str, Any]:
@@ -214,6 +199,13 @@ def tested(resolution: int, seed: int, quick: bool) -> dict[str, Any]:
     return {"rows": rows, "scenes": len(scenes)}
 
 
+_FITTED = """training scenes = {training_scenes} | test scenes = {test_scenes} |
+the constants in use are those of this run = {in_use_is_fitted}"""
+_OWN = """measure = `{measure}` | pixels = {resolution} | scenes = {num_scenes} {scenes} |
+rank correlation = {spearman:.2f} | within a scene = {spearman_within_scene:.2f} |
+error = {mae:.3f} [{mae_ci95[0]:.3f}, {mae_ci95[1]:.3f}] | constant = {mae_of_a_constant:.3f}"""
+
+
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report; prints the maps as the scorers' source has them."""
     maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
@@ -230,50 +222,18 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     )
     more = {"training_scenes": results["maps"]["scenes"], "test_scenes": tests[0]["scenes"]}
     more |= {"in_use_is_fitted": in_use, "camera": CAMERA}
-    own = [row for row in rows if row["part"] == "own"]
+    own = [r for r in rows if r["part"] == "own"]
+    own = [r for r in own if r["scenes"] == "all" or r["resolution"] == RESOLUTION]
     cross = [row for row in rows if row["part"] == "cross_talk"]
-    clean = [
+    shown = [
         row | {"defect": "no defect", "shown": f"{row['clean']:.2f}"}
         for row in cross
         if row["defect"] == DEFECTS[0]
     ]
-    changes = [row | {"shown": f"{row['change']:+.2f}"} for row in cross]
-    tables = {
-        "fitted": table(
-            [more],
-            {
-                "training scenes": "{training_scenes}",
-                "test scenes": "{test_scenes}",
-                "the constants in use are those of this run": lambda _: "yes" if in_use else "no",
-            },
-        ),
-        "own": table(
-            [r for r in own if r["scenes"] == "all" or r["resolution"] == RESOLUTION],
-            {
-                "measure": "`{measure}`",
-                "pixels": "{resolution}",
-                "scenes": "{num_scenes} {scenes}",
-                "rank correlation": "{spearman:.2f}",
-                "within a scene": "{spearman_within_scene:.2f}",
-                "error": "{mae:.3f} [{mae_ci95[0]:.3f}, {mae_ci95[1]:.3f}]",
-                "constant": "{mae_of_a_constant:.3f}",
-            },
-        ),
-        "cross_talk": pivot(
-            [*clean, *changes],
-            line=("defect", "{defect}"),
-            columns="`{measure}`",
-            contents={"": "{shown}"},
-        ),
-    }
+    shown += [row | {"shown": f"{row['change']:+.2f}"} for row in cross]
+    tables = {"fitted": table([more], _FITTED), "own": table(own, _OWN)}
+    tables["cross_talk"] = pivot(shown, "defect = {defect}", "`{measure}`", "{shown}")
     return Report([*fits, *rows], tables, meta=more)
 
 
-BENCHMARK = Benchmark(
-    name="defects",
-    title="Do the analytic measures of defects read the severity?",
-    parts=parts,
-    report=report,
-    code=("simulator", "ae_env", "benchmarks/defects"),
-)
-run = BENCHMARK.run
+run = benchmark("defects", parts, report)

@@ -9,10 +9,12 @@ every method; the gain is that of the PSNR over the noisy input. One thread.
 
 from __future__ import annotations
 
-import itertools
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -21,9 +23,8 @@ import torch
 from skimage.restoration import denoise_nl_means
 from torch import Tensor
 
-from benchmarks.fidelity.models import checksums, trained_noise_modules
-from benchmarks.harness import Benchmark, Part, Report, Row, data_root, pivot, table
-from benchmarks.isolated import timed
+from benchmarks.fidelity.models import trained_noise_modules
+from benchmarks.harness import Part, Report, Row, benchmark, data_root, interval, pivot, table
 from simulator import CameraProfile, get_camera
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -60,11 +61,6 @@ class Case:
     light: Tensor
     noisy: Tensor
 
-    @property
-    def nlf(self) -> NoiseLevelFunction:
-        """Its noise."""
-        return self.camera.nlf(self.iso)
-
 
 def sources() -> list[DetailPicture]:
     """One real picture of every source group of the test split."""
@@ -88,7 +84,7 @@ def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
     camera = get_camera(CAMERAS[number % len(CAMERAS)])
     reference, made = ReferenceCamera(camera), []
     # Every other one, as on a chessboard, and the others of the next but one source: BM3D is slow.
-    for iso, level in list(itertools.product(ISOS, LEVELS))[number // len(CAMERAS) % 2 :: 2]:
+    for iso, level in list(product(ISOS, LEVELS))[number // len(CAMERAS) % 2 :: 2]:
         scale = 2.0**level / white
         own, added = picture.nlf.exposed(scale), camera.nlf(iso)
         ratios = zip((*own.shot, *own.read), (*added.shot, *added.read), strict=True)
@@ -103,7 +99,14 @@ def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
 
 def networks() -> dict[str, Denoiser]:
     """The trained noise modules that are there."""
-    return {name: _network(module) for name, module in trained_noise_modules().items()}
+
+    @torch.no_grad()
+    def denoise(module: Any, raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
+        shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
+        result: Tensor = module(raw[None], shot, read)[0]
+        return result
+
+    return {name: partial(denoise, module) for name, module in trained_noise_modules().items()}
 
 
 def classical() -> dict[str, Denoiser]:
@@ -112,35 +115,26 @@ def classical() -> dict[str, Denoiser]:
     return {name: behind_anscombe(denoise) for name, denoise in planes.items()}
 
 
-def _network(module: Any) -> Denoiser:
-    @torch.no_grad()
-    def denoise(raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
-        shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
-        result: Tensor = module(raw[None], shot, read)[0]
-        return result
-
-    return denoise
-
-
 def measure(methods: str, first: int, seed: int, quick: bool) -> list[Row]:
     """A row for every case of some sources and every method of a kind."""
     known, rows = {"networks": networks, "classical": classical}[methods](), []
     chosen = list(enumerate(sources()))[first : first + (1 if quick else _AT_ONCE)]
-    for number, picture in chosen:
-        some = cases(number, picture, seed)
-        for case in some[::3] if quick else some:
-            before = _error(case.noisy, case.light)
-            green = case.light[1] - case.light[2]
-            for name, denoise in known.items():
-                found: list[Tensor] = []
-                seconds = timed(lambda d=denoise, c=case, f=found: f.append(d(c.noisy, c.nlf)))  # type: ignore[misc]
-                gain = 10.0 * np.log10(before / max(_error(found[0], case.light), 1e-30))
-                kept = float(((found[0][1] - found[0][2]) * green).sum() / green.square().sum())
-                rows.append(
-                    {"part": "cases", "method": name, "source": case.source, "kind": case.kind}
-                    | {"camera": case.camera.name, "iso": case.iso, "ev": case.level}
-                    | {"gain_db": float(gain), "green_kept": kept, "milliseconds": 1e3 * seconds}
-                )
+    every = [case for number, picture in chosen for case in cases(number, picture, seed)]
+    for case in every[::3] if quick else every:
+        before, green = _error(case.noisy, case.light), case.light[1] - case.light[2]
+        for name, denoise in known.items():
+            begun = perf_counter()
+            clean = denoise(case.noisy, case.camera.nlf(case.iso))
+            row: Row = {
+                "part": "cases",
+                "method": name,
+                "milliseconds": 1e3 * (perf_counter() - begun),
+            }
+            row |= {"source": case.source, "kind": case.kind, "camera": case.camera.name}
+            gain = 10.0 * np.log10(before / max(_error(clean, case.light), 1e-30))
+            kept = float(((clean[1] - clean[2]) * green).sum() / green.square().sum())
+            row |= {"iso": case.iso, "ev": case.level, "gain_db": float(gain)}
+            rows.append(row | {"green_kept": kept})
     return rows
 
 
@@ -150,20 +144,15 @@ def _error(image: Tensor, truth: Tensor) -> float:
 
 def measure_flat(camera: str, seed: int, quick: bool) -> list[Row]:
     """Means of flat fields, before and after each network, at the calibrated ISOs."""
-    profile = get_camera(camera)
-    reference, rows = ReferenceCamera(profile), []
-    denoisers = networks()
-    for iso in list(profile.nlf_by_iso)[:: 4 if quick else 1]:
-        for level in FLAT_LEVELS:
-            light = torch.full((4, FLAT_SIZE, FLAT_SIZE), 2.0**level)
-            noisy = reference.record(light, iso, noise_generator(seed, iso, float(level)))
-            for name, denoise in denoisers.items():
-                shift = (denoise(noisy, profile.nlf(iso)) - noisy).double().mean(dim=(1, 2))
-                worst = float(shift.abs().max()) / 2.0**level
-                rows.append(
-                    {"part": "flat", "method": name, "camera": camera, "iso": iso}
-                    | {"ev": level, "mean_shift": worst}
-                )
+    profile, rows, denoisers = get_camera(camera), [], networks()
+    reference = ReferenceCamera(profile)
+    for iso, ev in product(list(profile.nlf_by_iso)[:: 4 if quick else 1], FLAT_LEVELS):
+        light = torch.full((4, FLAT_SIZE, FLAT_SIZE), 2.0**ev)
+        noisy = reference.record(light, iso, noise_generator(seed, iso, float(ev)))
+        for name, denoise in denoisers.items():
+            shift = (denoise(noisy, profile.nlf(iso)) - noisy).double().mean(dim=(1, 2))
+            row: Row = {"part": "flat", "method": name, "camera": camera, "iso": iso, "ev": ev}
+            rows.append(row | {"mean_shift": float(shift.abs().max()) / 2.0**ev})
     return rows
 
 
@@ -214,11 +203,7 @@ def non_local_means(stable: np.ndarray) -> np.ndarray:
 
 
 def bm3d_planes(stable: np.ndarray) -> np.ndarray:
-    """BM3D (4, H, W) of the four planes jointly: blocks are matched on their mean.
-
-    Raises:
-        ImportError: If the extra ``bench`` is not installed.
-    """
+    """BM3D (4, H, W) of the four planes jointly: blocks are matched on their mean."""
     try:
         import bm3d
     except ImportError:
@@ -233,69 +218,42 @@ _HADAMARD = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """Parts to measure."""
-    count, step = len(sources()), 1 if quick else _AT_ONCE
-    starts = list(range(0, count, step))[: 2 if quick else None]
-    arguments, weights = {"seed": seed, "quick": quick}, checksums()
-    found = []
-    for methods, depends in (("networks", weights), ("classical", {})):
-        for first in starts:
-            given = {"methods": methods, "first": first, **arguments}
-            found.append(Part(f"{methods} {first}", measure, given, 1, depends=depends))
+    step = 1 if quick else _AT_ONCE
+    starts = list(range(0, len(sources()), step))[: 2 if quick else None]
+    given, found = {"seed": seed, "quick": quick}, []
+    for methods, first in product(("networks", "classical"), starts):
+        arguments = {"methods": methods, "first": first, **given}
+        found.append(Part(f"{methods} {first}", measure, arguments, threads=1))
     for camera in CAMERAS:
-        given = {"camera": camera, **arguments}
-        found.append(Part(f"flat {camera}", measure_flat, given, 1, depends=weights))
+        found.append(Part(f"flat {camera}", measure_flat, {"camera": camera, **given}, threads=1))
     return found
 
 
+_COLUMNS = """method = {method} | gain [dB] = {gain_db:.2f} |
+10th percentile = {gain_db_10_percent:.2f} | worst = {gain_db_worst:.2f} |
+to BM3D [dB] = {to_bm3d_db:+.2f} ({ci95:+.2f}) | green difference kept = {green_kept:.2f} |
+mean shift = {flat:.2%} | ms = {milliseconds:.1f}"""
+
+
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by name of the part."""
     rows = [row for own in results.values() for row in own]
     frame = pd.DataFrame(rows)
     cases, flat = frame[frame["part"] == "cases"], frame[frame["part"] == "flat"]
     by_source = cases.pivot_table("gain_db", "source", "method")
-    drawn = np.random.default_rng(0).integers(len(by_source), size=(10_000, len(by_source)))
     shifts, summary = flat.groupby("method")["mean_shift"].max(), []
     for name, own in cases.groupby("method", sort=False):
-        differences = (by_source[name] - by_source[REFERENCE]).to_numpy()
-        row: Row = {"part": "summary", "method": name, "gain_db": own["gain_db"].mean()}
-        row |= {"cases": len(own), "gain_db_10_percent": own["gain_db"].quantile(0.1)}
-        row |= {"gain_db_worst": own["gain_db"].min(), "to_bm3d_db": differences.mean()}
-        row |= {"ci95": np.quantile(differences[drawn].mean(axis=1), [0.025, 0.975]).tolist()}
-        row |= {k: own[k].median() for k in ("green_kept", "milliseconds")}
+        differences, gains = (by_source[name] - by_source[REFERENCE]).to_numpy(), own["gain_db"]
+        row: Row = {"part": "summary", "method": name, "cases": len(own), "gain_db": gains.mean()}
+        row |= {"gain_db_10_percent": gains.quantile(0.1), "gain_db_worst": gains.min()}
+        row |= {"to_bm3d_db": differences.mean(), "ci95": interval(differences)}
+        row |= own[["green_kept", "milliseconds"]].median().to_dict()
         summary.append(row | {"flat": shifts.get(name)})
     means = cases.groupby(["iso", "ev", "method"], sort=False)["gain_db"].mean().reset_index()
     means = means.sort_values(["iso", "ev"], ascending=[True, False], kind="stable")
-    by_iso = pivot(
-        means.to_dict("records"),
-        line=("method", "{method}"),
-        columns="ISO {iso:.0f}, EV {ev:.0f}",
-        contents={"": "{gain_db:.2f}"},
-    )
-    tables = {"methods": table(summary, _COLUMNS), "by_iso": by_iso}
+    line, group = "method = {method}", "ISO {iso:.0f}, EV {ev:.0f}"
+    tables = {"methods": table(summary, _COLUMNS)}
+    tables["by_iso"] = pivot(means.to_dict("records"), line, group, "{gain_db:.2f}")
     return Report([*summary, *rows], tables, meta={"sources": len(by_source)})
 
 
-_COLUMNS: dict[str, Any] = {
-    "method": "{method}",
-    "gain [dB]": "{gain_db:.2f}",
-    "10th percentile": "{gain_db_10_percent:.2f}",
-    "worst": "{gain_db_worst:.2f}",
-    "to BM3D [dB]": "{to_bm3d_db:+.2f} ({ci95[0]:+.2f} to {ci95[1]:+.2f})",
-    "green difference kept": "{green_kept:.2f}",
-    "mean shift": "{flat:.2%}",
-    "ms": "{milliseconds:.1f}",
-}
-
-BENCHMARK = Benchmark(
-    name="denoising",
-    title="Denoising of real detail, measured",
-    parts=parts,
-    report=report,
-    code=(
-        *("simulator/camera", "simulator/networks", "simulator/noise", "simulator/optics"),
-        *("simulator/raw", "simulator/reference", "ae_env/scenes"),
-        *("benchmarks/denoising", "benchmarks/fidelity/models"),
-    ),
-)
-run = BENCHMARK.run
+run = benchmark("denoising", parts, report)

@@ -1,9 +1,10 @@
 """One way to run a benchmark: parts in processes of their own, rows, a page with tables, plots.
 
-A benchmark is a module or a folder with a `Benchmark`, whose method `run` is what `ae-env bench`
-calls. It names its parts (`Part`); each part is a function that returns JSON values and runs in a
-fresh Python (`benchmarks.isolated`). A part that is done is kept on disk until the whole run is,
-so that a run that was stopped continues. A function of all results then writes the `Report`.
+A benchmark is a module or a folder whose function `run`, which `benchmark` makes, is what
+`ae-env bench` calls. Its ``parts(seed, quick)`` names what is measured: each `Part` is a function
+that returns JSON values and runs in a fresh Python (`benchmarks.isolated`). A part that is done is
+kept on disk until the whole run is, so that a run that was stopped continues. Its
+``report(results, meta)`` makes the `Report` of all results.
 """
 
 from __future__ import annotations
@@ -34,10 +35,14 @@ from simulator.utils.files import data_folder as data_root
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
+#: Content of the cells by heading; or as text: ``"heading = content | heading = content"``.
+Columns = str | Mapping[str, Cell]
 #: Significant digits of numbers in result files.
 DIGITS = 6
 #: Folder of what unfinished runs have measured.
 RUNS = ROOT / "runs" / "bench"
+#: What results depend on: code, and trained networks, those that do not come with the packages too.
+_CODE = ("simulator", "ae_env", "agents", "benchmarks", "runs/simulator")
 
 
 # -- parts ----------------------------------------------------------------------------------------
@@ -54,7 +59,6 @@ class Part:
         threads: Threads that torch and the kernels may use.
         fresh_cache: Whether it finds nothing on disk that earlier runs computed.
         timeout: Seconds after which it is stopped.
-        depends: Other things that its result depends on, such as checksums of weights.
     """
 
     name: str
@@ -63,7 +67,6 @@ class Part:
     threads: int = CORES
     fresh_cache: bool = False
     timeout: float = 4 * 3600.0
-    depends: Mapping[str, Any] = field(default_factory=dict)
 
     def run(self) -> Any:
         """The result of `task`, of a process of its own."""
@@ -72,23 +75,18 @@ class Part:
 
 
 class FinishedParts:
-    """Results of parts on disk, one file each.
+    """Results of parts on disk, one file each, which count for the very same code and networks.
 
     Args:
         folder: Where they lie.
-        words: Values that all of them depend on besides the code.
-        code: Files and folders of the checkout whose code they depend on; a result counts for the
-            very same code only. Modules named ``report`` present results and do not count.
+        words: Values that all of them depend on besides.
     """
 
-    def __init__(self, folder: Path, *words: Any, code: Sequence[str] = ()) -> None:
-        files: list[Path] = []
-        for name in code:
-            path = ROOT / name
-            files += path.rglob("*.py") if path.is_dir() else [path.with_suffix(".py")]
+    def __init__(self, folder: Path, *words: Any) -> None:
         checksum = 0
-        for path in sorted(file for file in files if file.stem != "report"):
-            checksum = zlib.crc32(path.read_bytes(), checksum)
+        for path in sorted(p for name in _CODE for p in (ROOT / name).rglob("*.[ps][ya]*")):
+            if path.suffix in (".py", ".safetensors"):
+                checksum = zlib.crc32(path.read_bytes(), checksum)
         self._folder, self._words = folder, [checksum, *words]
 
     def get(self, name: str, measure: Callable[[], Any]) -> Any:
@@ -130,60 +128,52 @@ class Report:
     figures: Mapping[str | Path, Figure] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """A measurement whose results are in ``docs/results``.
+def benchmark(
+    name: str,
+    parts: Callable[..., Sequence[Part]],
+    report: Callable[[dict[str, Any], dict[str, Any]], Report],
+) -> Callable[..., None]:
+    """The function that measures what no earlier run has, and writes ``.json``, ``.md``, pictures.
 
     Args:
-        name: Of its command; files are named after it.
-        title: Heading of the page.
-        parts: ``parts(seed, quick)``: what is measured, in order.
+        name: Of its command and its files.
+        parts: ``parts(seed, quick, **options)``: what is measured, in order.
         report: ``report(results, meta)``: what is written, of the results by name of the part.
-        code: Files and folders of the checkout that its results depend on.
-        file: Stem of the files, if not `name`.
+
+    Returns:
+        ``run(out, seed, quick, **options)``: folder of results, seed of everything random, whether
+        a short version does, and further arguments of `parts`.
     """
 
-    name: str
-    title: str
-    parts: Callable[..., Sequence[Part]]
-    report: Callable[[dict[str, Any], dict[str, Any]], Report]
-    code: Sequence[str]
-    file: str = ""
-
-    def run(self, out: Path, *, seed: int = 0, quick: bool = False, **options: Any) -> None:
-        """Measures what no earlier run has, and writes ``.json``, ``.md`` and pictures.
-
-        Args:
-            out: Folder of results.
-            seed: Of everything random.
-            quick: A short version, to see that everything runs.
-            options: Further arguments of `parts`.
-        """
-        words = [seed, quick, {name: str(value) for name, value in options.items()}]
-        finished = FinishedParts(RUNS / self.name, *words, code=self.code)
+    def run(out: Path, *, seed: int = 0, quick: bool = False, **options: Any) -> None:
         shown = "".join(
-            f" {value}" if name == "folder" else f" --{name} {value}"
-            for name, value in options.items()
+            f" {value}" if key == "folder" else f" --{key} {value}"
+            for key, value in options.items()
         )
-        command = f"ae-env bench {self.name}{shown}{' --quick' * quick}"
+        command = f"ae-env bench {name}{shown}{' --quick' * quick}"
         meta = result_meta(command, seed) | {"quick": quick}
-        parts = self.parts(seed, quick, **options)
-        results = {}
-        with progress_bars() as progress, progress(self.name) as task:
-            for number, part in enumerate(parts):
-                task(number, len(parts), part.name)
-                key = f"{part.name} {part.arguments} {part.depends}"
-                results[part.name] = finished.get(key, part.run)
+        finished = FinishedParts(RUNS / name, command, seed, _state(options.values()))
+        chosen, results = parts(seed, quick, **options), {}
+        with progress_bars() as progress, progress(name) as task:
+            for number, part in enumerate(chosen):
+                task(number, len(chosen), part.name)
+                results[part.name] = finished.get(f"{part.name} {part.arguments}", part.run)
             task(1, 1)
-        stem = self.file or self.name
-        files = write_report(self.report(results, meta), out, stem, self.title, meta)
+        files = write_report(report(results, meta), out, name.replace("-", "_"), meta)
         finished.forget()
         print_files(files)
 
+    return run
 
-def write_report(
-    report: Report, out: Path, stem: str, title: str, meta: Mapping[str, Any]
-) -> dict[str, Path]:
+
+def _state(options: Iterable[Any]) -> list[Any]:
+    """Name, size and time of every file among `options`, and in folders among them."""
+    given = [path for path in options if isinstance(path, Path)]
+    files = sorted(file for path in given for file in (path, *path.rglob("*")) if file.is_file())
+    return [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
+
+
+def write_report(report: Report, out: Path, stem: str, meta: Mapping[str, Any]) -> dict[str, Path]:
     """Writes the files of a report; their paths by what they hold."""
     rows, more = rounded(list(report.rows)), rounded(dict(report.meta))
     files = {"numbers": write_results(out / f"{stem}.json", rows, {**meta, **more})}
@@ -192,18 +182,15 @@ def write_report(
         files[f"picture {path.stem}"] = write_picture(path, figure)
     if report.tables:
         tables = {"origin": origin(meta), **report.tables}
-        files["page"] = write_atomically(
-            out / f"{stem}.md", filled_page(stem, title, tables, report.figures)
-        )
+        page = filled_page(stem, tables, report.figures)
+        files["page"] = write_atomically(out / f"{stem}.md", page)
     return files
 
 
-def filled_page(
-    stem: str, title: str, tables: Mapping[str, str], figures: Iterable[str | Path] = ()
-) -> str:
+def filled_page(stem: str, tables: Mapping[str, str], figures: Iterable[str | Path] = ()) -> str:
     """The page ``docs/results/STEM.md`` with new tables between its marks.
 
-    Where there is no such page, one of the title, the tables and the figures beside it.
+    Where there is no such page, one of the tables and the figures beside it.
 
     Raises:
         ValueError: If the page and the benchmark do not name the same tables.
@@ -212,7 +199,7 @@ def filled_page(
     if path.is_file():
         page = path.read_text(encoding="utf-8")
     else:
-        blocks = [f"# {title}", *(f"<!-- {name} -->\n<!-- end -->" for name in tables)]
+        blocks = [f"# {stem}", *(f"<!-- {name} -->\n<!-- end -->" for name in tables)]
         page = "\n\n".join([*blocks, *(f"![{name}]({name})" for name in figures)]) + "\n"
     marked = re.findall(r"^<!-- ([\w-]+) -->$", page, re.MULTILINE)
     if sorted(name for name in marked if name != "end") != sorted(tables):
@@ -227,12 +214,12 @@ def filled_page(
 
 def origin(meta: Mapping[str, Any]) -> str:
     """First block of a page: command, commit, date, seed, machine."""
-    machine, commit = meta["machine"], meta["commit"] or "unknown"
-    commit = commit[:12] + "+changes" * commit.endswith("+changes")
+    machine, (commit, _, changed) = meta["machine"], (meta["commit"] or "unknown").partition("+")
     quick = " **A quick run: its numbers are rough.**" if meta.get("quick") else ""
     return (
-        f"`{meta['command']}`, commit {commit}, {meta['date'][:10]}, seed {meta['seed']}, "
-        f"{machine['cpu']}, {machine['cores']} cores, GPU: {machine['gpu'] or 'none'}.{quick}"
+        f"`{meta['command']}`, commit {commit[:12]}{'+' * bool(changed)}{changed}, "
+        f"{meta['date'][:10]}, seed {meta['seed']}, {machine['cpu']}, {machine['cores']} cores, "
+        f"GPU: {machine['gpu'] or 'none'}.{quick}"
     )
 
 
@@ -279,6 +266,38 @@ def side_by_side(pictures: Mapping[str, torch.Tensor]) -> Figure:
     return figure
 
 
+def panels(curves: Iterable[Row], columns: int = 3, width: float = 3.6, **axes: Any) -> Figure:
+    """Lines in panels; a legend wherever the labels are new.
+
+    Args:
+        curves: Each has ``panel``, ``label``, ``x``, ``y`` and perhaps ``style``, of `Axes.plot`,
+            and ``axes``, like `axes` for its panel.
+        columns: Panels in a row.
+        width: Of a panel [inch].
+        axes: Arguments of `Axes.set`.
+    """
+    groups: dict[str, list[Row]] = {}
+    for curve in curves:
+        groups.setdefault(curve["panel"], []).append(curve)
+    columns = min(columns, len(groups))
+    lines = -(-len(groups) // columns)
+    figure = Figure(figsize=(width * columns, 3.0 * lines), dpi=90, layout="constrained")
+    axes_of = figure.subplots(lines, columns, squeeze=False).flat
+    explained = []
+    for (title, own), axis in zip(groups.items(), axes_of, strict=False):
+        for curve in own:
+            axis.plot(curve["x"], curve["y"], label=curve["label"], **curve.get("style", {}))
+        axis.set(**{"title": title, **axes, **own[-1].get("axes", {})})
+        axis.grid(alpha=0.3)
+        labels = [curve["label"] for curve in own]
+        if labels not in explained:
+            explained.append(labels)
+            axis.legend(fontsize=6)
+    for axis in axes_of:
+        axis.set_axis_off()
+    return figure
+
+
 def data_folder(name: str) -> Path:
     """Sub-folder `name` of the folder of real files.
 
@@ -306,60 +325,71 @@ def cell(row: Row, content: Cell) -> str:
     return markdown_cell(row, content, missing="")
 
 
-def table(rows: Iterable[Row], columns: Mapping[str, Cell]) -> str:
+def columns_of(columns: Columns) -> Mapping[str, Cell]:
+    """Content by heading.
+
+    >>> columns_of("scene = {scene} | time [ms] = {ms:.1f}"), columns_of("{ms:.1f}")
+    ({'scene': '{scene}', 'time [ms]': '{ms:.1f}'}, {'': '{ms:.1f}'})
+    """
+    if not isinstance(columns, str):
+        return columns
+    pairs = (column.rpartition(" = ") for column in " ".join(columns.split()).split(" | "))
+    return {heading: content for heading, _, content in pairs}
+
+
+def _words(row: Row) -> Row:
+    answers = ("**no**", "yes")
+    return {k: answers[bool(v)] if isinstance(v, bool | np.bool_) else v for k, v in row.items()}
+
+
+def table(rows: Iterable[Row], columns: Columns) -> str:
     """A Markdown table with a line for each row, see `agents.report.evaluation.to_markdown`.
 
-    `columns` maps headings to content; columns that are empty in every row are left out.
+    Columns that are empty in every row are left out; what is true or false is "yes" or "no".
     """
-    return to_markdown(rows, columns, missing="")
+    return to_markdown(map(_words, rows), columns_of(columns), missing="")
 
 
-def pivot(
-    rows: Iterable[Row], *, line: tuple[str, Cell], columns: Cell, contents: Mapping[str, Cell]
-) -> str:
+def pivot(rows: Iterable[Row], line: Columns, group: Cell, contents: Columns) -> str:
     """A Markdown table with a line for each value of one thing and columns for those of another.
 
     Args:
         rows: Rows to show, one of each pair.
         line: Heading of the first column, and name of a row's line.
-        columns: Name of a row's column, or group of columns.
-        contents: Content of each column of a group by its heading; an empty heading for one alone.
+        group: Name of a row's column, or group of columns.
+        contents: Columns of a group; without a heading for one alone.
     """
-    heading, named = line
-    rows, groups = list(rows), dict[str, None]()
-    lines: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        group = cell(row, columns)
-        groups[group] = None
-        lines.setdefault(cell(row, named), {}).setdefault(group, row)
-    shown: dict[str, Cell] = {heading: lambda row: row["line"]}
-    for group in groups:
-        for name, content in contents.items():
-            shown[": ".join(filter(None, (group, name)))] = _of_group(group, content)
-    return table(({"line": name, "groups": own} for name, own in lines.items()), shown)
+    ((heading, named),) = columns_of(line).items()
+    shown: dict[str, Cell] = {heading: "{line}"}
+    lines: dict[str, Row] = {}
+    for row in map(_words, rows):
+        name, own = cell(row, named), cell(row, group)
+        found = lines.setdefault(name, {"line": name})
+        for title, content in columns_of(contents).items():
+            key = ": ".join(filter(None, (own, title)))
+            found.setdefault(key, cell(row, content))
+            shown.setdefault(key, lambda line, key=key: line.get(key, ""))  # type: ignore[misc]
+    return table(lines.values(), shown)
 
 
-def _of_group(group: str, content: Cell) -> Cell:
-    return lambda row: cell(row["groups"][group], content) if group in row["groups"] else ""
-
-
-def bullets(lines: Iterable[str]) -> str:
-    """A Markdown list."""
-    return "\n".join(f"- {line}" for line in lines)
-
-
-def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str]) -> list[str]:
+def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str]) -> str:
     """A heading of the third level and a block for each group of rows with the same title."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(cell(row, title), []).append(row)
-    return [block for name, own in groups.items() for block in (f"### {name}", show(own))]
+    return "\n\n".join(f"### {name}\n\n{show(own)}" for name, own in groups.items())
 
 
-def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+def interval(values: np.ndarray, seed: int = 0, resamples: int = 10_000) -> list[float]:
+    """95 % bootstrap interval of the mean of `values`."""
+    drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
+    low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
+    return [float(low), float(high)]
+
+
+def quartiles(values: Sequence[float]) -> list[float]:
     """Lower quartile, median and upper quartile."""
-    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
-    return float(low), float(middle), float(high)
+    return [float(value) for value in np.quantile(values, (0.25, 0.5, 0.75))]
 
 
 #: PSNR of two images that are the same, or nearer than this [dB].

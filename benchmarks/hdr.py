@@ -20,12 +20,10 @@ from agents.applications.hdr import (
     fuse,
     hdr_picture,
 )
-from benchmarks.fidelity.defocus import equal_exposure
-from benchmarks.fidelity.models import checksums
-from benchmarks.harness import Benchmark, Part, Report, Row, data_root, psnr, side_by_side, table
+from benchmarks.fidelity.models import equal_exposure, radiance_views
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, psnr, side_by_side, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
-from simulator.training.scenes import reference_scenes
 
 CAMERA, F_NUMBER = "nikon_z6", 8.0
 ISOS = (100, 1600, 6400)
@@ -46,13 +44,6 @@ METHODS = {
 }
 
 
-def _scenes(quick: bool) -> list[ReferenceScene]:
-    """Views of held-out radiance maps, one of each."""
-    scenes = reference_scenes("test", get_camera(CAMERA), number=0, size=SIZE, data=data_root())
-    groups = {s.group: s for s in reversed(scenes) if s.kind == "radiance" and s.pitch == 2}
-    return list(groups.values())[: 2 if quick else None]
-
-
 def _view(
     reference: ReferenceCamera, scene: ReferenceScene, iso: int
 ) -> tuple[CameraSettings, Tensor, Tensor]:
@@ -65,42 +56,30 @@ def _view(
 @torch.no_grad()
 def measure(iso: int, seed: int, quick: bool) -> list[Row]:
     """All scenes at one ISO."""
-    camera = get_camera(CAMERA)
-    reference = ReferenceCamera(camera)
+    reference = ReferenceCamera(get_camera(CAMERA))
     simulator = CameraSimulator.from_pretrained("large", cache=None)
     exposures, rows = bracket_exposures(), []
-    for scene in _scenes(quick):
+    for scene in radiance_views(CAMERA, SIZE)[: 2 if quick else None]:
         settings, light, unclipped = _view(reference, scene, iso)
-        look = {"white_balance": scene.white_balance}
-        truth = RawImage(unclipped, settings, camera, **look)
         captures = [
-            reference.capture(
-                scene,
-                replace(settings, exposure_time=settings.exposure_time * 2.0**ev),
-                seed,
-                light=light,
-            ).sample
+            reference.capture(scene, _brighter(settings, ev), seed, light=light).sample
             for ev in exposures
         ]
-        raw = RawImage(captures[exposures.index(0.0)], settings, camera, **look)
+        raw = _raw(scene, captures[exposures.index(0.0)], settings)
         begun = time.perf_counter()
         ours = hdr_picture(raw, simulator=simulator)
         seconds = time.perf_counter() - begun
         merged = _merged(captures, exposures, raw)
         taken = [expose_and_develop(replace(raw, data=capture)) for capture in captures]
-        mine = [expose_and_develop(replace(raw, data=ours.radiance), ev) for ev in exposures]
-        right = [expose_and_develop(truth, ev) for ev in exposures]
+        right = _simulated(replace(raw, data=unclipped))
         fused, mertens = fuse(right), _mertens(right)
         pictures = {
             "single": (expose_and_develop(raw), fused),
-            "scaled": (fuse([expose_and_develop(raw, ev) for ev in exposures]), fused),
+            "scaled": (fuse(_simulated(raw)), fused),
             "ours": (ours.fused, fused),
             "bracket": (fuse(taken), fused),
-            "merged": (
-                fuse([expose_and_develop(replace(raw, data=merged), ev) for ev in exposures]),
-                fused,
-            ),
-            "ours mertens": (_mertens(mine), mertens),
+            "merged": (fuse(_simulated(replace(raw, data=merged))), fused),
+            "ours mertens": (_mertens(_simulated(replace(raw, data=ours.radiance))), mertens),
             "bracket mertens": (_mertens(taken), mertens),
         }
         lights = {"single": raw.data, "ours": ours.radiance, "merged": merged}
@@ -108,35 +87,45 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
         for method, (picture, wanted) in pictures.items():
             row: Row = {"scene": scene.scene_id, "group": scene.group, "iso": iso}
             row |= {"stops": float(np.log2(high / low)), "method": method}
-            row |= {"psnr": psnr(picture, wanted), "ssim": _ssim(picture, wanted)}
+            pair = picture.numpy(), wanted.numpy()
+            ssim = float(structural_similarity(*pair, channel_axis=0, data_range=1.0))
+            row |= {"psnr": psnr(picture, wanted), "ssim": ssim}
             if method in lights:
                 row["radiance_ev"] = _radiance_error(lights[method], unclipped)
             rows.append(row | ({"seconds": seconds} if method == "ours" else {}))
     return rows
 
 
+def _raw(scene: ReferenceScene, data: Tensor, settings: CameraSettings) -> RawImage:
+    return RawImage(data, settings, get_camera(CAMERA), white_balance=scene.white_balance)
+
+
+def _brighter(settings: CameraSettings, ev: float) -> CameraSettings:
+    return replace(settings, exposure_time=settings.exposure_time * 2.0**ev)
+
+
+def _simulated(raw: RawImage) -> list[Tensor]:
+    """The bracket of one raw, developed."""
+    return [expose_and_develop(raw, ev) for ev in bracket_exposures()]
+
+
 @torch.no_grad()
 def picture(seed: int, quick: bool) -> Figure:
     """The scene with the most light above the raw's white."""
-    camera, iso = get_camera(CAMERA), ISOS[1]
-    reference, found = ReferenceCamera(camera), []
-    for scene in _scenes(quick):
+    reference, iso, found = ReferenceCamera(get_camera(CAMERA)), ISOS[1], []
+    for scene in radiance_views(CAMERA, SIZE)[: 2 if quick else None]:
         settings, _, unclipped = _view(reference, scene, iso)
         dark, bright = (float(s.double().mean()) for s in (unclipped < 2.0**-6, unclipped > 1.0))
         found.append((min(dark, 10.0 * bright), scene, settings, unclipped))
     _, scene, settings, unclipped = max(found, key=lambda entry: entry[0])
-    look = {"white_balance": scene.white_balance}
-    raw = RawImage(reference.capture(scene, settings, seed).sample, settings, camera, **look)
+    raw = _raw(scene, reference.capture(scene, settings, seed).sample, settings)
     simulator = CameraSimulator.from_pretrained("large", cache=None)
-    right = [expose_and_develop(replace(raw, data=unclipped), ev) for ev in bracket_exposures()]
     return side_by_side(
         {
             f"the raw, developed (ISO {iso})": expose_and_develop(raw),
-            "its noise kept, fused": fuse(
-                [expose_and_develop(raw, ev) for ev in bracket_exposures()]
-            ),
+            "its noise kept, fused": fuse(_simulated(raw)),
             "ae-env hdr": hdr_picture(raw, simulator=simulator).fused,
-            "the map's own light, fused": fuse(right),
+            "the map's own light, fused": fuse(_simulated(replace(raw, data=unclipped))),
         }
     )
 
@@ -162,11 +151,6 @@ def _mertens(pictures: Sequence[Tensor]) -> Tensor:
     return torch.from_numpy(fused).permute(2, 0, 1).clamp(0.0, 1.0)
 
 
-def _ssim(picture: Tensor, wanted: Tensor) -> float:
-    pair = picture.numpy(), wanted.numpy()
-    return float(structural_similarity(*pair, channel_axis=0, data_range=1.0))
-
-
 def _radiance_error(light: Tensor, truth: Tensor) -> float:
     """Root mean square error of log2 of the light [EV], where it is not too dark."""
     shown = truth > DARKEST
@@ -175,55 +159,31 @@ def _radiance_error(light: Tensor, truth: Tensor) -> float:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each ISO."""
+    given = {"seed": seed, "quick": quick}
     isos = ISOS[1:2] if quick else ISOS
-    return [
-        Part(
-            f"ISO {iso}",
-            measure,
-            {"iso": iso, "seed": seed, "quick": quick},
-            threads=1,
-            depends=checksums("large"),
-        )
-        for iso in isos
-    ]
+    return [Part(f"ISO {iso}", measure, {"iso": iso, **given}, threads=1) for iso in isos]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """Means over the scenes, by ISO, and by the range of the light."""
     rows: list[Row] = [row for part in results.values() for row in part]
     frame = pd.DataFrame(rows)
-    frame["method"] = pd.Categorical(frame["method"], list(METHODS))
-    frame["range"] = pd.cut(
-        frame["stops"], [-np.inf, HIGH_RANGE, np.inf], right=False, labels=["low", "high"]
-    )
-    means: dict[str, Row] = {label: {"method": label} for label in METHODS.values()}
-    groups = frame.groupby(["iso", "range", "method"], observed=True)
-    pictures: dict[str, Any] = {"picture": lambda row: row["method"]}
-    errors: dict[str, Any] = {"light": lambda row: row["method"]}
-    for (iso, level, method), own in groups:
-        key, mean = f"ISO {iso} {level}", means[METHODS[str(method)]]
-        for name in ("psnr", "ssim", "radiance_ev"):
-            mean[f"{key} {name}"] = own[name].mean()
-        mean[f"{key} scenes"] = len(own)
-        pictures[key] = f"{{{key} psnr:.1f}} / {{{key} ssim:.3f}}"
-        errors[key] = f"{{{key} radiance_ev:.3f}}"
-    with_light = frame.dropna(subset="radiance_ev")["method"].unique()
-    seconds = {"seconds": frame["seconds"].median()}
+    frame["range"] = np.where(frame["stops"] < HIGH_RANGE, "low", "high")
+    groups = frame.groupby(["iso", "range", "method"])
+    means = groups[["psnr", "ssim", "radiance_ev"]].mean().assign(scenes=groups.size())
+    means = means.reindex([*METHODS], level="method").reindex(["low", "high"], level="range")
+    means = means.reset_index()
+    means["label"] = means["method"].map(METHODS)
+    shown = means.to_dict("records")
+    lit = [row for row in shown if not np.isnan(row["radiance_ev"])]
+    group, seconds = "ISO {iso} {range}", {"seconds": frame["seconds"].median()}
     tables = {
-        "pictures": table(means.values(), pictures),
-        "radiance": table((means[METHODS[method]] for method in with_light), errors),
-        "time": table([seconds], {"`ae-env hdr`'s own part, one core [s a view]": "{seconds:.2f}"}),
+        "pictures": pivot(shown, "picture = {label}", group, "{psnr:.1f} / {ssim:.3f}"),
+        "radiance": pivot(lit, "light = {label}", group, "{radiance_ev:.3f}"),
+        "time": table([seconds], "`ae-env hdr`'s own part, one core [s a view] = {seconds:.2f}"),
     }
     figure = picture(meta["seed"], meta["quick"])
-    return Report([*rows, *means.values()], tables, figures={"hdr.webp": figure})
+    return Report([*rows, *shown], tables, figures={"hdr.webp": figure})
 
 
-BENCHMARK = Benchmark(
-    name="hdr",
-    title="HDR from one raw",
-    parts=parts,
-    report=report,
-    code=("agents/applications", "benchmarks/hdr"),
-)
-run = BENCHMARK.run
+run = benchmark("hdr", parts, report)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -18,7 +18,6 @@ from typing import Any
 from simulator.utils.cache import CACHE_VARIABLE
 
 ROOT = Path(__file__).absolute().parents[1]
-MIB = 2.0**20
 #: Threads of everything that is not measured on one: targets are stated for two cores.
 CORES = min(2, os.cpu_count() or 1)
 
@@ -68,22 +67,19 @@ def isolated(
 
 
 def peak_memory() -> float:
-    """Most memory that this process has held since it started or `forget_peak` [MiB]."""
-    try:  # the resource module counts what the parent held before it became this program
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        (kib,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
-        return int(kib) / 1024.0
-    except (OSError, ValueError):
-        unit = 1.0 if sys.platform == "darwin" else 1024.0
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
+    """Most memory that this process has held since it started or `forget_peak` [MiB]; of Linux.
+
+    The resource module counts what the parent held before it became this program, too.
+    """
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    (kib,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
+    return int(kib) / 1024.0
 
 
 def forget_peak() -> None:
     """Lets `peak_memory` count from what is held now, where the system can."""
-    try:
+    with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return
 
 
 def timed(call: Callable[[], Any]) -> float:
@@ -101,11 +97,6 @@ def median_seconds(call: Callable[[], Any], *, least: float, calls: int = 3) -> 
     return statistics.median(seconds)
 
 
-def _main() -> None:
-    module, _, name = sys.argv[1].partition(":")
-    task = getattr(importlib.import_module(module), name)
-    print(json.dumps(task(**json.loads(sys.argv[2]))))
-
-
 if __name__ == "__main__":
-    _main()
+    module, _, name = sys.argv[1].partition(":")
+    print(json.dumps(getattr(importlib.import_module(module), name)(**json.loads(sys.argv[2]))))

@@ -17,7 +17,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram
-from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, table
+from benchmarks.harness import Part, Report, Row, benchmark, data_folder, panels, table
 
 #: Where the recordings lie in the folder of real data.
 FOLDER, FILE = "libcamera_agc", "traces.json"
@@ -78,42 +78,30 @@ def play(recording: Row, zone_factors: list[float]) -> dict[str, np.ndarray]:
 
 
 def compare(recording: Row, ours: dict[str, np.ndarray]) -> Row:
-    """How far `ours` is from the recording: largest deviations, frames beyond `SAME`, settling."""
+    """How far `ours` is from the recording: largest deviations, frames beyond `SAME`, settling.
+
+    It has settled once the exposure is within `SAME` of its last value, and stays; frames count
+    from the step.
+    """
     theirs = {name: np.array(recording[name]) for name in ("exposure_s", "gain")}
-    both = [one["exposure_s"] * one["gain"] for one in (ours, theirs)]
-    exposure = np.abs(both[0] / both[1] - 1.0)
     split = np.abs(ours["exposure_s"] / theirs["exposure_s"] - 1.0)
-    return {
-        "exposure_deviation": exposure.max(),
-        "split_deviation": split.max(),
-        "frames_beyond": int((np.maximum(exposure, split) > SAME).sum()),
-        "settling_ours": settling(both[0], recording["step_at"]),
-        "settling_theirs": settling(both[1], recording["step_at"]),
-        "us_per_decision": 1e6 * float(np.median(ours["seconds"])),
-    }
-
-
-def settling(exposure: np.ndarray, step_at: int) -> int:
-    """Frames from the step on until `exposure` is within `SAME` of its last value, and stays."""
-    away = np.abs(exposure[step_at:] / exposure[-1] - 1.0) > SAME
-    return int(np.flatnonzero(away)[-1]) + 1 if away.any() else 0
+    row: Row = {"split_deviation": split.max()}
+    both, settling = [one["exposure_s"] * one["gain"] for one in (ours, theirs)], []
+    for exposure in both:
+        away = np.abs(exposure[recording["step_at"] :] / exposure[-1] - 1.0) > SAME
+        settling.append(int(np.flatnonzero(away)[-1]) + 1 if away.any() else 0)
+    exposure = np.abs(both[0] / both[1] - 1.0)
+    row |= {"exposure_deviation": exposure.max(), "exposures": [one.tolist() for one in both]}
+    row |= {"frames_beyond": int((np.maximum(exposure, split) > SAME).sum())}
+    row |= {"settling_ours": settling[0], "settling_theirs": settling[1]}
+    return row | {"us_per_decision": 1e6 * float(np.median(ours["seconds"]))}
 
 
 def measure(path: str) -> list[Row]:
-    """A row for each recording; those that are drawn have both traces."""
     file, rows = json.loads(Path(path).read_text(encoding="utf-8")), []
-    for number, recording in enumerate(file["traces"]):
+    for recording in file["traces"]:
         ours = play(recording, file["meta"]["zone_factors"][recording["scene"]])
-        names = ("metering", "constraint", "exposure_mode", "scene", "step_ev", "flicker_period_us")
-        row: Row = {name: recording[name] for name in names} | compare(recording, ours)
-        if number in SHOWN:
-            exposures = {"ours": ours, "theirs": recording}
-            row["traces"] = {
-                whose: (np.array(t["exposure_s"]) * np.array(t["gain"])).tolist()
-                for whose, t in exposures.items()
-            }
-            row["step_at"] = recording["step_at"]
-        rows.append(row)
+        rows.append(recording | compare(recording, ours))
     return rows
 
 
@@ -124,58 +112,41 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def traces(rows: list[Row]) -> Figure:
-    """Exposure over the frames, theirs and ours."""
-    figure = Figure(figsize=(10, 5), layout="constrained")
-    shown = [row for row in rows if "traces" in row]
-    for axis, row in zip(figure.subplots(2, 3, sharex=True).flat, shown, strict=True):
-        first = row["step_at"] - 10
-        for whose, style in (("theirs", {"lw": 3, "alpha": 0.4}), ("ours", {"lw": 1, "c": "k"})):
-            exposure = row["traces"][whose][first : first + 70]
-            label = {"theirs": "libcamera", "ours": "ours"}[whose]
-            axis.plot(range(-10, len(exposure) - 10), exposure, label=label, **style)
+    """Exposure over the frames, theirs and ours, of the recordings `SHOWN`."""
+    curves, styles = [], ({"lw": 1, "c": "k", "zorder": 3}, {"lw": 3, "alpha": 0.4})
+    for row in (rows[number] for number in SHOWN):
         lamps = ", 100 Hz lamps" if row["flicker_period_us"] else ""
         title = f"{row['scene']}, {row['step_ev']:+g} EV\n{row['metering']}, {row['constraint']}"
-        axis.set_title(title + lamps, fontsize=9)
-        axis.set(yscale="log", xlabel="frames after the step", ylabel="exposure x gain [s]")
-        axis.label_outer()
-    axis.legend()
-    return figure
+        first = row["step_at"] - 10
+        for label, exposure, style in zip(
+            ("ours", "libcamera"), row["exposures"], styles, strict=True
+        ):
+            curve: Row = {"panel": title + lamps, "label": label, "style": style}
+            shown = exposure[first : first + 70]
+            curves.append(curve | {"x": range(-10, len(shown) - 10), "y": shown})
+    labels = {"xlabel": "frames after the step", "ylabel": "exposure x gain [s]"}
+    return panels(curves, yscale="log", **labels)
+
+
+_COLUMNS = """scene = {scene} | light [EV] = {step_ev:+g} | metering = {metering} |
+constraint = {constraint} | ladder = {exposure_mode} | lamps [us] = {flicker_period_us} |
+exposure off by = {exposure_deviation:.2%} | shutter off by = {split_deviation:.2%} |
+settling, libcamera = {settling_theirs} | ours = {settling_ours}"""
+_SUMMARY = """exposure (time x gain) off by = {exposure_deviation:.2%} |
+exposure time off by = {split_deviation:.2%} | settling differs by [frames] = {settling} |
+one decision, median [us] = {us:.0f}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the rows of all recordings."""
     rows: list[Row] = results["recordings"]
     frame = pd.DataFrame(rows)
-    settling = (frame["settling_ours"] - frame["settling_theirs"]).abs()
     summary = dict(frame[["exposure_deviation", "split_deviation"]].max())
-    summary |= {"settling": settling.max(), "us": frame["us_per_decision"].median()}
-    summary_columns = {
-        "exposure (time x gain) off by": "{exposure_deviation:.2%}",
-        "exposure time off by": "{split_deviation:.2%}",
-        "settling differs by [frames]": "{settling}",
-        "one decision, median [us]": "{us:.0f}",
-    }
-    columns = {
-        "scene": "{scene}",
-        "light [EV]": "{step_ev:+g}",
-        "metering": "{metering}",
-        "constraint": "{constraint}",
-        "ladder": "{exposure_mode}",
-        "lamps [us]": "{flicker_period_us}",
-        "exposure off by": "{exposure_deviation:.2%}",
-        "shutter off by": "{split_deviation:.2%}",
-        "settling, libcamera": "{settling_theirs}",
-        "ours": "{settling_ours}",
-    }
-    tables = {"summary": table([summary], summary_columns), "recordings": table(rows, columns)}
-    return Report(rows, tables, meta={"same": SAME}, figures={"libcamera.png": traces(rows)})
+    summary["settling"] = (frame["settling_ours"] - frame["settling_theirs"]).abs().max()
+    summary["us"] = frame["us_per_decision"].median()
+    tables = {"summary": table([summary], _SUMMARY), "recordings": table(rows, _COLUMNS)}
+    long = ("exposure_s", "gain", "light", "exposures")
+    kept = [{k: v for k, v in row.items() if k not in long} for row in rows]
+    return Report(kept, tables, meta={"same": SAME}, figures={"libcamera.png": traces(rows)})
 
 
-BENCHMARK = Benchmark(
-    name="libcamera",
-    title="libcamera's auto exposure and our model of it",
-    parts=parts,
-    report=report,
-    code=("agents/metering", "benchmarks/libcamera"),
-)
-run = BENCHMARK.run
+run = benchmark("libcamera", parts, report)

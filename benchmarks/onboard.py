@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tempfile
+from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import gymnasium as gym
@@ -16,7 +16,8 @@ from agents import PolicyContext, make_policy
 from agents.learning.regression import observation_tensors
 from agents.onboard.controller import Controller
 from agents.onboard.export import export_agent
-from benchmarks.harness import Benchmark, Part, Report, Row, table
+from benchmarks.harness import Part, Report, Row, benchmark, table
+from benchmarks.isolated import median_seconds, timed
 
 AGENTS = ("regression", "ppo")
 #: Episodes, in light that jumps by `STOPS` in the middle, and their frames.
@@ -62,9 +63,7 @@ def measure(policy: str, seed: int, quick: bool) -> Row:
     agent.reset(1)
     for _ in range(TIMED // 10 if quick else TIMED):
         for name, act in (("torch", lambda: agent.act(one)), ("onnx", lambda: alone.act(**one))):
-            begun = perf_counter()
-            act()
-            times[name].append(perf_counter() - begun)
+            times[name].append(timed(act))
     row: Row = {"policy": policy, "bytes": size, "decisions": count * FRAMES, "same": same}
     row |= {"largest_difference": error}
     return row | {f"us_{name}": 1e6 * float(np.median(values)) for name, values in times.items()}
@@ -79,9 +78,8 @@ def smaller(policy: str, seed: int, quick: bool) -> list[Row]:
         shown, _ = envs.reset(seed=seed)
         scores = np.zeros(count)
         for _ in range(FRAMES):
-            shown, reward, *_ = envs.step(
-                agent.act({**shown, "raw": _averaged(shown["raw"], side)})
-            )
+            less = {**shown, "raw": _averaged(shown["raw"], side)}
+            shown, reward, *_ = envs.step(agent.act(less))
             scores += reward / FRAMES
         rows.append({"policy": policy, "side": side, "scores": scores.tolist()})
     whole = np.array(rows[0]["scores"])
@@ -123,63 +121,37 @@ def encoding(quick: bool) -> list[Row]:
     rows = []
     for height, width in FRAME_SIZES:
         planes = np.random.default_rng(0).random((4, height, width), dtype=np.float32)
-        times = []
-        for _ in range(3 if quick else 15):
-            begun = perf_counter()
-            controller.encode_frame(planes)
-            times.append(perf_counter() - begun)
-        rows.append({"height": height, "width": width, "ms": 1e3 * float(np.median(times))})
+        call, calls = partial(controller.encode_frame, planes), 3 if quick else 15
+        ms = 1e3 * median_seconds(call, least=0.0, calls=calls)
+        rows.append({"height": height, "width": width, "ms": ms})
     return rows
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """Each agent, on whole and on smaller frames, and the frames."""
-    tasks = {"": measure, "smaller ": smaller}
-    return [
-        *(
-            Part(f"{name}{agent}", task, {"policy": agent, "seed": seed, "quick": quick}, threads=1)
-            for name, task in tasks.items()
-            for agent in AGENTS
-        ),
-        Part("frames", encoding, {"quick": quick}, threads=1),
-    ]
+    found = [Part("frames", encoding, {"quick": quick}, threads=1)]
+    for agent in AGENTS:
+        given = {"policy": agent, "seed": seed, "quick": quick}
+        found.append(Part(agent, measure, given, threads=1))
+        found.append(Part(f"smaller {agent}", smaller, given, threads=1))
+    return found
+
+
+_COLUMNS = """agent = {policy} | file [MB] = {mb:.2f} | same decisions = {same} of {decisions} |
+largest difference = {largest_difference:.1e} | torch [us] = {us_torch:.0f} |
+Controller [us] = {us_onnx:.0f} | torch / Controller = {speedup:.1f}"""
+_SMALLER = """agent = {policy} | pixels = {side} x {side} | mean score = {score:.4f} |
+lost = {lost:.4f} +- {error:.4f}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the rows of both agents."""
     frames = results["frames"]
     rows: list[Row] = [results[name] for name in AGENTS]
     less = [row for name in AGENTS for row in results[f"smaller {name}"]]
     for row in rows:
-        row["speedup"] = row["us_torch"] / row["us_onnx"]
-    columns: dict[str, Any] = {
-        "agent": "{policy}",
-        "file [MB]": lambda row: f"{row['bytes'] / 1e6:.2f}",
-        "same decisions": "{same} of {decisions}",
-        "largest difference": "{largest_difference:.1e}",
-        "torch [us]": "{us_torch:.0f}",
-        "Controller [us]": "{us_onnx:.0f}",
-        "torch / Controller": "{speedup:.1f}",
-    }
-    smaller_columns = {
-        "agent": "{policy}",
-        "pixels": "{side} x {side}",
-        "mean score": "{score:.4f}",
-        "lost": "{lost:.4f} +- {error:.4f}",
-    }
-    tables = {
-        "agents": table(rows, columns),
-        "frames": table(frames, {"planes": "4 x {height} x {width}", "ms": "{ms:.2f}"}),
-        "smaller": table(less, smaller_columns),
-    }
+        row |= {"speedup": row["us_torch"] / row["us_onnx"], "mb": row["bytes"] / 1e6}
+    tables = {"agents": table(rows, _COLUMNS), "smaller": table(less, _SMALLER)}
+    tables["frames"] = table(frames, "planes = 4 x {height} x {width} | ms = {ms:.2f}")
     return Report([*rows, *less, *frames], tables)
 
 
-BENCHMARK = Benchmark(
-    name="onboard",
-    title="Agents on a camera",
-    parts=parts,
-    report=report,
-    code=("agents/onboard", "agents/learning", "benchmarks/onboard"),
-)
-run = BENCHMARK.run
+run = benchmark("onboard", parts, report)

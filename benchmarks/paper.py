@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,14 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
-from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
-from benchmarks.fidelity.models import CONFIGS
-from benchmarks.fidelity.pairs import PUBLISHED
-from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, clipped, pivot, psnr, table
-from simulator import CameraSimulator, RawImage, exposure_ratio
+from benchmarks.fidelity.models import CONFIGS, baseline, scores
+from benchmarks.fidelity.pairs import PUBLISHED, needs_cleaning
+from benchmarks.harness import RUNS, Part, Report, Row, benchmark, clipped, pivot, table
+from simulator import CameraSimulator, RawImage
 from simulator.networks.weights import load_modules
-from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.sequences import any_pairs
-from simulator.training.data import settings_parameters
 from simulator.training.paper_dataset import (
     PARAMETERS,
     CapturedSequence,
@@ -55,13 +52,7 @@ LONGEST = 14 * 86400.0
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Two captures of one held-out sequence.
-
-    Args:
-        sequence: Name of the sequence.
-        source: The input.
-        target: The capture that a method should predict.
-    """
+    """Two captures of one held-out sequence: the input, and what a method should predict."""
 
     sequence: str
     source: RawImage
@@ -75,10 +66,7 @@ class Case:
     @property
     def cleaner(self) -> bool:
         """Whether the target has less noise than the source brings, averaged over the picture."""
-        ratio = exposure_ratio(self.source.settings, self.target.settings)
-        brought, data = self.source.noise.exposed(ratio), self.target.data
-        wanted = noise_variance(data, self.target.noise).mean()
-        return bool(wanted < noise_variance(data, brought).mean())
+        return needs_cleaning(self.source, self.target.settings, self.target.data)
 
 
 #: Transitions, in the order of the report; the last four are a partition of all.
@@ -98,24 +86,18 @@ def parts(
     seed: int, quick: bool, folder: Path | None = None, weights: Path | None = None
 ) -> list[Part]:
     """One part for each network: what is trained, or the weights that are given; and ours."""
-    if folder is None:
-        raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
+    assert folder is not None
     split_dataset(folder, seed=seed)  # raises before any work
-    arguments = {"folder": str(folder.resolve()), "seed": seed, "quick": quick}
-    depends = {"data": _digest(folder)}
-    if weights is None:
-        names = dict.fromkeys(TRAINED)
-    else:
-        card = load_modules(weights)[1]
-        if card["preset"] not in ("compact", "paper", "ncs"):
+    names = list(TRAINED)
+    if weights is not None:
+        preset = load_modules(weights)[1]["preset"]
+        if preset not in ("compact", "paper", "ncs"):
             wrong = f"`weights` (={str(weights)!r}) must be of all three modules"
-            raise ValueError(f"{wrong}, not {card['preset']!r}")
-        names, depends = {str(weights.resolve()): None}, depends | {"weights": card["sha256"]}
-    longer = {"depends": depends, "timeout": LONGEST}
-    return [
-        Part(name, measure, {"name": name, **arguments}, **longer)  # type: ignore[arg-type]
-        for name in (*names, "compact")
-    ]
+            raise ValueError(f"{wrong}, not {preset!r}")
+        names = [str(weights.resolve())]
+    given: dict[str, Any] = {"folder": str(folder.resolve()), "seed": seed, "quick": quick}
+    names = list(dict.fromkeys((*names, "compact")))
+    return [Part(name, measure, {"name": name, **given}, timeout=LONGEST) for name in names]
 
 
 def _digest(folder: Path) -> str:
@@ -127,11 +109,8 @@ def _digest(folder: Path) -> str:
 def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
     """One row for each held-out pair and stage of a network.
 
-    Args:
-        name: One of `TRAINED`, which is trained where it is not yet; ``"compact"``; or weights.
-        folder: Data in the paper's layout.
-        seed: Of the split, the training and the choice of pairs.
-        quick: A short version.
+    `name` is one of `TRAINED`, which is trained where it is not yet; ``"compact"``; or weights.
+    `seed` is that of the split, the training and the choice of pairs.
     """
     train, held_out = split_dataset(Path(folder), seed=seed)
     weights = trained(name, Path(folder), train, seed, quick) if name in TRAINED else name
@@ -140,19 +119,17 @@ def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
     head = {"preset": card["preset"], "sha256": card["sha256"], "trained_on": len(train)}
     rows: list[Row] = []
     for case in cases(held_out, seed, quick):
-        groups = [group for group, belongs in GROUPS.items() if belongs(case)]
         begin = time.perf_counter()
         estimates = estimate(case)
-        seconds = time.perf_counter() - begin
-        pair = {
-            "sequence": case.sequence,
-            "source": str(case.source.settings),
-            "target": str(case.target.settings),
-            "groups": groups,
-            "ms": 1e3 * seconds,  # of all stages together
-        }
+        pair: Row = {"sequence": case.sequence, "source": str(case.source.settings)}
+        pair |= {"target": str(case.target.settings)}
+        pair["groups"] = [group for group, belongs in GROUPS.items() if belongs(case)]
+        pair["ms"] = 1e3 * (time.perf_counter() - begin)  # of all stages together
+        truth = clipped(case.target.data, case.target.camera)
         for method, image in estimates.items():
-            rows.append({**head, "method": method, **pair, **_scores(image, case)})
+            rows.append(
+                {**head, "method": method, **pair, **scores(image, truth, case.target.camera)}
+            )
     return rows
 
 
@@ -195,35 +172,21 @@ def _methods(
     modules: nn.ModuleDict, preset: str, weights: str | Path
 ) -> Callable[[Case], dict[str, Tensor]]:
     """Maps a case to the estimate of each stage."""
+    if "baseline" in modules:
+        network = modules["baseline"]
+        return lambda case: {preset.upper(): baseline(network, case.source, case.target.settings)}
     # The w and b of our own weights are those of a body that did not take these pictures.
-    simulator = None
-    if "baseline" not in modules:
-        simulator = CameraSimulator.from_pretrained(
-            weights, device="auto", body_correction=preset != "compact", cache=None
-        )
+    simulator = CameraSimulator.from_pretrained(
+        weights, device="auto", body_correction=preset != "compact", cache=None
+    )
 
     @torch.no_grad()
     def estimate(case: Case) -> dict[str, Tensor]:
-        if simulator is None:
-            settings = case.source.settings, case.target.settings
-            parameters = torch.tensor([[v for s in settings for v in settings_parameters(s)]])
-            return {preset.upper(): modules["baseline"](case.source.data[None], parameters)[0]}
         stages = simulator.stages(case.source, case.target.settings)
         images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
         return {name: image.cpu() for name, image in images.items()}
 
     return estimate
-
-
-def _scores(estimate: Tensor, case: Case) -> Row:
-    """PSNR [dB] and SSIM against the capture, before the output's noise is added."""
-    image = clipped(estimate, case.target.camera)
-    truth = clipped(case.target.data, case.target.camera)
-    window = min(7, *(n - 1 + n % 2 for n in truth.shape[1:]))  # odd
-    ssim = structural_similarity(
-        image.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, win_size=window
-    )
-    return {"psnr_db": psnr(image, truth), "ssim": float(ssim)}
 
 
 # -- report ---------------------------------------------------------------------------------------
@@ -234,63 +197,27 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     rows = [row for own in results.values() for row in own]
     frame = pd.DataFrame(rows)
     times = frame.groupby(["preset", "sha256"], sort=False)["ms"].median().reset_index()
-    by_group, means = frame.explode("groups"), []
-    for group in GROUPS:
-        own = by_group[by_group["groups"] == group].groupby(["preset", "method"], sort=False)
-        for (preset, method), scores in own:
-            head: Row = {"group": group, "preset": preset, "method": method, "pairs": len(scores)}
-            means.append(head | dict(scores[["psnr_db", "ssim"]].mean()))
-    columns: dict[str, Any] = {
-        "network": "`{preset}`",
-        "weights": lambda row: f"`{row['sha256'][:12]}`",
-        "ms a pair (median)": "{ms:.0f}",
-    }
-    tables = {
-        "means": pivot(
-            means,
-            line=("PSNR [dB] / SSIM", _label),
-            columns="{group} ({pairs})",
-            contents={"": "{psnr_db:.2f} / {ssim:.3f}"},
-        ),
-        "published": table(
-            [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()],
-            {"published, of the authors' own split": "{camera}", "PSNR [dB] / SSIM": "{text}"},
-        ),
-        "networks": table(times.to_dict("records"), columns),
-    }
-    return Report([*means, *rows], tables, figures={"paper.png": _picture(means)})
-
-
-def _label(row: Mapping[str, Any]) -> str:
-    return row["method"] if row["preset"] in ("pc", "dl") else f"{row['method']} `{row['preset']}`"
-
-
-def _picture(means: list[Row]) -> Figure:
-    """A bar for each method, by group."""
-    labels = list(dict.fromkeys(map(_label, means)))
-    groups = [group for group in GROUPS if any(row["group"] == group for row in means)]
-    figure = Figure(figsize=(9.0, 4.0), dpi=100, layout="constrained")
-    axes = figure.subplots()
-    width = 0.8 / len(labels)
-    for number, label in enumerate(labels):
-        own = {row["group"]: row["psnr_db"] for row in means if _label(row) == label}
-        places = [groups.index(group) + number * width for group in own]
-        axes.bar(places, list(own.values()), width, label=label.replace("`", ""))
-    axes.set_xticks(
-        [n + 0.4 - width / 2 for n in range(len(groups))],
-        [group.replace(": ", "\n") for group in groups],
-        fontsize=8,
+    by_group = frame.explode("groups").rename(columns={"groups": "group"})
+    groups = by_group.groupby(["group", "preset", "method"], sort=False)
+    means = groups[["psnr_db", "ssim"]].mean().assign(pairs=groups.size()).reset_index()
+    ours = ~means["preset"].isin(TRAINED[1:])
+    means["label"] = means["method"].where(~ours, means["method"] + " `" + means["preset"] + "`")
+    means = means.sort_values(
+        "group", key=lambda names: names.map(list(GROUPS).index), kind="stable"
     )
-    axes.set_ylabel("PSNR [dB]")
-    axes.legend(fontsize=8, ncols=3)
-    return figure
+    published = [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()]
+    line, values = "PSNR [dB] / SSIM = {label}", "{psnr_db:.2f} / {ssim:.3f}"
+    networks = "network = `{preset}` | weights = `{sha256:.12}` | ms a pair (median) = {ms:.0f}"
+    of_paper = "published, of the authors' own split = {camera} | PSNR [dB] / SSIM = {text}"
+    tables = {
+        "means": pivot(means.to_dict("records"), line, "{group} ({pairs})", values),
+        "published": table(published, of_paper),
+        "networks": table(times.to_dict("records"), networks),
+    }
+    figure = Figure(figsize=(9.0, 4.0), dpi=100, layout="constrained")
+    bars = means.pivot(index="group", columns="label", values="psnr_db")
+    bars.plot.bar(ax=figure.subplots(), ylabel="PSNR [dB]", rot=15, fontsize=8)
+    return Report([*means.to_dict("records"), *rows], tables, figures={"paper.png": figure})
 
 
-BENCHMARK = Benchmark(
-    name="paper",
-    title="The paper's table on real captures",
-    parts=parts,
-    report=report,
-    code=("simulator", "benchmarks/paper", "benchmarks/harness"),
-)
-run = BENCHMARK.run
+run = benchmark("paper", parts, report)

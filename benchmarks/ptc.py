@@ -24,7 +24,7 @@ import torch
 from matplotlib.figure import Figure
 from scipy.stats import t as student
 
-from benchmarks.harness import Benchmark, Part, Report, Row, pivot, table
+from benchmarks.harness import Part, Report, Row, benchmark, panels, pivot, table
 from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture.prepared_scene import PreparedScene
@@ -40,28 +40,35 @@ LADDER = (0.0, *np.linspace(0.05, 1.05, 21))
 #: Up to this share of the saturation K is fitted (EMVA 1288).
 FITTED = 0.7
 _WHITE_TIME = 1 / 64  # exposure time [s] that the ladder's 1 stands for
-QUANTITIES = {"gain": "K [DN/e-]", "dark": "dark noise [DN]", "row": "row noise [DN]"}
-COVERAGE = {"": "{case}"} | {v: f"{{{k}}} of {{all}}" for k, v in QUANTITIES.items()}
-COVERAGE["ms a frame"] = "{ms:.2f}"
+QUANTITIES = ("gain", "dark", "row")
+_COVERAGE = """{case} | K [DN/e-] = {gain} of {all} | dark noise [DN] = {dark} of {all} |
+row noise [DN] = {row} of {all} | ms a frame = {ms:.2f}"""
 
 
 def flat_fields(camera: CameraProfile, iso: float, path: str, rows: bool, seed: int) -> np.ndarray:
     """One frame of each step of the ladder, (21 + 1, 4, SIZE, SIZE) digital numbers above black."""
     base = CameraSettings(iso, _WHITE_TIME, 4.0)
     states = [replace(base, exposure_time=_WHITE_TIME * max(level, 0.01)) for level in LADDER]
-    lights = [torch.full((4, SIZE, SIZE), float(level > 0)) for level in LADDER]
+    dark, lit = torch.zeros(4, SIZE, SIZE), torch.ones(4, SIZE, SIZE)
     if path == "reference camera":
         body = ReferenceCamera(camera, sensor_noise=rows)
-        scenes = [ReferenceScene("flat", "flat", "flat", light, base) for light in lights]
-        pairs = zip(scenes, states, strict=True)
-        frames = torch.stack([body.capture(scene, s, seed).sample for scene, s in pairs])
+        scenes = [ReferenceScene("flat", "flat", "flat", light, base) for light in (dark, lit)]
+        frames = torch.stack(
+            [
+                body.capture(scenes[level > 0], s, seed).sample
+                for level, s in zip(LADDER, states, strict=True)
+            ]
+        )
     else:
         clean, simulator = NoiseLevelFunction.zero(), CameraSimulator(device="cpu", cache=None)
-        dark, lit = (PreparedScene(light, base, camera, clean) for light in lights[:2])
         kind: Any = "sensor" if rows else "exact"
-        parts = ((dark, states[:1]), (lit, states[1:]))
         frames = torch.cat(
-            [simulator.prepare(s).expose(some, seed=seed, noise=kind) for s, some in parts]
+            [
+                simulator.prepare(PreparedScene(light, base, camera, clean)).expose(
+                    some, seed=seed, noise=kind
+                )
+                for light, some in ((dark, states[:1]), (lit, states[1:]))
+            ]
         )
     return (frames.double() * torch.tensor(camera.span).double()[:, None, None]).numpy()
 
@@ -112,13 +119,13 @@ def measure(camera: str, repetitions: int, seed: int) -> list[Row]:
             if name == "row_variance":  # its root, negative where less than nothing was found
                 key, ends = "row", np.sign(ends) * np.abs(ends) ** 0.5
             row |= {key: ends[0], f"{key}_ci95": ends[1:].tolist()}
-        curves = {k: np.mean([run[k] for run in runs], axis=0) for k in ("mean", "variance")}
-        found.append(row | {k: curve.tolist() for k, curve in curves.items()})
+        for name in ("mean", "variance"):
+            row[name] = np.mean([run[name] for run in runs], axis=0).tolist()
+        found.append(row)
     return found
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each camera."""
     given = {"repetitions": 3 if quick else 20}
     return [
         Part(name, measure, {"camera": name, **given, "seed": 1000 * (100 * seed + n)}, 1)
@@ -128,64 +135,46 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 def curves(rows: list[Row]) -> Figure:
     """Variance over mean, measured and put in: a panel for each camera."""
-    names = list(dict.fromkeys(row["camera"] for row in rows))
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    for name, axis in zip(names, figure.subplots(2, 3, sharex=True).flat, strict=True):
-        for row in (r for r in rows if r["camera"] == name):
-            colour = f"C{ISOS.index(row['iso'])}"
-            mean, given = np.array(row["mean"][1:]), row["put_in"]
-            marker = "o" if row["path"] == PATHS[0] else "x"
-            axis.plot(mean, row["variance"][1:], marker, color=colour, ms=4, fillstyle="none")
-            if row["path"] == PATHS[0]:
-                line = given["dark"] ** 2 + given["gain"] * mean
-                axis.plot(mean, line, color=colour, lw=0.8, label=f"ISO {row['iso']:g}")
-        axis.set(title=name, yscale="log", xlabel="mean [DN]", ylabel="variance [DN²]")
-        axis.set_ylim(bottom=30)  # below it only saturated steps
-    axis.legend(loc="lower center")
-    return figure
+    drawn: list[Row] = []
+    for row in rows:
+        colour, (first, _) = f"C{ISOS.index(row['iso'])}", PATHS
+        mean, given = np.array(row["mean"][1:]), row["put_in"]
+        style = {"marker": "o" if row["path"] == first else "x", "ls": "", "fillstyle": "none"}
+        common = {"panel": row["camera"], "x": mean, "label": "_"}
+        drawn.append(common | {"y": row["variance"][1:], "style": style | {"c": colour, "ms": 4}})
+        if row["path"] == first:
+            line = {"y": given["dark"] ** 2 + given["gain"] * mean, "style": {"c": colour}}
+            drawn.append(common | line | {"label": f"ISO {row['iso']:g}"})
+    # Below a variance of 30 there are only saturated steps.
+    axes = {"yscale": "log", "ylim": (30, None), "xlabel": "mean [DN]", "ylabel": "variance [DN²]"}
+    return panels(drawn, **axes)
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by camera."""
     rows: list[Row] = [row for own in results.values() for row in own]
     known = {row["camera"] for row in rows if row["row_noise"]}
     shown = [row for row in rows if row["row_noise"] == (row["camera"] in known)]
     coverage = [_coverage(rows, *case) for case in product(PATHS, (True, False))]
-    tables = {"coverage": table(coverage, COVERAGE)}
+    tables = {"coverage": table(coverage, _COVERAGE)}
     for key in QUANTITIES:
-        own = [row for row in shown if key != "row" or row["camera"] in known]
-        true = {"path": "put in", f"{key}_ci95": None}
-        given = [row | true | {key: row["put_in"][key]} for row in own]
-        tables[key] = _table(given + own, key)
+        own: list[Row] = []
+        for row in (row for row in shown if key != "row" or row["camera"] in known):
+            low, high = row[f"{key}_ci95"]
+            own.append(row | {"path": "put in", "text": f"{row['put_in'][key]:.4g}"})
+            own.append(row | {"text": f"{row[key]:.4g} ({low:.4g} to {high:.4g})"})
+        tables[key] = pivot(own, "camera = {camera}, ISO {iso:g}", "{path}", "{text}")
     meta = {"fitted": FITTED, "size": SIZE}
     return Report(rows, tables, meta=meta, figures={"ptc.png": curves(shown)})
 
 
-def _table(rows: list[Row], key: str) -> str:
-    def value(row: Row) -> str:
-        ends = row[f"{key}_ci95"]
-        return f"{row[key]:.4g}" + (f" ({ends[0]:.4g} to {ends[1]:.4g})" if ends else "")
-
-    return pivot(
-        rows, line=("camera", "{camera}, ISO {iso:g}"), columns="{path}", contents={"": value}
-    )
-
-
 def _coverage(rows: list[Row], path: str, rows_on: bool) -> Row:
     own = [row for row in rows if (row["path"], row["row_noise"]) == (path, rows_on)]
-    held = {
+    held: Row = {
         key: sum(low <= r["put_in"][key] <= high for r in own for low, high in [r[f"{key}_ci95"]])
         for key in QUANTITIES
     }
     held |= {"all": len(own), "ms": np.median([row["ms_per_frame"] for row in own])}
-    return {"case": f"{path}, row noise {'on' if rows_on else 'off'}", **held}
+    return held | {"case": f"{path}, row noise {'on' if rows_on else 'off'}"}
 
 
-BENCHMARK = Benchmark(
-    name="ptc",
-    title="Photon transfer curves of the simulated cameras",
-    parts=parts,
-    report=report,
-    code=("simulator", "benchmarks/ptc"),
-)
-run = BENCHMARK.run
+run = benchmark("ptc", parts, report)

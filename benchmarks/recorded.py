@@ -30,22 +30,12 @@ from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from benchmarks import brackets
-from benchmarks.brackets import timed_result
-from benchmarks.fidelity.models import checksums
-from benchmarks.harness import (
-    Benchmark,
-    Part,
-    Report,
-    Row,
-    clipped,
-    data_root,
-    psnr,
-    table,
-)
+from benchmarks.brackets import texture, timed_result
+from benchmarks.fidelity.models import radiance_views
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, data_folder, psnr, table
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
 from simulator.radiance.light import MEAN_SIGNAL
 from simulator.reference.camera import ReferenceCamera
-from simulator.training.scenes import reference_scenes
 
 CAMERA = "nikon_z6"
 #: Side of a frame [packed pixel].
@@ -74,17 +64,14 @@ REFERENCE, BOREAL = "reference camera", "boreal_brackets"
 
 def _reference_grids(quick: bool, seed: int) -> list[Scene]:
     """Grids that the reference camera photographs, written to DNGs and read back."""
-    camera = get_camera(CAMERA)
-    body = ReferenceCamera(camera)
-    found = reference_scenes("test", camera, number=0, size=RESOLUTION, data=data_root())
-    groups = {s.group: s for s in reversed(found) if s.kind == "radiance" and s.pitch == 2}
+    camera, body = get_camera(CAMERA), ReferenceCamera(get_camera(CAMERA))
     with tempfile.TemporaryDirectory() as folder:
-        for name, scene in list(groups.items())[: 2 if quick else None]:
-            Path(folder, name).mkdir()
+        for scene in radiance_views(CAMERA, RESOLUTION)[: 2 if quick else None]:
+            Path(folder, scene.group).mkdir()
             for number, settings in enumerate(ExposureGrid.default()):
                 sample = body.capture(scene, settings, seed).sample
                 raw = RawImage(sample, settings, camera, white_balance=scene.white_balance)
-                write_dng(Path(folder, name, f"state_{number:02d}.dng"), raw)
+                write_dng(Path(folder, scene.group, f"state_{number:02d}.dng"), raw)
         return _of_folder(folder)
 
 
@@ -103,11 +90,10 @@ def _of_folder(folder: str) -> list[Scene]:
 
 
 def _boreal(grid: ExposureGrid) -> list[Scene]:
-    folder, scenes = data_root() / BOREAL, []
+    folder, scenes = data_folder(BOREAL), []
     for name in brackets.SCENES:
-        frames, _ = brackets.calibrated(
-            {t: brackets.load(folder, name, t)[0] for t in brackets.TIMES_MS}
-        )
+        taken = {t: brackets.load(folder, name, t)[0] for t in brackets.TIMES_MS}
+        frames, _ = brackets.calibrated(taken)
         scenes.append(merged_scene(name, enumerate(frames.values()), grid, frames[1].camera))
     return [scene.resized(RESOLUTION) for scene in scenes]
 
@@ -220,7 +206,7 @@ class _Comparison:
 
     def _noise_error(self, frame: torch.Tensor, state: int) -> float | None:
         """How many stops the noise is off, which detail that both have dilutes."""
-        ours, theirs = (_texture(f, self.masks[state]) for f in (frame, self.real[state]))
+        ours, theirs = (texture(f, self.masks[state]) for f in (frame, self.real[state]))
         return abs(float(np.log2(ours / theirs))) if min(ours, theirs) > 0.0 else None
 
     def _by_stops(self, values: Mapping[int, float | None]) -> dict[str, float | None]:
@@ -235,13 +221,6 @@ class _Comparison:
 def _median(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
-
-
-def _texture(frame: torch.Tensor, mask: torch.Tensor) -> float:
-    """Mean square of the diagonal difference of 2 x 2 neighbours, all of them in `mask`."""
-    a, b, c, d = (frame[:, i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
-    inside = mask[:-1, :-1] & mask[1:, :-1] & mask[:-1, 1:] & mask[1:, 1:]
-    return float(((a - b - c + d) / 2.0)[:, inside].square().mean()) if inside.any() else 0.0
 
 
 def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -> float | None:
@@ -263,29 +242,18 @@ def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -
 def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
     """One part for each set of scenes."""
     shared: dict[str, Any] = {"seed": seed, "quick": quick}
-    depends = checksums(DEFAULT_SIMULATOR)
-    if folder is not None:
-        assert _options(str(folder)).grid  # raises before any work
-        name = folder.resolve().name.partition("?")[0]
-        arguments = {"source": name, "folder": str(folder.resolve()), **shared}
-        return [Part(name, measure, arguments, depends=depends)]
-    return [
-        Part(name, measure, {"source": name, **shared}, depends=depends)
-        for name in (REFERENCE, BOREAL)
-    ]
+    if folder is None:
+        return [Part(name, measure, {"source": name, **shared}) for name in (REFERENCE, BOREAL)]
+    assert _options(str(folder)).grid  # raises before any work
+    name = folder.resolve().name.partition("?")[0]
+    return [Part(name, measure, {"source": name, "folder": str(folder.resolve()), **shared})]
 
 
-_COLUMNS: dict[str, Any] = {
-    "PSNR, all pixels [dB]": "{psnr_all_db:.1f}",
-    "PSNR, known [dB]": "{psnr_db:.1f}",
-    "two real captures [dB]": "{ceiling_db:.1f}",
-    "without its noise [dB]": "{psnr_expected_db:.1f}",
-    "noise off by [stop]": "{noise_error_stops:.2f}",
-    "score error": "{score_error:.3f}",
-    "oracle's regret": "{oracle_regret:.3f}",
-    "same oracle": "{same_oracle:.0%}",
-    "ms a state": "{ms_per_state:.1f}",
-}
+_COLUMNS = """PSNR, all pixels [dB] = {psnr_all_db:.1f} | PSNR, known [dB] = {psnr_db:.1f} |
+two real captures [dB] = {ceiling_db:.1f} | without its noise [dB] = {psnr_expected_db:.1f} |
+noise off by [stop] = {noise_error_stops:.2f} | score error = {score_error:.3f} |
+oracle's regret = {oracle_regret:.3f} | ms a state = {ms_per_state:.1f}"""
+_REGRET = "mean = {mean:.3f} | upper quartile = {upper:.3f} | largest = {most:.3f}"
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -294,40 +262,34 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     frame = pd.json_normalize(rows)  # columns such as "psnr_by_stops.as bright"
     sets, stops = [], []
     for (source, method), own in frame.groupby(["source", "method"], sort=False):
-        head = {"source": source, "method": method, "number": len(own)}
+        head: Row = {"scenes": source, "title": METHODS[str(method)], "number": len(own)}
         means = own.drop(columns=["source", "method"]).mean(numeric_only=True)
         sets.append({**head, **means})
         stops.append(head | {name: means.get(f"psnr_by_stops.{name}") for name in STOPS})
         if method == list(METHODS)[-1]:
             ceilings = {name: means.get(f"ceiling_by_stops.{name}") for name in STOPS}
-            stops.append(head | {"method": "two real captures"} | ceilings)
+            stops.append(head | {"title": "two real captures"} | ceilings)
     regrets = frame.loc[frame["method"] == "simulated", "oracle_regret"]
     regret = {"mean": regrets.mean(), "upper": regrets.quantile(0.75), "most": regrets.max()}
-    heads: dict[str, Any] = {"scenes": "{source}", "method": _title}
-    each: dict[str, Any] = {"scene": "{scene}", "from": "{source_state}", "states": "{states}"}
-    each |= {"known": "{known_share:.1%}", "method": _title, **_COLUMNS}
-    del each["same oracle"]
+    each = (
+        "scene = {scene} | from = {source_state} | states = {states} | known = {known_share:.1%} | "
+    )
+    title, by_stops = (
+        "method = {title} | ",
+        " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS),
+    )
+    of_set = "scenes = {scenes} | method = {title} | "
     tables = {
-        "sets": table(sets, heads | {"number": "{number}"} | _COLUMNS),
-        "regret": table(
-            [regret],
-            {"mean": "{mean:.3f}", "upper quartile": "{upper:.3f}", "largest": "{most:.3f}"},
+        "sets": table(
+            sets, f"{of_set}number = {{number}} | {_COLUMNS} | same oracle = {{same_oracle:.0%}}"
         ),
-        "by_stops": table(stops, heads | {name: f"{{{name}:.1f}}" for name in STOPS}),
-        "scenes": table(rows, each),
+        "regret": table([regret], _REGRET),
+        "by_stops": table(stops, of_set + by_stops),
+        "scenes": table(
+            [r | {"title": METHODS[r["method"]]} for r in rows], each + title + _COLUMNS
+        ),
     }
     return Report(rows, tables)
 
 
-def _title(row: Mapping[str, Any]) -> str:
-    return METHODS.get(row["method"], str(row["method"]))
-
-
-BENCHMARK = Benchmark(
-    name="recorded",
-    title="Recorded grids",
-    parts=parts,
-    report=report,
-    code=("simulator", "ae_env", "benchmarks/recorded", "benchmarks/brackets"),
-)
-run = BENCHMARK.run
+run = benchmark("recorded", parts, report)

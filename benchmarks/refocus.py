@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import pandas as pd
@@ -14,13 +15,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from agents.applications.refocus import refocus
-from benchmarks.fidelity.defocus import equal_exposure
-from benchmarks.fidelity.models import checksums, weights
+from benchmarks.fidelity.models import equal_exposure, weights
 from benchmarks.harness import (
-    Benchmark,
     Part,
     Report,
     Row,
+    benchmark,
     clipped,
     data_root,
     psnr,
@@ -28,7 +28,6 @@ from benchmarks.harness import (
     table,
 )
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
-from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.disc_bank import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
@@ -76,10 +75,11 @@ def measure(number: int, seed: int, quick: bool) -> list[Row]:
 
 def _edges(reference: ReferenceCamera, scene: ReferenceScene) -> Tensor:
     """(H, W) bool, pixels near a step of depth."""
+    # Private: which side of the plane of focus a pixel is on is nowhere else.
     diameter = F.avg_pool2d(reference._signed_diameter(scene, 4.0)[None], 2)[0] / 2.0
     steps = torch.zeros_like(diameter)
-    steps[1:] = (diameter[1:] - diameter[:-1]).abs()
-    steps[:, 1:] = torch.maximum(steps[:, 1:], (diameter[:, 1:] - diameter[:, :-1]).abs())
+    steps[1:] = diameter.diff(dim=0).abs()
+    steps[:, 1:] = torch.maximum(steps[:, 1:], diameter.diff(dim=1).abs())
     window = 2 * EDGE_MARGIN + 1
     return F.max_pool2d((steps > EDGE_STEP).double()[None], window, 1, EDGE_MARGIN)[0] > 0
 
@@ -116,8 +116,7 @@ def _methods(
 
     methods: dict[str, Callable[[], Tensor]] = {"none": lambda: raw.data}
     if (path := weights("paper")) is not None:
-        aperture = CameraSimulator.from_pretrained(path, cache=None).aperture
-        assert isinstance(aperture, ApertureModule)
+        aperture: Any = CameraSimulator.from_pretrained(path, cache=None).aperture
 
         def paper() -> Tensor:
             light = denoised()[1][None]
@@ -157,16 +156,10 @@ def picture(seed: int) -> Figure:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each scene."""
     count = len(depth_photographs(get_camera(CAMERA), data=data_root()))
+    given = {"seed": seed, "quick": quick}
     return [
-        Part(
-            f"scene {number}",
-            measure,
-            {"number": number, "seed": seed, "quick": quick},
-            threads=1,
-            depends=checksums("large", "paper"),
-        )
+        Part(f"scene {number}", measure, {"number": number, **given}, threads=1)
         for number in range(0, count, 2 if quick else 1)
     ]
 
@@ -174,29 +167,21 @@ def parts(seed: int, quick: bool) -> list[Part]:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """Means over the scenes."""
     rows: list[Row] = [row for part in results.values() for row in part]
-    frame, means = pd.DataFrame(rows), []
-    frame["method"] = pd.Categorical(frame["method"], list(METHODS))
-    for (method, iso), own in frame.groupby(["method", "iso"], observed=True):
-        mean: Row = {"method": METHODS[str(method)], "iso": iso, "seconds": own["seconds"].median()}
-        for f_number, scores in own.groupby("f_number")[["psnr", "edge_psnr"]].mean().iterrows():
-            mean |= {f"{name} {f_number:g}": float(value) for name, value in scores.items()}
-        means.append(mean)
-    columns: dict[str, Any] = {"method": lambda row: row["method"], "ISO": "{iso}"}
-    for f_number in sorted(set(frame["f_number"]), reverse=True):
-        columns[f"f/{f_number:g}"] = _cell(f_number)
-    tables = {"psnr": table(means, {**columns, "seconds": "{seconds:.2f}"})}
+    groups = pd.DataFrame(rows).groupby(["method", "iso", "f_number"], sort=False)
+    frame = groups[["psnr", "edge_psnr"]].mean().reset_index()
+    seconds = pd.DataFrame(rows).groupby(["method", "iso"])["seconds"].median()
+    means: list[Row] = []
+    for method, iso in product(METHODS, sorted(set(frame["iso"]))):
+        own = frame[(frame["method"] == method) & (frame["iso"] == iso)]
+        mean: Row = {"method": METHODS[method], "iso": iso, "seconds": seconds.get((method, iso))}
+        for n, whole, edge in own[["f_number", "psnr", "edge_psnr"]].to_numpy():
+            mean |= {f"psnr {n:g}": whole, f"edge_psnr {n:g}": edge}
+        means += [mean] if len(own) else []
+    columns = {"method": "{method}", "ISO": "{iso}"}
+    for name in (f"{f_number:g}" for f_number in F_NUMBERS):
+        columns[f"f/{name}"] = f"{{psnr {name}:.1f}} / {{edge_psnr {name}:.1f}}"
+    tables = {"psnr": table(means, columns | {"seconds": "{seconds:.2f}"})}
     return Report([*rows, *means], tables, figures={"refocus.webp": picture(meta["seed"])})
 
 
-def _cell(f_number: float) -> Callable[[Row], str]:
-    return lambda row: f"{row[f'psnr {f_number:g}']:.1f} / {row[f'edge_psnr {f_number:g}']:.1f}"
-
-
-BENCHMARK = Benchmark(
-    name="refocus",
-    title="Shallow depth of field from one raw",
-    parts=parts,
-    report=report,
-    code=("agents/applications", "simulator/optics", "benchmarks/refocus"),
-)
-run = BENCHMARK.run
+run = benchmark("refocus", parts, report)

@@ -14,10 +14,12 @@ import functools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import torch
 from scipy.stats import pearsonr, spearmanr
 from skimage.metrics import structural_similarity
@@ -28,7 +30,7 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import prepare_scene
-from benchmarks.harness import Benchmark, Part, Report, Row, pivot, recorded, rounded, table
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, recorded, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
 
@@ -52,7 +54,6 @@ NEAR_EV = 0.75
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each question."""
     scenes = "bundled:small" if quick else "bundled"
     return [
         Part("milliseconds", milliseconds, {"repeats": 1 if quick else 7}),
@@ -80,17 +81,15 @@ def available() -> tuple[dict[str, CompositeScorer], dict[str, str]]:
 
 def milliseconds(repeats: int) -> list[Row]:
     """A row per scorer and size: median and half the range of the time of a batch, developed."""
-    scorers, rows = available()[0], []
+    rows = []
     for size in SIZES if repeats > 1 else SIZES[:1]:
         options = EnvOptions(scenes="bundled:small", split="test", resolution=size)
         scene, camera, states = options.load_scenes()[0], options.make_camera(), options.make_grid()
         captures = _described(scene, list(states), camera)
         images = prepare_scene(scene, camera).expose(list(states), seed=0).clamp_(0.0, 1.0)
-        matrix = captures.colour_matrices[0]
-        tasks: dict[str, Callable[[], Any]] = {
-            DEVELOP: lambda i=images, c=captures, m=matrix: develop(i, c.white_balance, m),  # type: ignore[misc]
-            **{name: partial(scorer, images, captures) for name, scorer in scorers.items()},
-        }
+        look = captures.white_balance, captures.colour_matrices[0]
+        tasks: dict[str, Callable[[], Any]] = {DEVELOP: partial(develop, images, *look)}
+        tasks |= {n: partial(scorer, images, captures) for n, scorer in available()[0].items()}
         for name, task in tasks.items():
             times = [1e3 * timed(task) for _ in range(repeats + 1)][1:]
             row = {"scorer": name, "size": size, "ms": float(np.median(times))}
@@ -108,12 +107,15 @@ def _described(scene: Scene, states: list[CameraSettings], camera: CameraProfile
 
 
 def best_ev(seed: int) -> list[Row]:
-    """A row per scorer: in how many stops above incident light each scene scores best."""
+    """A row per scorer: in how many stops above incident light each scene scores best.
+
+    Of equal exposures it is the nearest to the incident light's; None where all are equal.
+    """
     best: dict[str, dict[str, float | None]] = {}
-    for scene, camera, seeded in _small(seed):
-        states = [_state(scene, 100.0, offset) for offset in OFFSETS]
-        for name, scores in _scores(scene, states, camera, seeded).items():
-            best.setdefault(name, {})[scene.scene_id] = _best(scores)
+    for scene_id, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
+        equal = OFFSETS[scores >= scores.max() - _EQUAL]
+        nearest = float(equal[np.argmin(np.abs(equal))])
+        best.setdefault(name, {})[scene_id] = None if np.ptp(scores) < _EQUAL else nearest
     rows = []
     for name, by_scene in best.items():
         known = [value for value in by_scene.values() if value is not None]
@@ -123,25 +125,15 @@ def best_ev(seed: int) -> list[Row]:
     return rows
 
 
-def _best(scores: np.ndarray) -> float | None:
-    """The best exposure, of equal ones that nearest to the incident light's; None of all equal."""
-    if np.ptp(scores) < _EQUAL:
-        return None
-    best = OFFSETS[scores >= scores.max() - _EQUAL]
-    return float(best[np.argmin(np.abs(best))])
-
-
 def gain(seed: int) -> list[Row]:
     """A row per scorer: its change as the gain rises by 6 stops and the time falls by as many.
 
     Each pixel carries the noise of one pixel of the sensor, whatever the scene was averaged from.
     """
     found: dict[str, list[np.ndarray]] = {}
-    for scene, camera, seeded in _small(seed):
-        states = [_state(scene, iso, 0.0) for iso in (100.0, 100.0 * 2.0**STOPS)]
-        native = replace(scene, box_factor=1)
-        for name, scores in _scores(native, states, camera, seeded).items():
-            found.setdefault(name, []).append(scores.astype(np.float64))
+    states = [(100.0, 0.0), (100.0 * 2.0**STOPS, 0.0)]
+    for _, name, scores in _small(seed, states, native=True):
+        found.setdefault(name, []).append(scores.astype(np.float64))
     rows = []
     for name, pairs in found.items():
         low, high = np.array(pairs).T
@@ -149,31 +141,30 @@ def gain(seed: int) -> list[Row]:
         row: Row = {"scorer": name, "low_gain": low.mean(), "high_gain": high.mean()}
         row |= {"change": change.mean(), "change_sd": change.std()}
         rows.append(row | {"rises": (change > _EQUAL).mean(), "num_scenes": len(pairs)})
-    return [rounded(row) for row in rows]
+    return rows
 
 
-def _small(seed: int) -> Iterator[tuple[Scene, CameraProfile, int]]:
-    """The small bundled test scenes, their camera, and a seed for each."""
+def _small(
+    seed: int, taken: list[tuple[float, float]], *, native: bool = False
+) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Scene, scorer and scores (S,) of noisy captures without blur of the small test scenes.
+
+    They are taken at ISOs and exposures above that of the incident light [EV]; if `native`, each
+    pixel is one of the sensor's.
+    """
     options = EnvOptions(scenes="bundled:small", split="test", resolution=SIZE)
     camera = options.make_camera()
     for number, scene in enumerate(options.load_scenes()):
-        yield scene, camera, seed + number
-
-
-def _state(scene: Scene, iso: float, offset: float) -> CameraSettings:
-    """Settings `offset` stops above the incident light's exposure, at this gain."""
-    at_one_second = CameraSettings(iso, 1.0, F_NUMBER)
-    time = 2.0 ** (-at_one_second.log2_exposure - scene.ev100 + offset)
-    return CameraSettings(iso, time, F_NUMBER)
-
-
-def _scores(
-    scene: Scene, states: list[CameraSettings], camera: CameraProfile, seed: int
-) -> dict[str, np.ndarray]:
-    """(S,) of each scorer, on noisy captures without blur."""
-    captures = _described(scene, states, camera)
-    images = prepare_scene(scene, camera).expose(states, seed=seed).clamp_(0.0, 1.0)
-    return {name: scorer(images, captures).numpy() for name, scorer in available()[0].items()}
+        scene = replace(scene, box_factor=1) if native else scene
+        at_one_second = [CameraSettings(iso, 1.0, F_NUMBER) for iso, _ in taken]
+        states = [
+            replace(s, exposure_time=2.0 ** (ev - s.log2_exposure - scene.ev100))
+            for s, (_, ev) in zip(at_one_second, taken, strict=True)
+        ]
+        captures = _described(scene, states, camera)
+        images = prepare_scene(scene, camera).expose(states, seed=seed + number).clamp_(0.0, 1.0)
+        for name, scorer in available()[0].items():
+            yield scene.scene_id, name, scorer(images, captures).numpy()
 
 
 # -- good and bad captures ------------------------------------------------------------------------
@@ -183,25 +174,35 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
     """A row per scorer and reference; ``scenes`` and ``states`` are their numbers."""
     env: Any = gym.make("ae_env/AutoExposure-v0", scenes=scenes, split="test").unwrapped
     # Score tables of the composite hold its parts: one table serves all six scorers.
-    names = list(make_scorer("balanced").parts)
-    samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    found: list[Row] = []
     for i, scene in enumerate(env.scenes):
         env.reset(seed=seed + i, options={"scene": i})
         episode, expected = env.episode(), env.score_table()
-        scores = {name: expected.parts[name] for name in names} | {"balanced": expected.mean}
+        scores = {**expected.parts, "balanced": expected.mean}
         closeness = _closeness(env, scene, episode.speed, episode.defocus, seed + i)
-        for scorer in SCORERS:
-            for target in ("rmse", "ssim", "exposed", f"aspect:{scorer}"):
-                pair = _correlations(scores[scorer], closeness[target])
-                samples.setdefault((scorer, target.partition(":")[0]), []).append(pair)
+        for scorer, target in product(SCORERS, ("rmse", "ssim", "exposed", "aspect")):
+            near = closeness[f"aspect:{scorer}" if target == "aspect" else target]
+            known = np.isfinite(near)
+            row: Row = {"scorer": scorer, "reference": target}
+            for name, measure in (("spearman", spearmanr), ("pearson", pearsonr)):
+                row[name] = _correlation(measure, scores[scorer][known], near[known])
+            found.append(row)
     rows = []
-    for (scorer, target), pairs in samples.items():
-        values = np.array([pair for pair in pairs if np.isfinite(pair[0])])
-        row: Row = {"scorer": scorer, "reference": target, "num_scenes": len(values)}
-        for name, column in zip(("spearman", "pearson"), values.T, strict=True):
-            row |= {name: float(column.mean()), f"{name}_sd": float(column.std())}
-        rows.append(row | {"positive": float((values[:, 0] > 0).mean())})
+    known_rows = pd.DataFrame(found).dropna()
+    for (scorer, target), own in known_rows.groupby(["scorer", "reference"], sort=False):
+        row = {"scorer": scorer, "reference": target, "num_scenes": len(own)}
+        for name in ("spearman", "pearson"):
+            row |= {name: own[name].mean(), f"{name}_sd": own[name].std(ddof=0)}
+        rows.append(row | {"positive": float((own["spearman"] > 0).mean())})
     return {"rows": rows, "scenes": len(env.scenes), "states": len(env.grid)}
+
+
+def _correlation(measure: Callable[..., Any], scores: np.ndarray, closeness: np.ndarray) -> float:
+    """0 where one of the two does not vary at all, NaN for fewer than three states."""
+    if len(scores) < 3:
+        return np.nan
+    varies = min(np.ptp(scores), np.ptp(closeness)) >= 1e-12
+    return float(measure(scores, closeness).statistic) if varies else 0.0
 
 
 def _closeness(
@@ -213,64 +214,51 @@ def _closeness(
     sharp = prepare_scene(native, camera)
     blurred = prepare_scene(native, camera, speed=speed, defocus=defocus)
     proper = reference_settings(scene.ev100)
-    reference = _developed(sharp.expected(proper)[None], scene, camera)[0]
+
+    def developed(signal: torch.Tensor) -> np.ndarray:
+        pictures = develop(signal.clamp(max=1.0), scene.white_balance, camera.colour_matrix)
+        return pictures.permute(0, 2, 3, 1).numpy()
+
+    reference = developed(sharp.expected(proper)[None])[0]
     captures = blurred.expose(states, seed=seed)
     expected = torch.stack([blurred.expected(s) for s in states])
-    clean = recorded(expected, camera)
+    clean, pictures = recorded(expected, camera), developed(captures)
     exposed = recorded(torch.stack([sharp.expected(s) for s in states]), camera)
-    pictures = _developed(captures, scene, camera)
-    faultless = _developed(exposed, scene, camera)
-    ratios = [2.0 ** (proper.log2_exposure - s.log2_exposure) for s in states]
-    as_proper = [own * ratio for own, ratio in zip(expected, ratios, strict=True)]
-    smeared = _developed(torch.stack(as_proper), scene, camera)
+    ratios = torch.tensor([2.0 ** (proper.log2_exposure - s.log2_exposure) for s in states])
+    smeared = developed(expected * ratios[:, None, None, None])
 
     luminance = reference.mean(axis=-1)
     bright = luminance >= np.quantile(luminance, 0.75)
     dark = luminance <= np.quantile(luminance, 0.25)
-    difference = faultless - reference
+    difference = developed(exposed) - reference
     deviation = ((captures - clean).abs() / clean.clamp(min=DARK)).clamp_(max=1.0)
     below = clean < WHITE
     noise = (deviation * below).sum(dim=(1, 2, 3)) / below.sum(dim=(1, 2, 3))
     noise[below.float().mean(dim=(1, 2, 3)) < 0.1] = torch.nan
-    rmse = -np.sqrt(((pictures - reference) ** 2).mean(axis=(1, 2, 3)))
+    rmse = np.sqrt(((pictures - reference) ** 2).mean(axis=(1, 2, 3)))
     errors = {
         "brightness": np.abs(difference.mean(axis=(1, 2, 3))),
         "highlights": np.maximum(difference[:, bright], 0.0).mean(axis=(1, 2)),
         "shadows": np.maximum(-difference[:, dark], 0.0).mean(axis=(1, 2)),
         "noise": noise.numpy(),
         "sharpness": np.sqrt(((smeared - reference) ** 2).mean(axis=(1, 2, 3))),
-        "balanced": -rmse,
+        "balanced": rmse,
     }
     ssim = [structural_similarity(p, reference, channel_axis=2, data_range=1.0) for p in pictures]
-    aspects = {f"aspect:{name}": -error for name, error in errors.items()}
     near = np.abs(env.grid.ev100 - scene.ev100) <= NEAR_EV
-    exposed_rmse = np.where(near, rmse, np.nan)
-    return {"rmse": rmse, "ssim": np.array(ssim), "exposed": exposed_rmse, **aspects}
-
-
-def _developed(signal: torch.Tensor, scene: Scene, camera: CameraProfile) -> np.ndarray:
-    """(B, H, W, 3) float32 sRGB of captures (B, 4, H, W), clipped at white."""
-    clipped = signal.clamp(max=1.0)
-    pictures = develop(clipped, scene.white_balance, camera.colour_matrix)
-    return pictures.permute(0, 2, 3, 1).numpy()
-
-
-def _correlations(scores: np.ndarray, closeness: np.ndarray) -> tuple[float, float]:
-    """Spearman's and Pearson's coefficient over the states whose closeness is known.
-
-    0 where one of the two does not vary at all, NaN for fewer than three states.
-    """
-    known = np.isfinite(closeness)
-    scores, closeness = scores[known], closeness[known]
-    if len(scores) < 3:
-        return np.nan, np.nan
-    if np.ptp(scores) < 1e-12 or np.ptp(closeness) < 1e-12:
-        return 0.0, 0.0
-    spearman = float(spearmanr(scores, closeness).statistic)
-    return spearman, float(pearsonr(scores, closeness).statistic)
+    found = {f"aspect:{name}": -error for name, error in errors.items()}
+    return found | {"rmse": -rmse, "ssim": np.array(ssim), "exposed": np.where(near, -rmse, np.nan)}
 
 
 # -- report ---------------------------------------------------------------------------------------
+
+
+_GAIN = """scorer = `{scorer}` | ISO 100 = {low_gain:.3f} | ISO 6400 = {high_gain:.3f} |
+change = {change:+.3f} ± {change_sd:.3f} | scenes in which it rises = {rises:.0%}"""
+_BEST = """scorer = `{scorer}` | median [EV] = {median:+.1f} |
+range = {lowest:+.1f} to {highest:+.1f} | scene by scene = {each}"""
+_CORRELATION = """Spearman = {spearman:.2f} ± {spearman_sd:.2f} |
+Pearson = {pearson:.2f} ± {pearson_sd:.2f} | positive = {positive:.0%}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -279,54 +267,21 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     named = {**results, "correlation": correlations["rows"]}
     rows = [{"measure": name, **row} for name, own in named.items() for row in own]
     best = [row for row in results["best_ev"] if row["median"] is not None]
+    best.sort(key=lambda row: row["median"])
+    each = [" ".join("=" if v is None else f"{v:+g}" for v in r["by_scene"].values()) for r in best]
+    shown = [row | {"each": text} for row, text in zip(best, each, strict=True)]
+    times = results["milliseconds"]
+    why = [{"scorer": name, "why": text} for name, text in missing.items()]
+    line = "scorer = `{scorer}`"
     tables = {
         "gain": table(sorted(results["gain"], key=lambda row: -row["change"]), _GAIN),
-        "best_exposure": table(sorted(best, key=lambda row: row["median"]), _BEST),
-        "cost": pivot(
-            results["milliseconds"],
-            line=("scorer", "`{scorer}`"),
-            columns="{size} x {size} [ms]",
-            contents={"": "{ms:.1f} ± {ms_spread:.1f}"},
-        ),
-        "correlation": pivot(
-            correlations["rows"],
-            line=("scorer", "`{scorer}`"),
-            columns="{reference}",
-            contents={
-                "Spearman": "{spearman:.2f} ± {spearman_sd:.2f}",
-                "Pearson": "{pearson:.2f} ± {pearson_sd:.2f}",
-                "positive": "{positive:.0%}",
-            },
-        ),
-        "missing": table(
-            [{"scorer": name, "why": why} for name, why in missing.items()],
-            {"scorer": "`{scorer}`", "why": "{why}"},
-        ),
+        "best_exposure": table(shown, _BEST),
+        "cost": pivot(times, line, "{size} x {size} [ms]", "{ms:.1f} ± {ms_spread:.1f}"),
+        "correlation": pivot(correlations["rows"], line, "{reference}", _CORRELATION),
+        "missing": table(why, f"{line} | why = {{why}}"),
     }
     more = {key: correlations[key] for key in ("scenes", "states")} | {"not_measured": missing}
     return Report(rows, tables, meta=more)
 
 
-_GAIN: dict[str, Any] = {
-    "scorer": "`{scorer}`",
-    "ISO 100": "{low_gain:.3f}",
-    "ISO 6400": "{high_gain:.3f}",
-    "change": "{change:+.3f} ± {change_sd:.3f}",
-    "scenes in which it rises": "{rises:.0%}",
-}
-_BEST: dict[str, Any] = {
-    "scorer": "`{scorer}`",
-    "median [EV]": "{median:+.1f}",
-    "range": "{lowest:+.1f} to {highest:+.1f}",
-    "scene by scene": lambda row: " ".join(
-        "=" if v is None else f"{v:+g}" for v in row["by_scene"].values()
-    ),
-}
-BENCHMARK = Benchmark(
-    name="scorers",
-    title="The scorers, measured",
-    parts=parts,
-    report=report,
-    code=("simulator", "ae_env", "benchmarks/scorers", "benchmarks/harness"),
-)
-run = BENCHMARK.run
+run = benchmark("scorers", parts, report)

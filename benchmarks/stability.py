@@ -19,14 +19,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from scipy import stats
 
 import ae_env  # noqa: F401  registers the environment
 from agents import PolicyContext, make_policy
 from agents.policy_names import CLASSIC_METERS
 from agents.rollouts import make_envs
-from benchmarks.harness import Benchmark, Part, Report, Row, sections, table
+from benchmarks.harness import Part, Report, Row, benchmark, panels, sections, table
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 
 
@@ -80,19 +79,16 @@ def electrons(seed: int, quick: bool) -> list[Row]:
     return rows
 
 
-def _photon_law(grid: np.ndarray, level: float, read: float) -> np.ndarray:
-    """Distribution function of a photon count and Gaussian read noise [electrons]."""
-    counts = np.arange(int(level + 40 * math.sqrt(level) + 60))
-    weights = stats.poisson.pmf(counts, level)
-    return (weights[:, None] * stats.norm.cdf((grid - counts[:, None]) / read)).sum(axis=0)
-
-
 def _gaussian_distance(level: float, read: float) -> float:
-    """Largest distance of that function and of a Gaussian's of the same mean and variance."""
-    sigma = math.sqrt(level + read**2)
-    grid = np.linspace(-8 * sigma, level + 10 * sigma + 8, 8001)
-    gaussian = stats.norm.cdf((grid - level) / sigma)
-    return float(np.abs(_photon_law(grid, level, read) - gaussian).max())
+    """Largest distance of the distribution functions of photons and Gaussian read noise [electrons]
+    and of a Gaussian of the same mean and variance."""
+    sigma, counts = math.hypot(math.sqrt(level), read), np.arange(int(level + 40 * level**0.5 + 60))
+    grid, weights = (
+        np.linspace(-8 * sigma, level + 10 * sigma + 8, 8001),
+        stats.poisson.pmf(counts, level),
+    )
+    photons = (weights[:, None] * stats.norm.cdf((grid - counts[:, None]) / read)).sum(axis=0)
+    return float(np.abs(photons - stats.norm.cdf((grid - level) / sigma)).max())
 
 
 # -- over the signal ----------------------------------------------------------------------------
@@ -105,16 +101,15 @@ def statistics(seed: int, quick: bool) -> list[Row]:
     over frames. What chance alone gives is the limit.
     """
     camera, frames, side = get_camera("nikon_z6"), 16 if quick else 128, 64
-    levels = [2.0**stop for stop in range(-9, 0)]
-    state = CameraSettings(6400, 1 / 64, 4.0)
-    nlf, rows = camera.nlf(state.iso), []
-    chance = 5.0 / math.sqrt(4 * side * side * frames)
+    levels, state = [2.0**stop for stop in range(-9, 0)], CameraSettings(6400, 1 / 64, 4.0)
+    nlf, rows, chance = camera.nlf(state.iso), [], 5.0 / math.sqrt(4 * side * side * frames)
+    limits = {"variance": 1.5 * chance, "autocorrelation in space": 1.5 * chance}
     for noise in ("exact", "bank"):
         found: dict[str, list[float]] = {}
+        options: dict[str, Any] = {"noise": noise}
         for number, level in enumerate(levels):
             light = torch.full((4, side, side), level)
             prepared = PreparedScene(light, state, camera, NoiseLevelFunction.zero())
-            options: dict[str, Any] = {"noise": noise}
             seeds = range(seed + 1000 * number, seed + 1000 * number + frames)
             taken = torch.cat([prepared.expose([state], seed=s, **options) for s in seeds])
             step = 1 / (12 * np.square(camera.span))  # rounding adds its own
@@ -122,12 +117,10 @@ def statistics(seed: int, quick: bool) -> list[Row]:
             normals = (taken.double().numpy() - level) / np.sqrt(variance)[:, None, None]
             for name, value in _whiteness(normals).items():
                 found.setdefault(name, []).append(value)
-        limits = {"variance": 1.5 * chance, "autocorrelation in space": 1.5 * chance}
         for name, errors in found.items():
-            case, limit = f"{name}, {noise} noise", limits.get(name, chance)
-            rows.append(
-                _row(case, levels, errors, unit="of the normal", limit=limit, dtype="float32")
-            )
+            given: dict[str, Any] = {"unit": "of the normal", "dtype": "float32"}
+            limit = limits.get(name, chance)
+            rows.append(_row(f"{name}, {noise} noise", levels, errors, limit=limit, **given))
     return rows
 
 
@@ -167,14 +160,12 @@ def control(seed: int, quick: bool) -> list[Row]:
         loops = [[_loop(name, delay, s, seed) for s in (-6.0, 6.0)] for delay in delays]
         frames = [max(int(settled.max()) for settled, _ in pair) for pair in loops]
         swings = np.concatenate([amplitudes for pair in loops for _, amplitudes in pair])
-        swing, learnt = float(swings.max()), name in LEARNT
-        still = swing <= _ONE_STATE
-        note = f"swings by {swing:.2f} EV at the end"
+        still = float(swings.max()) <= _ONE_STATE
+        note = f"swings by {swings.max():.2f} EV at the end"
         if not still:
-            note += (
-                f", by more than {_ONE_STATE} in {(swings > _ONE_STATE).mean():.1%} of the cases"
-            )
-        note += f"; {len(swings)} cases" + ", learnt in steady light" * learnt
+            share = (swings > _ONE_STATE).mean()
+            note += f", by more than {_ONE_STATE} in {share:.1%} of the cases"
+        note += f"; {len(swings)} cases" + ", learnt in steady light" * (name in LEARNT)
         case = f"{name}, steps of +-6 EV"
         rows.append(_row(case, delays, frames, unit="frames to settle", ok=still, note=note))
     return rows
@@ -230,17 +221,13 @@ def long_runs(seed: int, quick: bool) -> list[Row]:
             env.reset(seed=seed if step == 0 else None)
         if step >= steps // 5 and step % (steps // 20) == 0:
             gc.collect()
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
             x.append(step)
-            memory.append(_memory_mib())
+            memory.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
         env.step(rng.integers(64))
     growth = [max(0.0, value - memory[0]) for value in memory]
     case = f"{steps:,} steps in {episodes:,} episodes"
     return [_row(case, x, growth, unit="MiB more", limit=_GROWTH_MIB)]
-
-
-def _memory_mib() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 # -- report ---------------------------------------------------------------------------------------
@@ -252,66 +239,32 @@ GROUPS: dict[str, tuple[Any, str]] = {
     "stiff control": (control, "delay [frames]"),
     "long runs": (long_runs, "steps"),
 }
+LOGARITHMIC = ("few electrons", "noise over signal")
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each group."""
-    arguments = {"seed": seed, "quick": quick}
-    return [Part(name, measure, arguments) for name, (measure, _) in GROUPS.items()]
+    given = {"seed": seed, "quick": quick}
+    return [Part(name, measure, given) for name, (measure, _) in GROUPS.items()]
+
+
+_COLUMNS = """case = {case} | dtype = {dtype} | largest error = {max_error:.3g} {error} |
+allowed = {limit:.3g} | finite = {finite} | right = {ok} | note = {note}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by group."""
     rows = [{"group": group, **row} for group, own in results.items() for row in own]
-    blocks = sections(rows, "{group}", lambda own: table(own, _COLUMNS))
-    return Report(rows, {"cases": "\n\n".join(blocks)}, figures={"stability.png": _draw(results)})
+    curves = []
+    for row in rows:
+        axes: Row = {"xlabel": GROUPS[row["group"]][1], "ylabel": row["error"]}
+        if row["group"] in LOGARITHMIC:
+            axes["xscale"] = "log"
+        x, y = row["curve"]["x"], row["curve"]["y"]
+        curve: Row = {"panel": row["group"], "label": row["case"][:56], "x": x, "y": y}
+        curves.append(curve | {"axes": axes, "style": {"marker": ".", "lw": 0.9}})
+    figure = panels(curves, columns=2, width=5.5)
+    tables = {"cases": sections(rows, "{group}", lambda own: table(own, _COLUMNS))}
+    return Report(rows, tables, figures={"stability.png": figure})
 
 
-_COLUMNS: dict[str, Any] = {
-    "case": "{case}",
-    "dtype": "{dtype}",
-    "largest error": "{max_error:.3g} {error}",
-    "allowed": "{limit:.3g}",
-    "finite": lambda row: "yes" if row["finite"] else "**no**",
-    "right": lambda row: "yes" if row["ok"] else "**no**",
-    "note": "{note}",
-}
-
-
-def _draw(results: dict[str, list[Row]]) -> Figure:
-    """A panel for each group: the curves of its cases, their limits dotted."""
-    columns = 2
-    figure = Figure(figsize=(11.0, 4.0 * -(-len(results) // columns)), dpi=80, layout="constrained")
-    panels = figure.subplots(-(-len(results) // columns), columns, squeeze=False).ravel()
-    for axis, (group, rows) in zip(panels, results.items(), strict=False):
-        xs: list[float] = []
-        ys: list[float] = []
-        for row in rows:
-            x, y = row["curve"]["x"], row["curve"]["y"]
-            (line,) = axis.plot(x, y, ".-", ms=3, lw=0.9, label=row["case"][:56])
-            if row["limit"]:
-                axis.axhline(row["limit"], color=line.get_color(), ls=":", lw=0.8)
-            xs, ys = [*xs, *x], [*ys, *y]
-        axis.set(title=group, xlabel=GROUPS[group][1], ylabel=rows[0]["error"])
-        if min(xs) > 0 and max(xs) > 50 * min(xs):
-            axis.set_xscale("log")
-        largest = max(ys + [row["limit"] or 0.0 for row in rows])
-        if largest > 50 * (sorted(ys)[len(ys) // 2] or largest * 1e-4):
-            axis.set_yscale("symlog", linthresh=1e-4 * largest)
-        axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-        if len(rows) <= 12:
-            axis.legend(fontsize=5.5)
-    for axis in panels[len(results) :]:
-        axis.set_axis_off()
-    return figure
-
-
-BENCHMARK = Benchmark(
-    name="stability",
-    title="Stability",
-    parts=parts,
-    report=report,
-    code=("simulator", "ae_env", "agents", "benchmarks/stability"),
-)
-run = BENCHMARK.run
+run = benchmark("stability", parts, report)

@@ -17,7 +17,8 @@ import torch.nn.functional as F
 
 from ae_env.scenes import load_scenes
 from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
-from benchmarks.harness import Benchmark, Part, Report, Row, table
+from benchmarks.harness import Part, Report, Row, benchmark, table
+from benchmarks.isolated import timed
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, write_dng
 
 #: Raws, height and width [packed pixel]; the last is averaged to half its sides on the page.
@@ -25,6 +26,7 @@ SIZES = ((256, 384), (512, 768), (1024, 1536))
 #: Keys pressed on each slider, and the time between two [ms].
 KEYS, PAUSE = 24, 500
 SLIDERS = ("ISO", "Shutter", "Aperture")
+_PROGRAM = (sys.executable, "-m", "agents.cli")
 _WATCH = """() => {
   window.times = []; window.begun = 0;
   document.addEventListener('keydown', () => { window.begun = performance.now(); }, true);
@@ -38,20 +40,18 @@ _WATCH = """() => {
 
 def measure(height: int, width: int, seed: int, quick: bool) -> Row:
     """One raw: in the page, in Python and as one command."""
+    keys = 4 if quick else KEYS
     with tempfile.TemporaryDirectory() as folder:
         path = _raw(Path(folder, "scene.dng"), height, width, seed)
-        times, load = _in_browser(path, 4 if quick else KEYS)
-        python = _in_python(path, 4 if quick else KEYS)
-        begun = perf_counter()
-        options = ["--iso", "400", "--shutter", "1/125", "--aperture", "5.6"]
-        files = ["-o", f"{folder}/out.dng", "--png", f"{folder}/out.png"]
-        subprocess.run(
-            [*_program("simulate"), str(path), *options, *files], check=True, capture_output=True
-        )
-        command = 1e3 * (perf_counter() - begun)
-    row: Row = {"height": height, "width": width, "keys": len(times), "command_ms": command}
+        times, load = _in_browser(path, keys)
+        python = _in_python(path, keys)
+        settings = ("--iso", "400", "--shutter", "1/125", "--aperture", "5.6")
+        files = ("-o", f"{folder}/out.dng", "--png", f"{folder}/out.png")
+        command = [*_PROGRAM, "simulate", str(path), *settings, *files]
+        seconds = timed(lambda: subprocess.run(command, check=True, capture_output=True))
+    row: Row = {"height": height, "width": width, "keys": len(times), "command_ms": 1e3 * seconds}
     row |= {"median_ms": float(np.median(times)), "p95_ms": float(np.quantile(times, 0.95))}
-    return row | {"python_ms": float(np.median(python)), "load_ms": load}
+    return row | {"python_ms": python, "load_ms": load}
 
 
 def _raw(path: Path, height: int, width: int, seed: int) -> Path:
@@ -67,10 +67,6 @@ def _raw(path: Path, height: int, width: int, seed: int) -> Path:
     return path
 
 
-def _program(command: str) -> list[str]:
-    return [sys.executable, "-m", "agents.cli", command]
-
-
 def _in_browser(path: Path, keys: int) -> tuple[list[float], float]:
     """Times of `keys` keys on each slider [ms], and that of the page's first picture."""
     from playwright.sync_api import sync_playwright
@@ -81,7 +77,7 @@ def _in_browser(path: Path, keys: int) -> tuple[list[float], float]:
     log = path.with_suffix(".log")
     with log.open("w") as file:
         process = subprocess.Popen(
-            [*_program("view"), str(path), "--no-open"], stdout=file, stderr=subprocess.STDOUT
+            [*_PROGRAM, "view", str(path), "--no-open"], stdout=file, stderr=subprocess.STDOUT
         )
     try:
         while not (found := re.search(r"open (http\S+)", log.read_text())):
@@ -112,50 +108,34 @@ def _in_browser(path: Path, keys: int) -> tuple[list[float], float]:
     return times, load
 
 
-def _in_python(path: Path, count: int) -> list[float]:
-    """Times of the same pictures without a browser [ms]."""
+def _in_python(path: Path, count: int) -> float:
+    """Median time of the same pictures without a browser [ms]."""
     library = find_scenes(str(path))
     viewed = ViewedScene(library.open(library.first), CameraSimulator.from_pretrained(device="cpu"))
-    settings = viewed.best()
-    views = [View(CameraSettings(iso, settings.exposure_time, 5.6)) for iso in (400, 500, 640, 800)]
-    times = []
-    for i in range(count + 1):
-        begun = perf_counter()
-        viewed.picture(views[i % len(views)])
-        times.append(1e3 * (perf_counter() - begun))
-    return times[1:]  # the first one prepares the scene
+    seconds = viewed.best().exposure_time
+    views = [View(CameraSettings(iso, seconds, 5.6)) for iso in (400, 500, 640, 800)]
+    times = [timed(lambda i=i: viewed.picture(views[i % 4])) for i in range(count + 1)]  # type: ignore[misc]
+    return 1e3 * float(np.median(times[1:]))  # the first one prepares the scene
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """Each size."""
     return [
         Part(f"{h}x{w}", measure, {"height": h, "width": w, "seed": seed, "quick": quick})
         for h, w in (SIZES[:1] if quick else SIZES)
     ]
 
 
+_COLUMNS = """raw = 4 x {height} x {width} | key to picture, median [ms] = {median_ms:.0f} |
+95 % within [ms] = {p95_ms:.0f} | of it simulated and developed [ms] = {python_ms:.0f} |
+`ae-env simulate` [ms] = {command_ms:.0f} | simulate / page = {speedup:.0f} |
+first picture [ms] = {load_ms:.0f}"""
+
+
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the rows of all sizes."""
     rows: list[Row] = list(results.values())
     for row in rows:
         row["speedup"] = row["command_ms"] / row["median_ms"]
-    columns = {
-        "raw": "4 x {height} x {width}",
-        "key to picture, median [ms]": "{median_ms:.0f}",
-        "95 % within [ms]": "{p95_ms:.0f}",
-        "of it simulated and developed [ms]": "{python_ms:.0f}",
-        "`ae-env simulate` [ms]": "{command_ms:.0f}",
-        "simulate / page": "{speedup:.0f}",
-        "first picture [ms]": "{load_ms:.0f}",
-    }
-    return Report(rows, {"latency": table(rows, columns)})
+    return Report(rows, {"latency": table(rows, _COLUMNS)})
 
 
-BENCHMARK = Benchmark(
-    name="viewer",
-    title="The viewer's latency",
-    parts=parts,
-    report=report,
-    code=("agents/viewer", "agents/cli/show", "benchmarks/viewer"),
-)
-run = BENCHMARK.run
+run = benchmark("viewer", parts, report)

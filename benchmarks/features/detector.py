@@ -16,12 +16,8 @@ DESCRIPTOR = 64
 
 
 class Features(NamedTuple):
-    """Keypoints of one picture, the strongest first.
-
-    Args:
-        points: (N, 2) x and y [pixel], 0 at the middle of the first pixel.
-        descriptors: (N, D) of length 1.
-    """
+    """Keypoints of one picture, the strongest first: x and y [pixel] (N, 2), 0 at the middle of the
+    first pixel, and descriptors (N, D) of length 1."""
 
     points: Tensor
     descriptors: Tensor
@@ -57,8 +53,7 @@ class Detector(nn.Module):
     def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Logits (B, 17, H/4, W/4), the last of "none", and descriptors (B, 64, H/4, W/4).
 
-        Args:
-            pictures: (B, 3, H, W) sRGB in [0, 1], H and W multiples of 8.
+        `pictures` (B, 3, H, W) are sRGB in [0, 1], H and W multiples of 8.
         """
         grey = 0.299 * pictures[:, :1] + 0.587 * pictures[:, 1:2] + 0.114 * pictures[:, 2:]
         # Every picture to the same mean and contrast, so that a gap is not hopeless from the start.
@@ -79,15 +74,12 @@ class Detector(nn.Module):
         scores = F.pixel_shuffle(logits.softmax(dim=1)[:, :-1], CELL)
         largest = F.max_pool2d(scores, 2 * SPACING + 1, 1, SPACING)
         scores = torch.where(scores == largest, scores, 0.0)[:, 0]
-        inside = torch.zeros_like(scores)
-        inside[:, BORDER:-BORDER, BORDER:-BORDER] = 1.0
-        scores = scores * inside
+        scores = F.pad(scores[:, BORDER:-BORDER, BORDER:-BORDER], (BORDER,) * 4)
         found = []
         for score, maps in zip(scores, dense, strict=True):
             values, index = score.flatten().topk(count)
             index = index[values > 0]
-            width = score.shape[1]
-            points = torch.stack([index % width, index // width], dim=1).float()
+            points = torch.stack([index % score.shape[1], index // score.shape[1]], dim=1).float()
             found.append(Features(points, sample(maps[None], points[None])[0]))
         return found
 

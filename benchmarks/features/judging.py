@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from benchmarks.features.detector import Features, mutual_matches
@@ -63,14 +64,9 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True)
 class HeldOutPair:
-    """Two pictures of one scene.
+    """Two pictures (2, 3, SIZE, SIZE) of one scene, sRGB in [0, 1] of 8 bits.
 
-    Args:
-        name: Of the source.
-        group: Source group.
-        condition: How they were taken.
-        pictures: (2, 3, SIZE, SIZE) sRGB in [0, 1], of 8 bits.
-        homography: (3, 3) from the first to the second.
+    `homography` (3, 3) is from the first to the second, `group` the source group.
     """
 
     name: str
@@ -125,18 +121,17 @@ def _views(source: Source, rng: np.random.Generator) -> tuple[list[ReferenceScen
 
     def light(homography: np.ndarray) -> Tensor:
         scaled = finer(homography) if pitch == 2 else homography
-        crop = torch.from_numpy(warped(image, scaled, pitch * SIZE))
-        return crop.permute(2, 0, 1).contiguous()
+        return torch.from_numpy(warped(image, scaled, pitch * SIZE)).permute(2, 0, 1).contiguous()
 
     places = [two_crops(rng, height, width, SIZE) for _ in range(_PLACES)]
     counts = [len(training_view(source._replace(light=light(h))).corners) for h, _ in places]
-    homographies = places[int(np.argmax(counts))]
+    first, second = places[int(np.argmax(counts))]
     metered = CameraSettings(100.0, 1.0 / 64.0, 5.6)
     scenes = [
         ReferenceScene(source.name, source.group, "planar", light(homography), metered)
-        for homography in homographies
+        for homography in (first, second)
     ]
-    return scenes, homographies[1] @ np.linalg.inv(homographies[0])
+    return scenes, second @ np.linalg.inv(first)
 
 
 # -- measures -------------------------------------------------------------------------------------
@@ -156,12 +151,7 @@ def judge(
 
 
 def measures(first: Features, second: Features, homography: np.ndarray) -> dict[str, float]:
-    """Repeatability, matching accuracy and the error of the homography of one pair.
-
-    Args:
-        first: Features of the first picture.
-        second: Features of the second picture.
-        homography: True one, from the first to the second.
+    """Measures of one pair under its true homography, from the first picture to the second.
 
     Returns:
         ``repeatability``: share of the keypoints seen by both pictures that the other one has
@@ -170,46 +160,49 @@ def measures(first: Features, second: Features, homography: np.ndarray) -> dict[
         many are within 3; ``corner_error``: mean error of the corners [pixel] under the estimated
         homography, infinite where there is none.
     """
-    a, b = first.points.double().numpy(), second.points.double().numpy()
-    forth, back = mapped(a, homography), mapped(b, np.linalg.inv(homography))
-    result = {"repeatability": 0.5 * (_repeated(forth, b) + _repeated(back, a))}
-    i, j = (index.numpy() for index in mutual_matches(first.descriptors, second.descriptors))
-    errors = np.linalg.norm(forth[i] - b[j], axis=1)
+    a, b, errors = matched(first, second, homography)
+    result = {"matches": float((errors <= 3.0).sum())}
     for threshold in THRESHOLDS:
-        result[f"accuracy_{threshold}"] = float((errors <= threshold).mean()) if len(i) else 0.0
-    result["matches"] = float((errors <= 3.0).sum())
-    return result | {"corner_error": _corner_error(a[i], b[j], homography)}
+        result[f"accuracy_{threshold}"] = float((errors <= threshold).mean()) if len(a) else 0.0
+    there, back = (f.points.double().numpy() for f in (first, second))
+    ways = (there, back, homography), (back, there, np.linalg.inv(homography))
+    result["repeatability"] = float(np.mean([_repeated(*way) for way in ways]))
+    return result | {"corner_error": _corner_error(a, b, homography)}
 
 
-def _repeated(expected: np.ndarray, found: np.ndarray) -> float:
-    """Share of the expected places in the picture with a keypoint nearby."""
+def matched(
+    first: Features, second: Features, homography: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of both pictures that are each other's nearest, and their errors [pixel]."""
+    i, j = mutual_matches(first.descriptors, second.descriptors)
+    a, b = first.points[i].double().numpy(), second.points[j].double().numpy()
+    return a, b, np.linalg.norm(mapped(a, homography) - b, axis=1)
+
+
+def _repeated(points: np.ndarray, found: np.ndarray, homography: np.ndarray) -> float:
+    """Share of the points that the other picture sees with a keypoint nearby."""
+    expected = mapped(points, homography)
     expected = expected[inside(expected, SIZE)]
     if not len(expected) or not len(found):
         return 0.0
-    distances = np.linalg.norm(expected[:, None] - found[None], axis=2)
-    return float((distances.min(axis=1) <= REPEATED).mean())
+    return float((cdist(expected, found).min(axis=1) <= REPEATED).mean())
 
 
 def _corner_error(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> float:
-    if len(first) < 4:
-        return float("inf")
     cv2.setRNGSeed(0)
-    estimate, _ = cv2.findHomography(first, second, cv2.RANSAC, _RANSAC_PX, maxIters=2000)
+    estimate = None
+    if len(first) >= 4:
+        estimate, _ = cv2.findHomography(first, second, cv2.RANSAC, _RANSAC_PX, maxIters=2000)
     if estimate is None:
         return float("inf")
-    edge = SIZE - 1.0
-    corners = np.array([[0.0, 0.0], [edge, 0.0], [edge, edge], [0.0, edge]])
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (SIZE - 1.0)
     errors = np.linalg.norm(mapped(corners, estimate) - mapped(corners, homography), axis=1)
     return float(errors.mean()) if np.isfinite(errors).all() else float("inf")
 
 
 def area_under(errors: np.ndarray, threshold: float) -> np.ndarray:
     """Area under the cumulated errors up to `threshold`, of each error alone; the mean of them is
-    that of all.
-
-    >>> area_under(np.array([0.0, 2.5, 7.0]), 5.0)
-    array([1. , 0.5, 0. ])
-    """
+    that of all."""
     return np.clip(1.0 - errors / threshold, 0.0, 1.0)
 
 
@@ -217,10 +210,7 @@ def area_under(errors: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def aliked(weights: Path) -> Detect:
-    """ALIKED (Zhao et al. 2023) through kornia, with weights of the user.
-
-    Args:
-        weights: File of ``aliked-n16.pth``, as its authors publish it.
+    """ALIKED (Zhao et al. 2023) through kornia, with the user's file of ``aliked-n16.pth``.
 
     Raises:
         ImportError: If kornia is not installed; names the extra.
@@ -229,15 +219,14 @@ def aliked(weights: Path) -> Detect:
     try:
         from kornia.feature import ALIKED
     except ImportError:
-        raise ImportError(
-            "ALIKED needs kornia: install the extra with pip install 'ae-env[features]'"
-        ) from None
+        wanted = "ALIKED needs kornia: install the extra with pip install 'ae-env[features]'"
+        raise ImportError(wanted) from None
     model = ALIKED("aliked-n16", max_num_keypoints=KEYPOINTS, detection_threshold=0.0)
     try:
         state = torch.load(weights, map_location="cpu", weights_only=True)
         missing, _ = model.load_state_dict(state, strict=False)
     except Exception as error:
-        raise ValueError(f"`weights` (={str(weights)!r}) must hold aliked-n16: {error}") from None
+        missing = [str(error)]
     if missing:
         raise ValueError(f"`weights` (={str(weights)!r}) must hold aliked-n16: no {missing[0]!r}")
     model.eval()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import cv2
@@ -29,13 +30,10 @@ _LEAST_CORNER, _CORNER_DISTANCE = 2e-5, 4
 
 
 class Source(NamedTuple):
-    """Light of one picture.
+    """Light of one picture; `group` is the unit of splitting.
 
-    Args:
-        name: Its name.
-        group: Source group, the unit of splitting and of resampling.
-        light: (3, 2H, 2W) linear at the pitch of the photosites, or (4, H, W) planes of a raw;
-            its median green is that of a metered exposure.
+    (3, 2H, 2W) linear at the pitch of the photosites, or (4, H, W) planes of a raw; its median
+    green is that of a metered exposure.
     """
 
     name: str
@@ -44,12 +42,7 @@ class Source(NamedTuple):
 
 
 class View(NamedTuple):
-    """A source picture to train on.
-
-    Args:
-        picture: (H, W, 3) uint8 sRGB, developed at its metered exposure.
-        corners: (N, 2) float32 x and y of its corners.
-    """
+    """A source picture (H, W, 3) uint8 sRGB at its metered exposure, and its corners (N, 2)."""
 
     picture: np.ndarray
     corners: np.ndarray
@@ -61,17 +54,15 @@ def sources(split: Split, *, raws: bool, limit: int | None = None) -> list[Sourc
     if data is None:
         raise FileNotFoundError("set AE_ENV_DATA to the folder of real files (photo_pool, maps)")
     found = []
-    photographs = photograph_pictures(data, split)
-    for _, picture in zip(range(limit or 10**6), photographs, strict=False):
+    for picture in islice(photograph_pictures(data, split), limit):
         found.append(Source(picture.name, picture.group, _metered(picture.light)))
-    for _, (path, group) in zip(range(limit or 10**6), radiance_files(data, split), strict=False):
+    for path, group in islice(radiance_files(data, split), limit):
         light = read_radiance(path)
         light = np.minimum(light / max(float(np.median(light[1])), 1e-9), _BRIGHTEST)
         found.append(Source(path.stem, group, _metered(torch.from_numpy(light))))
-    if raws:
-        for belongs in ("train", "validation", "test"):
-            for raw in recorded_mosaics(data, belongs):
-                found.append(Source(raw.name, raw.group, _metered(raw.light.clamp(min=0.0))))
+    for belongs in ("train", "validation", "test") if raws else ():
+        for raw in recorded_mosaics(data, belongs):
+            found.append(Source(raw.name, raw.group, _metered(raw.light.clamp(min=0.0))))
     return found
 
 
@@ -81,21 +72,17 @@ def _metered(light: Tensor) -> Tensor:
 
 
 def training_view(source: Source) -> View:
-    """The picture of a source as files hold them, and the corners of it."""
+    """The picture of a source as files hold them, and Shi and Tomasi's corners of it."""
     packed = source.light[None]
     if packed.shape[1] == 3:
         packed = F.avg_pool2d(packed, 2)[:, [0, 1, 1, 2]]
     picture = develop(packed)[0].permute(1, 2, 0).numpy()
-    return View(np.round(picture * 255.0).astype(np.uint8), corners(picture))
-
-
-def corners(picture: np.ndarray) -> np.ndarray:
-    """(N, 2) x and y of Shi and Tomasi's corners of a picture (H, W, 3) in [0, 1]."""
     grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     strength = torch.from_numpy(cv2.cornerMinEigenVal(grey, 5))[None, None]
     largest = F.max_pool2d(strength, 2 * _CORNER_DISTANCE + 1, 1, _CORNER_DISTANCE)
     peaks = ((strength == largest) & (strength > _LEAST_CORNER))[0, 0].nonzero()
-    return peaks.flip(1).numpy().astype(np.float32)
+    corners = peaks.flip(1).numpy().astype(np.float32)
+    return View(np.round(picture * 255.0).astype(np.uint8), corners)
 
 
 # -- homographies ---------------------------------------------------------------------------------
@@ -105,7 +92,6 @@ def crop_homography(
     rng: np.random.Generator,
     centre: np.ndarray,
     size: int,
-    *,
     scale: float,
     turn: float,
     jitter: float,
@@ -121,8 +107,7 @@ def crop_homography(
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     moved = square + 2.0 * rng.uniform(-jitter, jitter, (4, 2))
     given = (centre + half * moved @ rotation.T).astype(np.float32)
-    edge = size - 0.5
-    wanted = np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]], np.float32)
+    wanted = (0.5 * size * (square + 1.0) - 0.5).astype(np.float32)
     return cv2.getPerspectiveTransform(given, wanted).astype(np.float64)
 
 
@@ -130,8 +115,7 @@ def mapped(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Points (N, 2) mapped by a homography."""
     if not len(points):
         return points.reshape(0, 2)
-    image = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ homography.T
-    return image[:, :2] / image[:, 2:]
+    return cv2.perspectiveTransform(points.astype(np.float64)[None], homography)[0]
 
 
 def inside(points: np.ndarray, size: int, border: float = 0.0) -> np.ndarray:
@@ -140,16 +124,14 @@ def inside(points: np.ndarray, size: int, border: float = 0.0) -> np.ndarray:
 
 
 def two_crops(
-    rng: np.random.Generator, height: int, width: int, size: int, *, strength: float = 1.0
+    rng: np.random.Generator, height: int, width: int, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Homographies from a picture to two crops of the same place, the first one upright."""
     reach = min(0.75 * size, 0.5 * min(height, width))
     centre = np.array([rng.uniform(reach, width - reach), rng.uniform(reach, height - reach)])
-    first = crop_homography(rng, centre, size, scale=1.1, turn=0.0, jitter=0.0)
+    first = crop_homography(rng, centre, size, 1.1, 0.0, 0.0)
     moved = centre + rng.uniform(-0.1, 0.1, 2) * size
-    scale, turn, jitter = 1.25**strength, 25.0 * strength, 0.1 * strength
-    second = crop_homography(rng, moved, size, scale=scale, turn=turn, jitter=jitter)
-    return first, second
+    return first, crop_homography(rng, moved, size, 1.25, 25.0, 0.1)
 
 
 def warped(image: np.ndarray, homography: np.ndarray, size: int) -> np.ndarray:

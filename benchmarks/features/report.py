@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,6 @@ from matplotlib.figure import Figure
 
 from agents.evaluation.intervals import score_interval
 from benchmarks.features import judging, training
-from benchmarks.features.detector import mutual_matches
-from benchmarks.features.pairs import mapped
 from benchmarks.harness import Report, Row, pivot, sections, table
 
 #: Trainings under each augmentation.
@@ -46,15 +45,12 @@ COMPARED = (
     ("scaling", "jitter"),
     ("scaling", "none"),
 )
-_COST_COLUMNS: dict[str, Any] = {
-    "augmentation": lambda row: LABELS[row["arm"]],
-    "80 x 80 [ms]": "{ms_80:.2f}",
-    "512 x 512 [ms]": "{ms_512:.1f}",
-    "training [s]": "{seconds:.0f}",
-    "steps": "{steps}",
-}
+
+
+_COSTS = """augmentation = {label} | 80 x 80 [ms] = {ms_80:.2f} | 512 x 512 [ms] = {ms_512:.1f} |
+training [s] = {seconds:.0f} | steps = {steps}"""
 #: Tables by gap: their content.
-_BY_GAP: dict[str, Any] = {
+_BY_GAP = {
     "repeatability": "{repeatability:.3f}",
     "accuracy": "{accuracy_1:.3f} / {accuracy_3:.3f} / {accuracy_5:.3f}",
     "auc": "{auc_3:.3f} / {auc_5:.3f} / {auc_10:.3f}",
@@ -79,43 +75,17 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         for chosen in [*([gap] for gap in gaps), large]
         for measure in JUDGED
     ]
-    return Report(
-        [*costs, *means, *by_iso, *differences],
-        tables(costs, means, by_iso, differences),
-        figures={"features.webp": picture(means, meta)},
-    )
-
-
-def tables(
-    costs: list[Row], means: list[Row], by_iso: list[Row], differences: list[Row]
-) -> dict[str, str]:
-    """The tables of the page, of the four kinds of rows."""
-    line: Any = "augmentation", _COST_COLUMNS["augmentation"]
-    found = {"costs": table(costs, _COST_COLUMNS)}
+    line = "augmentation = {label}"
+    tables = {"costs": table(costs, _COSTS)}
     for name, content in _BY_GAP.items():
-        found[name] = pivot(means, line=line, columns=_gaps, contents={"": content})
-    contents = {"accuracy": "{accuracy:.3f}", "AUC 5 px": "{auc_5:.3f}"}
-    found["by-iso"] = pivot(by_iso, line=line, columns="ISO {isos[0]:g}", contents=contents)
-    line = "measure", lambda row: JUDGED[row["measure"]]
-    blocks = sections(
-        differences,
-        lambda row: f"{LABELS[row['arm']]} against {LABELS[row['against']]}".replace("*", ""),
-        lambda own: pivot(own, line=line, columns=_gaps, contents={"": _interval}),
+        tables[name] = pivot(means, line, "{at}", content)
+    contents = "accuracy = {accuracy:.3f} | AUC 5 px = {auc_5:.3f}"
+    tables["by-iso"] = pivot(by_iso, line, "ISO {isos[0]:g}", contents)
+    tables["differences"] = sections(
+        differences, "{pair}", lambda own: pivot(own, "measure = {judged}", "{at}", "{text}")
     )
-    return found | {"differences": "\n\n".join(blocks)}
-
-
-def _gaps(row: Row) -> str:
-    return " and ".join(f"{gap:g}" for gap in row["gaps"]) + " EV"
-
-
-def _interval(row: Row) -> str:
-    value = f"{row['difference']:+.3f}"
-    if row["interval"] is None:
-        return value
-    low, high = row["interval"]
-    text = f"{value} [{low:+.3f}, {high:+.3f}]"
-    return f"**{text}**" if row["beyond"] else text
+    figures: dict[str | Path, Figure] = {"features.webp": picture(means, meta)}
+    return Report([*costs, *means, *by_iso, *differences], tables, figures=figures)
 
 
 # -- rows -----------------------------------------------------------------------------------------
@@ -139,13 +109,17 @@ def _frame(runs: list[dict[str, Any]], split: str) -> pd.DataFrame:
 
 def _cost(arm: str, runs: list[dict[str, Any]], times: Row) -> Row:
     own = [run for run in runs if run["arm"] == arm]
-    row: Row = {"arm": arm, "part": "cost", **times}
+    row: Row = {"arm": arm, "label": LABELS[arm], "part": "cost", **times}
     if own[0]["seconds"] is not None:
         row["seconds"] = float(np.median([run["seconds"] for run in own]))
         row["steps"] = own[0]["steps"]
     if "validation" in own[0]:
         row["validation"] = float(_frame(own, "validation")["accuracy"].mean())
     return row
+
+
+def _at(gaps: list[float]) -> str:
+    return " and ".join(f"{gap:g}" for gap in gaps) + " EV"
 
 
 def _by_group(
@@ -160,10 +134,10 @@ def _by_group(
 
 def _mean(frame: pd.DataFrame, arm: str, gaps: list[float], isos: list[float]) -> Row:
     row: Row = {"arm": arm, "part": "mean", "gaps": gaps, "isos": isos}
+    row |= {"label": LABELS[arm], "at": _at(gaps)}
     for measure in MEASURES:
         values = _by_group(frame, arm, measure, gaps, isos)
-        row[measure] = float(values.mean())
-        row[f"{measure}_seeds"] = values.mean(axis=1).tolist()
+        row |= {measure: float(values.mean()), f"{measure}_seeds": values.mean(axis=1).tolist()}
     return row
 
 
@@ -172,9 +146,15 @@ def _difference(
 ) -> Row:
     first, second = (_by_group(frame, arm, measure, gaps, None) for arm in pair)
     found = score_interval(first - second, np.ones(first.shape[1]), seed=seed)
-    row = {"part": "difference", "arm": pair[0], "against": pair[1], "gaps": gaps}
+    row: Row = {"part": "difference", "arm": pair[0], "against": pair[1], "gaps": gaps}
     row |= {"measure": measure, "difference": found.value, "interval": found.pair}
-    return row | {"beyond": found.significant}
+    ours, other = (LABELS[arm].replace("*", "") for arm in pair)
+    row |= {"pair": f"{ours} against {other}", "at": _at(gaps), "judged": JUDGED[measure]}
+    row["text"] = f"{found.value:+.3f}"
+    if found.pair is not None:
+        row["text"] += " [{:+.3f}, {:+.3f}]".format(*found.pair)
+    mark = "**" if found.significant else ""
+    return row | {"beyond": found.significant, "text": mark + row["text"] + mark}
 
 
 # -- picture --------------------------------------------------------------------------------------
@@ -183,72 +163,49 @@ def _difference(
 def picture(means: list[Row], meta: dict[str, Any]) -> Figure:
     """Curves against the gap; below them matches of one hard pair, plain scaling and ours."""
     figure = Figure(figsize=(10.0, 7.0), dpi=100, layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 1.0))
-    axes = upper.subplots(1, 3)
-    for axis, (measure, title) in zip(
-        axes,
-        (
-            ("repeatability", "repeatability (2 px)"),
-            ("accuracy", "matching accuracy, mean of 1 to 5 px"),
-            ("auc_5", "homography AUC, 5 px"),
-        ),
-        strict=True,
-    ):
+    upper, lower = figure.subfigures(2, 1)
+    drawn = ("repeatability", "accuracy", "auc_5")
+    for axis, measure in zip(upper.subplots(1, 3), drawn, strict=True):
         for arm in dict.fromkeys(row["arm"] for row in means):
             own = [row for row in means if row["arm"] == arm]
-            gaps = [row["gaps"][0] for row in own]
-            (line,) = axis.plot(gaps, [row[measure] for row in own], "o-", ms=3)
-            line.set_label(LABELS[arm].replace("*", ""))
-            seeds = np.array([row[f"{measure}_seeds"] for row in own])
-            axis.fill_between(
-                gaps, seeds.min(1), seeds.max(1), color=line.get_color(), alpha=0.15, lw=0
+            gaps, seeds = (
+                [r["gaps"][0] for r in own],
+                np.array([r[f"{measure}_seeds"] for r in own]),
             )
-        axis.set_xlabel("exposure gap [EV]")
-        axis.set_title(title, fontsize=9)
-        axis.set_ylim(0.0)
-    axes[0].legend(fontsize=7)
-    quick = bool(meta.get("quick"))
-    steps = training.QUICK_STEPS if quick else training.STEPS
-    limit = 4 if quick else 12
+            label = LABELS[arm].replace("*", "")
+            (line,) = axis.plot(gaps, [row[measure] for row in own], "o-", ms=3, label=label)
+            ends = seeds.min(1), seeds.max(1)
+            axis.fill_between(gaps, *ends, color=line.get_color(), alpha=0.15, lw=0)
+        axis.set(xlabel="exposure gap [EV]", ylim=(0.0, None))
+        axis.set_title(JUDGED[measure], fontsize=9)
+    axis.legend(fontsize=7)
+    steps, limit = (training.QUICK_STEPS, 4) if meta["quick"] else (training.STEPS, 12)
     (condition,) = judging.conditions((4.0,), (12800.0,))[1:]
-    # The pair with the median number of right matches under plain scaling, of the first twelve.
-    scaled = training.train("scaling", meta["seed"], steps, limit)[0]
+    models = {
+        arm: training.train(arm, meta["seed"], steps, limit)[0] for arm in ("scaling", "full")
+    }
     pairs = list(judging.held_out_pairs("test", [condition], meta["seed"], limit))
-    found = [_matches(scaled, pair) for pair in pairs]
-    middle = int(np.argsort([match[2].sum() for match in found], kind="stable")[len(found) // 2])
-    for axis, arm in zip(lower.subplots(1, 2), ("scaling", "full"), strict=True):
-        model = training.train(arm, meta["seed"], steps, limit)[0]
-        _draw(axis, pairs[middle], _matches(model, pairs[middle]), LABELS[arm].replace("*", ""))
-    return figure
-
-
-def _matches(
-    model: training.Detector, pair: judging.HeldOutPair
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of both pictures that match, and whether each match is right."""
-    first, second = model.detect(pair.pictures, judging.KEYPOINTS)
-    i, j = mutual_matches(first.descriptors, second.descriptors)
-    a, b = first.points[i].double().numpy(), second.points[j].double().numpy()
-    return a, b, np.linalg.norm(mapped(a, pair.homography) - b, axis=1) <= 3.0
-
-
-def _draw(
-    axis: Any,
-    pair: judging.HeldOutPair,
-    matches: tuple[np.ndarray, np.ndarray, np.ndarray],
-    label: str,
-) -> None:
-    size, (a, b, right) = judging.SIZE, matches
+    matches = {
+        arm: [
+            judging.matched(*model.detect(p.pictures, judging.KEYPOINTS), p.homography)
+            for p in pairs
+        ]
+        for arm, model in models.items()
+    }
+    # The pair with the median number of right matches under plain scaling.
+    right = [(errors <= 3.0).sum() for *_, errors in matches["scaling"]]
+    middle = int(np.argsort(right, kind="stable")[len(right) // 2])
     # Each as bright as can be seen: the detectors see them as they were taken.
-    shown = [p / max(float(torch.quantile(p, 0.99)), 1e-3) for p in pair.pictures]
-    both = torch.cat(shown, dim=2).clamp(0.0, 1.0).permute(1, 2, 0)
-    axis.imshow(both.numpy())
-    for is_right, colour in ((False, "tab:red"), (True, "lime")):
-        for (x1, y1), (x2, y2) in zip(a[right == is_right], b[right == is_right], strict=True):
-            axis.plot([x1, x2 + size], [y1, y2], color=colour, lw=0.5, alpha=0.7)
-    axis.set_title(
-        f"{label}: {int(right.sum())} of {len(right)} matches right "
-        f"(0 and -{pair.condition.gap:g} EV, ISO {pair.condition.iso:g})",
-        fontsize=8,
-    )
-    axis.axis("off")
+    shown = [p / max(float(torch.quantile(p, 0.99)), 1e-3) for p in pairs[middle].pictures]
+    both = torch.cat(shown, dim=2).clamp(0.0, 1.0).permute(1, 2, 0).numpy()
+    for axis, arm in zip(lower.subplots(1, 2), models, strict=True):
+        axis.imshow(both)
+        a, b, errors = matches[arm][middle]
+        for (x1, y1), (x2, y2), error in zip(a, b, errors, strict=True):
+            colour = "lime" if error <= 3.0 else "tab:red"
+            axis.plot([x1, x2 + judging.SIZE], [y1, y2], color=colour, lw=0.5, alpha=0.7)
+        title = f"{LABELS[arm]}: {int((errors <= 3.0).sum())} of {len(errors)} matches right"
+        where = f"(0 and -{condition.gap:g} EV, ISO {condition.iso:g})"
+        axis.set_title(f"{title} {where}".replace("*", ""), fontsize=8)
+        axis.axis("off")
+    return figure

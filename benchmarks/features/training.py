@@ -6,6 +6,7 @@ import functools
 import time
 import zlib
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from ae_env.scorers.measures import srgb_decode
 from benchmarks.features.detector import CELL, Detector, sample
 from benchmarks.features.pairs import (
     View,
@@ -28,6 +30,7 @@ from benchmarks.features.pairs import (
 from benchmarks.harness import RUNS
 from benchmarks.isolated import ROOT
 from simulator.augment import ExposureAugmentation, sample_seeds
+from simulator.raw.develop import srgb_encode
 
 #: Exposures that plain scaling and ours draw from [EV]; the tests lie within.
 STOPS = (-6.0, 4.0)
@@ -69,16 +72,9 @@ def jittered(pictures: Tensor, seeds: list[int]) -> Tensor:
 
 def scaled(pictures: Tensor, seeds: list[int]) -> Tensor:
     """Linear light times 2**EV, clipped: sRGB's curve is undone for it."""
-    out = []
-    for picture, seed in zip(pictures, seeds, strict=True):
-        ratio = 2.0 ** np.random.default_rng(seed).uniform(*STOPS)
-        linear = torch.where(
-            picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4
-        )
-        linear = (linear * ratio).clamp(0.0, 1.0)
-        curved = 1.055 * linear.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
-        out.append(torch.where(linear <= 0.0031308, 12.92 * linear, curved))
-    return torch.stack(out)
+    ratios = [2.0 ** np.random.default_rng(seed).uniform(*STOPS) for seed in seeds]
+    linear = srgb_decode(pictures) * torch.tensor(ratios)[:, None, None, None]
+    return srgb_encode(linear.clamp(0.0, 1.0))
 
 
 #: By name: none, jitter, plain scaling, ours with its exposure alone, ours in full.
@@ -89,11 +85,6 @@ AUGMENTATIONS: dict[str, Augmentation] = {
     "exposure": ExposureAugmentation(CAMERA, STOPS, modules=("exposure",)),
     "full": ExposureAugmentation(CAMERA, STOPS, defocus=(0.0, 0.5), motion=(0.0, 1.0)),
 }
-
-
-def as_codes(pictures: Tensor) -> Tensor:
-    """Pictures as files hold them: 8 bits a sample, in [0, 1]."""
-    return (pictures * 255.0).round() / 255.0
 
 
 # -- training -------------------------------------------------------------------------------------
@@ -114,13 +105,7 @@ def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[De
 
     Random weights are trained without augmentation first, once for each seed, and go on under the
     augmentation for as many steps. All arms see the same crops in the same order, and what they
-    make of the same few of them.
-
-    Args:
-        arm: Of `AUGMENTATIONS`.
-        seed: Of the first weights, the crops and the augmentation.
-        steps: Of each of the two stages.
-        limit: Photographs, and maps; None for all.
+    make of the same few of them. `limit` is for photographs, and for maps; None for all.
     """
     begin, end = weights_file(START, seed, steps), weights_file(arm, seed, steps)
     if not begin.is_file():
@@ -146,35 +131,30 @@ def _fit(
     model: Detector, arm: str, seed: int, steps: range, rate: float, limit: int | None, path: Path
 ) -> None:
     """Trains a detector, in place, and stores it in a file."""
-    views = _views(limit)
-    begun = time.perf_counter()
+    views, begun = _views(limit), time.perf_counter()
     model.to(memory_format=torch.channels_last).train()
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(len(steps), 2))
-    for step, chosen in zip(range(steps.stop), batches(len(views), BATCH, seed), strict=False):
-        if step not in steps:
-            continue
-        batch = [
-            _pair(views[i], np.random.default_rng([seed, step, j])) for j, i in enumerate(chosen)
-        ]
+    chosen = islice(enumerate(batches(len(views), BATCH, seed)), steps.start, steps.stop)
+    for step, indices in chosen:
+        drawn = (np.random.default_rng([seed, step, j]) for j in range(BATCH))
+        batch = [_pair(views[i], rng) for i, rng in zip(indices, drawn, strict=True)]
         pictures = torch.from_numpy(np.stack([p for pair in batch for p in pair[0]]))
         pictures = pictures.permute(0, 3, 1, 2).float() / 255.0
         some = np.random.default_rng([seed, step]).random(len(pictures)) < AUGMENTED
-        indices = np.flatnonzero(some)
-        if len(indices):
-            seeds = sample_seeds(seed, step, indices.tolist())
-            pictures[indices] = AUGMENTATIONS[arm](pictures[indices], seeds)
-        loss = _loss(model, as_codes(pictures), batch)
+        if some.any():
+            seeds = sample_seeds(seed, step, np.flatnonzero(some).tolist())
+            pictures[some] = AUGMENTATIONS[arm](pictures[some], seeds)
+        loss = _loss(model, (pictures * 255.0).round() / 255.0, batch)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-    seconds = time.perf_counter() - begun
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     state = {name: value.contiguous() for name, value in model.state_dict().items()}
-    save_file({**state, "seconds": torch.tensor(seconds)}, partial)
+    save_file({**state, "seconds": torch.tensor(time.perf_counter() - begun)}, partial)
     partial.replace(path)
 
 

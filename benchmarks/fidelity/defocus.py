@@ -8,24 +8,23 @@ held-out procedural scenes, and in each of the photographs with measured depth.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from benchmarks.fidelity.models import load_models
+from benchmarks.fidelity.models import equal_exposure, load_models
 from benchmarks.harness import Row, clipped, data_root, pivot, sections
-from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
+from simulator import CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
 from simulator.optics.disc_bank import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
 
-CAMERA = "nikon_z6"
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].
 FULL, QUICK = (32, 256), (8, 128)
 F_SOURCE, F_TARGET = 11.0, 4.0
@@ -43,94 +42,90 @@ CLASSES: dict[str, tuple[float, float, float]] = {
 }
 #: Scenes with fewer pixels of a class do not count by scene.
 FEWEST_PIXELS = 500
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A scene at f/11 as it was captured, and at f/4.
-
-    Args:
-        name: Of its set.
-        sources: Noisy captures at f/11, by ISO.
-        target: (4, H, W) noise-free mean at f/4 and the same exposure, clipped.
-        diameter: (H, W) true circle of confusion at f/11 [pixel].
-        classes: Those of `CLASSES` as (H, W) bool.
-    """
-
-    name: str
-    sources: dict[int, RawImage]
-    target: Tensor
-    diameter: Tensor
-    classes: dict[str, Tensor]
+_CONTENTS = """Full = {relative_to_exp[full]:.2f} | met = {met} |
+median scene = {median_scene:.2f} | NS = {relative_to_exp[ns]:.2f} |
+true depth = {relative_to_exp[true_depth]:.2f} | paper = {relative_to_exp[paper]:.2f}"""
 
 
 @torch.no_grad()
 def measure(seed: int, quick: bool) -> list[Row]:
     """One row per set of scenes, ISO and class."""
-    camera, (groups, size) = get_camera(CAMERA), QUICK if quick else FULL
+    camera, (groups, size) = get_camera("nikon_z6"), QUICK if quick else FULL
     scenes = reference_scenes("test", camera, number=groups, size=size)
     scenes = [scene for scene in scenes if scene.kind == "depth"]
     photographs = depth_photographs(camera, data=data_root())
     chosen = [*scenes[::4], *photographs[::2]] if quick else [*scenes, *photographs]
-    simulators = load_models().simulators
-    pools: dict[tuple[str, int], _Pool] = {}
-    for scene in chosen:
-        view = _view(scene, ReferenceCamera(camera), seed)
-        for iso, source in view.sources.items():
-            pools.setdefault((view.name, iso), _Pool()).add(view, source, simulators)
+    frame = pd.DataFrame([row for scene in chosen for row in _errors(scene, seed)])
     rows = []
-    for (name, iso), pool in pools.items():
-        head = {"part": "defocus", "set": name, "iso": iso}
-        rows += [head | row for row in pool.rows()]
+    for (name, iso), own in frame.groupby(["set", "iso"], sort=False):
+        totals = own.groupby("pixels", sort=False).sum(numeric_only=True)
+        clear = totals["count"]["1.5 px and more"] + totals["count"]["below 1.5 px"]
+        for pixels, total in totals[totals["count"] > 0].iterrows():
+            asked, exp = CLASSES[str(pixels)][2], total["exp"]
+            relative = ((total[own.columns[4:]] / exp) ** 0.5).to_dict()
+            row: Row = {"part": "defocus", "set": name, "iso": int(iso), "pixels": pixels}
+            row |= {"count": int(total["count"]), "area": total["count"] / clear}
+            row |= {"rmse_exp": (exp / (4 * total["count"])) ** 0.5, "relative_to_exp": relative}
+            by_scene = own[(own["pixels"] == pixels) & (own["count"] >= FEWEST_PIXELS)]
+            row["median_scene"] = (by_scene["full"] / by_scene["exp"]).pow(0.5).median()
+            rows.append(row | {"asked": asked, "met": bool(relative["full"] <= asked)})
     return rows
 
 
-# -- views ----------------------------------------------------------------------------------------
-
-
-def _view(scene: ReferenceScene, camera: ReferenceCamera, seed: int) -> View:
-    """Photographs `scene`, exposed for its incident light as its reference settings are."""
+def _errors(scene: ReferenceScene, seed: int) -> Iterator[Row]:
+    """Sums of squared errors of every method over each class of pixels, at each ISO."""
+    camera = ReferenceCamera(get_camera("nikon_z6"))
     light = {n: camera.blurred_light(scene, n) for n in (F_SOURCE, F_TARGET)}
-    captures = {
-        iso: camera.capture(
-            scene, equal_exposure(scene.reference, iso, F_SOURCE), seed, light=light[F_SOURCE]
-        )
-        for iso in ISOS
-    }
-    settings = equal_exposure(scene.reference, ISOS[0], F_TARGET)
-    target = camera.capture(scene, settings, seed, light=light[F_TARGET]).mean
+    to_open = equal_exposure(scene.reference, ISOS[0], F_TARGET)
+    target = camera.capture(scene, to_open, seed, light=light[F_TARGET]).mean
     diameter = camera.blur_diameter(scene, F_SOURCE)
-    white = torch.maximum(captures[ISOS[0]].mean, target).amax(dim=0) >= OVER_EXPOSED
-    return View(
-        name="held-out procedural scenes"
-        if scene.kind == "depth"
-        else f"photograph: {scene.group}",
-        sources={iso: RawImage(c.sample, c.settings, camera.camera) for iso, c in captures.items()},
-        target=target,
-        diameter=diameter,
-        classes=_pixel_classes(diameter, white),
-    )
-
-
-def equal_exposure(reference: CameraSettings, iso: float, f_number: float) -> CameraSettings:
-    """The exposure of `reference` at another ISO and f-number."""
-    unit = CameraSettings(iso, 1.0, f_number)
-    return CameraSettings(iso, 2.0 ** (reference.log2_exposure - unit.log2_exposure), f_number)
+    classes: dict[str, Tensor] = {}
+    for iso in ISOS:
+        settings = equal_exposure(scene.reference, iso, F_SOURCE)
+        capture = camera.capture(scene, settings, seed, light=light[F_SOURCE])
+        if not classes:
+            white = torch.maximum(capture.mean, target).amax(dim=0) >= OVER_EXPOSED
+            classes = _pixel_classes(diameter, white)
+        source = RawImage(capture.sample, settings, camera.camera)
+        images = _opened(source, diameter)
+        errors = {
+            name: (clipped(image, source.camera) - target).double().square().sum(dim=0)
+            for name, image in images.items()
+        }
+        drawn = scene.kind == "depth"
+        row: Row = {"set": "held-out procedural scenes" if drawn else f"photograph: {scene.group}"}
+        for name, mask in classes.items():
+            row |= {"iso": iso, "pixels": name, "count": int(mask.sum())}
+            yield row | {variant: float(error[mask].sum()) for variant, error in errors.items()}
 
 
 def _pixel_classes(diameter: Tensor, white: Tensor) -> dict[str, Tensor]:
     """The pixels (H, W) of each of `CLASSES`, away from white (H, W) ones and from the frame."""
-    clear = ~torch.from_numpy(maximum_filter(white.numpy(), 2 * CLIP_MARGIN + 1))
-    for axis in (0, 1):
-        clear.narrow(axis, 0, BORDER).fill_(False)
-        clear.narrow(axis, clear.shape[axis] - BORDER, BORDER).fill_(False)
+    clear = torch.zeros_like(white)
+    inside = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+    near_white = torch.from_numpy(maximum_filter(white.numpy(), 2 * CLIP_MARGIN + 1))
+    clear[inside] = ~near_white[inside]
     return {
         name: clear & (diameter >= low) & (diameter < high)
         for name, (low, high, _) in CLASSES.items()
     }
 
 
-# -- errors ---------------------------------------------------------------------------------------
+def _opened(source: RawImage, true_diameter: Tensor) -> dict[str, Tensor]:
+    """One capture opened with every network."""
+    simulators, f_source = load_models().simulators, source.settings.effective_f_number
+    clean, deviation = _denoised(simulators["compact"], source)
+    # As the module does, its bank shared with the same blur of the true diameters.
+    aperture: Any = simulators["compact"].aperture
+    bank, diameter = DiscBank(clean[0]), aperture.defocus(clean, deviation)[0]
+    images = {"exp": source.data, "ns": clean[0]}
+    images["full"] = bank.blurred(added_blur(diameter, f_source, F_TARGET))
+    images["true_depth"] = bank.blurred(added_blur(true_diameter, f_source, F_TARGET))
+    if "paper" in simulators:
+        clean, deviation = _denoised(simulators["paper"], source)
+        network: Any = simulators["paper"].aperture
+        images["paper"] = network(clean, deviation, *torch.tensor([[f_source], [F_TARGET]]))[0]
+    return images
 
 
 def _denoised(simulator: CameraSimulator, source: RawImage) -> tuple[Tensor, Tensor]:
@@ -144,76 +139,8 @@ def _denoised(simulator: CameraSimulator, source: RawImage) -> tuple[Tensor, Ten
     return simulator.noise(exposed, shot, read), deviation
 
 
-@dataclass
-class _Pool:
-    """Sums over one set of scenes at one ISO."""
-
-    pixels: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CLASSES, 0))
-    squares: dict[str, dict[str, float]] = field(default_factory=lambda: {n: {} for n in CLASSES})
-    by_scene: dict[str, list[float]] = field(default_factory=lambda: {n: [] for n in CLASSES})
-
-    def add(self, view: View, source: RawImage, simulators: dict[str, CameraSimulator]) -> None:
-        """Opens one capture with every network."""
-        f_source = source.settings.effective_f_number
-        clean, deviation = _denoised(simulators["compact"], source)
-        # As the module does, its bank shared with the same blur of the true diameters.
-        aperture: Any = simulators["compact"].aperture
-        bank, diameter = DiscBank(clean[0]), aperture.defocus(clean, deviation)[0]
-        full = bank.blurred(added_blur(diameter, f_source, F_TARGET))
-        truth = bank.blurred(added_blur(view.diameter, f_source, F_TARGET))
-        images = {"exp": source.data, "ns": clean[0], "full": full, "true_depth": truth}
-        if "paper" in simulators:
-            clean, deviation = _denoised(simulators["paper"], source)
-            f_numbers = torch.tensor([[f_source], [F_TARGET]])
-            network: Any = simulators["paper"].aperture
-            images["paper"] = network(clean, deviation, *f_numbers)[0]
-        errors = {
-            name: (clipped(image, source.camera) - view.target).double().square().sum(dim=0)
-            for name, image in images.items()
-        }
-        for name, mask in view.classes.items():
-            count, sums = int(mask.sum()), self.squares[name]
-            self.pixels[name] += count
-            for variant, error in errors.items():
-                sums[variant] = sums.get(variant, 0.0) + float(error[mask].sum())
-            if count >= FEWEST_PIXELS:
-                ratio = errors["full"][mask].sum() / errors["exp"][mask].sum()
-                self.by_scene[name].append(float(ratio) ** 0.5)
-
-    def rows(self) -> Iterator[Row]:
-        """Errors by class."""
-        clear = self.pixels["1.5 px and more"] + self.pixels["below 1.5 px"]
-        for name, (_, _, asked) in CLASSES.items():
-            count = self.pixels[name]
-            if count == 0:
-                continue
-            rmse = {v: (s / (4 * count)) ** 0.5 for v, s in self.squares[name].items()}
-            ratios = self.by_scene[name]
-            yield {
-                "pixels": name,
-                "count": count,
-                "area": count / clear,
-                "rmse_exp": rmse["exp"],
-                "relative_to_exp": {v: e / rmse["exp"] for v, e in rmse.items()},
-                "median_scene": float(np.median(ratios)) if ratios else None,
-                "asked": asked,
-                "met": rmse["full"] <= asked * rmse["exp"],
-            }
-
-
 def tables(rows: list[Row]) -> dict[str, str]:
     """A table for each set of scenes, below its name."""
-    contents: dict[str, Any] = {
-        "Full": "{relative_to_exp[full]:.2f}",
-        "met": lambda r: "yes" if r["met"] else "no",
-        "median scene": "{median_scene:.2f}",
-        "NS": "{relative_to_exp[ns]:.2f}",
-        "true depth": "{relative_to_exp[true_depth]:.2f}",
-        "paper": "{relative_to_exp[paper]:.2f}",
-    }
-    line = "circle of confusion (area; asked)", "{pixels} ({area:.1%}; {asked:g})"
-
-    def show(own: list[Row]) -> str:
-        return pivot(own, line=line, columns="ISO {iso}", contents=contents)
-
-    return {"defocus": "\n\n".join(sections(rows, "{set}", show))}
+    line = "circle of confusion (area; asked) = {pixels} ({area:.1%}; {asked:g})"
+    by_set = sections(rows, "{set}", lambda own: pivot(own, line, "ISO {iso}", _CONTENTS))
+    return {"defocus": by_set}

@@ -1,4 +1,4 @@
-"""The trained networks that are measured, and the held-out scenes that they are measured on."""
+"""The trained networks that are measured, how they are asked, and held-out scenes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import data_root
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor, nn
+
+from benchmarks.harness import Row, clipped, data_root, psnr
 from benchmarks.isolated import ROOT
 from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
-from simulator import CameraSimulator, get_camera
+from simulator import CameraProfile, CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.noise_module import SIZES, NoiseModule
 from simulator.networks.weights import load_modules
 from simulator.reference.camera import ReferenceScene
+from simulator.training.data import settings_parameters
 from simulator.training.scenes import reference_scenes
 
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
@@ -28,14 +33,10 @@ FULL, QUICK = (64, 256, 128), (6, 128, 64)
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """Trained networks; None for what was not trained.
+    """Trained networks by name; those that were not trained are left out.
 
-    Args:
-        simulators: By preset.
-        corrected: The same with the w and b that the exposure module learnt for the body that was
-            trained on, as the paper uses them.
-        baselines: The paper's, by name: parameter concatenation, decoupled learning.
-        cards: Model card of each, by name.
+    `corrected` are simulators with the w and b that the exposure module learnt for the body that
+    was trained on, as the paper uses them; `baselines` the paper's; `cards` the model cards.
     """
 
     simulators: dict[str, CameraSimulator]
@@ -60,26 +61,15 @@ def train_missing() -> None:
             subprocess.run([*command, str(CONFIGS / f"{name}.yaml")], cwd=ROOT, check=True)
 
 
-def checksums(*names: str) -> dict[str, str]:
-    """Checksum of the weights of each of `names`, or of all models, that is there."""
-    names = names or tuple(dict.fromkeys((*SIZES, *PRESETS, *BASELINES)))
-    return {n: load_modules(w)[1]["sha256"] for n in names if (w := weights(n)) is not None}
-
-
 @functools.cache
 def load_models() -> Models:
     """All models that are there."""
     found = {n: w for n in (*PRESETS, *BASELINES) if (w := weights(n)) is not None}
     loaded = {name: load_modules(path) for name, path in found.items()}
+    make = functools.partial(CameraSimulator.from_pretrained, device="cpu", cache=None)
     own, corrected = (
-        {
-            name: CameraSimulator.from_pretrained(
-                found[name], device="cpu", body_correction=correct, cache=None
-            )
-            for name in PRESETS
-            if name in found
-        }
-        for correct in (False, True)
+        {name: make(found[name], body_correction=body) for name in PRESETS if name in found}
+        for body in (False, True)
     )
     baselines: Any = {n: loaded[n][0]["baseline"] for n in BASELINES if n in loaded}
     return Models(own, corrected, baselines, {name: card for name, (_, card) in loaded.items()})
@@ -91,9 +81,39 @@ def trained_noise_modules() -> dict[str, NoiseModule]:
     return {n: load_modules(w)[0]["noise"] for n, w in names.items()}  # type: ignore[misc]
 
 
+@torch.no_grad()
+def baseline(network: nn.Module, raw: RawImage, target: CameraSettings) -> Tensor:
+    """What one of the paper's baselines makes of a raw, (4, H, W): it is told both settings."""
+    told = [v for settings in (raw.settings, target) for v in settings_parameters(settings)]
+    image: Tensor = network(raw.data[None], torch.tensor([told]))[0].float()
+    return image
+
+
+def scores(estimate: Tensor, truth: Tensor, camera: CameraProfile) -> Row:
+    """PSNR [dB] and SSIM of an estimate before the output's noise is added."""
+    image, window = clipped(estimate, camera), min(7, *(n - 1 + n % 2 for n in truth.shape[1:]))
+    ssim = structural_similarity(
+        image.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, win_size=window
+    )
+    return {"psnr_db": psnr(image, truth), "ssim": float(ssim)}
+
+
 @functools.cache
 def held_out_scenes(camera: str, quick: bool) -> tuple[ReferenceScene, ...]:
     """The test split: procedural groups, photographs and, where present, radiance maps."""
     number, size, _ = QUICK if quick else FULL
     profile, folder = get_camera(camera), data_root()
     return tuple(reference_scenes("test", profile, number=number, size=size, data=folder))
+
+
+def equal_exposure(reference: CameraSettings, iso: float, f_number: float) -> CameraSettings:
+    """The exposure of `reference` at another ISO and f-number."""
+    unit = CameraSettings(iso, 1.0, f_number)
+    return CameraSettings(iso, 2.0 ** (reference.log2_exposure - unit.log2_exposure), f_number)
+
+
+def radiance_views(camera: str, size: int) -> list[ReferenceScene]:
+    """Views of held-out radiance maps, one of each."""
+    scenes = reference_scenes("test", get_camera(camera), number=0, size=size, data=data_root())
+    groups = {s.group: s for s in reversed(scenes) if s.kind == "radiance" and s.pitch == 2}
+    return list(groups.values())

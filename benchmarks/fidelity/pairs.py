@@ -15,18 +15,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from skimage.metrics import structural_similarity
-from torch import Tensor, nn
+import pandas as pd
+from torch import Tensor
 
-from benchmarks.fidelity.models import FULL, QUICK, Models, held_out_scenes, load_models
-from benchmarks.harness import Row, clipped, pivot, psnr, table
+from benchmarks.fidelity.models import FULL, QUICK, baseline, held_out_scenes, load_models, scores
+from benchmarks.harness import Row, pivot, table
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceCapture
 from simulator.reference.sequences import Pair, select_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence
-from simulator.training.data import draw_sequences, settings_parameters
+from simulator.training.data import draw_sequences
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.
 CAMERAS = {"nikon_z6": 1, "canon_70d": 7}
@@ -49,14 +48,10 @@ PUBLISHED = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One pair, photographed.
+    """One pair, photographed: the noisy input, and the noisy output and its mean.
 
-    Args:
-        group: Source group of the scene.
-        has_depth: Whether its depth is known.
-        source: The noisy input.
-        target: The noisy output and its mean.
-        blur: Largest circle of confusion of the source in the crop [pixel].
+    `group` is the source group of the scene, `blur` the largest circle of confusion of the source
+    in the crop [pixel].
     """
 
     group: str
@@ -78,11 +73,14 @@ class Case:
     @property
     def cleaner(self) -> bool:
         """Whether the target has less noise than the source brings, averaged over the crop."""
-        camera, mean = self.source.camera, self.target.mean
-        ratio = exposure_ratio(self.source.settings, self.target.settings)
-        exposed = camera.nlf(self.source.settings.iso).exposed(ratio)
-        wanted = camera.nlf(self.target.settings.iso)
-        return bool(noise_variance(mean, wanted).mean() < noise_variance(mean, exposed).mean())
+        return needs_cleaning(self.source, self.target.settings, self.target.mean)
+
+
+def needs_cleaning(source: RawImage, target: CameraSettings, mean: Tensor) -> bool:
+    """Whether light `mean` has less noise at `target` than what the source brings, on average."""
+    camera, ratio = source.camera, exposure_ratio(source.settings, target)
+    exposed, wanted = source.noise.exposed(ratio), camera.nlf(target.iso)
+    return bool(noise_variance(mean, wanted).mean() < noise_variance(mean, exposed).mean())
 
 
 #: Groups of which every pair is in exactly one: where the average margin comes from.
@@ -110,7 +108,7 @@ def measure(camera: str, mix: str, seed: int, quick: bool) -> list[Row]:
     """One row per group of pairs and method."""
     number, index = list(CAMERAS).index(camera), list(PAIRS).index(mix)
     count = (QUICK_PAIRS if quick else PAIRS)[mix]
-    profile, models = get_camera(camera), load_models()
+    profile = get_camera(camera)
     reference = ReferenceCamera(profile, body=BodyError.draw(profile, CAMERAS[camera]))
     sequences = draw_sequences(held_out_scenes(camera, quick), profile, seed)
     pairs = _pairs_of(mix, sequences, reference)
@@ -119,7 +117,7 @@ def measure(camera: str, mix: str, seed: int, quick: bool) -> list[Row]:
         pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), count, replace=False))]
     crop = (QUICK if quick else FULL)[2]
     cases = _photographed(pairs, sequences, reference, crop, seed)
-    return list(_rows([(case, _scores(case, models)) for case in cases], camera, mix))
+    return list(_rows([(case, _scores(case)) for case in cases], camera, mix))
 
 
 def _pairs_of(
@@ -134,11 +132,12 @@ def _pairs_of(
     if mix == "opening":
         return pairs
     wanted = [CameraSettings(100, 1.0, n).aperture_stop for n in (11, 4)]
-    return [
-        p
-        for p in pairs
-        if [sequences[p.sequence].settings[i].aperture_stop for i in (p.source, p.target)] == wanted
-    ]
+
+    def stops(pair: Pair) -> list[int]:
+        settings = sequences[pair.sequence].settings
+        return [settings[i].aperture_stop for i in (pair.source, pair.target)]
+
+    return [pair for pair in pairs if stops(pair) == wanted]
 
 
 def _photographed(
@@ -177,17 +176,20 @@ def _photographed(
 Method = tuple[str, str, bool]
 
 
-def _estimates(case: Case, models: Models) -> Iterator[tuple[Method, Tensor, float | None]]:
+def _estimates(case: Case) -> Iterator[tuple[Method, Tensor, float | None]]:
     """Every method's estimate of the target and its time [ms], and the ceiling."""
+    models, target = load_models(), case.target.settings
     for name, network in models.baselines.items():
-        yield (name.upper(), "", False), *_baseline(case, network)
+        begun = time.perf_counter()
+        image = baseline(network, case.source, target)
+        yield (name.upper(), "", False), image, 1e3 * (time.perf_counter() - begun)
     for preset, corrected in (("compact", True), ("compact", False), ("paper", True)):
         simulator = (models.corrected if corrected else models.simulators).get(preset)
         if simulator is None:
             continue
         times: dict[str, float] = {}
         handles = _stopwatch(simulator, times)
-        stages = simulator.stages(case.source, case.target.settings)
+        stages = simulator.stages(case.source, target)
         for handle in handles:
             handle.remove()
         images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
@@ -209,57 +211,40 @@ def _stopwatch(simulator: CameraSimulator, times: dict[str, float]) -> list[Any]
     return [*handles, simulator.exposure.register_forward_pre_hook(note("start"))]
 
 
-@torch.no_grad()
-def _baseline(case: Case, network: nn.Module) -> tuple[Tensor, float]:
-    settings = case.source.settings, case.target.settings
-    parameters = torch.tensor([[v for s in settings for v in settings_parameters(s)]])
-    began = time.perf_counter()
-    image = network(case.source.data[None], parameters)[0]
-    return image, 1e3 * (time.perf_counter() - began)
-
-
-def _scores(case: Case, models: Models) -> dict[Method, Row]:
+def _scores(case: Case) -> dict[Method, Row]:
     """PSNR [dB] and SSIM against the noisy target and against its mean, and the time."""
-    scores = {}
-    for method, estimate, milliseconds in _estimates(case, models):
-        image, scores[method] = clipped(estimate, case.source.camera), {"ms": milliseconds}
+    found: dict[Method, Row] = {}
+    for method, estimate, ms in _estimates(case):
+        found[method] = {"ms": ms}
         for name, target in (("noisy", case.target.sample), ("mean", case.target.mean)):
-            ssim = structural_similarity(
-                image.numpy(), target.numpy(), channel_axis=0, data_range=1.0
-            )
-            scores[method] |= {f"{name}_db": psnr(image, target), f"{name}_ssim": float(ssim)}
-    return scores
+            own = scores(estimate, target, case.source.camera)
+            found[method] |= {f"{name}_db": own["psnr_db"], f"{name}_ssim": own["ssim"]}
+    return found
 
 
 def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str, mix: str) -> Iterator[Row]:
     for group, belongs in GROUPS.items():
-        chosen = [(case, scores) for case, scores in scored if belongs(case)]
+        chosen = [(case, found) for case, found in scored if belongs(case)]
         if not chosen or (mix != "all" and not group.startswith(("aperture opens", "opens"))):
             continue
         subjects = [case.group for case, _ in chosen]
-        for method in chosen[0][1]:
+        frames = {m: pd.DataFrame([found[m] for _, found in chosen]) for m in chosen[0][1]}
+        for method, own in frames.items():
             name, preset, corrected = method
-            head: Row = {"part": "pairs", "camera": camera, "mix": mix, "group": group}
-            head["method"] = name
-            head |= {"preset": preset, "body_correction": corrected, "pairs": len(chosen)}
-            row = head | {"source_groups": len(set(subjects))}
-            for field in ("noisy_db", "noisy_ssim", "mean_db", "mean_ssim"):
-                row[field] = float(np.mean([scores[method][field] for _, scores in chosen]))
-            for over, other in _compared(method).items():
+            row: Row = {"part": "pairs", "camera": camera, "mix": mix, "group": group}
+            row |= {"method": name, "preset": preset, "body_correction": corrected}
+            row |= {"pairs": len(chosen), "source_groups": len(set(subjects))}
+            row |= own.drop(columns="ms").mean().to_dict()
+            # Gains are over the exposure alone, and over the stage before.
+            others = {"over_exp": ("EXP", preset or "compact", corrected or not preset)}
+            if before := {"NS": "EXP", "Full": "NS"}.get(name):
+                others["over_before"] = (before, preset, corrected)
+            for over, other in others.items():
                 for field in ("noisy_db", "mean_db"):
-                    gains = np.array([s[method][field] - s[other][field] for _, s in chosen])
+                    gains = (own[field] - frames[other][field]).to_numpy()
                     row[f"{over}_{field}"] = float(gains.mean())
                     row[f"{over}_{field}_error"] = _standard_error(gains, subjects)
-            times = [s[method]["ms"] for _, s in chosen if s[method]["ms"] is not None]
-            yield row | {"milliseconds": float(np.median(times)) if times else None}
-
-
-def _compared(method: Method) -> dict[str, Method]:
-    """Baselines of a method's gain: the exposure alone, and the stage before."""
-    name, preset, corrected = method
-    exposed = ("EXP", preset or "compact", corrected or not preset)
-    before = {"NS": "EXP", "Full": "NS"}.get(name)
-    return {"over_exp": exposed} | ({"over_before": (before, preset, corrected)} if before else {})
+            yield row | {"milliseconds": own["ms"].astype(float).median()}
 
 
 def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
@@ -273,60 +258,44 @@ def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
 
 # -- report ---------------------------------------------------------------------------------------
 
+_COUNTS = "camera = {camera} | mix = {mix} | pairs = {pairs} | source groups = {source_groups}"
+_PAPER = """noisy = {noisy_db:.2f} / {noisy_ssim:.3f} | mean = {mean_db:.2f} / {mean_ssim:.3f} |
+ms = {milliseconds:.1f}"""
+_MARGINS = """share = {share:.0%} |
+over EXP [dB] = {over_exp_noisy_db:+.2f} ± {over_exp_noisy_db_error:.2f} |
+over NS [dB] = {over_before_noisy_db:+.2f} ± {over_before_noisy_db_error:.2f} |
+contribution [dB] = {contribution:+.2f}"""
+
 
 def tables(rows: list[Row]) -> dict[str, str]:
     """The table, how many pairs there are, the margin by group, and the breakdown."""
+    for row in rows:
+        row["name"], row["label"] = _NAMES[row["camera"]], row["method"]
+        if row["preset"]:
+            plain = ", w = 1, b = 0" * (not row["body_correction"])
+            row["label"] += f" `{row['preset']}`" + plain
     paper = [r for r in rows if (r["mix"], r["group"]) == ("all", "all")]
     whole = {r["camera"]: r["pairs"] for r in paper}
-    ceiling = [r for r in rows if r["method"] == "ceiling"]
-    counts = [r for r in ceiling if r["group"] in ("all", "aperture opens")]
-    counts = [r for r in counts if (r["group"] == "all") == (r["mix"] == "all")]
-    full = [
-        r | {"share": r["pairs"] / whole[r["camera"]]}
-        for r in rows
-        if (r["method"], r["preset"], r["body_correction"]) == ("Full", "compact", True)
-        and r["mix"] == "all"
-        and r["group"] in (*PARTITION, "all")
+    counts = [
+        row
+        for row in rows
+        if row["method"] == "ceiling"
+        and row["group"] == ("all" if row["mix"] == "all" else "aperture opens")
     ]
-    paper_contents: dict[str, Any] = {
-        "noisy": "{noisy_db:.2f} / {noisy_ssim:.3f}",
-        "mean": "{mean_db:.2f} / {mean_ssim:.3f}",
-        "ms": "{milliseconds:.1f}",
-    }
-    margins: dict[str, Any] = {
-        "share": "{share:.0%}",
-        "over EXP [dB]": "{over_exp_noisy_db:+.2f} ± {over_exp_noisy_db_error:.2f}",
-        "over NS [dB]": "{over_before_noisy_db:+.2f} ± {over_before_noisy_db_error:.2f}",
-        "contribution [dB]": lambda r: f"{r['share'] * r['over_exp_noisy_db']:+.2f}",
-    }
+    full = []
+    for row in (r for r in rows if r["mix"] == "all" and r["group"] in (*PARTITION, "all")):
+        if row["label"] == "Full `compact`":
+            share = row["pairs"] / whole[row["camera"]]
+            full.append(row | {"share": share, "contribution": share * row["over_exp_noisy_db"]})
     found = {
-        "counts": table(counts, {"camera": "{camera}", "mix": "{mix}", **_COUNTS}),
-        "paper": pivot(
-            paper, line=("PSNR [dB] / SSIM", _label), columns=_camera, contents=paper_contents
-        ),
-        "margin": pivot(full, line=("pairs", "{group}"), columns=_camera, contents=margins),
+        "counts": table(counts, _COUNTS),
+        "paper": pivot(paper, "PSNR [dB] / SSIM = {label}", "{name}", _PAPER),
+        "margin": pivot(full, "pairs = {group}", "{name}", _MARGINS),
     }
     for camera in CAMERAS:
         own = [
             r for r in rows if r["camera"] == camera and (r["body_correction"] or not r["preset"])
         ]
-        found[f"groups-{camera}"] = pivot(
-            own,
-            line=("mix: pairs", "{mix}: {group} ({pairs})"),
-            columns=_label,
-            contents={"": "{noisy_db:.2f} / {mean_db:.2f}"},
-        )
+        line, values = "mix: pairs = {mix}: {group} ({pairs})", "{noisy_db:.2f} / {mean_db:.2f}"
+        found[f"groups-{camera}"] = pivot(own, line, "{label}", values)
     return found
-
-
-_COUNTS = {"pairs": "{pairs}", "source groups": "{source_groups}"}
-
-
-def _camera(row: Row) -> str:
-    return _NAMES[row["camera"]]
-
-
-def _label(row: Row) -> str:
-    if not row["preset"]:
-        return row["method"]
-    return f"{row['method']} `{row['preset']}`" + ", w = 1, b = 0" * (not row["body_correction"])

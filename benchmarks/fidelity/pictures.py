@@ -6,22 +6,20 @@ The three situations that the paper shows: low light, high light, and a close sh
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from benchmarks.fidelity.defocus import equal_exposure
-from benchmarks.fidelity.models import load_models
+from benchmarks.fidelity.models import equal_exposure, load_models
 from benchmarks.harness import RUNS, Row, clipped, data_root, psnr, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
 
-CAMERA = "nikon_z6"
 #: The published picture; a quick run leaves it alone.
 IMAGE = ROOT / "docs" / "images" / "simulator_stages.webp"
 QUICK_IMAGE = RUNS / "simulator" / "simulator_stages.webp"
@@ -48,14 +46,9 @@ CASES: dict[str, tuple[dict[str, tuple[float, float]], Any, Any]] = {
 
 def measure(seed: int, quick: bool) -> list[Row]:
     """Draws the picture; one row per situation with its settings and PSNR."""
-    profile = get_camera(CAMERA)
-    scenes = {
-        scene.scene_id: scene
-        for scene in (
-            *reference_scenes("test", profile, number=0, data=data_root()),
-            *depth_photographs(profile, data=None),
-        )
-    }
+    camera = get_camera("nikon_z6")
+    found = list(reference_scenes("test", camera, number=0, data=data_root()))
+    scenes = {s.scene_id: s for s in (*found, *depth_photographs(camera, data=None))}
     figure = Figure(figsize=(13.0, 2.5 * len(CASES)), dpi=80, layout="constrained")
     axes, rows = figure.subplots(len(CASES), len(COLUMNS), squeeze=False), []
     for line, (case, (crops, source, target)) in zip(axes, CASES.items(), strict=True):
@@ -71,29 +64,24 @@ def _photographed(
     scene: ReferenceScene, source_at: Any, target_at: Any, seed: int
 ) -> tuple[Row, list[np.ndarray]]:
     """Settings and PSNR, and the developed pictures (H, W, 3) in the order of `COLUMNS`."""
-    profile = get_camera(CAMERA)
+    profile, settings = get_camera("nikon_z6"), []
     camera = ReferenceCamera(profile)
-    settings = [_settings(scene, *wanted) for wanted in (source_at, target_at)]
-    captures = [camera.capture(scene, s, seed + i) for i, s in enumerate(settings)]
-    source = RawImage(captures[0].sample, settings[0], profile, white_balance=scene.white_balance)
+    for iso, f_number, ev in (source_at, target_at):
+        right = equal_exposure(scene.reference, iso, f_number).exposure_time
+        settings.append(CameraSettings(iso, 2.0 ** round(math.log2(right) + ev), f_number))
+    taken, wanted = (camera.capture(scene, s, seed + i) for i, s in enumerate(settings))
+    source = RawImage(taken.sample, settings[0], profile, white_balance=scene.white_balance)
     stages = load_models().simulators["compact"].stages(source, settings[1], seed=seed + 2)
     before = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
     row: Row = {"scene": scene.scene_id, "illuminance": scene.illuminance}
     row |= {"source": str(settings[0]), "target": str(settings[1])}
-    row["psnr_db"] = {k: psnr(clipped(v, profile), captures[1].mean) for k, v in before.items()}
-    sample = captures[1].sample
-    shown = (sample, source.data, stages.exposed, stages.denoised, stages.capture, sample)
-    return row, [_developed(data, source) for data in shown]
-
-
-def _settings(scene: ReferenceScene, iso: float, f_number: float, ev: float) -> CameraSettings:
-    right = equal_exposure(scene.reference, iso, f_number).exposure_time
-    return CameraSettings(iso, 2.0 ** round(math.log2(right) + ev), f_number)
-
-
-def _developed(data: torch.Tensor, like: RawImage) -> np.ndarray:
-    raw = RawImage(data, like.settings, like.camera, white_balance=like.white_balance)
-    return render_srgb(raw, demosaic="half").permute(1, 2, 0).numpy()  # a pixel a packed pixel
+    row["psnr_db"] = {k: psnr(clipped(v, profile), wanted.mean) for k, v in before.items()}
+    shown = (wanted.sample, source.data, stages.exposed, stages.denoised, stages.capture)
+    pictures = [  # a pixel a packed pixel
+        render_srgb(replace(source, data=data), demosaic="half").permute(1, 2, 0).numpy()
+        for data in (*shown, wanted.sample)
+    ]
+    return row, pictures
 
 
 def _draw(axes: Any, row: Row, pictures: list[np.ndarray], middle: tuple[float, float]) -> None:
@@ -116,7 +104,7 @@ def _draw(axes: Any, row: Row, pictures: list[np.ndarray], middle: tuple[float, 
 
 def tables(rows: list[Row]) -> dict[str, str]:
     """Settings and PSNR of the pictures."""
-    columns = {"situation": "{case}", "scene": "{scene}", "light [lux]": "{illuminance:g}"}
-    columns |= {"input": "{source}", "simulated": "{target}"}
-    columns |= {name: f"{{psnr_db[{name}]:.2f}}" for name in ("EXP", "NS", "Full")}
+    columns = """situation = {case} | scene = {scene} | light [lux] = {illuminance:g} |
+    input = {source} | simulated = {target} | EXP = {psnr_db[EXP]:.2f} | NS = {psnr_db[NS]:.2f} |
+    Full = {psnr_db[Full]:.2f}"""
     return {"pictures": table(rows, columns)}

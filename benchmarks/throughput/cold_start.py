@@ -7,20 +7,16 @@ import os
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 from statistics import median
 
 from benchmarks.harness import Row, quartiles
 from benchmarks.isolated import CORES
-from benchmarks.throughput.steps import ID
+from benchmarks.throughput.worker import ID
 from simulator.utils.cache import CACHE_VARIABLE
 
 #: Cases, and how often each is measured, quick and in full.
-CASES = ("nothing cached", "all but scenes cached")
-REPEATS = (1, 5)
-#: Episodes after the first, in which motion comes up.
-EPISODES = 8
-#: The times of a row, in seconds.
+CASES, REPEATS = ("nothing cached", "all but scenes cached"), (1, 5)
+#: The times of a row, in seconds; the last are more episodes, in which motion comes up.
 TIMES = ("import", "make", "reset", "step", "episodes")
 _PROGRAM = f"""
 import json, time
@@ -35,7 +31,7 @@ lap()
 env.step(0)
 lap()
 cpu = time.process_time()
-for episode in range({EPISODES}):
+for episode in range(8):
     env.reset()
     for action in range(0, 64, 8):
         env.step(action)
@@ -46,27 +42,21 @@ print(json.dumps([after - before for before, after in zip(times, times[1:])] + [
 
 def measure_cold_start(quick: bool) -> list[Row]:
     """A row for each of `CASES`: medians of the `TIMES` of fresh processes, and of their sum."""
-    found: dict[str, list[dict[str, float]]] = {case: [] for case in CASES}
+    found: dict[str, list[list[float]]] = {case: [] for case in CASES}
     for _ in range(REPEATS[not quick]):
         with tempfile.TemporaryDirectory() as folder:
+            caches = {"NUMBA_CACHE_DIR": f"{folder}/kernels", CACHE_VARIABLE: f"{folder}/cache"}
             for case in CASES:
-                found[case].append(_episode(Path(folder)))
+                output = subprocess.check_output(
+                    [sys.executable, "-c", _PROGRAM], env=os.environ | caches
+                )
+                found[case].append(json.loads(output.splitlines()[-1]))
     rows = []
     for case, runs in found.items():
-        low, middle, high = quartiles([sum(run[name] for name in TIMES[:-1]) for run in runs])
-        times = {f"{name}_s": median(run[name] for run in runs) for name in (*TIMES, "cpu")}
-        row = {"case": case, "threads": CORES, "total_s": middle, **times}
+        low, middle, high = quartiles([sum(run[:4]) for run in runs])
+        row: Row = {"case": case, "threads": CORES, "total_s": middle}
+        row |= {
+            f"{name}_s": median(run[i] for run in runs) for i, name in enumerate((*TIMES, "cpu"))
+        }
         rows.append(row | {"spread": (high - low) / middle})
     return rows
-
-
-def _episode(folder: Path) -> dict[str, float]:
-    variables = {"NUMBA_CACHE_DIR": str(folder / "kernels"), CACHE_VARIABLE: str(folder / "cache")}
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM],
-        env=os.environ | variables,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return dict(zip((*TIMES, "cpu"), json.loads(done.stdout.splitlines()[-1]), strict=True))

@@ -54,7 +54,7 @@ def parts(quick: bool) -> Iterator[Part]:
 
 
 def rows(results: dict[str, Any]) -> list[Row]:
-    """One row per file and case."""
+    """One row per file and case; parts of other kinds have no file in their names."""
     found = []
     for label, row in results.items():
         if label.startswith("frame|"):
@@ -78,10 +78,11 @@ def simulate(path: str, case: str, passes: int) -> Row:
     memory for; ``seconds`` the median of those that follow, if any, and ``stages`` the last one's.
     """
     weights, depth, target, noise = CASES[case]
+    settings, simulator = CameraSettings(*target), CameraSimulator()
     options: dict[str, Any] = {"noise": noise}
-    settings, simulator, times = CameraSettings(*target), CameraSimulator(), []
     if weights is not None:
         simulator = CameraSimulator.from_pretrained(weights, cache=None)
+    seconds = []
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out.dng"
         _write_foreign_dng(out, *SMALL)
@@ -94,21 +95,15 @@ def simulate(path: str, case: str, passes: int) -> Row:
             result = simulator.simulate(prepared, settings, **options)
             clock.append(time.perf_counter())
             write_dng(out, result)
-            times.append([*clock, time.perf_counter()])
+            clock.append(time.perf_counter())
+            seconds.append(clock[-1] - clock[0])
             megapixels = 4e-6 * raw.data[0].numel()
             modules, peak = list(prepared.plan(settings).modules), peak_memory()
             del raw, prepared, result
-    seconds = [clock[-1] - clock[0] for clock in times[1:]]
-    last = times[-1]
-    return {
-        "megapixels": megapixels,
-        "first": seconds[0],
-        "seconds": statistics.median(seconds[1:] or seconds),
-        "peak_mib": peak,
-        "stages": {name: last[i + 1] - last[i] for i, name in enumerate(STAGES)},
-        "networks": weights is not None,
-        "modules": modules,
-    }
+    row: Row = {"megapixels": megapixels, "first": seconds[1], "peak_mib": peak, "modules": modules}
+    row |= {"seconds": statistics.median(seconds[2:] or seconds[1:])}
+    row |= {"stages": {name: clock[i + 1] - clock[i] for i, name in enumerate(STAGES)}}
+    return row | {"networks": weights is not None}
 
 
 def libraw(path: str) -> dict[str, float]:

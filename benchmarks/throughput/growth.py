@@ -17,14 +17,8 @@ from scipy.stats import linregress
 import ae_env  # noqa: F401  registers the environment
 from benchmarks.harness import Part, Row
 from benchmarks.isolated import forget_peak, median_seconds, peak_memory, timed
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    get_camera,
-)
+from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, PreparedScene, RawImage
+from simulator.camera import get_camera
 from simulator.optics.blur import disc_blur
 from simulator.radiance.procedural import dead_leaves
 
@@ -35,7 +29,6 @@ STATES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 _LEAST = (0.1, 0.6)
 #: Memory below this is that of the allocator's own steps [MiB].
 MEMORY_FLOOR = 4.0
-CAMERA = "nikon_z6"
 #: Side of the picture that is repeated, mirrored, over a larger frame [packed pixel], and diameter
 #: of the circle of confusion where it is out of focus.
 _TILE, _DEFOCUS = 512, 4.0
@@ -66,22 +59,32 @@ def curves(results: dict[str, Any]) -> list[Row]:
             found.setdefault((against, name), []).append(point)
     rows = []
     for (against, name), points in found.items():
-        x = [point["x"] for point in points]
-        fits = {
-            key: fitted_exponent(x, [p[key] for p in points], floor=MEMORY_FLOOR * (key == "mib"))
-            for key in points[0]
-            if key != "x"
+        row: Row = {"name": name, "against": against, "points": points}
+        row["exponents"] = {
+            key: fitted_exponent([(point["x"], point[key]) for point in points], floor)
+            for key, floor in (("seconds", 0.0), ("mib", MEMORY_FLOOR))
         }
-        rows.append({"name": name, "against": against, "points": points, "exponents": fits})
+        rows.append(row)
     return rows
+
+
+def fitted_exponent(points: list[tuple[float, float]], floor: float) -> list[float] | None:
+    """Exponent k of y ~ x^k over the upper two decades of x, and its standard error.
+
+    Values at or below `floor` do not count; None with fewer than three points.
+    """
+    most = max(x for x, _ in points)
+    used = [(x, y) for x, y in points if y > floor and 100 * x >= 0.999 * most]
+    if len(used) < 3:
+        return None
+    fit = linregress(*np.log10(used).T)
+    return [float(fit.slope), float(fit.stderr)]
 
 
 # -- the points, each run in a process of its own --------------------------------------------------
 
 
-def measure_pixels(
-    height: int, width: int, weights: str | None, *, quick: bool
-) -> dict[str, float]:
+def measure_pixels(height: int, width: int, weights: str | None, quick: bool) -> Row:
     """`simulate` of one raw at one state: time and memory, the raw itself included."""
     simulator, settings, depth = CameraSimulator(), CameraSettings(1600, 1 / 256, 8.0), "far"
     if weights is not None:  # to cleaner settings and a wider aperture, so that both are needed
@@ -89,7 +92,8 @@ def measure_pixels(
         settings, depth = CameraSettings(100, 1 / 16, 4.0), "unknown"
     options: dict[str, Any] = {"depth": depth}
     simulator.simulate(noisy_raw(64, 64), settings, **options)
-    before = _held()
+    forget_peak()
+    before = peak_memory()
     raw = noisy_raw(height, width)
     forget_peak()
     seconds = [timed(lambda: simulator.simulate(raw, settings, **options))]
@@ -99,7 +103,7 @@ def measure_pixels(
     return {"x": 4.0 * height * width, "seconds": float(np.median(seconds)), "mib": memory}
 
 
-def measure_states(count: int, noise: Any, *, quick: bool) -> dict[str, float]:
+def measure_states(count: int, noise: Any, quick: bool) -> Row:
     """A sweep of a clean 128 x 128 scene over `count` states: time, and memory of the frames."""
     raw, clean = noisy_raw(128, 128), NoiseLevelFunction.zero()
     prepared = PreparedScene(raw.data.clamp(min=0.0), raw.settings, raw.camera, clean)
@@ -107,17 +111,10 @@ def measure_states(count: int, noise: Any, *, quick: bool) -> dict[str, float]:
     states = [CameraSettings(100 * 2**i, 2.0 ** (-t - 2), 2 ** (1 + n / 2)) for i, t, n in every]
     states = [states[i] for i in np.random.default_rng(0).permutation(len(states))[:count]]
     prepared.expose(states[:1], noise=noise)
-    before = _held()
+    forget_peak()
+    before = peak_memory()
     seconds = median_seconds(lambda: prepared.expose(states, noise=noise), least=_LEAST[not quick])
     return {"x": float(count), "seconds": seconds, "mib": peak_memory() - before}
-
-
-def _held() -> float:
-    forget_peak()
-    return peak_memory()
-
-
-# -- raws and the fit ------------------------------------------------------------------------------
 
 
 def noisy_raw(height: int, width: int) -> RawImage:
@@ -126,7 +123,7 @@ def noisy_raw(height: int, width: int) -> RawImage:
     In focus on the left of each tile, out of focus on the right.
     """
     settings = CameraSettings(400, 1 / 64, 8.0)
-    camera, rng = get_camera(CAMERA), np.random.default_rng(0)
+    camera, rng = get_camera("nikon_z6"), np.random.default_rng(0)
     red, green, blue = dead_leaves(rng, _TILE)
     tile = torch.from_numpy(np.stack([red * 0.5, green, green, blue * 0.6]))  # a sensor's, roughly
     tile[..., _TILE // 2 :] = disc_blur(tile, _DEFOCUS)[..., _TILE // 2 :]
@@ -134,25 +131,9 @@ def noisy_raw(height: int, width: int) -> RawImage:
     data = np.empty((4, height, width), np.float32)
     for plane, part in enumerate(data):  # little more memory than the raw itself
         part[:] = np.pad(tile[plane].numpy(), more, mode="symmetric")[:height, :width]
-        part += np.sqrt(part * noise.shot[plane] + noise.read[plane]) * rng.standard_normal(
-            part.shape, dtype=np.float32
-        )
-    span, black = (np.array(v, np.float32) for v in (camera.span, camera.black_level))
-    for plane, part in enumerate(data):
-        numbers = np.rint(part * span[plane] + black[plane]).clip(0, camera.white_level)
-        part[:] = (numbers - black[plane]) / span[plane]
+        normals = rng.standard_normal(part.shape, dtype=np.float32)
+        part += np.sqrt(part * noise.shot[plane] + noise.read[plane]) * normals
+        span, black = (np.float32(v[plane]) for v in (camera.span, camera.black_level))
+        numbers = np.rint(part * span + black).clip(0, camera.white_level)
+        part[:] = (numbers - black) / span
     return RawImage(torch.from_numpy(data), settings, camera)
-
-
-def fitted_exponent(
-    x: list[float], y: list[float], *, floor: float = 0.0
-) -> tuple[float, float] | None:
-    """Exponent k of y ~ x^k over the upper two decades of x, and its standard error.
-
-    Values at or below `floor` do not count; None with fewer than three points.
-    """
-    points = [(a, b) for a, b in zip(x, y, strict=True) if b > floor and 100 * a >= 0.999 * max(x)]
-    if len(points) < 3:
-        return None
-    fit = linregress(*np.log10(points).T)
-    return float(fit.slope), float(fit.stderr)

@@ -24,10 +24,10 @@ _CODES = _F(255 / math.sqrt(1 + 1 / 1024))
 #: Samples that are worked on at a time, and to which the start of each such run is rounded.
 _RUN, _GRAIN = 256, 16
 _BANK = 2**20
-_FAST = {"nnan", "ninf", "nsz", "contract"}
 
-
-_compiled = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy")
+_compiled = numba.njit(
+    nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"}, error_model="numpy"
+)
 
 
 @_compiled
@@ -63,24 +63,14 @@ def _loop(light, ratio, shot, read, bank, exact, state, out):  # type: ignore[no
 
 
 class KernelLimit:
-    """The bare loop over a batch of frames.
+    """The bare loop over a batch of frames, shared out among threads.
 
-    Args:
-        lights: (S, 4, H, W) float32, what frames are exposed from.
-        num_frames: Frames of a step, each of a light drawn at random.
-        noise: ``"bank"`` reads normals from a table, ``"exact"`` draws new ones.
-        threads: Among which the frames of a step are shared out.
-        seed: Of lights, exposure ratios and noise.
+    Frames of a step are exposed from `lights` (S, 4, H, W), drawn at random. With the noise
+    ``"bank"`` normals are read from a table, with ``"exact"`` new ones are drawn.
     """
 
     def __init__(
-        self,
-        lights: np.ndarray,
-        num_frames: int,
-        *,
-        noise: str,
-        threads: int = 1,
-        seed: int = 0,
+        self, lights: np.ndarray, num_frames: int, *, noise: str, threads: int, seed: int
     ) -> None:
         self._rng = np.random.default_rng(seed)
         self._lights = np.ascontiguousarray(lights.reshape(*lights.shape[:2], -1))
@@ -91,7 +81,6 @@ class KernelLimit:
         self._states = [np.uint64(seed + i + 1) for i in range(threads)]
         # Variances of the order of those of a camera at ISO 400.
         self._shot, self._read = np.full(4, 1e-4, _F), np.full(4, 1e-6, _F)
-        self._threads = threads
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def step(self) -> np.ndarray:
@@ -99,15 +88,17 @@ class KernelLimit:
         count = len(self._flat)
         self._chosen = self._rng.integers(len(self._lights), size=count)
         self._ratios = self._rng.uniform(0.1, 2.0, count).astype(_F)
-        if self._pool is None:
-            self._share(0)
-        else:
-            list(self._pool.map(self._share, range(self._threads)))
+        threads = range(len(self._states))
+        list(
+            map(self._share, threads)
+            if self._pool is None
+            else self._pool.map(self._share, threads)
+        )
         return self._out
 
     def _share(self, thread: int) -> None:
         state = self._states[thread]
-        for i in range(thread, len(self._flat), self._threads):
+        for i in range(thread, len(self._flat), len(self._states)):
             args = (self._lights[self._chosen[i]], self._ratios[i], self._shot, self._read)
             state = np.uint64(_loop(*args, self._bank, self._exact, state, self._flat[i]))
         self._states[thread] = state

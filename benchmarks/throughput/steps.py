@@ -1,13 +1,13 @@
-"""Environment steps per second beside the kernel limit, copies of the environment, and a lookup."""
+"""Environment steps per second beside the kernel limit, copies and a lookup; and resets."""
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -18,12 +18,11 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 import ae_env  # noqa: F401  registers the environment
 from ae_env.scorers import Captures
 from benchmarks.harness import Row, quartiles
+from benchmarks.isolated import timed
 from benchmarks.throughput.kernel_limit import KernelLimit, lookup
+from benchmarks.throughput.worker import CACHED, ID, warm_environments
 
-ID = "ae_env/AutoExposure-v0"
 SCENES = "bundled:small"
-#: Neither motion nor defocus: every frame is exposed from the scene's own light.
-CACHED: dict[str, Any] = {"motion": "none", "depth": "far"}
 #: Rounds, and seconds that a case takes in each.
 QUICK, FULL = (3, 0.08), (9, 0.3)
 #: Names of the limits that others are compared with.
@@ -44,17 +43,10 @@ class LiveScore:
 
 @dataclass
 class Case:
-    """One thing to time: `step` makes `num_envs` frames.
+    """One thing to time: `step` makes `num_envs` frames; `noise` names its kernel limit.
 
-    Args:
-        name: In the table.
-        num_envs: Frames of one step.
-        step: What is timed.
-        noise: Names the kernel that it is compared with.
-        observation: What the environment shows.
-        error: Largest difference of a code between an episode in the batch and the same one alone.
-        close: Called at the end.
-        seconds: Time per frame, one for each round.
+    `error` is the largest difference of a code between an episode in a batch and the same alone;
+    `seconds` the time per frame, one for each round.
     """
 
     name: str
@@ -72,7 +64,12 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
     torch.set_num_threads(1)  # while children are forked: threads would not come along
     cases = [_copies(8 if quick else 64, size, seed)] if threads > 1 else []
     torch.set_num_threads(threads)
-    cases += [*_limits(threads, size, seed), *_environments(size, seed, threads > 1)]
+    scenes: Any = gym.make(ID, scenes=SCENES, resolution=size).unwrapped
+    lights = np.stack([scene.light.numpy() for scene in scenes.scenes])
+    for noise, name in KERNEL.items():
+        kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
+        cases.append(Case(name, 64, kernel.step, noise))
+    cases += [Case(LOOKUP, 64, lookup((4, size, size), 64, seed)), *_cases(size, seed, threads > 1)]
     try:
         _measure(cases, *(QUICK if quick else FULL))
     finally:
@@ -84,16 +81,7 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
 # -- the cases ------------------------------------------------------------------------------------
 
 
-def _limits(threads: int, size: int, seed: int) -> Iterator[Case]:
-    scenes: Any = gym.make(ID, scenes=SCENES, resolution=size).unwrapped
-    lights = np.stack([scene.light.numpy() for scene in scenes.scenes])
-    for noise, name in KERNEL.items():
-        kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
-        yield Case(name, 64, kernel.step, noise)
-    yield Case(LOOKUP, 64, lookup((4, size, size), 64, seed))
-
-
-def _environments(size: int, seed: int, full: bool) -> Iterator[Case]:
+def _cases(size: int, seed: int, full: bool) -> Iterator[Case]:
     """Cases of the environment itself; without `full` only the chief ones."""
     live, exact = {"scorer": f"{__name__}:LiveScore"}, {"noise": "exact"}
     # An episode of 8 steps takes 9 frames; the kernel takes one per step.
@@ -107,9 +95,10 @@ def _environments(size: int, seed: int, full: bool) -> Iterator[Case]:
         ("vector env, motion and defocus", 64, {}),
     ]
     if full:
-        for observation in ("linear", "dn"):
-            name = f"vector env, cached scene, {observation}"
-            cases.append((name, 64, CACHED | {"observation": observation}))
+        for shown in ("linear", "dn"):
+            cases.append(
+                (f"vector env, cached scene, {shown}", 64, CACHED | {"observation": shown})
+            )
         for lighting in ("sine", "flicker"):
             name = f"vector env, motion and defocus, {lighting} light"
             cases.append((name, 64, {"lighting": lighting}))
@@ -119,27 +108,13 @@ def _environments(size: int, seed: int, full: bool) -> Iterator[Case]:
             cases.append(("vector env, motion and defocus", count, {}))
     for name, count, options in cases:
         make: dict[str, Any] = {"scenes": SCENES, "resolution": size} | options
-        yield _single(name, make, seed) if count == 1 else _batch(name, count, make, seed)
-
-
-def _single(name: str, make: dict[str, Any], seed: int) -> Case:
-    env, rng = warm_environment(make, seed), np.random.default_rng(seed)
-
-    def step() -> None:
-        if env.step(rng.integers(64))[3]:
-            env.reset()
-
-    return Case(name, 1, step, make.get("noise", "bank"))
-
-
-def _batch(name: str, num_envs: int, make: dict[str, Any], seed: int) -> Case:
-    envs = gym.make_vec(ID, num_envs=num_envs, autoreset_mode="SAME_STEP", **make)
-    scenes = len(envs.unwrapped.scenes)  # type: ignore[attr-defined]
-    for first in range(0, scenes, num_envs):  # everything that is computed once for a scene
-        chosen = [(first + i) % scenes for i in range(num_envs)]
-        envs.reset(seed=seed, options={"scene": chosen})
-    error, shown = _largest_difference(envs, make, seed), make.get("observation", "uint8")
-    return Case(name, num_envs, _stepper(envs, seed), make.get("noise", "bank"), shown, error)
+        noise, shown = make.get("noise", "bank"), make.get("observation", "uint8")
+        if count == 1:
+            yield Case(name, 1, _stepper(warm_environments(1, make, seed), seed), noise)
+            continue
+        envs = warm_environments(count, make | {"autoreset_mode": "SAME_STEP"}, seed)
+        error = _largest_difference(envs, make, seed)
+        yield Case(name, count, _stepper(envs, seed), noise, shown, error)
 
 
 def _copies(count: int, size: int, seed: int) -> Case:
@@ -149,33 +124,30 @@ def _copies(count: int, size: int, seed: int) -> Case:
     may have run on several threads before.
     """
     options: dict[str, Any] = {"scenes": SCENES, "resolution": size, **CACHED}
-    make = functools.partial(_copy, options)
-    make().close()
+    warm_environments(1, options).close()
     context = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-    mode = AutoresetMode.SAME_STEP
-    envs = AsyncVectorEnv([make] * count, context=context, autoreset_mode=mode)
+    copies, mode = [partial(_copy, options)] * count, AutoresetMode.SAME_STEP
+    envs = AsyncVectorEnv(copies, context=context, autoreset_mode=mode)
     error, name = _largest_difference(envs, options, seed), "copies in subprocesses, cached scene"
     return Case(name, count, _stepper(envs, seed), error=error, close=envs.close)
 
 
 def _copy(options: dict[str, Any]) -> gym.Env:
     torch.set_num_threads(1)
-    return warm_environment(options, 0)
-
-
-def warm_environment(make: dict[str, Any], seed: int) -> gym.Env:
-    """An environment that has seen every scene."""
-    env = gym.make(ID, **make)
-    for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
-        env.reset(seed=seed, options={"scene": number})
+    env: gym.Env = warm_environments(1, options)
     return env
 
 
-def _stepper(envs: gym.vector.VectorEnv, seed: int) -> Callable[[], Any]:
-    """A step of `envs` with random actions."""
+def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
+    """A step of `envs` with random actions; a single one is reset where its episode ends."""
     envs.reset(seed=seed)
-    rng = np.random.default_rng(seed)
-    return lambda: envs.step(rng.integers(64, size=envs.num_envs))
+    rng, count = np.random.default_rng(seed), getattr(envs, "num_envs", None)
+
+    def step() -> None:
+        if envs.step(rng.integers(64, size=count))[3] is True:
+            envs.reset()
+
+    return step
 
 
 def _largest_difference(envs: gym.vector.VectorEnv, make: dict[str, Any], seed: int) -> float:
@@ -195,7 +167,7 @@ def _largest_difference(envs: gym.vector.VectorEnv, make: dict[str, Any], seed: 
 # -- measuring ------------------------------------------------------------------------------------
 
 
-def _measure(cases: Sequence[Case], rounds: int, slice_seconds: float) -> None:
+def _measure(cases: list[Case], rounds: int, slice_seconds: float) -> None:
     """Case after case, round after round; the first round warms up and sets the repeats."""
     repeats = [1] * len(cases)
     for i in range(rounds + 1):
@@ -206,29 +178,45 @@ def _measure(cases: Sequence[Case], rounds: int, slice_seconds: float) -> None:
             elapsed = time.perf_counter() - start
             if i:
                 case.seconds.append(elapsed / (repeats[k] * case.num_envs))
-                continue
-            start = time.perf_counter()
-            case.step()  # warm now
-            # Whole episodes, so that resets have their share.
-            count = slice_seconds / (time.perf_counter() - start)
-            repeats[k] = 8 * max(1, round(count / 8))
+            else:  # warm now; whole episodes, so that resets have their share
+                repeats[k] = 8 * max(1, round(slice_seconds / timed(case.step) / 8))
 
 
-def _rows(cases: Sequence[Case], threads: int, size: int) -> list[Row]:
-    limits = {case.name: case.seconds for case in cases}
-
-    def ratio(case: Case, limit: str) -> float:
-        pairs = zip(limits[limit], case.seconds, strict=True)
-        return statistics.median(least / own for least, own in pairs)
-
-    rows = []
+def _rows(cases: list[Case], threads: int, size: int) -> list[Row]:
+    limits, rows = {case.name: case.seconds for case in cases}, []
     for case in cases:
         low, middle, high = quartiles(case.seconds)
         row: Row = {"case": case.name, "num_envs": case.num_envs, "observation": case.observation}
-        row |= {
-            "steps_per_second": 1.0 / middle,
-            "ratio_to_kernel": ratio(case, KERNEL[case.noise]),
-        }
-        row |= {"ratio_to_lookup": ratio(case, LOOKUP), "spread": (high - low) / middle}
+        row |= {"steps_per_second": 1.0 / middle, "spread": (high - low) / middle}
+        for name, limit in (("kernel", KERNEL[case.noise]), ("lookup", LOOKUP)):
+            pairs = zip(limits[limit], case.seconds, strict=True)
+            row[f"ratio_to_{name}"] = statistics.median(least / own for least, own in pairs)
         rows.append(row | {"error_codes": case.error, "size": size, "threads": threads})
+    return rows
+
+
+# -- resets: with 8 frames an episode, one frame in nine -------------------------------------------
+
+#: Environments, episodes that warm up after each scene has been seen, and episodes that are timed.
+RESETS, QUICK_RESETS = ((1, 500, 400), (64, 100, 100)), ((1, 20, 20), (64, 5, 5))
+
+
+def measure_resets(seed: int, quick: bool) -> list[Row]:
+    """Rows of one environment and of 64, in motion and out of focus, with random actions."""
+    rows = []
+    for num_envs, warm, number in QUICK_RESETS if quick else RESETS:
+        envs = warm_environments(num_envs, {"max_episode_steps": None}, seed).unwrapped
+        rng, resets, steps = np.random.default_rng(seed), [], []
+        for _ in range(warm):
+            envs.reset()
+        for _ in range(number):
+            resets.append(timed(envs.reset))
+            for _ in range(8):
+                actions = rng.integers(64, size=num_envs if num_envs > 1 else None)
+                steps.append(timed(partial(envs.step, actions)))
+        (low, reset, high), (_, step, _) = quartiles(resets), quartiles(steps)
+        row: Row = {"case": "vector env" if num_envs > 1 else "one environment"}
+        row |= {"num_envs": num_envs, "reset_ms": reset * 1e3, "step_ms": step * 1e3}
+        row |= {"ratio": reset / step, "spread": (high - low) / reset}
+        rows.append(row | {"ratio_of_means": float(np.mean(resets) / np.mean(steps))})
     return rows

@@ -12,7 +12,6 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +23,22 @@ import ae_env
 import simulator
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 
+ID = "ae_env/AutoExposure-v0"
+#: Neither motion nor defocus: every frame is exposed from the scene's own light.
+CACHED: dict[str, Any] = {"motion": "none", "depth": "far"}
 #: Steps of an episode; cases run whole episodes, so that resets have their share.
 _EPISODE = 8
-_CACHED = {"motion": "none", "depth": "far"}
 _SINE = {"lighting": "sine"}
 #: Name -> number of environments and arguments of the environment.
 STEPS: dict[str, tuple[int, dict[str, Any]]] = {
-    "steps, cached scene": (64, _CACHED),
+    "steps, cached scene": (64, CACHED),
     "steps, motion and defocus": (64, {}),
-    "steps, cached scene, sine lighting": (64, _CACHED | _SINE),
+    "steps, cached scene, sine lighting": (64, CACHED | _SINE),
     "steps, motion and defocus, sine lighting": (64, _SINE),
-    "steps, cached scene, exact noise": (64, {"noise": "exact"} | _CACHED),
-    "steps, cached scene, linear observation": (64, {"observation": "linear"} | _CACHED),
+    "steps, cached scene, exact noise": (64, {"noise": "exact"} | CACHED),
+    "steps, cached scene, linear observation": (64, {"observation": "linear"} | CACHED),
     "steps, motion and defocus, flicker": (64, {"lighting": "flicker"}),
-    "steps, one environment, cached scene": (1, _CACHED),
+    "steps, one environment, cached scene": (1, CACHED),
     "steps, one environment, motion and defocus": (1, {}),
 }
 #: Name -> height and width of the raw, kind of noise, and what is repeated.
@@ -51,63 +52,38 @@ SWEEPS: dict[str, tuple[int, str, str]] = {
     for side in sides
     for noise in ("exact", "bank")
 }
+#: What is timed, environment steps or sweeps of one call, and frames that checkouts must agree on.
+Case = tuple[Callable[[], Any], int, np.ndarray]
 
 
-@dataclass
-class Case:
-    """One thing to time.
-
-    Args:
-        run: Makes `frames` frames.
-        frames: Environment steps, or sweeps, of one call.
-        first: Frames that two checkouts must agree on, made before anything is timed.
-    """
-
-    run: Callable[[], Any]
-    frames: int
-    first: np.ndarray
-
-    def time(self, seconds: float) -> dict[str, float]:
-        """Wall and processor time per frame [s], over `seconds` or a little more."""
-        begin, begin_cpu, calls = time.perf_counter(), time.process_time(), 0
-        while (elapsed := time.perf_counter() - begin) < seconds or not calls:
-            self.run()
-            calls += 1
-        frames = calls * self.frames
-        return {"wall": elapsed / frames, "cpu": (time.process_time() - begin_cpu) / frames}
+def warm_environments(num_envs: int, make: dict[str, Any], seed: int = 0) -> Any:
+    """One environment, or a batch of them, after all that is computed once for a scene."""
+    many = num_envs > 1
+    envs: Any = gym.make_vec(ID, num_envs=num_envs, **make) if many else gym.make(ID, **make)
+    scenes = len(envs.unwrapped.scenes)
+    for first in range(0, scenes, num_envs):
+        chosen = [(first + i) % scenes for i in range(num_envs)]
+        envs.reset(seed=seed, options={"scene": chosen if many else first})
+    return envs
 
 
 def _steps(num_envs: int, options: dict[str, Any]) -> Case:
     """Steps of `num_envs` environments of 64 x 64 with random actions."""
-    make: dict[str, Any] = {"scenes": "bundled:small", "resolution": 64} | options
-    rng = np.random.default_rng(0)
-    if num_envs == 1:
-        env = gym.make("ae_env/AutoExposure-v0", **make)
-        for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
-            env.reset(seed=0, options={"scene": number})
-        frames = [env.reset(seed=1)[0]["raw"], *(env.step(a)[0]["raw"] for a in (0, 21, 42, 63))]
-
-        def episode() -> None:
-            env.reset()
-            for _ in range(_EPISODE):
-                env.step(rng.integers(64))
-
-        return Case(episode, _EPISODE, np.stack(frames))
-    make["autoreset_mode"] = "SAME_STEP"
-    envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **make)
-    scenes = len(envs.unwrapped.scenes)  # type: ignore[attr-defined]
-    for first in range(0, scenes, num_envs):  # everything that is computed once for a scene
-        chosen = [(first + i) % scenes for i in range(num_envs)]
-        envs.reset(seed=0, options={"scene": chosen})
-    frames = [envs.reset(seed=1)[0]["raw"]]
-    frames += [envs.step(np.full(num_envs, a))[0]["raw"] for a in (0, 21, 42, 63)]
+    many = num_envs > 1
+    make = {"scenes": "bundled:small", "resolution": 64} | options
+    envs = warm_environments(num_envs, make | ({"autoreset_mode": "SAME_STEP"} if many else {}))
+    frames, rng = [envs.reset(seed=1)[0]["raw"]], np.random.default_rng(0)
+    for action in (0, 21, 42, 63):
+        frames.append(envs.step(np.full(num_envs, action) if many else action)[0]["raw"])
     envs.reset(seed=2)
 
-    def episodes() -> None:
+    def episode() -> None:
+        if not many:
+            envs.reset()
         for _ in range(_EPISODE):
-            envs.step(rng.integers(64, size=num_envs))
+            envs.step(rng.integers(64, size=num_envs if many else None))
 
-    return Case(episodes, _EPISODE * num_envs, np.stack(frames))
+    return episode, _EPISODE * num_envs, np.stack(frames)
 
 
 def _sweep(side: int, noise: Any, kind: str) -> Case:
@@ -125,16 +101,15 @@ def _sweep(side: int, noise: Any, kind: str) -> Case:
         return prepared.expose(grid, noise=noise)
 
     def simulate() -> torch.Tensor:
-        return torch.stack(
-            [camera_simulator.simulate(raw, settings, noise=noise).data for settings in grid]
-        )
+        frames = (camera_simulator.simulate(raw, s, noise=noise).data for s in grid)
+        return torch.stack(list(frames))
 
     def blurred() -> torch.Tensor:
         again = camera_simulator.prepare(raw, image_speed=0.2, defocus=6.0)
         return again.expose(grid, noise=noise)
 
-    run = {"expose": expose, "simulate": simulate, "blurred": blurred}[kind]
-    return Case(run, 1, run().numpy())
+    call = {"expose": expose, "simulate": simulate, "blurred": blurred}[kind]
+    return call, 1, call().numpy()
 
 
 def _raw(side: int) -> RawImage:
@@ -150,6 +125,16 @@ def _raw(side: int) -> RawImage:
     return RawImage(data.contiguous(), settings, camera)
 
 
+def _timed(call: Callable[[], Any], frames: int, seconds: float) -> dict[str, float]:
+    """Wall and processor time per frame [s], over `seconds` or a little more."""
+    begin, begin_cpu, calls = time.perf_counter(), time.process_time(), 0
+    while (elapsed := time.perf_counter() - begin) < seconds or not calls:
+        call()
+        calls += 1
+    frames *= calls
+    return {"wall": elapsed / frames, "cpu": (time.process_time() - begin_cpu) / frames}
+
+
 def _answers(folder: Path) -> Iterator[dict[str, Any]]:
     """An answer to every request: which packages run, or how long a case takes."""
     cases: dict[str, Case] = {}
@@ -159,18 +144,13 @@ def _answers(folder: Path) -> Iterator[dict[str, Any]]:
         name = request["case"]
         if name not in cases:
             cases[name] = _steps(*STEPS[name]) if name in STEPS else _sweep(*SWEEPS[name])
-            np.save(folder / "first.npy", cases[name].first)
-        yield cases[name].time(request["seconds"])
+            np.save(folder / "first.npy", cases[name][2])
+        yield _timed(*cases[name][:2], request["seconds"])
 
 
-def main() -> None:
-    """Answers until standard input ends; argument: threads, folder to write first frames to."""
+if __name__ == "__main__":
     torch.set_num_threads(int(sys.argv[1]))
     answers = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # nothing else may come between the answers
         for answer in _answers(Path(sys.argv[2])):
             print(json.dumps(answer), file=answers, flush=True)
-
-
-if __name__ == "__main__":
-    main()

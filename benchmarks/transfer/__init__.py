@@ -13,22 +13,25 @@ that they depend on.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from agents.cli.console import print_files
-from benchmarks.harness import RUNS, FinishedParts, Row, rounded
+from benchmarks.harness import RUNS, FinishedParts, Row, filled_page, origin, rounded
 from benchmarks.isolated import ROOT
-from benchmarks.transfer.agents import agent_rows
-from benchmarks.transfer.report import FILES, write_page
-from benchmarks.transfer.tables import table_rows
+from benchmarks.transfer.agents import agent_rows, agent_tables
+from benchmarks.transfer.tables import score_tables, table_rows
 from benchmarks.transfer.worlds import QUICK, TransferPlan, has_weights, training_set
-from simulator.utils.files import result_meta, write_results
+from simulator.utils.files import result_meta, write_atomically, write_results
 
-PARTS = tuple(FILES)
-#: What the score tables depend on.
-_CODE = ("simulator", "ae_env", "benchmarks/transfer")
+#: Result file of each half, and its tables.
+HALVES: dict[str, tuple[str, Callable[[list[Row]], dict[str, str]]]] = {
+    "agents": ("transfer.json", agent_tables),
+    "tables": ("transfer_tables.json", score_tables),
+}
 
 
 def run(
@@ -52,25 +55,31 @@ def run(
     """
     plan = plan or (QUICK if quick else TransferPlan())
     folder = folder or ROOT / "runs" / ("bench_transfer_quick" if quick else "bench_transfer")
-    finished = FinishedParts(RUNS / "transfer", seed, code=_CODE)
-    measures: dict[str, Callable[[], list[Row]]] = {
-        "agents": lambda: agent_rows(plan, folder, seed=seed),
-        "tables": lambda: table_rows(plan, finished, seed=seed),
-    }
-    for name in PARTS if part is None else (part,):
+    simulators = [name for one in plan.tables for name in one.simulators]
+    for name in HALVES if part is None else (part,):
         command = f"ae-env bench transfer --part {name}{' --quick' * quick}"
-        rows = measures[name]()
-        meta = result_meta(command, seed) | {"quick": quick, "plan": asdict(plan)}
-        meta |= {"training_set": training_set(plan), "left_out": _left_out(plan, name)}
-        path = write_results(out / FILES[name], [rounded(row) for row in rows], meta)
+        finished = FinishedParts(RUNS / "transfer", seed)
+        if name == "agents":
+            rows = agent_rows(plan, folder, seed=seed)
+        else:
+            rows = table_rows(plan, finished, seed=seed)
+        meta: dict[str, Any] = result_meta(command, seed) | {"quick": quick, "plan": asdict(plan)}
+        used = plan.worlds if name == "agents" else tuple(dict.fromkeys(simulators))
+        meta |= {"training_set": training_set(plan)}
+        meta |= {"left_out": [one for one in used if not has_weights(one)]}
+        path = write_results(out / HALVES[name][0], [rounded(row) for row in rows], meta)
         print_files({f"numbers of the {name}": path})
         if name == "tables":  # the next run measures again
             finished.forget()
     print_files({"page": write_page(out)})
 
 
-def _left_out(plan: TransferPlan, half: str) -> list[str]:
-    """Worlds or simulators whose networks are not there."""
-    used = (name for part in plan.tables for name in part.simulators)
-    names = plan.worlds if half == "agents" else dict.fromkeys(used)
-    return [name for name in names if not has_weights(name)]
+def write_page(out: Path) -> Path:
+    """Writes ``transfer.md`` of those result files that are in `out`."""
+    found = dict.fromkeys((*HALVES, *(f"{half}-origin" for half in HALVES), "verdicts"), "")
+    for half, (name, tables) in HALVES.items():
+        if (out / name).is_file():
+            content = json.loads((out / name).read_text(encoding="utf-8"))
+            found |= {f"{half}-origin": origin(content["meta"])} | tables(content["rows"])
+    shown = {name: text or "Not measured in this run." for name, text in found.items()}
+    return write_atomically(out / "transfer.md", filled_page("transfer", shown))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from ae_env.scenes.scene import Crop
 from agents.cli.console import progress_bars
 from agents.evaluation.engine import evaluate
-from agents.evaluation.intervals import Interval, difference_interval, score_interval
+from agents.evaluation.intervals import difference_interval, score_interval
 from agents.evaluation.result import EvaluationResult
 from agents.learning.training import (
     AgentConfig,
@@ -26,7 +26,8 @@ from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from agents.rollouts import make_envs
-from benchmarks.harness import Row
+from benchmarks.ablation import changed_config
+from benchmarks.harness import Row, sections, table
 from benchmarks.isolated import ROOT
 from benchmarks.transfer.worlds import (
     EXP,
@@ -53,13 +54,32 @@ Jobs = dict[tuple[str, str], list[TrainingJob]]
 def agent_rows(plan: TransferPlan, folder: Path, *, seed: int = 0) -> list[Row]:
     """Trains what `folder` does not have, judges all agents; a row for each agent and world.
 
-    `seed` is that of the evaluation; the training seeds are the plan's.
+    The agents of a world together are a row, too, as so many training seeds. `seed` is that of the
+    evaluation; the training seeds are the plan's.
     """
     jobs = training_jobs(plan, folder)
     train(jobs)
-    result = judged(plan, jobs, seed=seed)
-    minutes = {key: [training_seconds(job.out) / 60.0 for job in own] for key, own in jobs.items()}
-    return result_rows(result, minutes, plan)
+    result, gains, rows = judged(plan, jobs, seed=seed), {}, []
+    for agent, world in jobs:  # the span is the same for all
+        gains[agent, world], span = result.group_gains(f"{agent} in {world}")
+    together = len(plan.agents) > 1
+    for world in dict.fromkeys(world for _, world in jobs) if together else ():
+        every = [gains[agent, world] for agent in plan.agents]
+        gains[TOGETHER, world] = np.concatenate(every)
+    for agent in (*plan.agents, *([TOGETHER] if together else [])):
+        for world in (world for name, world in gains if name == agent):
+            members = plan.agents if agent == TOGETHER else (agent,)
+            errors = [result.episode_metrics(f"{one} in {world}") for one in members]
+            taken = [[training_seconds(j.out) / 60 for j in jobs[one, world]] for one in members]
+            row: Row = {"agent": agent, "world": world, "high_iso": WORLDS[world].high_iso}
+            row |= {"simulator": WORLDS[world].simulator, "frames": plan.frames}
+            row |= {"crop": CROP, "scorer": plan.scorer, **comparison(gains, span, agent, world)}
+            row |= {"num_scenes": len(set(result.scene_ids.tolist()))}
+            for name in ("regret", "ev_within_third"):
+                row[name] = float(np.mean([own[name].mean() for own in errors]))
+            row["minutes"] = float(np.mean([np.median(own) for own in taken]))
+            rows.append(row | {"minutes_by_seed": [m for own in taken for m in own]})
+    return rows
 
 
 # -- training -------------------------------------------------------------------------------------
@@ -82,15 +102,9 @@ def training_jobs(plan: TransferPlan, folder: Path) -> Jobs:
 
 
 def _config(plan: TransferPlan, agent: str, world: str) -> AgentConfig:
-    config = load_config(ROOT / "configs" / f"{agent}.yaml")
     options = WORLDS[world].options(training_set(plan)) | common_options(plan)
-    return AgentConfig.model_validate(
-        {
-            **config.model_dump(),
-            "environment": {**config.environment, **options},
-            "training": {**config.training, _FRAMES[agent]: plan.frames},
-        }
-    )
+    config = load_config(ROOT / "configs" / f"{agent}.yaml")
+    return changed_config(config, options, {_FRAMES[agent]: plan.frames})
 
 
 def common_options(plan: TransferPlan) -> dict[str, Any]:
@@ -116,8 +130,7 @@ def train(jobs: Jobs) -> None:
 def _train(job: TrainingJob) -> None:
     """In a worker: trains one agent, and adds the time that it takes to what it took before."""
     last, began = 0, time.perf_counter()
-    resumes = Path(f"{job.out}.checkpoint").is_file()
-    before = training_seconds(job.out) if resumes else 0.0
+    before = training_seconds(job.out) if Path(f"{job.out}.checkpoint").is_file() else 0.0
     job.out.parent.mkdir(parents=True, exist_ok=True)
 
     def report(done: int, total: int, _: Mapping[str, float]) -> None:
@@ -148,68 +161,15 @@ def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult
     """Every agent on the same episodes on held-out scenes, in the truth."""
     scenes = held_out(plan, plan.judged_scenes, CROP)
     options = {"scenes": scenes, "split": "test", **common_options(plan)}
-    envs = make_envs(options, num_envs=1, frames=1)
-    context = PolicyContext.from_envs(envs)
-    envs.close()
+    with closing(make_envs(options, num_envs=1, frames=1)) as envs:
+        context = PolicyContext.from_envs(envs)
     policies = {
-        policy_name(agent, world): [make_policy(f"{agent}:{job.out}", context) for job in own]
+        f"{agent} in {world}": [make_policy(f"{agent}:{job.out}", context) for job in own]
         for (agent, world), own in jobs.items()
     }
     with progress_bars() as progress, progress("evaluation") as task:
-        return evaluate(
-            policies, options, episodes_per_scene=plan.episodes, seed=seed, progress=task
-        )
-
-
-def policy_name(agent: str, world: str) -> str:
-    """Name of an agent in the evaluation."""
-    return f"{agent} in {world}"
-
-
-def result_rows(
-    result: EvaluationResult, minutes: Mapping[tuple[str, str], list[float]], plan: TransferPlan
-) -> list[Row]:
-    """A row for each agent and world, and for all agents of a world together.
-
-    `minutes` is what each seed took to train, by agent and world.
-    """
-    gains = {}
-    for agent, world in minutes:  # the span is the same for all
-        gains[agent, world], span = result.group_gains(policy_name(agent, world))
-    rows = []
-    for (agent, world), taken in minutes.items():
-        errors = result.episode_metrics(policy_name(agent, world))
-        row: Row = {"agent": agent, "world": world, "high_iso": WORLDS[world].high_iso}
-        row |= {"simulator": WORLDS[world].simulator, "frames": plan.frames}
-        row |= {"crop": CROP, "scorer": plan.scorer}
-        row |= comparison(gains, span, agent, world)
-        row |= {"num_scenes": len(set(result.scene_ids.tolist()))}
-        row |= {"regret": float(errors["regret"].mean())}
-        row |= {"ev_within_third": float(errors["ev_within_third"].mean())}
-        rows.append(row | {"minutes": float(np.median(taken)), "minutes_by_seed": taken})
-    return rows + _together(rows, gains, span)
-
-
-def _together(
-    rows: list[Row], gains: Mapping[tuple[str, str], np.ndarray], span: np.ndarray
-) -> list[Row]:
-    """A row for each world of the agents together, as so many training seeds."""
-    agents = tuple(dict.fromkeys(row["agent"] for row in rows))
-    worlds = tuple(dict.fromkeys(row["world"] for row in rows))
-    if len(agents) < 2:
-        return []
-    joint = {
-        (TOGETHER, world): np.concatenate([gains[agent, world] for agent in agents])
-        for world in worlds
-    }
-    means = ("minutes", "regret", "ev_within_third")
-    found = []
-    for world in worlds:
-        own = [row for row in rows if row["world"] == world]
-        row = own[0] | {"agent": TOGETHER} | {n: np.mean([r[n] for r in own]) for n in means}
-        row |= comparison(joint, span, TOGETHER, world)
-        found.append(row | {"minutes_by_seed": [m for r in own for m in r["minutes_by_seed"]]})
-    return found
+        given: Any = {"episodes_per_scene": plan.episodes, "seed": seed, "progress": task}
+        return evaluate(policies, options, **given)
 
 
 def comparison(
@@ -223,19 +183,51 @@ def comparison(
         agent: Which agent.
         world: Where it was trained. EXP's is the world of the same sources.
     """
-    own, truth = gains[agent, world], gains[agent, TRUTH]
-    row = {"num_seeds": len(own), "num_groups": len(span)}
-    row |= _named("normalised_score", score_interval(own, span))
-    row["by_seed"] = (own.sum(axis=1) / span.sum()).tolist()
-    if world == TRUTH:
-        return row
-    row |= _named("drop", difference_interval(truth, own, span))
+    own, truth, score = gains[agent, world], gains[agent, TRUTH], "normalised_score"
+    found = {score: score_interval(own, span)}
     exp = World(EXP, high_iso=WORLDS[world].high_iso).name
-    if world != exp and (agent, exp) in gains:
-        row |= _named("more_than_exp", difference_interval(own, gains[agent, exp], span))
+    if world != TRUTH:
+        found["drop"] = difference_interval(truth, own, span)
+        if world != exp and (agent, exp) in gains:
+            found["more_than_exp"] = difference_interval(own, gains[agent, exp], span)
+    row: Row = {"num_seeds": len(own), "num_groups": len(span)}
+    row["by_seed"] = (own.sum(axis=1) / span.sum()).tolist()
+    for name, interval in found.items():
+        row |= {name: interval.value, "ci95" if name == score else f"{name}_ci95": interval.pair}
     return row
 
 
-def _named(name: str, interval: Interval) -> Row:
-    ends = "ci95" if name == "normalised_score" else f"{name}_ci95"
-    return {name: interval.value, ends: interval.pair}
+# -- tables ---------------------------------------------------------------------------------------
+
+#: Largest drop that is asked for.
+MOST_DROP = 0.015
+_COLUMNS = """trained in = `{world}` |
+normalised score = {normalised_score:.3f} [{ci95[0]:.3f}, {ci95[1]:.3f}] |
+drop against `truth` = {drop:+.3f} [{drop_ci95[0]:+.3f}, {drop_ci95[1]:+.3f}] |
+more than in `EXP` = {more_than_exp:+.3f} [{more_than_exp_ci95[0]:+.3f}, {more_than_exp_ci95[1]:+.3f}] |
+within 1/3 EV = {ev_within_third:.0%} | minutes to train = {minutes:.1f}"""
+_ASKED = """agent = {agent} | trained in = `{world}` | asked = {asked} | measured = {measured} |
+met = {met}"""
+
+
+def agent_tables(rows: Sequence[Row]) -> dict[str, str]:
+    """Whether what was asked for holds, and a table for each agent."""
+    by_agent = sections(rows, "{agent}", lambda own: table(own, _COLUMNS))
+    return {"verdicts": table(verdicts(rows), _ASKED), "agents": by_agent}
+
+
+def verdicts(rows: Sequence[Row]) -> Iterator[Row]:
+    """What was asked for, and whether it holds, for each agent."""
+    for row in (row for row in rows if row["simulator"] == "compact"):
+        name, asked, met = "drop", f"drop below {MOST_DROP}", row["drop"] < MOST_DROP
+        if row["high_iso"]:
+            if row.get("more_than_exp") is None:
+                continue
+            name, asked = "more_than_exp", "drop smaller than EXP's beyond the interval"
+            met = row[f"{name}_ci95"] is not None and row[f"{name}_ci95"][0] > 0.0
+        ends = (
+            ""
+            if row[f"{name}_ci95"] is None
+            else " [{:+.3f}, {:+.3f}]".format(*row[f"{name}_ci95"])
+        )
+        yield row | {"asked": asked, "met": met, "measured": f"{row[name]:+.3f}{ends}"}

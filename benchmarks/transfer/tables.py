@@ -24,7 +24,7 @@ from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.cli.console import progress_bars
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.rollouts import RolloutPlan, make_envs
-from benchmarks.harness import FinishedParts, Row
+from benchmarks.harness import FinishedParts, Row, cell, pivot, sections, table
 from benchmarks.transfer.worlds import (
     EXP,
     RESOLUTION,
@@ -47,10 +47,8 @@ Totals = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) -> list[Row]:
     """A row for each crop, source ISO, source exposure and simulator.
 
-    Args:
-        plan: The plan.
-        finished: Keeps what is measured, so that a run that was stopped continues.
-        seed: Of motion and defocus, and of the photographs.
+    `finished` keeps what is measured, so that a run that was stopped continues; `seed` is that of
+    motion and defocus, and of the photographs.
     """
     rows: list[Row] = []
     sets = [(part, crop, iso) for part in plan.tables for crop in part.crops for iso in part.isos]
@@ -112,10 +110,7 @@ def drawn_moves(scenes: Sequence[Scene], seed: int) -> list[dict[str, Any]]:
 def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:
     """Measures of a predicted table, over the states that the scene allows.
 
-    Args:
-        table: Predicted.
-        true: Of the scene's own light.
-        totals: Scores (S,) from those of the scorer's parts.
+    `true` is of the scene's own light; `totals` makes scores (S,) of those of the scorer's parts.
 
     Returns:
         ``rank_correlation``: Spearman's; ``regret``: what the state that looks best loses in the
@@ -123,24 +118,18 @@ def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:
         only that part of the scorer is the predicted one.
     """
     allowed = np.ones(len(true.mean), bool) if true.allowed is None else true.allowed
-    right = totals(true.parts)
-    terms = {
+    right, row = totals(true.parts), Measured()
+    pair = table.mean[allowed], true.mean[allowed]
+    # Where all states of one table score alike, nothing is told.
+    varies = min(np.ptp(rankdata(own)) for own in pair) > 0.0
+    row["rank_correlation"] = float(cast(Any, spearmanr(*pair)).statistic) if varies else 0.0
+    row["regret"] = float(true.mean[true.oracle] - true.mean[table.oracle])
+    row["absolute_error"] = float(np.abs(pair[0] - pair[1]).mean())
+    row["terms"] = {
         name: float(np.abs(totals({**true.parts, name: part}) - right)[allowed].mean())
         for name, part in table.parts.items()
     }
-    return {
-        "rank_correlation": _spearman(table.mean[allowed], true.mean[allowed]),
-        "regret": float(true.mean[true.oracle] - true.mean[table.oracle]),
-        "absolute_error": float(np.abs(table.mean - true.mean)[allowed].mean()),
-        "terms": terms,
-    }
-
-
-def _spearman(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's correlation; 0 where all states of one table score alike, which tells nothing."""
-    if np.ptp(rankdata(first)) == 0.0 or np.ptp(rankdata(second)) == 0.0:
-        return 0.0
-    return float(cast(Any, spearmanr(first, second)).statistic)
+    return row
 
 
 # -- over scenes ----------------------------------------------------------------------------------
@@ -169,3 +158,57 @@ def summary(measured: Sequence[Measured]) -> list[Row]:
         row["saturated"] = float(values["saturated"].mean())
         rows.append(row | {"ms": float(scenes["ms"].median())})
     return rows
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+_CROPS = {
+    "box": "averaged to 64 x 64 pixels",
+    "native": "of 64 x 64 native pixels, with all of their noise",
+}
+_HEADINGS = {
+    "Rank correlation": "{rank_correlation:.4f}",
+    "Regret": "{regret:.4f}",
+    "Error": "{absolute_error:.4f}",
+    "Regret less that of EXP": "{regret_to_exp:+.4f}{regret_star}",
+    "Error less that of EXP": "{absolute_error_to_exp:+.4f}{absolute_error_star}",
+}
+_SOURCE, _SIMULATOR = "source = ISO {iso}, {ev:+d} EV", "`{simulator}`"
+
+
+def score_tables(rows: Sequence[Row]) -> dict[str, str]:
+    """Tables of each scorer and crop; a star where an interval leaves out zero."""
+    shown = []
+    for row in rows:
+        title = f"`{row['scorer']}`, frames {_CROPS[row['crop']]}"
+        stars = {}
+        for name in MEASURES[1:]:
+            low, high = row.get(f"{name}_to_exp_ci95") or (0.0, 0.0)
+            stars[f"{name}_star"] = "*" * (low > 0.0 or high < 0.0)
+        shown.append(row | {"title": title, **stars})
+    return {"tables": sections(shown, "{title}", _of_set)}
+
+
+def _of_set(rows: list[Row]) -> str:
+    frame = pd.DataFrame(rows)
+    # Of an even number of settings the upper of the two in the middle.
+    times = frame.groupby("simulator", sort=False)["ms"].quantile(0.5, interpolation="higher")
+    blocks = [
+        f"{rows[0]['num_scenes']} scenes in {rows[0]['num_groups']} source groups.",
+        table(
+            times.reset_index().to_dict("records"),
+            "simulator = `{simulator}` | ms per table = {ms:.1f}",
+        ),
+    ]
+    for heading, content in _HEADINGS.items():
+        own = [row for row in rows if cell(row, content)]  # EXP has no difference to itself
+        by_simulator = pivot(own, _SOURCE, _SIMULATOR, content)
+        blocks += [f"{heading}, by ISO and exposure of the source:", by_simulator]
+    if len(terms := rows[0]["terms"]) > 1:
+        columns = f"{_SOURCE} | simulator = {_SIMULATOR} | saturated = {{saturated:.1%}}"
+        columns += "".join(f" | {name} = {{terms[{name}]:.4f}}" for name in terms)
+        isos, evs = (frame[name].agg(["min", "max"]).tolist() for name in ("iso", "ev"))
+        ends = [r for r in rows if r["iso"] in isos and r["ev"] in (*evs, 0)]
+        shown = table(ends, columns + " | worst term = {worst_term}")
+        blocks += ["*Where the error enters*:", shown]
+    return "\n\n".join(blocks)
