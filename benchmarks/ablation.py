@@ -50,7 +50,6 @@ LIGHTS, SCENES = ("shadows", "clouds", "pans"), 40
 
 
 def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
-    """Trains a variant, unless its file is there, and judges it."""
     training, environment = VARIANTS.get(variant, ({}, {}))
     name = "".join(c if c.isalnum() else "-" for c in variant)
     out = RUNS.parent / "bench_ablation" / f"{name}-{frames}-{seed}"
@@ -82,14 +81,12 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
 def changed_config(
     config: AgentConfig, environment: dict[str, Any], training: dict[str, Any]
 ) -> AgentConfig:
-    """A configuration with other options of its environment and other hyperparameters."""
     changed = {"environment": environment, "training": training}
     parts = {name: {**getattr(config, name), **own} for name, own in changed.items()}
     return AgentConfig.model_validate({**config.model_dump(), **parts})
 
 
 def _train_recurrent(out: Path, frames: int, seed: int) -> str:
-    """Trains the example's agent, with a learning curve, and names it."""
     curve = LearningCurve(sibling(out, ".csv"))
     recent: deque[float] = deque(maxlen=50)  # as PPO reports it
 

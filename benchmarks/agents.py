@@ -36,13 +36,7 @@ QUICK = {"regression": {"frames": 2_000}, "ppo": {"total_timesteps": 2_048}}
 
 
 def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
-    """Trains, evaluates and writes ``agents/`` under `out`.
-
-    Args:
-        out: Folder of results.
-        seed: Of the evaluation; the training seeds are 0, 1 and 2.
-        quick: A few frames of training, to see that everything runs.
-    """
+    """Trains, evaluates and writes ``agents/`` under `out`."""
     jobs: dict[str, list[TrainingJob]] = {}
     folder = ROOT / "runs" / ("bench_agents_quick" if quick else "bench_agents")
     for name, path in CONFIGS.items():

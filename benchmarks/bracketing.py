@@ -65,7 +65,6 @@ def known_light(context: Any, envs: Any) -> Any:
 
 
 def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None) -> Row:
-    """What `policy` reaches: means of each source group."""
     make: Any = partial(
         gym.make_vec,
         "ae_env:ae_env/ExposureBracket-v0",
@@ -88,7 +87,6 @@ def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each set of scenes, budget and policy."""
     sets, found = SETS if data_root() is not None else SETS[:1], []
     given = {"seed": seed, "most": QUICK_SCENES if quick else None}
     for scenes, budget, policy in product(sets, BUDGETS, POLICIES):
@@ -98,7 +96,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def rows_of(results: dict[str, Any]) -> list[Row]:
-    """A row for each part: means, intervals, and the difference to `BASELINE`."""
     rows, own = [], {(r["scenes"], r["budget"], r["policy"]): r for r in results.values()}
     for (scenes, budget, policy), result in own.items():
         quality, span = np.array(result["quality"]), np.ones(len(result["groups"]))
@@ -116,7 +113,6 @@ def rows_of(results: dict[str, Any]) -> list[Row]:
 
 
 def distributions(rows: Sequence[Row]) -> Figure:
-    """Share of the source groups whose loss of quality is below a value."""
     curves = []
     for row in (row for row in rows if row["budget"] == BUDGETS[-1]):
         count, known = len(row["each"]), row["policy"] == "known"
@@ -136,7 +132,6 @@ longest exposure = {longest:.3g} s"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """A table for each set of scenes and budget, and one of what was fitted to each."""
     rows = rows_of(results)
     tables = {"fitted": table((row for row in rows if "headroom" in row), _FITTED)}
     for scenes, budget in product(SETS, BUDGETS):

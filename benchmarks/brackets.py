@@ -145,7 +145,6 @@ def _blocks(data: np.ndarray, reduce: Any = np.mean) -> np.ndarray:
 
 
 def denoised_scenes(source: RawImage) -> dict[str, PreparedScene]:
-    """`source` without its noise, by method: each size of the family, and non-local means."""
     found = {}
     for name in SIZES:
         simulator = CameraSimulator.from_pretrained(name, device="cpu")
@@ -159,7 +158,6 @@ def denoised_scenes(source: RawImage) -> dict[str, PreparedScene]:
 def transition_rows(
     pair: Pair, denoised: Mapping[str, PreparedScene], repeats: int, seed: int
 ) -> list[Row]:
-    """Simulated and real frame of one transition, beside the baselines that bound the figures."""
     target, bare = pair.target.settings, CameraSimulator(device="cpu")
     real, source = pair.target.data.numpy(), pair.source
     calls = {"simulated": lambda: bare.simulate(source, target, seed=seed).data}
@@ -193,7 +191,6 @@ def transition_rows(
 
 
 def compare(image: np.ndarray, real: np.ndarray, pair: Pair, moved: tuple[int, int]) -> Row:
-    """PSNR, SSIM and relative RMSE over the unmasked pixels, `image` rolled by `moved` first."""
     image = np.roll(image, moved, axis=(1, 2)).astype(np.float64)
     real = real.astype(np.float64)
     inside = ~np.roll(pair.masked, moved, axis=(0, 1))
@@ -226,7 +223,6 @@ def texture(image: torch.Tensor, use: torch.Tensor) -> float:
 
 
 def _decibel(mean_square: float) -> float | None:
-    """PSNR against 1, None for a perfect match."""
     return -10 * float(np.log10(mean_square)) if mean_square > 0 else None
 
 
@@ -237,7 +233,6 @@ def timed_result(call: Callable[[], torch.Tensor], repeats: int) -> tuple[torch.
 
 
 def measure(scene: str, repeats: int, seed: int) -> dict[str, Any]:
-    """Rows of one scene, the blind noise estimates of green, and the frames' shape."""
     pairs, estimates = load_pairs(data_folder("boreal_brackets"), scene)
     frames = {pair.source_ms: pair.source for pair in pairs}
     rows = ratio_rows(scene, frames)
@@ -248,7 +243,6 @@ def measure(scene: str, repeats: int, seed: int) -> dict[str, Any]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each scene; only the static one, each simulation timed once, if `quick`."""
     data_folder("boreal_brackets")  # raises before any work
     given = {"repeats": 1 if quick else REPEATS, "seed": seed}
     scenes = SCENES[: 1 if quick else None]

@@ -20,7 +20,6 @@ FILES, SIZE, PER_SHARD = 512, (512, 768), 8
 
 
 def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
-    """All raws, from nothing to the last shard."""
     files = 16 if quick else FILES
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     torch.set_num_threads(1)
@@ -55,7 +54,6 @@ core hours for a million raws = {core_hours:.1f}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """Overhead is the time in which no shard was being made; a core hour is one of a worker."""
     rows: list[Row] = list(results.values())
     for row in rows:
         row["rate"] = row["files"] / row["seconds"]

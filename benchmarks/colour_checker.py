@@ -63,13 +63,7 @@ BRADFORD = np.array(
 
 @dataclass(frozen=True)
 class Chart:
-    """Where the patches lie on the packed visible area.
-
-    Args:
-        corners: Centres (x, y) of the 4 corner patches, clockwise from the top left.
-        rows: First and last row of the chart (0 to 3) that is wholly in the picture.
-        columns: First and last column (0 to 5); dark skin is row 0, column 0.
-    """
+    """Where the patches lie on the packed visible area."""
 
     corners: tuple[tuple[float, float], ...]
     rows: tuple[int, int] = (0, 3)
@@ -112,7 +106,6 @@ def lab_to_luminance(lab: np.ndarray) -> np.ndarray:
 
 
 def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
-    """Mean of each patch on the packed raw: index to (4,) R, G1, G2, B."""
     means = {}
     for index, (x, y, half) in chart.patches().items():
         rows = slice(round(y - half), round(y + half) + 1)
@@ -127,7 +120,6 @@ def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
 
 
 def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
-    """One row per patch, for one file and white balance (``"camera"`` or ``"chart"``)."""
     means = patch_means(raw, chart)
     order = sorted(means)
     planes, lab = np.stack([means[i] for i in order]), PUBLISHED[order]  # (N, 4), (N, 3)
@@ -176,7 +168,6 @@ def paper_range(raw: RawImage) -> Row:
 
 
 def linearity(raw: RawImage, chart: Chart) -> list[Row]:
-    """Per channel: how straight the neutral row's raw values lie over the published luminance."""
     means, rows = patch_means(raw, chart), []
     order = [i for i in sorted(means) if i >= 18]
     published = lab_to_luminance(PUBLISHED[order])
@@ -192,7 +183,6 @@ def linearity(raw: RawImage, chart: Chart) -> list[Row]:
 
 
 def summary(rows: list[Row]) -> Row:
-    """Mean, median and maximum of dE2000 over `rows`."""
     frame = pd.DataFrame(rows).set_index("patch").filter(like="delta_e")
     errors, means = frame["delta_e_2000"], frame.mean()
     found: Row = {"patches": len(rows), "mean": errors.mean(), "median": errors.median()}
@@ -202,7 +192,6 @@ def summary(rows: list[Row]) -> Row:
 
 
 def measure_file(file: str) -> dict[str, Any]:
-    """Rows of one raw, their summaries, its linearity, and its white paper."""
     raw, chart = read_raw(data_folder("canon_crw_cc0") / file), FILES[file]
     rows, summaries = [], []
     for white_balance in ("camera", "chart"):
@@ -215,7 +204,6 @@ def measure_file(file: str) -> dict[str, Any]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """One part for each raw; only the first if `quick`."""
     data_folder("canon_crw_cc0")  # raises before any work
     return [
         Part(file, measure_file, {"file": file}) for file in list(FILES)[: 1 if quick else None]

@@ -40,7 +40,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def watch(stops: float, seed: int) -> dict[str, Any]:
-    """Rows of all policies at one step of the light, and the median curve of each."""
     options: dict[str, Any] = {"scenes": "bundled:small", "split": "test", "resolution": 64}
     options |= {"grid": "third_stop", "lighting": {"kind": "step", "stops": stops, "at": STEP}}
     with closing(make_envs(options, num_envs=1, frames=1)) as envs:
@@ -96,7 +95,6 @@ to 1/3 EV = {third}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by step of the light."""
     rows = [row for result in results.values() for row in result["rows"]]
     filtered = [_filter_row(stops) for stops in STOPS]
     curves = []

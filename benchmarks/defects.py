@@ -80,7 +80,6 @@ def generator_of(seed: int, scene: int, defect: str) -> torch.Generator:
 def signs_of(
     scenes: list[Scene], defect: str, names: list[str], seed: int
 ) -> dict[str, np.ndarray]:
-    """Signs (scenes, L) by name, of renderings with `defect`."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for i, scene in enumerate(scenes):
         pictures = render(scene, defect, generator_of(seed, i, defect))
@@ -100,7 +99,6 @@ def fit_map(sign: np.ndarray, severity: np.ndarray) -> list[list[float]]:
 
 
 def fit(scenes: list[Scene], seed: int) -> dict[str, list[list[float]]]:
-    """Knots of every map of `KNOTS`, from renderings of `scenes`."""
     maps = {}
     for defect in DEFECTS:
         names = ["over_exposure", "under_exposure"] if defect == "exposure" else [defect]
@@ -120,7 +118,6 @@ def fit(scenes: list[Scene], seed: int) -> dict[str, list[list[float]]]:
 
 
 def severities_of(scenes: list[Scene], defect: str, seed: int) -> dict[str, np.ndarray]:
-    """Estimated severities (scenes, L) of all defects, of renderings with `defect`."""
     signs = signs_of(scenes, defect, list(SIGNS), seed)
     values = {
         name: mapped(name, torch.from_numpy(v.ravel())).numpy().reshape(v.shape)
@@ -161,7 +158,6 @@ def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:
 
 
 def scenes_of(split: str, resolution: int, per_kind: int, quick: bool) -> list[Scene]:
-    """At most `per_kind` bundled scenes of each kind."""
     spec = "bundled:small" if quick else "bundled"
     found = load_scenes(spec, split, camera=get_camera(CAMERA), resolution=resolution)  # type: ignore[arg-type]
     kept: dict[str, list[Scene]] = {}
@@ -173,7 +169,6 @@ def scenes_of(split: str, resolution: int, per_kind: int, quick: bool) -> list[S
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """The maps are fitted in one part, and the constants in use tested in others."""
     given = {"seed": seed, "quick": quick}
     sizes = (RESOLUTION, OTHER_RESOLUTION)
     tests = [Part(f"test {n}", tested, {"resolution": n, **given}) for n in sizes]
@@ -181,13 +176,11 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def fitted(seed: int, quick: bool) -> dict[str, Any]:
-    """The maps of this run, and on how many scenes they were fitted."""
     training = scenes_of("train", RESOLUTION, TRAINING_SCENES, quick)
     return {"maps": fit(training, seed), "scenes": len(training)}
 
 
 def tested(resolution: int, seed: int, quick: bool) -> dict[str, Any]:
-    """Rows of the test scenes at one resolution."""
     scenes, rows = scenes_of("test", resolution, TEST_SCENES, quick), []
     for defect in DEFECTS:
         estimated = severities_of(scenes, defect, seed)
@@ -207,7 +200,6 @@ error = {mae:.3f} [{mae_ci95[0]:.3f}, {mae_ci95[1]:.3f}] | constant = {mae_of_a_
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report; prints the maps as the scorers' source has them."""
     maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
     for name, knots in maps.items():
         columns = ", ".join(repr(column) for column in zip(*knots, strict=True))

@@ -63,7 +63,6 @@ class Case:
 
 
 def sources() -> list[DetailPicture]:
-    """One real picture of every source group of the test split."""
     found: dict[str, DetailPicture] = {}
     for picture in detail_pictures("test", data=data_root(), drawn=0):
         if picture.kind != "linear" and min(picture.light.shape[1:]) >= 2 * SIZE:
@@ -98,8 +97,6 @@ def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
 
 
 def networks() -> dict[str, Denoiser]:
-    """The trained noise modules that are there."""
-
     @torch.no_grad()
     def denoise(module: Any, raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
         shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
@@ -110,13 +107,11 @@ def networks() -> dict[str, Denoiser]:
 
 
 def classical() -> dict[str, Denoiser]:
-    """The methods to compare with."""
     planes = {"VST + NLM": non_local_means, REFERENCE: bm3d_planes}
     return {name: behind_anscombe(denoise) for name, denoise in planes.items()}
 
 
 def measure(methods: str, first: int, seed: int, quick: bool) -> list[Row]:
-    """A row for every case of some sources and every method of a kind."""
     known, rows = {"networks": networks, "classical": classical}[methods](), []
     chosen = list(enumerate(sources()))[first : first + (1 if quick else _AT_ONCE)]
     every = [case for number, picture in chosen for case in cases(number, picture, seed)]
@@ -143,7 +138,6 @@ def _error(image: Tensor, truth: Tensor) -> float:
 
 
 def measure_flat(camera: str, seed: int, quick: bool) -> list[Row]:
-    """Means of flat fields, before and after each network, at the calibrated ISOs."""
     profile, rows, denoisers = get_camera(camera), [], networks()
     reference = ReferenceCamera(profile)
     for iso, ev in product(list(profile.nlf_by_iso)[:: 4 if quick else 1], FLAT_LEVELS):
@@ -203,7 +197,6 @@ def non_local_means(stable: np.ndarray) -> np.ndarray:
 
 
 def bm3d_planes(stable: np.ndarray) -> np.ndarray:
-    """BM3D (4, H, W) of the four planes jointly: blocks are matched on their mean."""
     try:
         import bm3d
     except ImportError:

@@ -55,7 +55,6 @@ def _view(
 
 @torch.no_grad()
 def measure(iso: int, seed: int, quick: bool) -> list[Row]:
-    """All scenes at one ISO."""
     reference = ReferenceCamera(get_camera(CAMERA))
     simulator = CameraSimulator.from_pretrained("large", cache=None)
     exposures, rows = bracket_exposures(), []
@@ -111,7 +110,6 @@ def _simulated(raw: RawImage) -> list[Tensor]:
 
 @torch.no_grad()
 def picture(seed: int, quick: bool) -> Figure:
-    """The scene with the most light above the raw's white."""
     reference, iso, found = ReferenceCamera(get_camera(CAMERA)), ISOS[1], []
     for scene in radiance_views(CAMERA, SIZE)[: 2 if quick else None]:
         settings, _, unclipped = _view(reference, scene, iso)
@@ -165,7 +163,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """Means over the scenes, by ISO, and by the range of the light."""
     rows: list[Row] = [row for part in results.values() for row in part]
     frame = pd.DataFrame(rows)
     frame["range"] = np.where(frame["stops"] < HIGH_RANGE, "low", "high")

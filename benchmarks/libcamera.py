@@ -36,10 +36,6 @@ SHOWN = (0, 5, 12, 20, 30, 34)
 def play(recording: Row, zone_factors: list[float]) -> dict[str, np.ndarray]:
     """What our AGC does on the sensor and in the light of `recording`, frame by frame.
 
-    Args:
-        recording: An entry of ``traces`` of the file.
-        zone_factors: Light of each of its 15 zones, relative to that of the recording.
-
     Returns:
         ``exposure_s`` and ``gain`` that each frame was taken with, ``seconds`` that each decision
         took.
@@ -106,13 +102,11 @@ def measure(path: str) -> list[Row]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """All recordings at once: nothing is random and it takes seconds."""
     path = data_folder(FOLDER) / FILE  # raises before any work
     return [Part("recordings", measure, {"path": str(path)}, threads=1)]
 
 
 def traces(rows: list[Row]) -> Figure:
-    """Exposure over the frames, theirs and ours, of the recordings `SHOWN`."""
     curves, styles = [], ({"lw": 1, "c": "k", "zorder": 3}, {"lw": 3, "alpha": 0.4})
     for row in (rows[number] for number in SHOWN):
         lamps = ", 100 Hz lamps" if row["flicker_period_us"] else ""

@@ -45,7 +45,6 @@ def _prepared(policy: str, quick: bool) -> tuple[int, Any, Any]:
 
 
 def measure(policy: str, seed: int, quick: bool) -> Row:
-    """One agent, over episodes on test scenes."""
     count, envs, agent = _prepared(policy, quick)
     with tempfile.TemporaryDirectory() as folder:
         file = export_agent(agent, Path(folder, "agent.onnx"))
@@ -70,7 +69,6 @@ def measure(policy: str, seed: int, quick: bool) -> Row:
 
 
 def smaller(policy: str, seed: int, quick: bool) -> list[Row]:
-    """Scores of an agent that sees its frame averaged to fewer pixels, in the same episodes."""
     count, envs, agent = _prepared(policy, quick)
     rows: list[Row] = []
     for side in SIDES:
@@ -113,7 +111,6 @@ def _difference(agent: Any, controller: Controller, shown: dict[str, Any]) -> fl
 
 
 def encoding(quick: bool) -> list[Row]:
-    """Time to average a frame to what the agent sees, by its size."""
     envs = gym.make_vec("ae_env:ae_env/AutoExposure-v0", num_envs=1, scenes="bundled:small")
     agent = make_policy("ppo", PolicyContext.from_envs(envs))
     with tempfile.TemporaryDirectory() as folder:

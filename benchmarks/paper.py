@@ -85,7 +85,6 @@ GROUPS: dict[str, Callable[[Case], bool]] = {
 def parts(
     seed: int, quick: bool, folder: Path | None = None, weights: Path | None = None
 ) -> list[Part]:
-    """One part for each network: what is trained, or the weights that are given; and ours."""
     assert folder is not None
     split_dataset(folder, seed=seed)  # raises before any work
     names = list(TRAINED)
@@ -101,7 +100,6 @@ def parts(
 
 
 def _digest(folder: Path) -> str:
-    """Digest of the tables."""
     tables = (path.read_bytes() for path in sorted(folder.rglob(PARAMETERS)))
     return hashlib.sha256(b"".join(tables)).hexdigest()
 
@@ -136,7 +134,6 @@ def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
 def trained(
     name: str, folder: Path, sequences: list[CapturedSequence], seed: int, quick: bool
 ) -> Path:
-    """The weights of a network trained on `sequences`, trained now unless it was before."""
     config = load_config(CONFIGS / f"{name}.yaml")
     changes: dict[str, Any] = {"seed": seed}
     if quick:
@@ -193,7 +190,6 @@ def _methods(
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """Means over the pairs of each group, beside what the paper publishes."""
     rows = [row for own in results.values() for row in own]
     frame = pd.DataFrame(rows)
     times = frame.groupby(["preset", "sha256"], sort=False)["ms"].median().reset_index()

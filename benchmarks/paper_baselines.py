@@ -49,11 +49,7 @@ def _check(width: int, dilations: Sequence[int]) -> None:
 
 
 class AdaptiveNorm(nn.Module):
-    """``lambda * x + mu * BN(x)``, both learnt scalars, from lambda = 1 and mu = 0.
-
-    Args:
-        width: Channels, >= 1.
-    """
+    """``lambda * x + mu * BN(x)``, both learnt scalars, from lambda = 1 and mu = 0."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -73,10 +69,6 @@ class ParameterConcatenation(nn.Module):
     3 x 3 convolutions of growing dilation, each with `AdaptiveNorm` and LeakyReLU(0.2), then a
     1 x 1 convolution; convolutions start as the identity. 77,046 parameters at the published
     width. In training the normalisation uses statistics of the batch, in ``eval()`` running ones.
-
-    Args:
-        width: Channels, >= 1; 32 as published (CAN32), 10 or more for every plane to pass at first.
-        dilations: Dilation of each 3 x 3 convolution, >= 1.
 
     Raises:
         ValueError: If `width` or a dilation is below one.
@@ -107,10 +99,6 @@ class ParameterConcatenation(nn.Module):
     def forward(self, image: Tensor, parameters: Tensor) -> Tensor:
         """The raw at the target's settings.
 
-        Args:
-            image: (B, 4, H, W), any H, W >= 1.
-            parameters: (B, 6), see the module's docstring.
-
         Returns:
             (B, 4, H, W).
         """
@@ -125,14 +113,6 @@ class GeneratedConvolution(nn.Module):
 
     Every sample of a batch is convolved with its own kernel. Starts as a He-initialised kernel
     that the parameters vary by some tens of percent.
-
-    Args:
-        inputs: Input channels, >= 1.
-        outputs: Output channels, >= 1.
-        stride: 1, or 2 to halve the size (rounded up).
-        dilation: >= 1.
-        upsample: A 4 x 4 transposed convolution of stride 2 in place of 3 x 3; with `inputs` =
-            `outputs` only.
     """
 
     def __init__(
@@ -221,10 +201,6 @@ class DecoupledNet(nn.Module):
     The image comes with its edge map. 4.88 M parameters at the published width. Instance
     normalisation takes the absolute brightness out of the features, as published.
 
-    Args:
-        width: Channels, >= 1; 64 as published.
-        dilations: Dilation of each residual block, >= 1.
-
     Raises:
         ValueError: If `width` or a dilation is below one.
 
@@ -249,10 +225,6 @@ class DecoupledNet(nn.Module):
 
     def forward(self, image: Tensor, parameters: Tensor) -> Tensor:
         """The raw at the target's settings.
-
-        Args:
-            image: (B, 4, H, W), any H, W >= 1.
-            parameters: (B, 6), see the module's docstring.
 
         Returns:
             (B, 4, H, W).

@@ -46,7 +46,6 @@ row noise [DN] = {row} of {all} | ms a frame = {ms:.2f}"""
 
 
 def flat_fields(camera: CameraProfile, iso: float, path: str, rows: bool, seed: int) -> np.ndarray:
-    """One frame of each step of the ladder, (21 + 1, 4, SIZE, SIZE) digital numbers above black."""
     base = CameraSettings(iso, _WHITE_TIME, 4.0)
     states = [replace(base, exposure_time=_WHITE_TIME * max(level, 0.01)) for level in LADDER]
     dark, lit = torch.zeros(4, SIZE, SIZE), torch.ones(4, SIZE, SIZE)
@@ -81,7 +80,6 @@ def row_variance(dark: np.ndarray) -> float:
 
 
 def transfer(camera: CameraProfile, iso: float, path: str, rows: bool, seed: int) -> Row:
-    """One photon transfer curve: its points, and what is read from them."""
     begun = perf_counter()
     first, second = (flat_fields(camera, iso, path, rows, 2 * seed + i) for i in (0, 1))
     ms = 1e3 * (perf_counter() - begun) / (2 * len(LADDER))
@@ -96,7 +94,6 @@ def transfer(camera: CameraProfile, iso: float, path: str, rows: bool, seed: int
 
 
 def put_in(camera: CameraProfile, iso: float, rows: bool) -> Row:
-    """What the profile says of its green planes: K, dark noise and row noise."""
     nlf, span = camera.nlf(iso), camera.span[1]
     dark = span * np.mean(nlf.read[1:3]) ** 0.5
     row = camera.read_noise(iso).row * dark if rows else 0.0
@@ -104,7 +101,6 @@ def put_in(camera: CameraProfile, iso: float, rows: bool) -> Row:
 
 
 def measure(camera: str, repetitions: int, seed: int) -> list[Row]:
-    """Rows of one camera, of every ISO, path and kind of noise."""
     body, found = get_camera(camera), []
     kinds = (False, True) if body.read_noise_by_iso else (False,)
     for iso, rows, path in product(ISOS, kinds, PATHS):
@@ -134,7 +130,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def curves(rows: list[Row]) -> Figure:
-    """Variance over mean, measured and put in: a panel for each camera."""
     drawn: list[Row] = []
     for row in rows:
         colour, (first, _) = f"C{ISOS.index(row['iso'])}", PATHS

@@ -103,7 +103,6 @@ def _boreal(grid: ExposureGrid) -> list[Scene]:
 
 @torch.no_grad()
 def measure(source: str, seed: int, quick: bool, folder: str | None = None) -> list[Row]:
-    """Rows of one set of scenes, one for each scene and method."""
     linear_below = np.inf
     if folder is not None:
         scenes, grid = _of_folder(folder), _options(folder).grid
@@ -240,7 +239,6 @@ def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -
 
 
 def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
-    """One part for each set of scenes."""
     shared: dict[str, Any] = {"seed": seed, "quick": quick}
     if folder is None:
         return [Part(name, measure, {"source": name, **shared}) for name in (REFERENCE, BOREAL)]
@@ -257,7 +255,6 @@ _REGRET = "mean = {mean:.3f} | upper quartile = {upper:.3f} | largest = {most:.3
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """One row a set and method, PSNR by stops, then the scenes."""
     rows = [row for own in results.values() for row in own]
     frame = pd.json_normalize(rows)  # columns such as "psnr_by_stops.as bright"
     sets, stops = [], []

@@ -49,7 +49,6 @@ METHODS = {
 
 @torch.no_grad()
 def measure(number: int, seed: int, quick: bool) -> list[Row]:
-    """One of the scenes, at all ISOs and f-numbers."""
     camera = get_camera(CAMERA)
     scene = depth_photographs(camera, data=data_root())[number]
     reference = ReferenceCamera(camera)
@@ -135,7 +134,6 @@ def _methods(
 
 @torch.no_grad()
 def picture(seed: int) -> Figure:
-    """A scene at f/11 and at the widest aperture: estimated, known and true depth."""
     camera, iso, f_number = get_camera(CAMERA), ISOS[0], F_NUMBERS[-1]
     scene = depth_photographs(camera, data=data_root())[0]
     reference = ReferenceCamera(camera)
@@ -165,7 +163,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """Means over the scenes."""
     rows: list[Row] = [row for part in results.values() for row in part]
     groups = pd.DataFrame(rows).groupby(["method", "iso", "f_number"], sort=False)
     frame = groups[["psnr", "edge_psnr"]].mean().reset_index()

@@ -65,7 +65,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 @functools.cache
 def available() -> tuple[dict[str, CompositeScorer], dict[str, str]]:
-    """The known scorers, and why those that cannot be made here cannot."""
     made, missing = {}, {}
     for name in list_scorers():
         try:
@@ -80,7 +79,6 @@ def available() -> tuple[dict[str, CompositeScorer], dict[str, str]]:
 
 
 def milliseconds(repeats: int) -> list[Row]:
-    """A row per scorer and size: median and half the range of the time of a batch, developed."""
     rows = []
     for size in SIZES if repeats > 1 else SIZES[:1]:
         options = EnvOptions(scenes="bundled:small", split="test", resolution=size)
@@ -98,7 +96,6 @@ def milliseconds(repeats: int) -> list[Row]:
 
 
 def _described(scene: Scene, states: list[CameraSettings], camera: CameraProfile) -> Captures:
-    """Captures of `scene` in each of `states`, without blur."""
     zeros, scenes = np.zeros(len(states)), [scene] * len(states)
     return describe_captures(scenes, states, camera, speed=zeros, defocus=zeros, gain=zeros + 1.0)
 
@@ -262,7 +259,6 @@ Pearson = {pearson:.2f} ± {pearson_sd:.2f} | positive = {positive:.0%}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by question."""
     correlations, missing = results["correlation"], available()[1]
     named = {**results, "correlation": correlations["rows"]}
     rows = [{"measure": name, **row} for name, own in named.items() for row in own]

@@ -66,7 +66,6 @@ _LAGS = 16
 
 
 def electrons(seed: int, quick: bool) -> list[Row]:
-    """How far the Gaussian of the noise model is from photons, over the number of electrons."""
     nlf, rows = get_camera("nikon_z6").nlf(6400.0), []
     levels = np.geomspace(0.1, 1000.0, 13 if quick else 41)
     for read in (math.sqrt(nlf.read[1]) / nlf.shot[1], 0.3):
@@ -153,7 +152,6 @@ _ONE_STATE = 1.2
 
 
 def control(seed: int, quick: bool) -> list[Row]:
-    """Frames until a policy stays, over the delay, when the light jumps by six stops."""
     rows = []
     for name in POLICIES:
         delays = (0, 2) if quick or name in LEARNT else DELAYS
@@ -212,7 +210,6 @@ STEPS, EPISODES, _GROWTH_MIB = 100_000, 1_000, 16.0
 
 
 def long_runs(seed: int, quick: bool) -> list[Row]:
-    """Memory of a process over the steps of one environment."""
     steps, episodes = (2_000, 20) if quick else (STEPS, EPISODES)
     env = gym.make("ae_env/AutoExposure-v0", scenes="bundled:small", max_episode_steps=None)
     rng, x, memory = np.random.default_rng(seed), list[int](), list[float]()
@@ -252,7 +249,6 @@ allowed = {limit:.3g} | finite = {finite} | right = {ok} | note = {note}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by group."""
     rows = [{"group": group, **row} for group, own in results.items() for row in own]
     curves = []
     for row in rows:

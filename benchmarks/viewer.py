@@ -39,7 +39,6 @@ _WATCH = """() => {
 
 
 def measure(height: int, width: int, seed: int, quick: bool) -> Row:
-    """One raw: in the page, in Python and as one command."""
     keys = 4 if quick else KEYS
     with tempfile.TemporaryDirectory() as folder:
         path = _raw(Path(folder, "scene.dng"), height, width, seed)
@@ -55,7 +54,6 @@ def measure(height: int, width: int, seed: int, quick: bool) -> Row:
 
 
 def _raw(path: Path, height: int, width: int, seed: int) -> Path:
-    """A raw of a bundled scene, enlarged to `height` and `width`, with its camera's noise."""
     camera = get_camera("nikon_z6")
     scene = load_scenes("bundled:small", "test", camera=camera, resolution=None)[0]
     settings = CameraSettings(100, 2.0 ** -round(scene.ev100 - 4), 4)

@@ -46,14 +46,12 @@ def _judged(
 
 
 def measure_aliked(weights: str, body: int, quick: bool) -> list[dict[str, Any]]:
-    """Judges ALIKED with given weights on the same pairs."""
     torch.set_num_threads(1)
     rows = _judged({"aliked": judging.aliked(Path(weights))}, "test", body, quick)["aliked"]
     return [{"arm": "aliked", "seed": 0, "steps": None, "seconds": None, "test": rows}]
 
 
 def measure_time(seed: int) -> list[Row]:
-    """Milliseconds for each picture, of every augmentation, on one thread."""
     torch.set_num_threads(1)
     rows = []
     for arm, augmentation in training.AUGMENTATIONS.items():
@@ -70,7 +68,6 @@ def measure_time(seed: int) -> list[Row]:
 
 
 def parts(seed: int, quick: bool, weights: Path | None = None) -> list[Part]:
-    """A part for each seed of the training; what it has trained is kept if it is stopped."""
     found, given = [Part("time", measure_time, {"seed": seed}, 1)], {"body": seed, "quick": quick}
     if weights is not None:
         if not weights.is_file():

@@ -140,7 +140,6 @@ def _views(source: Source, rng: np.random.Generator) -> tuple[list[ReferenceScen
 def judge(
     detects: dict[str, Detect], pairs: Iterator[HeldOutPair]
 ) -> dict[str, list[dict[str, Any]]]:
-    """A row of measures for each pair, of each detector by its name."""
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in detects}
     for pair in pairs:
         given = {"name": pair.name, "group": pair.group, **pair.condition._asdict()}
@@ -210,12 +209,7 @@ def area_under(errors: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def aliked(weights: Path) -> Detect:
-    """ALIKED (Zhao et al. 2023) through kornia, with the user's file of ``aliked-n16.pth``.
-
-    Raises:
-        ImportError: If kornia is not installed; names the extra.
-        ValueError: If the file does not hold these weights.
-    """
+    """ALIKED (Zhao et al. 2023) through kornia, with the user's file of ``aliked-n16.pth``."""
     try:
         from kornia.feature import ALIKED
     except ImportError:

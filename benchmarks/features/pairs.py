@@ -49,7 +49,6 @@ class View(NamedTuple):
 
 
 def sources(split: Split, *, raws: bool, limit: int | None = None) -> list[Source]:
-    """Photographs and radiance maps of a split, `limit` of each; with `raws` also all raws."""
     data = data_root()
     if data is None:
         raise FileNotFoundError("set AE_ENV_DATA to the folder of real files (photo_pool, maps)")
@@ -126,7 +125,6 @@ def inside(points: np.ndarray, size: int, border: float = 0.0) -> np.ndarray:
 def two_crops(
     rng: np.random.Generator, height: int, width: int, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Homographies from a picture to two crops of the same place, the first one upright."""
     reach = min(0.75 * size, 0.5 * min(height, width))
     centre = np.array([rng.uniform(reach, width - reach), rng.uniform(reach, height - reach)])
     first = crop_homography(rng, centre, size, 1.1, 0.0, 0.0)
@@ -135,7 +133,6 @@ def two_crops(
 
 
 def warped(image: np.ndarray, homography: np.ndarray, size: int) -> np.ndarray:
-    """Crop (size, size, C) of an image (H, W, C)."""
     flags, border = cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101
     return cv2.warpPerspective(image, homography, (size, size), flags=flags, borderMode=border)
 

@@ -59,7 +59,6 @@ _BY_GAP = {
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """Means, differences with intervals, times."""
     times = {row["arm"]: row for row in results["time"]}
     runs = [run for name, found in results.items() if name != "time" for run in found]
     frame = _frame(runs, "test")
@@ -92,7 +91,6 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
 
 
 def _frame(runs: list[dict[str, Any]], split: str) -> pd.DataFrame:
-    """All pairs of a split, a line for each training that they were judged with."""
     frame = pd.DataFrame(
         [
             {"arm": run["arm"], "seed": run["seed"], **row}
@@ -161,7 +159,6 @@ def _difference(
 
 
 def picture(means: list[Row], meta: dict[str, Any]) -> Figure:
-    """Curves against the gap; below them matches of one hard pair, plain scaling and ours."""
     figure = Figure(figsize=(10.0, 7.0), dpi=100, layout="constrained")
     upper, lower = figure.subfigures(2, 1)
     drawn = ("repeatability", "accuracy", "auc_5")

@@ -54,7 +54,6 @@ Augmentation = Callable[[Tensor, list[int]], Tensor]
 
 
 def unchanged(pictures: Tensor, seeds: list[int]) -> Tensor:
-    """Pictures (B, 3, H, W) as they are."""
     return pictures
 
 
@@ -71,7 +70,6 @@ def jittered(pictures: Tensor, seeds: list[int]) -> Tensor:
 
 
 def scaled(pictures: Tensor, seeds: list[int]) -> Tensor:
-    """Linear light times 2**EV, clipped: sRGB's curve is undone for it."""
     ratios = [2.0 ** np.random.default_rng(seed).uniform(*STOPS) for seed in seeds]
     linear = srgb_decode(pictures) * torch.tensor(ratios)[:, None, None, None]
     return srgb_encode(linear.clamp(0.0, 1.0))
@@ -130,7 +128,6 @@ def _stored(path: Path) -> tuple[Detector, float]:
 def _fit(
     model: Detector, arm: str, seed: int, steps: range, rate: float, limit: int | None, path: Path
 ) -> None:
-    """Trains a detector, in place, and stores it in a file."""
     views, begun = _views(limit), time.perf_counter()
     model.to(memory_format=torch.channels_last).train()
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=1e-4)

@@ -28,7 +28,6 @@ weights (SHA-256) = `{sha256:.12}`"""
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """Parts to measure; a full run first trains the networks that are missing."""
     if not quick:
         train_missing()
     given, found = {"seed": seed, "quick": quick}, []

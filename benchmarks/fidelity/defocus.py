@@ -49,7 +49,6 @@ true depth = {relative_to_exp[true_depth]:.2f} | paper = {relative_to_exp[paper]
 
 @torch.no_grad()
 def measure(seed: int, quick: bool) -> list[Row]:
-    """One row per set of scenes, ISO and class."""
     camera, (groups, size) = get_camera("nikon_z6"), QUICK if quick else FULL
     scenes = reference_scenes("test", camera, number=groups, size=size)
     scenes = [scene for scene in scenes if scene.kind == "depth"]
@@ -73,7 +72,6 @@ def measure(seed: int, quick: bool) -> list[Row]:
 
 
 def _errors(scene: ReferenceScene, seed: int) -> Iterator[Row]:
-    """Sums of squared errors of every method over each class of pixels, at each ISO."""
     camera = ReferenceCamera(get_camera("nikon_z6"))
     light = {n: camera.blurred_light(scene, n) for n in (F_SOURCE, F_TARGET)}
     to_open = equal_exposure(scene.reference, ISOS[0], F_TARGET)
@@ -112,7 +110,6 @@ def _pixel_classes(diameter: Tensor, white: Tensor) -> dict[str, Tensor]:
 
 
 def _opened(source: RawImage, true_diameter: Tensor) -> dict[str, Tensor]:
-    """One capture opened with every network."""
     simulators, f_source = load_models().simulators, source.settings.effective_f_number
     clean, deviation = _denoised(simulators["compact"], source)
     # As the module does, its bank shared with the same blur of the true diameters.
@@ -140,7 +137,6 @@ def _denoised(simulator: CameraSimulator, source: RawImage) -> tuple[Tensor, Ten
 
 
 def tables(rows: list[Row]) -> dict[str, str]:
-    """A table for each set of scenes, below its name."""
     line = "circle of confusion (area; asked) = {pixels} ({area:.1%}; {asked:g})"
     by_set = sections(rows, "{set}", lambda own: pivot(own, line, "ISO {iso}", _CONTENTS))
     return {"defocus": by_set}

@@ -29,7 +29,6 @@ asked = {{asked:.0%}}"""
 
 
 def measure(seed: int, quick: bool) -> list[Row]:
-    """One row per picture."""
     simulator = CameraSimulator.from_pretrained(device="cpu", cache=None)
     camera, data, rows = get_camera("nikon_z6"), data_root(), []
     scenes = list(reference_scenes("test", camera, number=0, data=data))
@@ -52,7 +51,6 @@ def measure(seed: int, quick: bool) -> list[Row]:
 
 
 def tables(rows: list[Row]) -> dict[str, str]:
-    """The share that stays, and the pictures that change most."""
     small = np.mean([row["change"] < ASKED for row in rows])
     share = {"pictures": len(rows), "small": small, "asked": ASKED_SHARE}
     most = sorted(rows, key=lambda row: -row["change"])[:8]

@@ -54,7 +54,6 @@ def weights(name: str) -> str | Path | None:
 
 
 def train_missing() -> None:
-    """Trains what is not there by its configuration; a training that was stopped continues."""
     for name in (*PRESETS, *BASELINES):
         if weights(name) is None:
             command = [sys.executable, "-m", "benchmarks.paper_baselines", "train-simulator"]
@@ -63,7 +62,6 @@ def train_missing() -> None:
 
 @functools.cache
 def load_models() -> Models:
-    """All models that are there."""
     found = {n: w for n in (*PRESETS, *BASELINES) if (w := weights(n)) is not None}
     loaded = {name: load_modules(path) for name, path in found.items()}
     make = functools.partial(CameraSimulator.from_pretrained, device="cpu", cache=None)
@@ -90,7 +88,6 @@ def baseline(network: nn.Module, raw: RawImage, target: CameraSettings) -> Tenso
 
 
 def scores(estimate: Tensor, truth: Tensor, camera: CameraProfile) -> Row:
-    """PSNR [dB] and SSIM of an estimate before the output's noise is added."""
     image, window = clipped(estimate, camera), min(7, *(n - 1 + n % 2 for n in truth.shape[1:]))
     ssim = structural_similarity(
         image.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, win_size=window
@@ -107,7 +104,6 @@ def held_out_scenes(camera: str, quick: bool) -> tuple[ReferenceScene, ...]:
 
 
 def equal_exposure(reference: CameraSettings, iso: float, f_number: float) -> CameraSettings:
-    """The exposure of `reference` at another ISO and f-number."""
     unit = CameraSettings(iso, 1.0, f_number)
     return CameraSettings(iso, 2.0 ** (reference.log2_exposure - unit.log2_exposure), f_number)
 

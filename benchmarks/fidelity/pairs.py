@@ -105,7 +105,6 @@ GROUPS: dict[str, Callable[[Case], bool]] = {
 
 
 def measure(camera: str, mix: str, seed: int, quick: bool) -> list[Row]:
-    """One row per group of pairs and method."""
     number, index = list(CAMERAS).index(camera), list(PAIRS).index(mix)
     count = (QUICK_PAIRS if quick else PAIRS)[mix]
     profile = get_camera(camera)
@@ -212,7 +211,6 @@ def _stopwatch(simulator: CameraSimulator, times: dict[str, float]) -> list[Any]
 
 
 def _scores(case: Case) -> dict[Method, Row]:
-    """PSNR [dB] and SSIM against the noisy target and against its mean, and the time."""
     found: dict[Method, Row] = {}
     for method, estimate, ms in _estimates(case):
         found[method] = {"ms": ms}
@@ -268,7 +266,6 @@ contribution [dB] = {contribution:+.2f}"""
 
 
 def tables(rows: list[Row]) -> dict[str, str]:
-    """The table, how many pairs there are, the margin by group, and the breakdown."""
     for row in rows:
         row["name"], row["label"] = _NAMES[row["camera"]], row["method"]
         if row["preset"]:

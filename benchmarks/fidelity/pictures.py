@@ -45,7 +45,6 @@ CASES: dict[str, tuple[dict[str, tuple[float, float]], Any, Any]] = {
 
 
 def measure(seed: int, quick: bool) -> list[Row]:
-    """Draws the picture; one row per situation with its settings and PSNR."""
     camera = get_camera("nikon_z6")
     found = list(reference_scenes("test", camera, number=0, data=data_root()))
     scenes = {s.scene_id: s for s in (*found, *depth_photographs(camera, data=None))}
@@ -103,7 +102,6 @@ def _draw(axes: Any, row: Row, pictures: list[np.ndarray], middle: tuple[float, 
 
 
 def tables(rows: list[Row]) -> dict[str, str]:
-    """Settings and PSNR of the pictures."""
     columns = """situation = {case} | scene = {scene} | light [lux] = {illuminance:g} |
     input = {source} | simulated = {target} | EXP = {psnr_db[EXP]:.2f} | NS = {psnr_db[NS]:.2f} |
     Full = {psnr_db[Full]:.2f}"""

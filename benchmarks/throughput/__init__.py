@@ -37,7 +37,6 @@ _LINEAR = 1.1
 
 
 def parts(seed: int, quick: bool, against: Path | None = None) -> list[Part]:
-    """Parts to measure; the other checkout comes first."""
     found, given = [], {"seed": seed, "quick": quick}
     if against is not None:
         other = str(checkout(against))
@@ -85,7 +84,6 @@ LibRaw: develop [s] = {libraw[develop]:.3f} | modules = {names}"""
 
 
 def tables(steps: list[Row], paired: list[Row], more: dict[str, Any]) -> dict[str, str]:
-    """The tables of the page; `more` holds the other rows by name."""
     points = [
         {"against": curve["against"], "name": curve["name"], "ms": 1e3 * point["seconds"]} | point
         for curve in more["growth"]
@@ -116,7 +114,6 @@ def tables(steps: list[Row], paired: list[Row], more: dict[str, Any]) -> dict[st
 
 
 def targets(steps: list[Row], paired: list[Row], more: dict[str, Any]) -> Iterator[Row]:
-    """What was asked for, beside what was measured."""
     chosen = {"case": CASE, "num_envs": NUM_ENVS, "size": SIZE, "threads": CORES}
     for row in (row for row in steps if chosen.items() <= row.items()):
         where = f"{NUM_ENVS} environments at {SIZE} x {SIZE}, cached scene, {CORES} threads"

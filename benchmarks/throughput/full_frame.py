@@ -38,7 +38,6 @@ STAGES = ("read", "prepare", "simulate", "write")
 
 
 def parts(quick: bool) -> Iterator[Part]:
-    """A part for each file and case, and LibRaw's for each file."""
     synthetic = RUNS / "throughput" / f"frame{'_quick' * quick}.dng"
     synthetic.parent.mkdir(parents=True, exist_ok=True)
     _write_foreign_dng(synthetic, *(QUICK if quick else FULL))
@@ -54,7 +53,6 @@ def parts(quick: bool) -> Iterator[Part]:
 
 
 def rows(results: dict[str, Any]) -> list[Row]:
-    """One row per file and case; parts of other kinds have no file in their names."""
     found = []
     for label, row in results.items():
         if label.startswith("frame|"):
@@ -65,7 +63,6 @@ def rows(results: dict[str, Any]) -> list[Row]:
 
 
 def _write_foreign_dng(path: Path, height: int, width: int) -> None:
-    """Writes a DNG that does not say that it comes from this library."""
     write_dng(path, noisy_raw(height, width))
     note = SOFTWARE_NAME.encode()
     path.write_bytes(path.read_bytes().replace(note, b" " * len(note)))

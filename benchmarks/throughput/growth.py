@@ -35,7 +35,6 @@ _TILE, _DEFOCUS = 512, 4.0
 
 
 def parts(quick: bool) -> Iterator[Part]:
-    """A part for each point of each curve; `quick` leaves out most of them."""
     pixels = [{"height": h, "width": w} for h, w in (PIXELS[1:4] if quick else PIXELS)]
     states = [{"count": n} for n in (STATES[:7:3] if quick else STATES)]
     curves: dict[str, tuple[Callable[..., Any], list[Any], dict[str, Any]]] = {
@@ -51,7 +50,6 @@ def parts(quick: bool) -> Iterator[Part]:
 
 
 def curves(results: dict[str, Any]) -> list[Row]:
-    """The curves with their points, and exponents of time and memory over the upper decades."""
     found: dict[tuple[str, str], list[Row]] = {}
     for label, point in results.items():
         if label.startswith("growth|"):

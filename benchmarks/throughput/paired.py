@@ -33,11 +33,7 @@ of processor time = {ratio_cpu:.3f} | frames differ by = {max_difference:.2g}"""
 
 
 def checkout(against: Path) -> Path:
-    """The folder of another checkout; of a commit, a worktree of it under ``runs``.
-
-    Raises:
-        ValueError: If `against` is neither.
-    """
+    """The folder of another checkout; of a commit, a worktree of it under ``runs``."""
     if (against / "simulator" / "__init__.py").is_file():
         return against.absolute()
     folder = ROOT / "runs" / "against" / against
@@ -50,11 +46,7 @@ def checkout(against: Path) -> Path:
 
 
 class Worker:
-    """A process that measures one checkout with so many threads.
-
-    Raises:
-        RuntimeError: If it does not start, or runs another checkout's packages.
-    """
+    """A process that measures one checkout with so many threads."""
 
     def __init__(self, checkout: Path, threads: int) -> None:
         self.checkout = checkout.resolve()

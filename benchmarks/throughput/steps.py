@@ -60,7 +60,6 @@ class Case:
 
 
 def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
-    """Rows of results at one frame size and number of threads."""
     torch.set_num_threads(1)  # while children are forked: threads would not come along
     cases = [_copies(8 if quick else 64, size, seed)] if threads > 1 else []
     torch.set_num_threads(threads)
@@ -202,7 +201,6 @@ RESETS, QUICK_RESETS = ((1, 500, 400), (64, 100, 100)), ((1, 20, 20), (64, 5, 5)
 
 
 def measure_resets(seed: int, quick: bool) -> list[Row]:
-    """Rows of one environment and of 64, in motion and out of focus, with random actions."""
     rows = []
     for num_envs, warm, number in QUICK_RESETS if quick else RESETS:
         envs = warm_environments(num_envs, {"max_episode_steps": None}, seed).unwrapped

@@ -113,7 +113,6 @@ def _sweep(side: int, noise: Any, kind: str) -> Case:
 
 
 def _raw(side: int) -> RawImage:
-    """A smooth picture with the noise of ISO 400 on it."""
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 4, 9, 9, generator=generator)
     light = torch.nn.functional.interpolate(coarse, (side, side), mode="bilinear")[0] * 0.3

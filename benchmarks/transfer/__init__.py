@@ -43,16 +43,7 @@ def run(
     plan: TransferPlan | None = None,
     folder: Path | None = None,
 ) -> None:
-    """Trains, judges, predicts tables; writes a JSON for each half and the page.
-
-    Args:
-        out: Folder of results.
-        seed: Of the evaluation and the tables; the training seeds are the plan's.
-        quick: A few frames and scenes, to see that everything runs.
-        part: ``"agents"`` or ``"tables"``; both by default.
-        plan: Another one than the real or the quick one.
-        folder: Of the trained agents; by default ``runs/bench_transfer``.
-    """
+    """Trains, judges, predicts tables; writes a JSON for each half and the page."""
     plan = plan or (QUICK if quick else TransferPlan())
     folder = folder or ROOT / "runs" / ("bench_transfer_quick" if quick else "bench_transfer")
     simulators = [name for one in plan.tables for name in one.simulators]

@@ -108,12 +108,10 @@ def _config(plan: TransferPlan, agent: str, world: str) -> AgentConfig:
 
 
 def common_options(plan: TransferPlan) -> dict[str, Any]:
-    """Arguments of the environment that are the same in training and judging."""
     return {"resolution": RESOLUTION, "crop": CROP, "scorer": plan.scorer}
 
 
 def train(jobs: Jobs) -> None:
-    """Trains every job that is not trained yet, as many at a time as there are cores."""
     everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
     waiting = [job for job in everything if not is_trained(job.config, job.out)]
     with progress_bars() as progress, ExitStack() as bars:
@@ -175,14 +173,7 @@ def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult
 def comparison(
     gains: Mapping[tuple[str, str], np.ndarray], span: np.ndarray, agent: str, world: str
 ) -> Row:
-    """Normalised score of an agent, its drop against the truth, and by how much it beats EXP's.
-
-    Args:
-        gains: ``q - q_random`` by agent and world, (K, G) per training seed and source group.
-        span: ``q_oracle - q_random`` per source group, (G,).
-        agent: Which agent.
-        world: Where it was trained. EXP's is the world of the same sources.
-    """
+    """Normalised score of an agent, its drop against the truth, and by how much it beats EXP's."""
     own, truth, score = gains[agent, world], gains[agent, TRUTH], "normalised_score"
     found = {score: score_interval(own, span)}
     exp = World(EXP, high_iso=WORLDS[world].high_iso).name
@@ -211,13 +202,11 @@ met = {met}"""
 
 
 def agent_tables(rows: Sequence[Row]) -> dict[str, str]:
-    """Whether what was asked for holds, and a table for each agent."""
     by_agent = sections(rows, "{agent}", lambda own: table(own, _COLUMNS))
     return {"verdicts": table(verdicts(rows), _ASKED), "agents": by_agent}
 
 
 def verdicts(rows: Sequence[Row]) -> Iterator[Row]:
-    """What was asked for, and whether it holds, for each agent."""
     for row in (row for row in rows if row["simulator"] == "compact"):
         name, asked, met = "drop", f"drop below {MOST_DROP}", row["drop"] < MOST_DROP
         if row["high_iso"]:

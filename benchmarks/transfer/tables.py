@@ -136,7 +136,6 @@ def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:
 
 
 def summary(measured: Sequence[Measured]) -> list[Row]:
-    """A row for each simulator: means over source groups, and paired differences to EXP."""
     frame, terms = pd.DataFrame(measured), list(measured[0]["terms"])
     for term in terms:
         frame[f"term {term}"] = [m["terms"][term] for m in measured]

@@ -34,7 +34,6 @@ BOTH = "both"
 def scenes_of(
     name: str, crop: Crop, split: Split, camera: CameraProfile, resolution: int | None
 ) -> list[Scene]:
-    """Scenes of a set: `BOTH`, or a name that `load_scenes` knows; see there for the arguments."""
     names = ("bundled", "polyhaven") if name == BOTH else (name,)
     common: dict[str, Any] = {"camera": camera, "resolution": resolution, "crop": crop}
     return [scene for one in names for scene in load_scenes(one, split, **common)]
@@ -63,12 +62,7 @@ high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:s
 
 @dataclass(frozen=True)
 class World:
-    """What an agent is trained in.
-
-    Args:
-        simulator: ``"truth"``, or what simulates from one raw of each scene, of `SIMULATORS`.
-        high_iso: Whether those raws are of ISO 1600 to 6400, instead of 100 to 6400.
-    """
+    """What an agent is trained in."""
 
     simulator: str
     high_iso: bool = False
@@ -112,17 +106,7 @@ def has_weights(name: str) -> bool:
 
 @dataclass(frozen=True)
 class TableSet:
-    """Score tables that are predicted.
-
-    Args:
-        scorer: What they are of.
-        scenes: Held-out scenes.
-        simulators: Those that predict; the ones whose networks are not there are left out.
-        isos: Of the sources.
-        evs: Exposure of the sources relative to the meter [EV].
-        crops: ``"box"`` averages a scene's pixels to a frame, and their noise with them;
-            ``"native"`` cuts a frame of native pixels out, with all of their noise.
-    """
+    """Score tables that are predicted."""
 
     scorer: str = "balanced"
     scenes: int = 32
@@ -138,19 +122,7 @@ SEEN = TableSet("fidelity", 10, (EXP, "compact", PAPER), (1600, 6400), (-1, 0, 1
 
 @dataclass(frozen=True)
 class TransferPlan:
-    """How much is trained and measured.
-
-    Args:
-        scenes: Set to train on: `BOTH`, ``"bundled"`` or ``"bundled:small"``.
-        worlds: Names of `WORLDS`, the truth among them.
-        agents: Names of configurations.
-        seeds: Training seeds.
-        frames: Frames of each training; PPO takes whole updates of 1024.
-        episodes: Episodes on each held-out scene that agents are judged in.
-        judged_scenes: Held-out scenes that agents are judged on, groups in turn; None for all.
-        scorer: What agents are trained for and judged by.
-        tables: What is measured of score tables.
-    """
+    """How much is trained and measured."""
 
     scenes: str = BOTH
     worlds: tuple[str, ...] = tuple(WORLDS)

@@ -23,7 +23,6 @@ _SHARES = {"validation": 4, "test": 8}
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """Parts to measure; a full run first trains the networks that are missing."""
     if not quick:
         train_missing()
     common = {"seed": seed, "quick": quick}

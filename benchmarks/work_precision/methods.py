@@ -51,15 +51,7 @@ class Prepared(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One way from a raw to captures at other settings; either `prepare` or `shoot` is there.
-
-    Args:
-        name: As the tables have it.
-        dtype: Of the networks.
-        tolerance: Of the simulator's plan; None where there is no plan.
-        prepare: What is done once per raw.
-        shoot: One capture (4, H, W) from a raw, settings and a seed, and the same without noise.
-    """
+    """One way from a raw to captures at other settings; either `prepare` or `shoot` is there."""
 
     name: str
     dtype: Dtype = "float32"
@@ -141,7 +133,6 @@ def _denoised_by(name: str, denoise: Denoiser, bare: CameraSimulator) -> Method:
 
 
 def planned(name: str, tolerance: float, dtype: Dtype = "float32") -> Method:
-    """Networks up to `name`, prepared once, within `tolerance`; they find defocus themselves."""
     own = simulator(name, dtype)
 
     def prepare(raw: RawImage) -> Prepared:
@@ -201,8 +192,6 @@ def _without_repetition(own: CameraSimulator, dtype: Dtype) -> Method:
 
 
 def _planned_transition(own: CameraSimulator, tolerance: float) -> Method:
-    """One transition of `own` at a time, leaving out what `tolerance` allows."""
-
     def shoot(raw: RawImage, settings: CameraSettings, seed: int) -> tuple[Tensor, Tensor]:
         prepared = own.prepare(raw, depth="unknown", tolerance=tolerance)
         return prepared.expose([settings], seed=seed)[0], prepared.expected(settings)

@@ -111,12 +111,7 @@ def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Te
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """Captures of one scene at the same settings before their noise is drawn.
-
-    Args:
-        light: (K, 4, H, W) light of each photograph's capture.
-        added: (K, 4, H, W) variance of the noise that is added to it.
-    """
+    """Captures of one scene at the same settings before their noise is drawn."""
 
     light: Tensor
     added: Tensor

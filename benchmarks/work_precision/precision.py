@@ -34,7 +34,6 @@ _SAME_DB = 0.01
 
 
 def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
-    """One row per method."""
     height, width = size
     chosen, count = trials((height, width)), STATES[height]
     methods = all_methods()

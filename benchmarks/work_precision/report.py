@@ -40,7 +40,6 @@ TARGETS = {"paper, no repetition": (100.0, 0.0), "paper full": (200.0, 0.0)}
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The report, of the results by name of the part."""
     rows: list[Row] = []
     for own in results.values():
         rows += own if isinstance(own, list) else [own]
@@ -130,7 +129,6 @@ _LEFT_OUT: dict[str, Any] = {
 
 
 def _targets(rows: list[Row]) -> Iterator[Row]:
-    """Every planned sweep in float32 against the full runs, by size."""
     rows = [row for row in rows if row["dtype"] == "float32"]
     for row, other in itertools.product(rows, rows):
         shared = row["tolerance"] == DEFAULT and row["mode"] == "shared"

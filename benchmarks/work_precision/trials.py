@@ -45,13 +45,7 @@ _ALL_GROUPS = 32
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One scene, photographed.
-
-    Args:
-        scene: What is photographed.
-        source: Settings of the source.
-        camera: The body.
-    """
+    """One scene, photographed."""
 
     scene: ReferenceScene
     source: CameraSettings
