@@ -338,7 +338,7 @@ def columns_of(columns: Columns) -> Mapping[str, Cell]:
 
 
 def _words(row: Row) -> Row:
-    answers = ("**no**", "yes")
+    answers = ("no", "yes")
     return {k: answers[bool(v)] if isinstance(v, bool | np.bool_) else v for k, v in row.items()}
 
 
@@ -360,7 +360,7 @@ def pivot(rows: Iterable[Row], line: Columns, group: Cell, contents: Columns) ->
         contents: Columns of a group; without a heading for one alone.
     """
     ((heading, named),) = columns_of(line).items()
-    shown: dict[str, Cell] = {heading: "{line}"}
+    shown: dict[str, Cell] = {heading: "{line:md}"}
     lines: dict[str, Row] = {}
     for row in map(_words, rows):
         name, own = cell(row, named), cell(row, group)

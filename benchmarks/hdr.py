@@ -175,8 +175,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     lit = [row for row in shown if not np.isnan(row["radiance_ev"])]
     group, seconds = "ISO {iso} {range}", {"seconds": frame["seconds"].median()}
     tables = {
-        "pictures": pivot(shown, "picture = {label}", group, "{psnr:.1f} / {ssim:.3f}"),
-        "radiance": pivot(lit, "light = {label}", group, "{radiance_ev:.3f}"),
+        "pictures": pivot(shown, "picture = {label:md}", group, "{psnr:.1f} / {ssim:.3f}"),
+        "radiance": pivot(lit, "light = {label:md}", group, "{radiance_ev:.3f}"),
         "time": table([seconds], "`ae-env hdr`'s own part, one core [s a view] = {seconds:.2f}"),
     }
     figure = picture(meta["seed"], meta["quick"])

@@ -193,6 +193,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     rows = [row for own in results.values() for row in own]
     frame = pd.DataFrame(rows)
     times = frame.groupby(["preset", "sha256"], sort=False)["ms"].median().reset_index()
+    times["sha"] = times["sha256"].str[:12]
     by_group = frame.explode("groups").rename(columns={"groups": "group"})
     groups = by_group.groupby(["group", "preset", "method"], sort=False)
     means = groups[["psnr_db", "ssim"]].mean().assign(pairs=groups.size()).reset_index()
@@ -202,8 +203,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "group", key=lambda names: names.map(list(GROUPS).index), kind="stable"
     )
     published = [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()]
-    line, values = "PSNR [dB] / SSIM = {label}", "{psnr_db:.2f} / {ssim:.3f}"
-    networks = "network = `{preset}` | weights = `{sha256:.12}` | ms a pair (median) = {ms:.0f}"
+    line, values = "PSNR [dB] / SSIM = {label:md}", "{psnr_db:.2f} / {ssim:.3f}"
+    networks = "network = `{preset}` | weights = `{sha}` | ms a pair (median) = {ms:.0f}"
     of_paper = "published, of the authors' own split = {camera} | PSNR [dB] / SSIM = {text}"
     tables = {
         "means": pivot(means.to_dict("records"), line, "{group} ({pairs})", values),

@@ -112,7 +112,8 @@ class GeneratedConvolution(nn.Module):
     """A convolution without bias whose kernel is a fully connected layer of the parameters.
 
     Every sample of a batch is convolved with its own kernel. Starts as a He-initialised kernel
-    that the parameters vary by some tens of percent.
+    that the parameters vary by some tens of percent. `upsample`: a 4 x 4 transposed convolution of
+    stride 2 in place of 3 x 3, for as many outputs as inputs.
     """
 
     def __init__(

@@ -268,23 +268,18 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             stops.append(head | {"title": "two real captures"} | ceilings)
     regrets = frame.loc[frame["method"] == "simulated", "oracle_regret"]
     regret = {"mean": regrets.mean(), "upper": regrets.quantile(0.75), "most": regrets.max()}
+    of_set, method = "scenes = {scenes} | ", "method = {title:md} | "
     each = (
         "scene = {scene} | from = {source_state} | states = {states} | known = {known_share:.1%} | "
     )
-    title, by_stops = (
-        "method = {title} | ",
-        " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS),
-    )
-    of_set = "scenes = {scenes} | method = {title} | "
+    same, number = " | same oracle = {same_oracle:.0%}", "number = {number} | "
+    every = [row | {"title": METHODS[row["method"]]} for row in rows]
+    by_stops = " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS)
     tables = {
-        "sets": table(
-            sets, f"{of_set}number = {{number}} | {_COLUMNS} | same oracle = {{same_oracle:.0%}}"
-        ),
+        "sets": table(sets, of_set + method + number + _COLUMNS + same),
         "regret": table([regret], _REGRET),
-        "by_stops": table(stops, of_set + by_stops),
-        "scenes": table(
-            [r | {"title": METHODS[r["method"]]} for r in rows], each + title + _COLUMNS
-        ),
+        "by_stops": table(stops, of_set + method + by_stops),
+        "scenes": table(every, each + method + _COLUMNS),
     }
     return Report(rows, tables)
 

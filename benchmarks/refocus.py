@@ -174,7 +174,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         for n, whole, edge in own[["f_number", "psnr", "edge_psnr"]].to_numpy():
             mean |= {f"psnr {n:g}": whole, f"edge_psnr {n:g}": edge}
         means += [mean] if len(own) else []
-    columns = {"method": "{method}", "ISO": "{iso}"}
+    columns = {"method": "{method:md}", "ISO": "{iso}"}
     for name in (f"{f_number:g}" for f_number in F_NUMBERS):
         columns[f"f/{name}"] = f"{{psnr {name}:.1f}} / {{edge_psnr {name}:.1f}}"
     tables = {"psnr": table(means, columns | {"seconds": "{seconds:.2f}"})}

@@ -100,7 +100,10 @@ _SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
 
 
 class _Format(string.Formatter):
-    """Formats of rows: ``{a[b]}`` is an entry of an entry, a pair of numbers is "1 to 2"."""
+    """Formats of rows: ``{a[b]}`` is an entry of an entry, a pair of numbers is "1 to 2".
+
+    Texts are shown as they are, those of ``{a:md}`` are Markdown.
+    """
 
     def get_field(self, name: str, args: Any, kwargs: Any) -> Any:
         try:
@@ -114,6 +117,8 @@ class _Format(string.Formatter):
     def format_field(self, value: Any, spec: str) -> Any:
         if isinstance(value, list | tuple):
             return " to ".join(format(one, spec) for one in value)
+        if spec == "md":
+            return value
         return escape(value) if isinstance(value, str) else format(value, spec)
 
 

@@ -1,36 +1,269 @@
-"""Trains the detector under one of the augmentations."""
+"""A small detector of local features, the pictures that it learns from, and its training."""
 
 from __future__ import annotations
 
 import functools
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from ae_env.scorers.measures import srgb_decode
-from benchmarks.features.detector import CELL, Detector, sample
-from benchmarks.features.pairs import (
-    View,
-    batches,
-    inside,
-    mapped,
-    sources,
-    training_view,
-    two_crops,
-    warped,
-)
-from benchmarks.harness import RUNS
+from benchmarks.harness import RUNS, data_root
 from benchmarks.isolated import ROOT
+from simulator import develop
 from simulator.augment import ExposureAugmentation, sample_seeds
-from simulator.raw.develop import srgb_encode
+from simulator.radiance.maps import read_radiance
+from simulator.raw.develop import GREY_CARD_SIGNAL, srgb_encode
+from simulator.training.scenes import (
+    Split,
+    photograph_pictures,
+    radiance_files,
+    recorded_mosaics,
+)
+
+# -- pictures, and pairs of views of them with a known homography ---------------------------------
+
+#: Brightest light of a map, in its medians.
+_BRIGHTEST = 64.0
+#: Corners that are labels: least contrast, and least distance [pixel].
+_LEAST_CORNER, _CORNER_DISTANCE = 2e-5, 4
+
+
+class Source(NamedTuple):
+    """Light of one picture; `group` is the unit of splitting.
+
+    (3, 2H, 2W) linear at the pitch of the photosites, or (4, H, W) planes of a raw; its median
+    green is that of a metered exposure.
+    """
+
+    name: str
+    group: str
+    light: Tensor
+
+
+class View(NamedTuple):
+    """A source picture (H, W, 3) uint8 sRGB at its metered exposure, and its corners (N, 2)."""
+
+    picture: np.ndarray
+    corners: np.ndarray
+
+
+def sources(split: Split, *, raws: bool, limit: int | None = None) -> list[Source]:
+    data = data_root()
+    if data is None:
+        raise FileNotFoundError("set AE_ENV_DATA to the folder of real files (photo_pool, maps)")
+    found = []
+    for picture in islice(photograph_pictures(data, split), limit):
+        found.append(Source(picture.name, picture.group, _metered(picture.light)))
+    for path, group in islice(radiance_files(data, split), limit):
+        light = read_radiance(path)
+        light = np.minimum(light / max(float(np.median(light[1])), 1e-9), _BRIGHTEST)
+        found.append(Source(path.stem, group, _metered(torch.from_numpy(light))))
+    for belongs in ("train", "validation", "test") if raws else ():
+        for raw in recorded_mosaics(data, belongs):
+            found.append(Source(raw.name, raw.group, _metered(raw.light.clamp(min=0.0))))
+    return found
+
+
+def _metered(light: Tensor) -> Tensor:
+    """`light` at an exposure at which its median green is that of a grey card."""
+    return light.float() * (GREY_CARD_SIGNAL / max(float(light[1].median()), 1e-9))
+
+
+def training_view(source: Source) -> View:
+    """The picture of a source as files hold them, and Shi and Tomasi's corners of it."""
+    packed = source.light[None]
+    if packed.shape[1] == 3:
+        packed = F.avg_pool2d(packed, 2)[:, [0, 1, 1, 2]]
+    picture = develop(packed)[0].permute(1, 2, 0).numpy()
+    grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+    strength = torch.from_numpy(cv2.cornerMinEigenVal(grey, 5))[None, None]
+    largest = F.max_pool2d(strength, 2 * _CORNER_DISTANCE + 1, 1, _CORNER_DISTANCE)
+    peaks = ((strength == largest) & (strength > _LEAST_CORNER))[0, 0].nonzero()
+    corners = peaks.flip(1).numpy().astype(np.float32)
+    return View(np.round(picture * 255.0).astype(np.uint8), corners)
+
+
+# -- homographies ---------------------------------------------------------------------------------
+
+
+def crop_homography(
+    rng: np.random.Generator,
+    centre: np.ndarray,
+    size: int,
+    scale: float,
+    turn: float,
+    jitter: float,
+) -> np.ndarray:
+    """(3, 3) from a picture to a crop of `size` pixels a side around `centre` (x, y).
+
+    Drawn: a factor of up to `scale` either way, a rotation of up to `turn` degrees, and shifts of
+    the corners of up to `jitter` sides of the crop.
+    """
+    half = 0.5 * size * scale ** rng.uniform(-1.0, 1.0)
+    angle = np.radians(rng.uniform(-turn, turn))
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = square + 2.0 * rng.uniform(-jitter, jitter, (4, 2))
+    given = (centre + half * moved @ rotation.T).astype(np.float32)
+    wanted = (0.5 * size * (square + 1.0) - 0.5).astype(np.float32)
+    return cv2.getPerspectiveTransform(given, wanted).astype(np.float64)
+
+
+def mapped(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Points (N, 2) mapped by a homography."""
+    if not len(points):
+        return points.reshape(0, 2)
+    return cv2.perspectiveTransform(points.astype(np.float64)[None], homography)[0]
+
+
+def inside(points: np.ndarray, size: int, border: float = 0.0) -> np.ndarray:
+    """(N,) whether points lie in a crop."""
+    return ((points >= border) & (points <= size - 1 - border)).all(axis=1)
+
+
+def two_crops(
+    rng: np.random.Generator, height: int, width: int, size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    reach = min(0.75 * size, 0.5 * min(height, width))
+    centre = np.array([rng.uniform(reach, width - reach), rng.uniform(reach, height - reach)])
+    first = crop_homography(rng, centre, size, 1.1, 0.0, 0.0)
+    moved = centre + rng.uniform(-0.1, 0.1, 2) * size
+    return first, crop_homography(rng, moved, size, 1.25, 25.0, 0.1)
+
+
+def warped(image: np.ndarray, homography: np.ndarray, size: int) -> np.ndarray:
+    flags, border = cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101
+    return cv2.warpPerspective(image, homography, (size, size), flags=flags, borderMode=border)
+
+
+def finer(homography: np.ndarray) -> np.ndarray:
+    """The same between pictures of twice the pixels a side."""
+    # Pixel x of a picture is at 2 x + 1/2 of the finer one.
+    up = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]])
+    return up @ homography @ np.linalg.inv(up)
+
+
+def batches(count: int, size: int, seed: int) -> Iterator[np.ndarray]:
+    """Indices of endless batches, each picture as often as any other."""
+    rng, left = np.random.default_rng([seed, 1]), np.zeros(0, np.int64)
+    while True:
+        while len(left) < size:
+            left = np.concatenate([left, rng.permutation(count)])
+        yield left[:size]
+        left = left[size:]
+
+
+# -- a small detector and descriptor of local features --------------------------------------------
+
+#: Pixels a side of a cell that holds at most one keypoint.
+CELL = 4
+#: Keypoints closer than this to the border are left out, and to a stronger one [pixel].
+BORDER, SPACING = 4, 3
+DESCRIPTOR = 64
+
+
+class Features(NamedTuple):
+    """Keypoints of one picture, the strongest first: x and y [pixel] (N, 2), 0 at the middle of the
+    first pixel, and descriptors (N, D) of length 1."""
+
+    points: Tensor
+    descriptors: Tensor
+
+
+def _double(channels_in: int, channels: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for given in (channels_in, channels):
+        layers += [nn.Conv2d(given, channels, 3, padding=1, bias=False)]
+        layers += [nn.BatchNorm2d(channels), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)
+
+
+class Detector(nn.Module):
+    """Scores and dense descriptors of a picture, both from one encoder.
+
+    After SuperPoint (DeTone et al. 2018): a softmax over the pixels of a cell and "none of them",
+    and normalised descriptors that are interpolated. It is smaller, and its cells are finer.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (16, 32, 64, 64)
+        self.levels = nn.ModuleList(
+            _double(given, width) for given, width in zip((1, *widths), widths, strict=False)
+        )
+        self.merged = nn.Sequential(nn.Conv2d(128, 64, 1, bias=False), nn.BatchNorm2d(64))
+        self.score = nn.Sequential(
+            nn.Conv2d(64, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, CELL**2 + 1, 1)
+        )
+        self.descriptor = nn.Conv2d(64, DESCRIPTOR, 1)
+
+    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B, 17, H/4, W/4), the last of "none", and descriptors (B, 64, H/4, W/4).
+
+        `pictures` (B, 3, H, W) are sRGB in [0, 1], H and W multiples of 8.
+        """
+        grey = 0.299 * pictures[:, :1] + 0.587 * pictures[:, 1:2] + 0.114 * pictures[:, 2:]
+        # Every picture to the same mean and contrast, so that a gap is not hopeless from the start.
+        deviation, mean = torch.std_mean(grey, dim=(1, 2, 3), keepdim=True)
+        x = (grey - mean) / (deviation + 1e-3)
+        for index, level in enumerate(self.levels):
+            x = level(x if index == 0 else F.max_pool2d(x, 2))
+            if index == 2:
+                fine = x
+        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+        x = F.relu(self.merged(torch.cat([fine, x], dim=1)))
+        return self.score(x), self.descriptor(x)
+
+    @torch.no_grad()
+    def detect(self, pictures: Tensor, count: int) -> list[Features]:
+        """The `count` strongest keypoints of each picture."""
+        logits, dense = self(pictures.contiguous(memory_format=torch.channels_last))
+        scores = F.pixel_shuffle(logits.softmax(dim=1)[:, :-1], CELL)
+        largest = F.max_pool2d(scores, 2 * SPACING + 1, 1, SPACING)
+        scores = torch.where(scores == largest, scores, 0.0)[:, 0]
+        scores = F.pad(scores[:, BORDER:-BORDER, BORDER:-BORDER], (BORDER,) * 4)
+        found = []
+        for score, maps in zip(scores, dense, strict=True):
+            values, index = score.flatten().topk(count)
+            index = index[values > 0]
+            points = torch.stack([index % score.shape[1], index // score.shape[1]], dim=1).float()
+            found.append(Features(points, sample(maps[None], points[None])[0]))
+        return found
+
+
+def sample(dense: Tensor, points: Tensor) -> Tensor:
+    """Descriptors (B, K, D) of length 1 at points (B, K, 2) of pictures, of a map of cells."""
+    height, width = (CELL * n for n in dense.shape[-2:])
+    size = torch.tensor([width, height], dtype=points.dtype)
+    grid = (points + 0.5) / size * 2.0 - 1.0
+    values = F.grid_sample(dense, grid[:, :, None], align_corners=False, padding_mode="border")
+    return F.normalize(values[..., 0].transpose(1, 2), dim=-1)
+
+
+def mutual_matches(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices of descriptors (N, D) and (M, D) that are each other's nearest."""
+    if not len(first) or not len(second):
+        none = torch.zeros(0, dtype=torch.int64)
+        return none, none
+    similar = first @ second.T
+    forth, back = similar.argmax(dim=1), similar.argmax(dim=0)
+    index = torch.arange(len(first))
+    mutual = back[forth] == index
+    return index[mutual], forth[mutual]
+
+
+# -- training -------------------------------------------------------------------------------------
 
 #: Exposures that plain scaling and ours draw from [EV]; the tests lie within.
 STOPS = (-6.0, 4.0)

@@ -24,7 +24,7 @@ MODULES: dict[str, Any] = {
     "pictures": pictures,
 }
 _CARDS = """model = `{name}` | parameters = {parameters:,} | stage: steps in CPU time = {steps} |
-weights (SHA-256) = `{sha256:.12}`"""
+weights (SHA-256) = `{sha}`"""
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
@@ -46,7 +46,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     for name, card in cards.items():
         stages = card.get("stages", {}).items()
         steps = (f"{s}: {own['steps']:,} in {own['seconds'] / 60:.1f} min" for s, own in stages)
-        shown.append({"name": name, **card, "steps": "; ".join(steps)})
+        shown.append({"name": name, **card, "steps": "; ".join(steps), "sha": card["sha256"][:12]})
     tables = {"models": table(shown, _CARDS)}
     for name, module in MODULES.items():
         tables |= module.tables([row for row in rows if row["part"] == name])

@@ -286,7 +286,7 @@ def tables(rows: list[Row]) -> dict[str, str]:
             full.append(row | {"share": share, "contribution": share * row["over_exp_noisy_db"]})
     found = {
         "counts": table(counts, _COUNTS),
-        "paper": pivot(paper, "PSNR [dB] / SSIM = {label}", "{name}", _PAPER),
+        "paper": pivot(paper, "PSNR [dB] / SSIM = {label:md}", "{name}", _PAPER),
         "margin": pivot(full, "pairs = {group}", "{name}", _MARGINS),
     }
     for camera in CAMERAS:
@@ -294,5 +294,5 @@ def tables(rows: list[Row]) -> dict[str, str]:
             r for r in rows if r["camera"] == camera and (r["body_correction"] or not r["preset"])
         ]
         line, values = "mix: pairs = {mix}: {group} ({pairs})", "{noisy_db:.2f} / {mean_db:.2f}"
-        found[f"groups-{camera}"] = pivot(own, line, "{label}", values)
+        found[f"groups-{camera}"] = pivot(own, line, "{label:md}", values)
     return found

@@ -22,9 +22,15 @@ from typing import Any
 from agents.cli.console import print_files
 from benchmarks.harness import RUNS, FinishedParts, Row, filled_page, origin, rounded
 from benchmarks.isolated import ROOT
-from benchmarks.transfer.agents import agent_rows, agent_tables
+from benchmarks.transfer.agents import (
+    QUICK,
+    TransferPlan,
+    agent_rows,
+    agent_tables,
+    has_weights,
+    training_set,
+)
 from benchmarks.transfer.tables import score_tables, table_rows
-from benchmarks.transfer.worlds import QUICK, TransferPlan, has_weights, training_set
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 #: Result file of each half, and its tables.

@@ -25,7 +25,7 @@ from agents.cli.console import progress_bars
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.rollouts import RolloutPlan, make_envs
 from benchmarks.harness import FinishedParts, Row, cell, pivot, sections, table
-from benchmarks.transfer.worlds import (
+from benchmarks.transfer.agents import (
     EXP,
     RESOLUTION,
     TableSet,
@@ -185,7 +185,7 @@ def score_tables(rows: Sequence[Row]) -> dict[str, str]:
             low, high = row.get(f"{name}_to_exp_ci95") or (0.0, 0.0)
             stars[f"{name}_star"] = "*" * (low > 0.0 or high < 0.0)
         shown.append(row | {"title": title, **stars})
-    return {"tables": sections(shown, "{title}", _of_set)}
+    return {"tables": sections(shown, "{title:md}", _of_set)}
 
 
 def _of_set(rows: list[Row]) -> str:

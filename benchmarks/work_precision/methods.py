@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from benchmarks.denoising import Denoiser, classical
-from benchmarks.fidelity.models import load_models, weights
+from benchmarks.fidelity.models import baseline, load_models, weights
 from benchmarks.harness import recorded
 from simulator import (
     CameraSettings,
@@ -25,7 +26,6 @@ from simulator import (
     exposure_ratio,
 )
 from simulator.capture.plan import DEFAULT_TOLERANCE
-from simulator.training.data import settings_parameters
 from simulator.utils.compute import computes_bfloat16
 
 Dtype = Literal["float32", "bfloat16"]
@@ -38,31 +38,25 @@ FAMILY = ("nano", "compact", "large")
 
 
 class Prepared(Protocol):
-    """A raw, ready to be exposed."""
+    """A raw, ready to be exposed: a capture per state (S, 4, H, W), and one without noise."""
 
-    def expose(
-        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
-    ) -> Tensor:
-        """One capture per state, (S, 4, H, W); written to `out` if that is given."""
-
-    def expected(self, settings: CameraSettings) -> Tensor:
-        """(4, H, W) the same without noise, not clipped."""
+    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor: ...  # noqa: D102
+    def expected(self, settings: CameraSettings) -> Tensor: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One way from a raw to captures at other settings; either `prepare` or `shoot` is there."""
+    """One way from a raw to captures at other settings; either `prepare` or `shoot` is there.
+
+    `prepare` is what is done once per raw; `shoot` makes one capture (4, H, W) from a raw, settings
+    and a seed, and the same without noise. `tolerance` is that of the simulator's plan, if any.
+    """
 
     name: str
     dtype: Dtype = "float32"
     tolerance: float | None = None
     prepare: Callable[[RawImage], Prepared] | None = None
     shoot: Callable[[RawImage, CameraSettings, int], tuple[Tensor, Tensor]] | None = None
-
-    @property
-    def mode(self) -> str:
-        """Whether the work is shared by the states of a sweep."""
-        return "transition" if self.prepare is None else "shared"
 
     @property
     def key(self) -> str:
@@ -90,7 +84,10 @@ def all_methods() -> list[Method]:
         methods.append(full("large", simulator("large", dtype), dtype))
         if "paper" in models.simulators:
             paper = simulator("paper", dtype)
-            methods += [full("paper", paper, dtype), _without_repetition(paper, dtype)]
+            methods += [
+                full("paper", paper, dtype),
+                Method("paper, no repetition", dtype, prepare=partial(_PaperSweep, paper)),
+            ]
         methods += [_baseline(name, net, dtype) for name, net in models.baselines.items()]
     return methods
 
@@ -110,11 +107,8 @@ class _Exposed:
     def __init__(self, raw: RawImage) -> None:
         self._raw = raw
 
-    def expose(
-        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
-    ) -> Tensor:
-        camera = self._raw.camera
-        return torch.stack([recorded(self.expected(s), camera) for s in states], out=out)
+    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
+        return torch.stack([recorded(self.expected(s), self._raw.camera) for s in states])
 
     def expected(self, settings: CameraSettings) -> Tensor:
         return self._raw.data * exposure_ratio(self._raw.settings, settings)
@@ -124,12 +118,16 @@ def _denoised_by(name: str, denoise: Denoiser, bare: CameraSimulator) -> Method:
     """A denoiser, once, then as a simulator without networks."""
 
     def prepare(raw: RawImage) -> Prepared:
-        prepared = bare.prepare(raw)
-        return replace(
-            prepared, light=denoise(prepared.light, prepared.nlf), nlf=NoiseLevelFunction.zero()
-        )
+        prepared, clean = bare.prepare(raw), NoiseLevelFunction.zero()
+        return replace(prepared, light=denoise(prepared.light, prepared.nlf), nlf=clean)
 
     return Method(name, prepare=prepare)
+
+
+def _noisy(light: Tensor, settings: CameraSettings, raw: RawImage, seed: int) -> Tensor:
+    """A capture of light without noise at the settings that it was exposed with."""
+    clean = PreparedScene(light, settings, raw.camera, NoiseLevelFunction.zero())
+    return clean.expose([settings], seed=seed)[0]
 
 
 def planned(name: str, tolerance: float, dtype: Dtype = "float32") -> Method:
@@ -153,14 +151,8 @@ class _PaperSweep:
         self._opened: dict[tuple[float, float], Tensor] = {}
         self._denoised: dict[float, Tensor] = {}
 
-    def expose(
-        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
-    ) -> Tensor:
-        clean = (
-            PreparedScene(self.expected(s), s, self._raw.camera, NoiseLevelFunction.zero())
-            for s in states
-        )
-        return torch.stack([c.expose([c.reference], seed=seed)[0] for c in clean], out=out)
+    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
+        return torch.stack([_noisy(self.expected(s), s, self._raw, seed) for s in states])
 
     @torch.no_grad()
     def expected(self, settings: CameraSettings) -> Tensor:
@@ -182,10 +174,6 @@ class _PaperSweep:
                 zero = torch.zeros_like(denoised)
                 self._opened[ratio, target] = own.aperture(denoised, zero, *f_numbers)[0].float()
             return self._opened[ratio, target]
-
-
-def _without_repetition(own: CameraSimulator, dtype: Dtype) -> Method:
-    return Method("paper, no repetition", dtype, prepare=lambda raw: _PaperSweep(own, raw))
 
 
 # -- transitions ----------------------------------------------------------------------------------
@@ -212,12 +200,9 @@ def full(preset: str, own: CameraSimulator, dtype: Dtype = "float32") -> Method:
 def _baseline(name: str, network: nn.Module, dtype: Dtype) -> Method:
     """A network that is told both settings, with the target's noise added to what it predicts."""
 
-    @torch.no_grad()
     def shoot(raw: RawImage, settings: CameraSettings, seed: int) -> tuple[Tensor, Tensor]:
-        told = [v for s in (raw.settings, settings) for v in settings_parameters(s)]
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=dtype == "bfloat16"):
-            light = network(raw.data[None], torch.tensor([told]))[0].float()
-        clean = PreparedScene(light, settings, raw.camera, NoiseLevelFunction.zero())
-        return clean.expose([settings], seed=seed)[0], light
+            light = baseline(network, raw, settings)
+        return _noisy(light, settings, raw, seed), light
 
     return Method(name, dtype, shoot=shoot)
