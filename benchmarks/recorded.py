@@ -13,7 +13,7 @@ held-out radiance maps, written to files and read back, and the real bracket of
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from ae_env.scenes.load import DEFAULT_SIMULATOR, SceneNetworks
 from ae_env.scenes.recorded import PREFIX, RecordedOptions, merged_scene
 from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
-from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from ae_env.scorers.score_table import ScoreTables
 from benchmarks import brackets
 from benchmarks.brackets import texture, timed_result
 from benchmarks.fidelity.models import radiance_views
@@ -112,122 +112,76 @@ def measure(source: str, seed: int, quick: bool, folder: str | None = None) -> l
         grid = ExposureGrid((100,), tuple(t / 1000 for t in brackets.TIMES_MS), (4,))
         scenes, linear_below = _boreal(grid), brackets.LINEAR_BELOW
     networks = SceneNetworks(DEFAULT_SIMULATOR, cache=False)
-    found = [(s, _Comparison(s, grid, networks, seed, linear_below).rows()) for s in scenes]
+    found = [(s, _compared(s, grid, networks, seed, linear_below)) for s in scenes]
     return [{"source": source, "scene": s.scene_id, **row} for s, rows in found for row in rows]
 
 
-class _Comparison:
-    """One scene's captures, and what is simulated from one of them."""
+def _compared(
+    scene: Scene, grid: ExposureGrid, networks: SceneNetworks, seed: int, linear_below: float
+) -> Iterator[Row]:
+    """A row for each method, of one scene's captures and what is simulated from one of them."""
+    assert scene.recorded is not None
+    assert scene.allowed is not None
+    real, allowed, camera = scene.recorded, scene.allowed, scene.camera
+    # Of the recorded states the one whose mean of green is nearest to a right exposure's.
+    means = real[:, 1:3].mean(dim=(1, 2, 3)).numpy()
+    source = int(np.where(allowed, np.abs(means - MEAN_SIGNAL), np.inf).argmin())
+    others = [s for s in np.flatnonzero(allowed).tolist() if s != source]
+    look: Any = {"white_balance": scene.white_balance, "box_factor": scene.box_factor}
+    raw = RawImage(real[source], grid[source], camera, **look)
+    light = Scene.from_raw(raw, scene_id=scene.scene_id)  # what one capture tells
+    tables, clean = ScoreTables(grid, camera, make_scorer("balanced")), networks.denoised(light)
+    true, known = tables.table(scene), real[source].amax(dim=0) < KNOWN_BELOW
+    brightest = torch.maximum(real[source], real).amax(dim=1)  # (S, H, W)
+    masks, ratios = (
+        known & (brightest < linear_below),
+        [exposure_ratio(grid[source], s) for s in grid],
+    )
 
-    def __init__(
-        self,
-        scene: Scene,
-        grid: ExposureGrid,
-        networks: SceneNetworks,
-        seed: int,
-        linear_below: float,
-    ) -> None:
-        assert scene.recorded is not None
-        assert scene.allowed is not None
-        self.scene, self.grid, self.networks, self.seed = scene, grid, networks, seed
-        self.real, self.allowed = scene.recorded, scene.allowed
-        # Of the recorded states the one whose mean of green is nearest to a right exposure's.
-        means = self.real[:, 1:3].mean(dim=(1, 2, 3)).numpy()
-        self.source = int(np.where(self.allowed, np.abs(means - MEAN_SIGNAL), np.inf).argmin())
-        self.others = [s for s in np.flatnonzero(self.allowed).tolist() if s != self.source]
-        self.tables = ScoreTables(grid, scene.camera, make_scorer("balanced"))
-        self.true = self.tables.table(scene)
-        brightest = torch.maximum(self.real[self.source], self.real).amax(dim=1)  # (S, H, W)
-        self.known = self.real[self.source].amax(dim=0) < KNOWN_BELOW
-        self.masks = self.known & (brightest < linear_below)
-        raw = RawImage(
-            self.real[self.source],
-            grid[self.source],
-            scene.camera,
-            white_balance=scene.white_balance,
-            box_factor=scene.box_factor,
+    def simulate() -> torch.Tensor:
+        prepared = networks.denoised(light).prepared
+        return torch.stack(list(prepared.stream(grid.states, seed=seed)))
+
+    def scale() -> torch.Tensor:
+        return torch.stack([clipped(light.light * ratio, camera) for ratio in ratios])
+
+    for method, call in (("simulated", simulate), ("scaled", scale)):
+        frames, milliseconds = timed_result(call, 3)
+        expected, q = frames, tables.table(replace(light, recorded=frames, allowed=allowed))
+        if method == "simulated":
+            expected = clipped(clean.prepared.expected_sweep(grid.states), camera)
+            q = tables.table(clean)
+        states = []
+        for s in others:
+            mask, state = masks[s], {"psnr_all_db": psnr(frames[s], real[s])}
+            if mask.any():
+                truth, of_two = real[s][:, mask], _ceiling(scene, grid, s, mask)
+                state |= {"psnr_db": psnr(frames[s][:, mask], truth), "ceiling_db": of_two}
+                state["psnr_expected_db"] = psnr(expected[s][:, mask], truth)
+            # How many stops the noise is off, which detail that both have dilutes.
+            ours, theirs = (texture(frame[s], mask) for frame in (frames, real))
+            if min(ours, theirs) > 0.0:
+                state["noise_error_stops"] = abs(float(np.log2(ours / theirs)))
+            states.append(state)
+        frame = pd.DataFrame(states)
+        stops = pd.cut(
+            np.log2(ratios)[others], [*STOPS.values(), np.inf], False, labels=list(STOPS)
         )
-        self.light = Scene.from_raw(raw, scene_id=scene.scene_id)  # what one capture tells
-
-    def rows(self) -> list[Row]:
-        """A row for each method."""
-        grid, light, camera = self.grid, self.light, self.scene.camera
-        known = self.networks.denoised(light)
-
-        def simulate() -> torch.Tensor:
-            prepared = self.networks.denoised(light).prepared
-            return torch.stack(list(prepared.stream(grid.states, seed=self.seed)))
-
-        def scale() -> torch.Tensor:
-            ratios = [exposure_ratio(light.reference, settings) for settings in grid]
-            return torch.stack([clipped(light.light * ratio, camera) for ratio in ratios])
-
-        (simulated, fast), (scaled, faster) = (timed_result(f, 3) for f in (simulate, scale))
-        expected = clipped(known.prepared.expected_sweep(grid.states), camera)
-        as_if_taken = replace(light, recorded=scaled, allowed=self.allowed)
-        return [
-            self._row("simulated", simulated, expected, self.tables.table(known), fast),
-            self._row("scaled", scaled, scaled, self.tables.table(as_if_taken), faster),
-        ]
-
-    def _row(
-        self,
-        method: str,
-        frames: torch.Tensor,
-        expected: torch.Tensor,
-        q: ScoreTable,
-        milliseconds: float,
-    ) -> Row:
-        best = int(np.where(self.allowed, q.mean, -np.inf).argmax())
-        errors = {s: self._psnr(frames[s], s) for s in self.others}
-        ceilings = {s: _ceiling(self.scene, self.grid, s, self.masks[s]) for s in self.others}
-        return {
-            "method": method,
-            "states": len(self.others) + 1,
-            "source_state": str(self.grid[self.source]),
-            "known_share": float(self.known.float().mean()),
-            "psnr_all_db": _median([psnr(frames[s], self.real[s]) for s in self.others]),
-            "psnr_db": _median(errors.values()),
-            "ceiling_db": _median(ceilings.values()),
-            "psnr_expected_db": _median([self._psnr(expected[s], s) for s in self.others]),
-            "noise_error_stops": _median([self._noise_error(frames[s], s) for s in self.others]),
-            "score_error": float(np.sqrt(np.mean((q.mean - self.true.mean)[self.others] ** 2))),
-            "oracle_regret": float(self.true.mean[self.true.oracle] - self.true.mean[best]),
-            "same_oracle": best == self.true.oracle,
-            "ms_per_state": milliseconds / len(self.grid),
-            "psnr_by_stops": self._by_stops(errors),
-            "ceiling_by_stops": self._by_stops(ceilings),
-        }
-
-    def _psnr(self, frame: torch.Tensor, state: int) -> float | None:
-        mask = self.masks[state]
-        return psnr(frame[:, mask], self.real[state][:, mask]) if bool(mask.any()) else None
-
-    def _noise_error(self, frame: torch.Tensor, state: int) -> float | None:
-        """How many stops the noise is off, which detail that both have dilutes."""
-        ours, theirs = (texture(f, self.masks[state]) for f in (frame, self.real[state]))
-        return abs(float(np.log2(ours / theirs))) if min(ours, theirs) > 0.0 else None
-
-    def _by_stops(self, values: Mapping[int, float | None]) -> dict[str, float | None]:
-        stops = {s: np.log2(exposure_ratio(self.grid[self.source], self.grid[s])) for s in values}
-        names, bounds = list(STOPS), [*STOPS.values(), np.inf]
-        return {
-            name: _median([v for s, v in values.items() if low <= stops[s] < high])
-            for name, low, high in zip(names, bounds, bounds[1:], strict=False)
-        }
+        by_stops = frame.groupby(stops, observed=False)[["psnr_db", "ceiling_db"]].median()
+        row: Row = {"method": method, "states": len(others) + 1, "source_state": str(grid[source])}
+        row |= {"known_share": float(known.float().mean()), **frame.median()}
+        row["score_error"] = float(np.sqrt(np.mean((q.mean - true.mean)[others] ** 2)))
+        best = int(np.where(allowed, q.mean, -np.inf).argmax())
+        row["oracle_regret"] = float(true.mean[true.oracle] - true.mean[best])
+        row |= {"same_oracle": best == true.oracle, "ms_per_state": milliseconds / len(grid)}
+        row["psnr_by_stops"] = by_stops["psnr_db"].to_dict()
+        yield row | {"ceiling_by_stops": by_stops["ceiling_db"].to_dict()}
 
 
-def _median(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
-
-
-def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -> float | None:
+def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -> float:
     """PSNR of two captures of the same light, each with the camera's noise [dB]."""
     assert scene.recorded is not None
     signal = scene.recorded[state][:, mask]
-    if not signal.numel():
-        return None
     nlf = scene.camera.nlf(grid[state].iso).scaled(1.0 / scene.box_factor**2)
     shot, read = (torch.tensor(v)[:, None] for v in (nlf.shot, nlf.read))
     variance = (shot * signal.clamp(min=0.0) + read) * (signal < 1.0)
@@ -250,7 +204,8 @@ def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
 _COLUMNS = """PSNR, all pixels [dB] = {psnr_all_db:.1f} | PSNR, known [dB] = {psnr_db:.1f} |
 two real captures [dB] = {ceiling_db:.1f} | without its noise [dB] = {psnr_expected_db:.1f} |
 noise off by [stop] = {noise_error_stops:.2f} | score error = {score_error:.3f} |
-oracle's regret = {oracle_regret:.3f} | ms a state = {ms_per_state:.1f}"""
+oracle's regret = {oracle_regret:.3f}"""
+_TIME = " | ms a state = {ms_per_state:.1f}"
 _REGRET = "mean = {mean:.3f} | upper quartile = {upper:.3f} | largest = {most:.3f}"
 
 
@@ -276,10 +231,10 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     every = [row | {"title": METHODS[row["method"]]} for row in rows]
     by_stops = " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS)
     tables = {
-        "sets": table(sets, of_set + method + number + _COLUMNS + same),
+        "sets": table(sets, of_set + method + number + _COLUMNS + same + _TIME),
         "regret": table([regret], _REGRET),
         "by_stops": table(stops, of_set + method + by_stops),
-        "scenes": table(every, each + method + _COLUMNS),
+        "scenes": table(every, each + method + _COLUMNS + _TIME),
     }
     return Report(rows, tables)
 

@@ -59,7 +59,8 @@ def bench(
     seed: Seed = 0,
     quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
     against: Annotated[
-        Path | None, typer.Option(help="Of throughput: another checkout, timed in turns with this.")
+        Path | None,
+        typer.Option(help="Of throughput: another checkout or commit, timed in turns with this."),
     ] = None,
     weights: Annotated[
         Path | None,
@@ -113,9 +114,6 @@ def _check_options(name: str, **options: Any) -> None:
         if name not in _TAKES[option]:
             rule = f"is for {' and '.join(_TAKES[option])} only"
             raise ValueError(f"`{option}` (={str(value)!r}) {rule}")
-    against = options.get("against")
-    if against is not None and not (against / "simulator" / "__init__.py").is_file():
-        raise ValueError(f"`against` (={str(against)!r}) must be a checkout of this project")
     if "part" in options:
         check_word("part", options["part"], ("agents", "tables"))
     if name == "paper" and "folder" not in options:
