@@ -31,6 +31,7 @@ from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator import CameraProfile
 from simulator.reference.camera import ReferenceScene
+from simulator.utils.cache import Store, cache_key
 from simulator.utils.files import data_folder as data_root
 from simulator.utils.files import result_meta, write_atomically, write_results
 
@@ -75,36 +76,27 @@ class Part:
 
 
 class FinishedParts:
-    """Results of parts on disk, one file each, which count for the very same code and networks.
-
-    Args:
-        folder: Where they lie.
-        words: Values that all of them depend on besides.
-    """
+    """Results of parts in a folder, which count for the very same code, networks and `words`."""
 
     def __init__(self, folder: Path, *words: Any) -> None:
         checksum = 0
         for path in sorted(p for name in _CODE for p in (ROOT / name).rglob("*.[ps][ya]*")):
             if path.suffix in (".py", ".safetensors"):
                 checksum = zlib.crc32(path.read_bytes(), checksum)
-        self._folder, self._words = folder, [checksum, *words]
+        self._store, self._words = Store(folder), [checksum, *words]
 
     def get(self, name: str, measure: Callable[[], Any]) -> Any:
         """The result under `name`: of an earlier run, or what `measure` returns."""
-        key = zlib.crc32(json.dumps([*self._words, name]).encode())
-        stem = "".join(c if c.isalnum() else "_" for c in name)[:48]
-        path = self._folder / f"{stem}-{key:08x}.json"
-        try:
-            return json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # not there, or damaged
-            text = json.dumps(measure())
-        write_atomically(path, text)
-        return json.loads(text)
+        key = cache_key("parts", [*self._words, name])
+        found = self._store.get(key)
+        if found is None:
+            found = {"result": json.dumps(measure())}
+            self._store.put(key, found)
+        return json.loads(found["result"])
 
     def forget(self) -> None:
         """Removes all results, those of earlier code too: the next run measures everything."""
-        for path in self._folder.glob("*.json"):
-            path.unlink(missing_ok=True)
+        self._store.clear()
 
 
 # -- a benchmark ----------------------------------------------------------------------------------

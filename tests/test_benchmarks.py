@@ -21,7 +21,7 @@ from benchmarks import features, harness, paper, recorded, transfer
 from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.features import training
 from benchmarks.harness import FinishedParts, Part, Report, benchmark, pivot, rounded, table
-from benchmarks.throughput import full_frame
+from benchmarks.throughput import frames
 from benchmarks.transfer import agents, tables
 from benchmarks.transfer.agents import WORLDS, TableSet, TransferPlan, World
 from benchmarks.work_precision import pareto_front
@@ -59,7 +59,7 @@ def test_tables_and_numbers() -> None:
     given = {"a": [1 / 3, float("nan"), 10**9], "b": True, "c": 1.23456789e-12}
     assert rounded(given) == {"a": [0.333333, None, 10**9], "b": True, "c": 1.23457e-12}
     results = {"paired 1": [], "libraw|a.dng": {"s": 1}, "frame|a.dng|full": {"s": 2}}
-    assert full_frame.rows(results) == [
+    assert frames.frame_rows(results) == [
         {"case": "full", "file": "a.dng", "s": 2, "libraw": {"s": 1}}
     ]
 
@@ -91,12 +91,12 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
     page = (tmp_path / "mine.md").read_text()
     assert "<!-- origin -->\n`ae-env bench mine`" in page
     assert "<!-- numbers -->\ntext\n<!-- end -->" in page
-    assert list((tmp_path / "runs" / "mine").iterdir()) == []
+    assert list((tmp_path / "runs" / "mine").rglob("*.*")) == []
     # Damaged parts, and those of another seed, are measured again.
     finished = FinishedParts(tmp_path / "parts", 0)
     assert [finished.get("part", lambda n=n: [n]) for n in (1, 2)] == [[1], [1]]
     assert FinishedParts(tmp_path / "parts", 1).get("part", lambda: [4]) == [4]
-    for path in (tmp_path / "parts").iterdir():
+    for path in (tmp_path / "parts").rglob("*.safetensors"):
         path.write_text("[1, 2")
     assert finished.get("part", lambda: [3]) == [3]
 

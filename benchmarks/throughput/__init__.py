@@ -21,9 +21,16 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness import Part, Report, Row, benchmark, cell, pivot, sections, table
 from benchmarks.isolated import CORES
-from benchmarks.throughput import cold_start, full_frame, growth
+from benchmarks.throughput import frames
 from benchmarks.throughput.paired import COLUMNS, checkout, measure_paired
-from benchmarks.throughput.steps import KERNEL, LOOKUP, SCENES, measure_resets, measure_steps
+from benchmarks.throughput.steps import (
+    KERNEL,
+    LOOKUP,
+    SCENES,
+    measure_cold_start,
+    measure_resets,
+    measure_steps,
+)
 
 #: Threads and frame sizes of the steps.
 STEPS = ((CORES, 128), (CORES, 64), (1, 128))
@@ -47,16 +54,16 @@ def parts(seed: int, quick: bool, against: Path | None = None) -> list[Part]:
         arguments = {"threads": n, "size": size, **given}
         found.append(Part(f"steps {n} {size}", measure_steps, arguments, threads=n))
     found.append(Part("resets", measure_resets, given, threads=1))
-    found.append(Part("cold start", cold_start.measure_cold_start, {"quick": quick}))
-    return [*found, *growth.parts(quick), *full_frame.parts(quick)]
+    found.append(Part("cold start", measure_cold_start, {"quick": quick}))
+    return [*found, *frames.growth_parts(quick), *frames.frame_parts(quick)]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     steps = [row for name, own in results.items() if name.startswith("steps ") for row in own]
     paired = [row for name, own in results.items() if name.startswith("paired ") for row in own]
     more: dict[str, Any] = {"scenes": SCENES, "resets": results["resets"]}
-    more |= {"cold_start": results["cold start"], "growth": growth.curves(results)}
-    more["full_frame"] = full_frame.rows(results)
+    more |= {"cold_start": results["cold start"], "growth": frames.curves(results)}
+    more["full_frame"] = frames.frame_rows(results)
     more["targets"] = list(targets(steps, paired, more))
     figures: dict[str | Path, Figure] = {"throughput.png": _draw(steps)}
     return Report([*steps, *paired], tables(steps, paired, more), meta=more, figures=figures)

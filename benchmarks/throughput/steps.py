@@ -1,13 +1,19 @@
-"""Environment steps per second beside the kernel limit, copies and a lookup; and resets."""
+"""Environment steps per second beside the kernel limit; resets; the first episode of all."""
 
 from __future__ import annotations
 
+import json
 import multiprocessing
+import os
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from statistics import median
 from typing import Any
 
 import gymnasium as gym
@@ -18,9 +24,10 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 import ae_env  # noqa: F401  registers the environment
 from ae_env.scorers import Captures
 from benchmarks.harness import Row, quartiles
-from benchmarks.isolated import timed
+from benchmarks.isolated import CORES, timed
 from benchmarks.throughput.kernel_limit import KernelLimit, lookup
 from benchmarks.throughput.worker import CACHED, ID, warm_environments
+from simulator.utils.cache import CACHE_VARIABLE
 
 SCENES = "bundled:small"
 #: Rounds, and seconds that a case takes in each.
@@ -217,4 +224,54 @@ def measure_resets(seed: int, quick: bool) -> list[Row]:
         row |= {"num_envs": num_envs, "reset_ms": reset * 1e3, "step_ms": step * 1e3}
         row |= {"ratio": reset / step, "spread": (high - low) / reset}
         rows.append(row | {"ratio_of_means": float(np.mean(resets) / np.mean(steps))})
+    return rows
+
+
+# -- the first episode ----------------------------------------------------------------------------
+
+#: Cases, and how often each is measured, quick and in full.
+CASES, REPEATS = ("nothing cached", "all but scenes cached"), (1, 5)
+#: The times of a row, in seconds; the last are more episodes, in which motion comes up.
+TIMES = ("import", "make", "reset", "step", "episodes")
+_PROGRAM = f"""
+import json, time
+times = [time.perf_counter()]
+def lap(): times.append(time.perf_counter())
+import gymnasium, ae_env
+lap()
+env = gymnasium.make({ID!r})
+lap()
+env.reset(seed=0)
+lap()
+env.step(0)
+lap()
+cpu = time.process_time()
+for episode in range(8):
+    env.reset()
+    for action in range(0, 64, 8):
+        env.step(action)
+lap()
+print(json.dumps([after - before for before, after in zip(times, times[1:])] + [cpu]))
+"""
+
+
+def measure_cold_start(quick: bool) -> list[Row]:
+    """A row for each of `CASES`: medians of the `TIMES` of fresh processes, and of their sum."""
+    found: dict[str, list[list[float]]] = {case: [] for case in CASES}
+    for _ in range(REPEATS[not quick]):
+        with tempfile.TemporaryDirectory() as folder:
+            caches = {"NUMBA_CACHE_DIR": f"{folder}/kernels", CACHE_VARIABLE: f"{folder}/cache"}
+            for case in CASES:
+                output = subprocess.check_output(
+                    [sys.executable, "-c", _PROGRAM], env=os.environ | caches
+                )
+                found[case].append(json.loads(output.splitlines()[-1]))
+    rows = []
+    for case, runs in found.items():
+        low, middle, high = quartiles([sum(run[:4]) for run in runs])
+        row: Row = {"case": case, "threads": CORES, "total_s": middle}
+        row |= {
+            f"{name}_s": median(run[i] for run in runs) for i, name in enumerate((*TIMES, "cpu"))
+        }
+        rows.append(row | {"spread": (high - low) / middle})
     return rows
