@@ -60,10 +60,9 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
     exposures, rows = bracket_exposures(), []
     for scene in radiance_views(CAMERA, SIZE)[: 2 if quick else None]:
         settings, light, unclipped = _view(reference, scene, iso)
-        captures = [
-            reference.capture(scene, _brighter(settings, ev), seed, light=light).sample
-            for ev in exposures
-        ]
+        times = [settings.exposure_time * 2.0**ev for ev in exposures]
+        states = [replace(settings, exposure_time=seconds) for seconds in times]
+        captures = [reference.capture(scene, s, seed, light=light).sample for s in states]
         raw = _raw(scene, captures[exposures.index(0.0)], settings)
         begun = time.perf_counter()
         ours = hdr_picture(raw, simulator=simulator)
@@ -97,10 +96,6 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
 
 def _raw(scene: ReferenceScene, data: Tensor, settings: CameraSettings) -> RawImage:
     return RawImage(data, settings, get_camera(CAMERA), white_balance=scene.white_balance)
-
-
-def _brighter(settings: CameraSettings, ev: float) -> CameraSettings:
-    return replace(settings, exposure_time=settings.exposure_time * 2.0**ev)
 
 
 def _simulated(raw: RawImage) -> list[Tensor]:

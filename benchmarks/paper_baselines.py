@@ -22,7 +22,6 @@ from torch import Tensor, nn
 
 from simulator.networks.unet import LEAK, instance_norm
 from simulator.networks.weights import BUILDERS
-from simulator.utils.checks import check_integer
 
 #: Camera parameters of a pair: three of the source, three of the target.
 NUM_PARAMETERS = 6
@@ -40,12 +39,6 @@ def scaled_parameters(parameters: Tensor, image: Tensor) -> Tensor:
         shape = tuple(parameters.shape)
         raise ValueError(f"`parameters` (of shape {shape}) must have shape ({batch}, 6)")
     return (parameters.to(image) + image.new_tensor(PARAMETER_OFFSET)) / PARAMETER_UNIT
-
-
-def _check(width: int, dilations: Sequence[int]) -> None:
-    for name, values in (("width", [width]), ("dilations", dilations)):
-        for value in values:
-            check_integer(name, value, 1)
 
 
 class AdaptiveNorm(nn.Module):
@@ -70,22 +63,14 @@ class ParameterConcatenation(nn.Module):
     1 x 1 convolution; convolutions start as the identity. 77,046 parameters at the published
     width. In training the normalisation uses statistics of the batch, in ``eval()`` running ones.
 
-    Raises:
-        ValueError: If `width` or a dilation is below one.
-
     Source: Chen, Xu and Koltun 2017, Fast Image Processing with Fully-Convolutional Networks,
     table 1 and equations 2 and 3.
-
-    >>> net = ParameterConcatenation(width=8).eval()
-    >>> net(torch.zeros(1, 4, 5, 3), torch.zeros(1, 6)).shape
-    torch.Size([1, 4, 5, 3])
     """
 
     def __init__(
         self, *, width: int = 32, dilations: Sequence[int] = (1, 2, 4, 8, 16, 32, 64, 128, 1)
     ) -> None:
         super().__init__()
-        _check(width, dilations)
         layers: list[nn.Module] = []
         inputs = 4 + NUM_PARAMETERS
         for dilation in dilations:
@@ -97,11 +82,7 @@ class ParameterConcatenation(nn.Module):
         self.body = nn.Sequential(*layers, nn.Conv2d(width, 4, 1))
 
     def forward(self, image: Tensor, parameters: Tensor) -> Tensor:
-        """The raw at the target's settings.
-
-        Returns:
-            (B, 4, H, W).
-        """
+        """The raw (B, 4, H, W) at the target's settings, of any size."""
         scaled = scaled_parameters(parameters, image)
         planes = scaled[:, :, None, None].expand(-1, -1, *image.shape[-2:])
         result: Tensor = self.body(torch.cat([image, planes], dim=1))
@@ -202,22 +183,14 @@ class DecoupledNet(nn.Module):
     The image comes with its edge map. 4.88 M parameters at the published width. Instance
     normalisation takes the absolute brightness out of the features, as published.
 
-    Raises:
-        ValueError: If `width` or a dilation is below one.
-
     Source: Fan et al. 2018, Decouple Learning for Parameterized Image Operators. One thing
     differs: no ReLU on the output, because a packed raw may be negative.
-
-    >>> net = DecoupledNet(width=8)
-    >>> net(torch.zeros(1, 4, 5, 3), torch.zeros(1, 6)).shape
-    torch.Size([1, 4, 5, 3])
     """
 
     def __init__(
         self, *, width: int = 64, dilations: Sequence[int] = (2, 4, 4, 8, 8, 16, 1)
     ) -> None:
         super().__init__()
-        _check(width, dilations)
         layer = partial(_NormalisedGenerated, width, width)
         self.head = nn.ModuleList([_NormalisedGenerated(5, width), layer(), layer(stride=2)])
         self.blocks = nn.ModuleList(_ResidualBlock(width, dilation) for dilation in dilations)
@@ -225,11 +198,7 @@ class DecoupledNet(nn.Module):
         self.tail = GeneratedConvolution(width, 4)
 
     def forward(self, image: Tensor, parameters: Tensor) -> Tensor:
-        """The raw at the target's settings.
-
-        Returns:
-            (B, 4, H, W).
-        """
+        """The raw (B, 4, H, W) at the target's settings, of any size."""
         height, width = image.shape[-2:]
         scaled = scaled_parameters(parameters, image)
         x = torch.cat([image, edge_map(image)], dim=1)

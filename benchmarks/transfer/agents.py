@@ -23,7 +23,6 @@ from agents.evaluation.intervals import difference_interval, score_interval
 from agents.evaluation.plan import groups_in_turn
 from agents.evaluation.result import EvaluationResult
 from agents.learning.training import (
-    AgentConfig,
     TrainingJob,
     is_trained,
     load_config,
@@ -108,9 +107,7 @@ class World:
 
 def simulator_argument(name: str) -> str | None:
     """The environment's argument for a simulator's name."""
-    if name == EXP:
-        return None
-    return str(weights(name))
+    return None if name == EXP else str(weights(name))
 
 
 #: All of them by name; the truth comes first: the others are compared with it.
@@ -237,20 +234,16 @@ def training_jobs(plan: TransferPlan, folder: Path) -> Jobs:
     Seeds change slowest, so that a run that is stopped has some of every world. Worlds whose
     networks are not there are left out.
     """
-    worlds = [name for name in plan.worlds if has_weights(name)]
+    worlds, base = [name for name in plan.worlds if has_weights(name)], training_set(plan)
     jobs: Jobs = {(agent, world): [] for agent in plan.agents for world in worlds}
     for seed in plan.seeds:
         for (agent, world), own in jobs.items():
-            config = _config(plan, agent, world).with_seed(seed)
+            options = WORLDS[world].options(base) | common_options(plan)
+            config = load_config(ROOT / "configs" / f"{agent}.yaml").with_seed(seed)
+            config = changed_config(config, options, {_FRAMES[agent]: plan.frames})
             name = f"{agent}, {world}, seed {seed}"
             own.append(TrainingJob(name, config, folder / f"{agent}-{world}-{seed}"))
     return jobs
-
-
-def _config(plan: TransferPlan, agent: str, world: str) -> AgentConfig:
-    options = WORLDS[world].options(training_set(plan)) | common_options(plan)
-    config = load_config(ROOT / "configs" / f"{agent}.yaml")
-    return changed_config(config, options, {_FRAMES[agent]: plan.frames})
 
 
 def common_options(plan: TransferPlan) -> dict[str, Any]:
