@@ -79,10 +79,9 @@ class FinishedParts:
     """Results of parts in a folder, which count for the very same code, networks and `words`."""
 
     def __init__(self, folder: Path, *words: Any) -> None:
-        checksum = 0
-        for path in sorted(p for name in _CODE for p in (ROOT / name).rglob("*.[ps][ya]*")):
-            if path.suffix in (".py", ".safetensors"):
-                checksum = zlib.crc32(path.read_bytes(), checksum)
+        files, checksum = (path for name in _CODE for path in (ROOT / name).rglob("*")), 0
+        for path in sorted(p for p in files if p.suffix in (".py", ".safetensors")):
+            checksum = zlib.crc32(path.read_bytes(), checksum)
         self._store, self._words = Store(folder), [checksum, *words]
 
     def get(self, name: str, measure: Callable[[], Any]) -> Any:
@@ -144,7 +143,8 @@ def benchmark(
         )
         command = f"ae-env bench {name}{shown}{' --quick' * quick}"
         meta = result_meta(command, seed) | {"quick": quick}
-        finished = FinishedParts(RUNS / name, command, seed, _state(options.values()))
+        data = [value for key, value in options.items() if key != "against"]
+        finished = FinishedParts(RUNS / name, command, seed, _state(data))
         chosen, results = parts(seed, quick, **options), {}
         with progress_bars() as progress, progress(name) as task:
             for number, part in enumerate(chosen):
@@ -158,9 +158,9 @@ def benchmark(
     return run
 
 
-def _state(options: Iterable[Any]) -> list[Any]:
-    """Name, size and time of every file among `options`, and in folders among them."""
-    given = [path for path in options if isinstance(path, Path)]
+def _state(data: Iterable[Any]) -> list[Any]:
+    """Name, size and time of every file of `data`, and in its folders."""
+    given = [path for path in data if isinstance(path, Path)]
     files = sorted(file for path in given for file in (path, *path.rglob("*")) if file.is_file())
     return [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
 

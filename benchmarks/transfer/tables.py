@@ -25,16 +25,7 @@ from agents.cli.console import progress_bars
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.rollouts import RolloutPlan, make_envs
 from benchmarks.harness import FinishedParts, Row, cell, pivot, sections, table
-from benchmarks.transfer.agents import (
-    EXP,
-    RESOLUTION,
-    TableSet,
-    TransferPlan,
-    has_weights,
-    held_out,
-    simulator_argument,
-    training_set,
-)
+from benchmarks.transfer import agents as worlds
 
 #: What is measured of a predicted table, each the better the smaller but the first.
 MEASURES = ("rank_correlation", "regret", "absolute_error")
@@ -44,7 +35,7 @@ Measured = dict[str, Any]
 Totals = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
-def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) -> list[Row]:
+def table_rows(plan: worlds.TransferPlan, finished: FinishedParts, *, seed: int = 0) -> list[Row]:
     """A row for each crop, source ISO, source exposure and simulator.
 
     `finished` keeps what is measured, so that a run that was stopped continues; `seed` is that of
@@ -57,7 +48,7 @@ def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) ->
             name = f"{part.scorer} {crop} ISO {iso}"
             task(number, len(sets), name)
             measure = partial(_measure, plan, part, crop, iso, seed)
-            found = finished.get(f"{name} {part} {training_set(plan)}", measure)
+            found = finished.get(f"{name} {part} {worlds.training_set(plan)}", measure)
             for ev, measured in zip(part.evs, found, strict=True):
                 common = {"scorer": part.scorer, "crop": crop, "iso": iso, "ev": ev}
                 rows += [common | row for row in summary(measured)]
@@ -66,18 +57,18 @@ def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) ->
 
 
 def _measure(
-    plan: TransferPlan, part: TableSet, crop: Crop, iso: int, seed: int
+    plan: worlds.TransferPlan, part: worlds.TableSet, crop: Crop, iso: int, seed: int
 ) -> list[list[Measured]]:
     """What is measured of every scene and simulator: a list for each source exposure."""
-    options = EnvOptions(scorer=part.scorer, resolution=RESOLUTION)
+    options = EnvOptions(scorer=part.scorer, resolution=worlds.RESOLUTION)
     scorer = options.make_scorer()
     tables = ScoreTables(options.make_grid(), options.make_camera(), scorer)
-    scenes = held_out(plan, part.scenes, crop)
+    scenes = worlds.held_out(plan, part.scenes, crop)
     moves = drawn_moves(scenes, seed)
     true = [tables.table(scene, **own) for scene, own in zip(scenes, moves, strict=True)]
     simulators: dict[str, SceneNetworks | None] = {}
-    for name in filter(has_weights, part.simulators):
-        given = simulator_argument(name)
+    for name in filter(worlds.has_weights, part.simulators):
+        given = worlds.simulator_argument(name)
         simulators[name] = None if given is None else SceneNetworks(given, cache=False)
     found: list[list[Measured]] = []
     for ev in part.evs:
@@ -97,7 +88,7 @@ def _measure(
 
 def drawn_moves(scenes: Sequence[Scene], seed: int) -> list[dict[str, Any]]:
     """Motion and defocus of an episode on each scene, as the environment draws them."""
-    options = {"scenes": list(scenes), "resolution": RESOLUTION, "scorer": "sharpness"}
+    options = {"scenes": list(scenes), "resolution": worlds.RESOLUTION, "scorer": "sharpness"}
     with closing(make_envs(options, num_envs=min(64, len(scenes)), frames=1)) as envs:
         base: Any = envs.unwrapped
         return [
@@ -148,8 +139,8 @@ def summary(measured: Sequence[Measured]) -> list[Row]:
         for measure in MEASURES:
             mean = score_interval(values[measure].to_numpy(), alike)
             row |= {measure: mean.value, f"{measure}_ci95": mean.pair}
-            if name != EXP and EXP in means.index:
-                exp = means.loc[EXP][measure].to_numpy()
+            if name != worlds.EXP and worlds.EXP in means.index:
+                exp = means.loc[worlds.EXP][measure].to_numpy()
                 gain = difference_interval(values[measure].to_numpy(), exp, alike)
                 row |= {f"{measure}_to_exp": gain.value, f"{measure}_to_exp_ci95": gain.pair}
         row["terms"] = {term: float(values[f"term {term}"].mean()) for term in terms}
