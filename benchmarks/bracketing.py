@@ -120,7 +120,7 @@ def distributions(rows: Sequence[Row]) -> Figure:
         curve: Row = {"panel": f"{row['scenes']}, {row['budget']:g} s", "label": row["name"]}
         y = (np.arange(count) + 1.0) / count
         curves.append(curve | {"x": row["each"], "y": y, "style": style})
-    labels = {"xlabel": "1 - quality (left is better)", "ylabel": "share of the source groups"}
+    labels: Row = {"xlabel": "1 - quality (left is better)", "ylabel": "share of the source groups"}
     return panels(curves, width=5.0, xscale="log", **labels)
 
 

@@ -200,10 +200,10 @@ def compare(image: np.ndarray, real: np.ndarray, pair: Pair, moved: tuple[int, i
     longer = pair.target if pair.target_ms > pair.source_ms else pair.source
     linear = use & (longer.data.numpy() < LINEAR_BELOW)
     square = (image - real) ** 2
-    options: Any = {"data_range": 1.0, "channel_axis": 0, "gaussian_weights": True, "sigma": 1.5}
-    _, similarity = structural_similarity(
-        image, real, use_sample_covariance=False, full=True, **options
-    )
+    options: Any = {"data_range": 1.0, "channel_axis": 0, "use_sample_covariance": False}
+    options |= {"gaussian_weights": True, "sigma": 1.5, "full": True}
+    measure: Any = structural_similarity
+    _, similarity = measure(image, real, **options)
     error, power = square[use].mean(), (real[use] ** 2).mean()
     scores: Row = {"psnr_db": _decibel(error), "ssim": float(similarity[use].mean())}
     scores |= {"psnr_linear_range_db": _decibel(square[linear].mean())}

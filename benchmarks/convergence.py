@@ -104,7 +104,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             curve: Row = {"panel": f"light {stops} EV", "label": name, "y": y}
             curve["style"] = {"ls": "--" if colour is None else "-", "color": colour}
             curves.append(curve | {"x": np.arange(1, FRAMES + 1) - STEP})
-    labels = {"xlabel": "frames since the step", "ylabel": "EV100 less the final one (median)"}
+    labels: Row = {"xlabel": "frames since the step", "ylabel": "EV100 less the final one (median)"}
     figure = panels(curves, xlim=(-5, 40), **labels)
     for axes in figure.axes:
         axes.axhspan(-THIRD_EV, THIRD_EV, color="0.92")

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from agents.cli.console import print_files, progress_bars
@@ -392,6 +393,12 @@ def psnr(estimate: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     """PSNR over all planes [dB], at most `LARGEST_PSNR`."""
     error = float((estimate.double() - truth.double()).square().mean()) / peak**2
     return LARGEST_PSNR if error <= 0 else min(LARGEST_PSNR, -10.0 * math.log10(error))
+
+
+def ssim(image: np.ndarray, truth: np.ndarray, channel_axis: int = 0, **options: Any) -> float:
+    """SSIM of images whose white is 1, see `skimage.metrics.structural_similarity`."""
+    measure: Any = structural_similarity
+    return float(measure(image, truth, channel_axis=channel_axis, data_range=1.0, **options))
 
 
 def clipped(image: Tensor, camera: CameraProfile) -> Tensor:

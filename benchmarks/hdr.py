@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
-from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from agents.applications.hdr import (
@@ -21,7 +20,7 @@ from agents.applications.hdr import (
     hdr_picture,
 )
 from benchmarks.fidelity.models import equal_exposure, radiance_views
-from benchmarks.harness import Part, Report, Row, benchmark, pivot, psnr, side_by_side, table
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, psnr, side_by_side, ssim, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
@@ -85,9 +84,8 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
         for method, (picture, wanted) in pictures.items():
             row: Row = {"scene": scene.scene_id, "group": scene.group, "iso": iso}
             row |= {"stops": float(np.log2(high / low)), "method": method}
-            pair = picture.numpy(), wanted.numpy()
-            ssim = float(structural_similarity(*pair, channel_axis=0, data_range=1.0))
-            row |= {"psnr": psnr(picture, wanted), "ssim": ssim}
+            row |= {"psnr": psnr(picture, wanted)}
+            row |= {"ssim": ssim(picture.numpy(), wanted.numpy())}
             if method in lights:
                 row["radiance_ev"] = _radiance_error(lights[method], unclipped)
             rows.append(row | ({"seconds": seconds} if method == "ours" else {}))

@@ -118,7 +118,7 @@ def traces(rows: list[Row]) -> Figure:
             curve: Row = {"panel": title + lamps, "label": label, "style": style}
             shown = exposure[first : first + 70]
             curves.append(curve | {"x": range(-10, len(shown) - 10), "y": shown})
-    labels = {"xlabel": "frames after the step", "ylabel": "exposure x gain [s]"}
+    labels: Row = {"xlabel": "frames after the step", "ylabel": "exposure x gain [s]"}
     return panels(curves, yscale="log", **labels)
 
 

@@ -22,7 +22,6 @@ import numpy as np
 import pandas as pd
 import torch
 from scipy.stats import pearsonr, spearmanr
-from skimage.metrics import structural_similarity
 
 import ae_env  # noqa: F401  registers the environment
 from ae_env.options import EnvOptions
@@ -30,7 +29,7 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import prepare_scene
-from benchmarks.harness import Part, Report, Row, benchmark, pivot, recorded, table
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, recorded, ssim, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
 
@@ -185,11 +184,11 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
                 row[name] = _correlation(measure, scores[scorer][known], near[known])
             found.append(row)
     rows = []
-    known_rows = pd.DataFrame(found).dropna()
-    for (scorer, target), own in known_rows.groupby(["scorer", "reference"], sort=False):
-        row = {"scorer": scorer, "reference": target, "num_scenes": len(own)}
-        for name in ("spearman", "pearson"):
-            row |= {name: own[name].mean(), f"{name}_sd": own[name].std(ddof=0)}
+    known_pairs = pd.DataFrame(found).dropna().groupby(["scorer", "reference"], sort=False)
+    for (name, reference), own in known_pairs:
+        row = {"scorer": name, "reference": reference, "num_scenes": len(own)}
+        for key in ("spearman", "pearson"):
+            row |= {key: own[key].mean(), f"{key}_sd": own[key].std(ddof=0)}
         rows.append(row | {"positive": float((own["spearman"] > 0).mean())})
     return {"rows": rows, "scenes": len(env.scenes), "states": len(env.grid)}
 
@@ -241,10 +240,14 @@ def _closeness(
         "sharpness": np.sqrt(((smeared - reference) ** 2).mean(axis=(1, 2, 3))),
         "balanced": rmse,
     }
-    ssim = [structural_similarity(p, reference, channel_axis=2, data_range=1.0) for p in pictures]
+    similar = [ssim(p, reference, channel_axis=2) for p in pictures]
     near = np.abs(env.grid.ev100 - scene.ev100) <= NEAR_EV
     found = {f"aspect:{name}": -error for name, error in errors.items()}
-    return found | {"rmse": -rmse, "ssim": np.array(ssim), "exposed": np.where(near, -rmse, np.nan)}
+    return found | {
+        "rmse": -rmse,
+        "ssim": np.array(similar),
+        "exposed": np.where(near, -rmse, np.nan),
+    }
 
 
 # -- report ---------------------------------------------------------------------------------------

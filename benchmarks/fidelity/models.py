@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
-from benchmarks.harness import Row, clipped, data_root, psnr
+from benchmarks.harness import Row, clipped, data_root, psnr, ssim
 from benchmarks.isolated import ROOT
 from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraProfile, CameraSettings, CameraSimulator, RawImage, get_camera
@@ -89,10 +88,8 @@ def baseline(network: nn.Module, raw: RawImage, target: CameraSettings) -> Tenso
 
 def scores(estimate: Tensor, truth: Tensor, camera: CameraProfile) -> Row:
     image, window = clipped(estimate, camera), min(7, *(n - 1 + n % 2 for n in truth.shape[1:]))
-    ssim = structural_similarity(
-        image.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, win_size=window
-    )
-    return {"psnr_db": psnr(image, truth), "ssim": float(ssim)}
+    similar = ssim(image.numpy(), truth.numpy(), win_size=window)
+    return {"psnr_db": psnr(image, truth), "ssim": similar}
 
 
 @functools.cache

@@ -120,13 +120,13 @@ def measure_paired(against: str, threads: int, quick: bool) -> list[Row]:
             other.stop()
     rows = []
     for case, pairs in times.items():
-        before, after = ([pair[side]["wall"] for pair in pairs] for side in (0, 1))
-        ratios = [old / new for old, new in zip(before, after, strict=True)]
+        then, now = ([pair[side]["wall"] for pair in pairs] for side in (0, 1))
+        ratios = [old / new for old, new in zip(then, now, strict=True)]
         low, middle, high = quartiles(ratios)
         row: Row = {"case": case, "num_envs": STEPS[case][0] if case in STEPS else None}
         row |= {"threads": threads, "size": SWEEPS[case][0] if case in SWEEPS else 64}
-        row |= {"steps_per_second": 1.0 / statistics.median(after)}
-        row |= {"steps_per_second_before": 1.0 / statistics.median(before)}
+        row |= {"steps_per_second": 1.0 / statistics.median(now)}
+        row |= {"steps_per_second_before": 1.0 / statistics.median(then)}
         row |= {"ratio_to_before": middle, "ratio_quartiles": [low, high]}
         row |= {"ratio_min": min(ratios), "ratio_max": max(ratios), "rounds": len(pairs)}
         # Processor time suffers less from other programs.
