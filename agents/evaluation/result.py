@@ -157,7 +157,7 @@ class EvaluationResult:
         return "score" if self.plan is None else self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
-        """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
+        """What blur depends on, as arguments of `ae_env.scorers.captures.prepare_scene`."""
         known = {"speed": self.speed, "defocus": self.defocus}
         found: dict[str, Any] = {
             n: 0.0 if v is None else float(v[episode]) for n, v in known.items()
