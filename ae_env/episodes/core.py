@@ -35,7 +35,7 @@ from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions
 from simulator.noise.generator import Noise
-from simulator.optics.disc_bank import DIAMETERS
+from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18

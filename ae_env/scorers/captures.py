@@ -18,8 +18,8 @@ from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.disc_bank import DIAMETERS
-from simulator.optics.motion_path import ALONG_ROWS, Movement
+from simulator.optics.discs import DIAMETERS
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.cache import LruCache
 
