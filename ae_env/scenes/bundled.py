@@ -296,11 +296,7 @@ def _stored(key: str, camera: CameraProfile, resolution: int | None) -> list[Sce
         layouts = [None] * len(facts) if stored is None else map(_from_bytes, stored)
         return [
             Scene.from_array(
-                own.float(),
-                CameraSettings(*row.pop("reference")),
-                camera,
-                layout=layout,
-                **row,
+                own.float(), CameraSettings(*row.pop("reference")), camera, layout=layout, **row
             )
             for row, own, layout in zip(facts, light, layouts, strict=True)
         ]

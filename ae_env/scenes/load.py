@@ -60,11 +60,7 @@ from simulator.utils.files import sibling
 logger = logging.getLogger(__name__)
 
 #: Names of the scenes that come with the package.
-BUNDLED: dict[str, Size] = {
-    "bundled": "normal",
-    "bundled:small": "small",
-    "bundled:large": "large",
-}
+BUNDLED: dict[str, Size] = {"bundled": "normal", "bundled:small": "small", "bundled:large": "large"}
 #: Those of one kind, or of the hard part.
 BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
 #: Views into Poly Haven's panoramas, alone and with as many procedural scenes.

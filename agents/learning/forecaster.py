@@ -175,10 +175,7 @@ def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
 # -- training -------------------------------------------------------------------------------------
 
 
-def train_forecaster(
-    training: ForecasterTraining,
-    session: Session = UNWATCHED,
-) -> LightForecaster:
+def train_forecaster(training: ForecasterTraining, session: Session = UNWATCHED) -> LightForecaster:
     """Trains a forecaster on light of the training kinds.
 
     Args:

@@ -225,9 +225,7 @@ class PPOPolicy(NetworkPolicy):
 
 
 def train_ppo(
-    envs: gym.vector.VectorEnv,
-    training: PPOTraining,
-    session: Session = UNWATCHED,
+    envs: gym.vector.VectorEnv, training: PPOTraining, session: Session = UNWATCHED
 ) -> ExposureActorCritic:
     """Trains PPO on the scenes of `envs` (autoreset mode SAME_STEP).
 

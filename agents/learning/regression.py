@@ -297,9 +297,7 @@ class RegressionTraining(Configuration):
 
 
 def train_regression(
-    envs: gym.vector.VectorEnv,
-    training: RegressionTraining,
-    session: Session = UNWATCHED,
+    envs: gym.vector.VectorEnv, training: RegressionTraining, session: Session = UNWATCHED
 ) -> ScoreRegressor:
     """Trains a regression agent on the training scenes of `envs` (autoreset mode SAME_STEP).
 

@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from ae_env.observation import SENSOR_RANGES, decode_sensors
 from agents.foresight import Foresight, TrendTracker
 from agents.metering.meters import make_meter
-from agents.metering.programs import (
-    ProgramOptions,
-    StateChooser,
-    check_used,
-    program_cost,
-)
+from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
 from agents.metering.reading import EVTracker, Floats, ReferenceFrames
 from agents.metering.tuned import ScoreRegression
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax

@@ -92,11 +92,7 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
 
 
 def weighted_reading(
-    observations: Observations,
-    estimate: Floats | None = None,
-    *,
-    camera: CameraProfile,
-    name: str,
+    observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile, name: str
 ) -> Reading:
     """EV of the weighted mean signal, with the weights of `weight_map`."""
     signal = linear_signal(observations["raw"], camera, GREEN)
@@ -108,10 +104,7 @@ def weighted_reading(
 
 
 def matrix_reading(
-    observations: Observations,
-    estimate: Floats | None = None,
-    *,
-    camera: CameraProfile,
+    observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile
 ) -> Reading:
     """Multi-zone metering: contrast-aware zones, then highlight and shadow constraints.
 

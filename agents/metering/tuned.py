@@ -87,12 +87,7 @@ class ScoreRegression:
             prior = self._local_fit(features, self.bandwidths * widen, prior)
         return prior
 
-    def _local_fit(
-        self,
-        features: Floats,
-        bandwidths: Floats,
-        prior: Floats,
-    ) -> Floats:
+    def _local_fit(self, features: Floats, bandwidths: Floats, prior: Floats) -> Floats:
         """Ridge-regularised local linear fit around each query, shrunk to `prior`."""
         known, query = self.features / bandwidths, features / bandwidths
         # Squared distances through the inner product: no (N, n, d) array.
@@ -120,11 +115,7 @@ class ScoreRegression:
         """Write the regression as a safetensors file."""
         from safetensors.numpy import save
 
-        arrays = {
-            "features": self.features,
-            "scores": self.scores,
-            "bandwidths": self.bandwidths,
-        }
+        arrays = {"features": self.features, "scores": self.scores, "bandwidths": self.bandwidths}
         return write_atomically(path, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
 
     @classmethod
@@ -153,10 +144,7 @@ def _widest_good(bandwidths: Sequence[float], criteria: Sequence[float]) -> floa
 
 
 def _left_out_score(
-    features: Floats,
-    scores: Floats,
-    folds: NDArray[np.intp],
-    bandwidths: Floats,
+    features: Floats, scores: Floats, folds: NDArray[np.intp], bandwidths: Floats
 ) -> float:
     """Mean score of the states picked for each fold by the regression on the others."""
     total = 0.0

@@ -137,11 +137,7 @@ def _draw_leaves(
 
 
 def paint_leaves(
-    size: int,
-    radius: np.ndarray,
-    centre_y: np.ndarray,
-    centre_x: np.ndarray,
-    shape: np.ndarray,
+    size: int, radius: np.ndarray, centre_y: np.ndarray, centre_x: np.ndarray, shape: np.ndarray
 ) -> np.ndarray:
     """(size, size) label of the topmost leaf at each pixel, 0 for the ground."""
     angle, elongation, is_box = shape
