@@ -18,7 +18,7 @@ from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
 from simulator.camera import CameraProfile
-from simulator.optics.motion_path import ALONG_ROWS, Movement
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.develop import develop
 from simulator.settings import CameraSettings, format_exposure_time
 

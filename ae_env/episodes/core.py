@@ -34,7 +34,7 @@ from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.generator import Noise
-from simulator.optics.disc_bank import DIAMETERS
+from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18

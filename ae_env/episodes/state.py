@@ -17,7 +17,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 from simulator.utils.checks import check_integer, did_you_mean
 
 #: Share of the episodes in which nothing moves.

@@ -15,7 +15,7 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.protocol import Captures, PixelBlur, layout_blur, stacked
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.motion_path import ALONG_ROWS, Movement
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.cache import LruCache
 

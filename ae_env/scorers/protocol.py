@@ -12,8 +12,8 @@ import torch
 
 from ae_env.scenes.scene import Scene
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.disc_bank import DIAMETERS
-from simulator.optics.motion_path import Movement
+from simulator.optics.discs import DIAMETERS
+from simulator.optics.motion import Movement
 from simulator.settings import CameraSettings
 
 

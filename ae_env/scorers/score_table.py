@@ -28,7 +28,7 @@ from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.motion_path import ALONG_ROWS, Movement
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
 

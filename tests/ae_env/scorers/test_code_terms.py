@@ -14,7 +14,7 @@ from ae_env.scorers.score_table import ScoreTables, prepare_scene, source_noises
 from ae_env.scorers.terms import Highlights, Noise, Shadows, TermScores
 from simulator.capture.layout import Layout
 from simulator.capture.sensor import clip_and_quantise
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 from tests.ae_env.environments import make_env
 from tests.ae_env.scorer_images import CAMERA, GRID, Own, make_captures, make_scene
 
