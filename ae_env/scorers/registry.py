@@ -58,12 +58,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "blind_noise": measures.BlindNoise,
     "defects": defects.Defects,
     "fidelity": fidelity.Fidelity,
-    "analytic_exposure": defects.AnalyticExposure,
-    "analytic_noise": defects.AnalyticNoise,
-    "analytic_white_balance": defects.AnalyticWhiteBalance,
-    "analytic_saturation": defects.AnalyticSaturation,
-    "analytic_haze": defects.AnalyticHaze,
-    "analytic_blur": defects.AnalyticBlur,
+    **defects.ANALYTIC,
 }
 
 
