@@ -167,18 +167,9 @@ def score_tables(
     ExposureGrid.from_spec(grid), make_scorer(scorer), get_camera(camera)
     if weights != "none":
         check_weights(weights)
-    plan = ShardPlan.of(
-        what,
-        out,
-        per_shard=per_shard,
-        resolution=resolution,
-        camera=camera,
-        grid=grid,
-        scorer=scorer,
-        weights=weights,
-        captures=captures,
-        seed=seed,
-    )
+    options: dict[str, Any] = {"resolution": resolution, "camera": camera, "grid": grid}
+    options |= {"per_shard": per_shard, "scorer": scorer, "weights": weights}
+    plan = ShardPlan.of(what, out, **options, captures=captures, seed=seed)
     console.make_folder(out)
     begun = perf_counter()
     with progress_bars() as progress, progress("shards") as task:
