@@ -23,7 +23,7 @@ from ae_env.scorers.measures import luma_of
 from agents.cli.console import print_line
 from benchmarks.harness import Benchmark, Part, Report, Row, pivot, table
 from simulator import develop, exposure_ratio, get_camera
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 from simulator.raw.develop import GREY_CARD_SIGNAL
 
 CAMERA = "nikon_z6"

@@ -252,7 +252,8 @@ def _use_rest() -> None:
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.optics.blur import Blur, blur_many, disc_blur, motion_blur
+    from simulator.optics.discs import Blur, blur_many, disc_blur
+    from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw
 
     library = find_scenes(DEFAULT_SCENES)

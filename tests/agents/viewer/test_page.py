@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 
 from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 
 playwright = pytest.importorskip("playwright.sync_api")
 expect = playwright.expect

@@ -26,7 +26,7 @@ from simulator import (
     get_camera,
     write_dng,
 )
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 
 CAMERA = get_camera("nikon_z6")
 SETTINGS = CameraSettings(100, 1 / 64, 4)
