@@ -21,7 +21,7 @@ from agents.evaluation.intervals import (
     score_interval,
 )
 from agents.policy_names import is_metering
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 from simulator.utils.checks import check_word
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class EvaluationResult:
         scenes: Scene of each episode.
         speed: Image speed of each episode [frame heights per second], ``(E,)``.
         defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
-        movement: Fields of each episode's `simulator.optics.motion_path.Movement`, ``(E, 4)``.
+        movement: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
         other_scores: Mean score of the states that each policy chose under scorers that nothing was
             trained on: by scorer, then by policy.
     """
@@ -157,7 +157,7 @@ class EvaluationResult:
         return "score" if self.plan is None else self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
-        """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
+        """What blur depends on, as arguments of `ae_env.scorers.captures.prepare_scene`."""
         drawn = () if self.movement is None else self.movement[episode].tolist()
         return {
             "speed": 0.0 if self.speed is None else float(self.speed[episode]),
