@@ -14,7 +14,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation.intervals import Rank
 from agents.evaluation.plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
@@ -350,7 +349,7 @@ def page_of(table: Path) -> Path:
     return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
 
 
-def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     """The rows of the policies that are ranked: means over all conditions or budgets.
 
     Args:
@@ -361,7 +360,7 @@ def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
     real = is_real(first.groups)
     parts = {"procedural": ~real, "real": real}
     rows = []
-    for one in ranking:
+    for one in ranking.itertuples():
         means = {
             key: np.mean([result.mean(one.policy, key) for result in results.values()])
             for key in _MEANS[first.measure]
@@ -372,10 +371,10 @@ def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
             if part.any()
         }
         track = first.tracks[one.policy]
-        low, high = one.score.pair or (None, None)
+        low, high = one.ci95 or (None, None)
         row = {
             "policy": one.policy,
-            "score": one.score.value,
+            "score": one.normalised_score,
             "ci95_low": low,
             "ci95_high": high,
             "ms_alone": 1000.0 * means["seconds"] if "seconds" in means else track.ms_alone,
