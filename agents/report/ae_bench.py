@@ -107,32 +107,7 @@ _TABLES = {
 }
 #: What tells a page that this module wrote.
 _MARK = "<!-- written by `ae-env evaluate --append`"
-_PAGE = """\
-# AE-Bench v2
-
-<!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->
-
-40 scenes that nothing was trained on: 24 of the procedural generators, and a view of each of the \
-16 real places of the test split (`ae-env scenes download` fetches them). Three tasks, each a \
-preset of `configs/evaluation`; what the columns mean: [evaluation.md](evaluation.md). Times are \
-those of each row's own machine (`cpu` in the CSV file). [AE-Bench v1](ae-bench/v1.md) is \
-superseded.
-
-Add your own policy with one command for each task that it is for:
-
-    ae-env evaluate --preset ae_bench_v2_still --policy my.py:Mine \\
-        --append {table} --author "Your name"
-
-`_still`, `_video` or `_bracket`; `--observation statistics` shows the policy the statistics of an \
-image processor in place of pixels. A row replaces the one of the same task, policy, observation \
-and author, where there is one, and no other. Send it as a pull request with the two files that \
-the command changes, `{table}` and `{page}`, and, if it may be public, the policy's file.
-
-The plans of all tasks, their scenes and the rules of the environment have the hash `{hash}`, \
-which every row carries; a run under another one is refused.
-
-{tables}
-"""
+_PAGE = Path(__file__).with_name("ae_bench.md")
 
 
 def scene_signature(scene: Scene) -> list[Any]:
@@ -403,6 +378,6 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
         for task, (title, text, columns) in _TABLES.items()
         if (rows.task == task).any()
     ]
-    return _PAGE.format(
+    return _PAGE.read_text(encoding="utf-8").format(
         table=shown(table), page=shown(page_of(table)), hash=plan.hash, tables="\n\n".join(blocks)
     )

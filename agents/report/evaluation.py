@@ -81,17 +81,7 @@ _BY_CONDITION = (
 )
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
-       max-width: 78rem; margin: 2rem auto; padding: 0 1.2rem; }
-h1 { font-size: 1.7rem; } h2 { margin-top: 2.4rem; border-bottom: 1px solid #ddd; }
-img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-size: .86rem; display: block; overflow-x: auto; }
-th, td { padding: .22rem .6rem; border-bottom: 1px solid #e6e6e6; white-space: nowrap; }
-thead th { border-bottom: 2px solid #999; } tbody tr:hover { background: #f5f7fa; }
-code { background: #f3f3f3; padding: .08rem .25rem; border-radius: 3px; }
-pre { background: #f3f3f3; padding: .8rem; overflow-x: auto; } pre code { padding: 0; }
-"""
+_PAGE = Path(__file__).with_name("report.html")
 #: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
 _SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
 
@@ -227,12 +217,8 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
 
     page = MarkdownIt("commonmark", {"html": False}).enable("table")
     page.add_render_rule("image", image)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
-        f"<body>\n{page.render(markdown)}</body>\n</html>\n"
-    )
+    template = string.Template(_PAGE.read_text(encoding="utf-8"))
+    return template.substitute(title=html.escape(title), body=page.render(markdown))
 
 
 # -- files ----------------------------------------------------------------------------------------
