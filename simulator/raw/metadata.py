@@ -42,13 +42,8 @@ _NAMES = (
     *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),
     *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
-    *(
-        "StandardOutputSensitivity",
-        "DateTimeOriginal",
-        "FocalLength",
-        "UserComment",
-        "DefaultScale",
-    ),
+    *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
+    "DefaultScale",
 )
 _NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))

@@ -18,27 +18,6 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 from simulator.utils.compute import kernel, parallel_ranges
 
-
-@kernel()
-def summed_area(image, total):  # type: ignore[no-untyped-def]
-    """Sum over all pixels above and to the left of each corner of a pixel.
-
-    Args:
-        image: (H, W), any number type.
-        total: (H + 1, W + 1) float64, written to.
-    """
-    height, width = image.shape
-    columns = np.zeros(width)
-    total[0] = 0.0
-    for y in range(height):
-        columns += image[y]
-        row, value = total[y + 1], 0.0
-        row[0] = 0.0
-        for x in range(width):
-            value += columns[x]
-            row[x + 1] = value
-
-
 _BLOCK, _STEP = 8, 4
 #: Share of each level's blocks that is used: those with the least slope.
 _SMOOTH = 0.3
@@ -129,8 +108,22 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
+@kernel()
+def summed_area(image, total):  # type: ignore[no-untyped-def]
+    """Fill `total` (H + 1, W + 1) by the sums over all pixels above and to the left of a corner."""
+    height, width = image.shape
+    columns = np.zeros(width)
+    total[0] = 0.0
+    for y in range(height):
+        columns += image[y]
+        row, value = total[y + 1], 0.0
+        row[0] = 0.0
+        for x in range(width):
+            value += columns[x]
+            row[x + 1] = value
+
+
 def _sums(image: np.ndarray) -> np.ndarray:
-    """(H + 1, W + 1) sum over all pixels above and to the left of each corner of a pixel."""
     total = np.empty((image.shape[0] + 1, image.shape[1] + 1))
     summed_area(image, total)
     return total

@@ -15,7 +15,7 @@ import functools
 import io
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -26,20 +26,20 @@ import torch
 from torch import Tensor, nn
 
 from simulator.camera import CameraProfile, get_camera
-from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
-from simulator.networks.noise_module import NoiseModule
+from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import Pair, any_pairs, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.data import Batch, settings_parameters
-from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, expose
+from simulator.training.data import Batch, no_progress, stacked, stated_fields
+from simulator.training.losses import expose
 from simulator.training.train import (
     SimulatorConfig,
     TrainingProgress,
     first_modules,
     make_accelerator,
     save_trained,
+    stage_loss,
     train_stage,
 )
 from simulator.utils.cache import LruCache
@@ -399,17 +399,15 @@ def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pa
     """
     pairs = opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
     if stage == "noise":
-        pairs = [p for p in pairs if _is_cleaner(*_captures(sequences, p))]
+        captures = [sequence.captures for sequence in sequences]
+        pairs = [
+            p
+            for p in pairs
+            if _is_cleaner(captures[p.sequence][p.source], captures[p.sequence][p.target])
+        ]
     if not pairs:
         raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
     return pairs
-
-
-def _captures(
-    sequences: Sequence[CapturedSequence], pair: Pair
-) -> tuple[PackedCapture, PackedCapture]:
-    captures = sequences[pair.sequence].captures
-    return captures[pair.source], captures[pair.target]
 
 
 def _is_cleaner(source: PackedCapture, target: PackedCapture) -> bool:
@@ -449,31 +447,24 @@ class CapturedPairs:
         for item in items:  # pictures of several sizes: what they have in common
             for name in ("source", "target", "sample", "defocus"):
                 item[name] = item[name][..., : smallest[0], : smallest[1]]
-        return Batch(*(torch.stack([item[name] for item in items]) for name in Batch._fields))
+        return stacked(items)
 
     def _pair(self, pair: Pair, crop: int, rng: np.random.Generator) -> dict[str, Tensor]:
-        source, target = _captures(self.sequences, pair)
+        captures = self.sequences[pair.sequence].captures
+        source, target = captures[pair.source], captures[pair.target]
         light, sample = self._read(source), self._read(target)
         top, left = (int(rng.integers(max(n - crop, 0) + 1)) for n in light.shape[1:])
         light, sample = (
             t[:, top : top + crop, left : left + crop].clamp(max=1.0) for t in (light, sample)
         )
         if light.shape != sample.shape:
-            raise ValueError(
-                f"`{target.file}` must be as large as the other captures of its sequence"
-            )
-        settings, nlf = (source.settings, target.settings), source.noise
+            raise ValueError(f"`{target.file}` must be as large as the others of its sequence")
         return {
             "source": light,
             "target": sample,
             "sample": sample,
-            "ratio": torch.tensor(exposure_ratio(*settings), dtype=torch.float32),
-            "shot": torch.tensor(nlf.shot),
-            "read": torch.tensor(nlf.read),
-            "f_source": torch.tensor(settings[0].effective_f_number),
-            "f_target": torch.tensor(settings[1].effective_f_number),
-            "parameters": torch.tensor([v for s in settings for v in settings_parameters(s)]),
             "defocus": torch.zeros(light.shape[1:]),  # not known, and not used
+            **stated_fields(source.settings, target.settings, source.noise),
         }
 
     def _read(self, capture: PackedCapture) -> Tensor:
@@ -490,9 +481,9 @@ class CapturedNoiseLoss(nn.Module):
     Source pixels above 0.99 are left out.
     """
 
-    def __init__(self, exposure: ExposureModule, noise: NoiseModule) -> None:
+    def __init__(self, modules: Any) -> None:
         super().__init__()
-        self.exposure, self.noise = exposure, noise
+        self.exposure, self.noise = modules["exposure"], modules["noise"]
 
     def forward(self, batch: Batch) -> Mapping[str, Tensor]:
         """The loss on `batch`, and the error relative to not denoising."""
@@ -512,11 +503,9 @@ def train_on_captures(
     *,
     command: str,
     device: str = "cpu",
-    progress: TrainingProgress | None = None,
+    progress: TrainingProgress = no_progress,
 ) -> Path:
-    """Trains the stages of `config` on real captures and writes the weights with their card.
-
-    A stage that is done or half done resumes from its checkpoint.
+    """Trains the stages of `config` on real captures, as `train_and_save` does on simulated ones.
 
     Args:
         config: A training of preset ``"paper"``, ``"pc"`` or ``"dl"``; its camera, body and scenes
@@ -535,35 +524,25 @@ def train_on_captures(
     """
     check_word("preset", config.preset, ("paper", "pc", "dl"))
     accelerator = make_accelerator(config, device, None)
-    made, start = first_modules(config)
-    modules: Any = made
-    losses: dict[str, Callable[[], nn.Module]] = {
-        "exposure": lambda: ExposureLoss(modules["exposure"]),
-        "noise": lambda: CapturedNoiseLoss(modules["exposure"], modules["noise"]),
-        "aperture": lambda: ApertureLoss(*(modules[name] for name in STAGES[:3])),
-        "baseline": lambda: BaselineLoss(modules["baseline"]),
-    }
+    modules, start = first_modules(config)
     names = [name for name in STAGES if name in config.stages()]
     stages: dict[str, dict[str, Any]] = {}
+    values, known = config.card(), [sequence.name for sequence in sequences]
     for number, name in enumerate(names, start=1):
         pairs = CapturedPairs(sequences, name, seed=config.seed)
-        values = config.card()
+        entries = ("preset", "seed", "precision", *names[:number])
         clock = train_stage(
             name,
-            losses[name](),
+            CapturedNoiseLoss(modules) if name == "noise" else stage_loss(name, modules),
             modules[name],
             pairs,
             config.stages()[name],
             accelerator,
             checkpoint=path.parent / f"{name}.checkpoint",
-            identity=[
-                {key: values[key] for key in ("preset", "seed", "precision", *names[:number])},
-                start,
-                [sequence.name for sequence in sequences],
-            ],
-            progress=None if progress is None else functools.partial(progress, name),
+            identity=[{entry: values[entry] for entry in entries}, start, known],
+            progress=functools.partial(progress, name),
         )
         stages[name] = clock.card(len(pairs.pairs))
     done = {"start": start, "sequences": len(sequences), "stages": stages}
-    save_trained(path, made, config, command, **done)
+    save_trained(path, modules, config, command, **done)
     return sibling(path, ".safetensors")

@@ -23,12 +23,7 @@ from simulator import CameraSettings, get_camera
 from simulator.capture.statistics import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
-from simulator.reference.camera import (
-    DRAPED,
-    MOSAIC,
-    ReferenceCamera,
-    ReferenceScene,
-)
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import train
