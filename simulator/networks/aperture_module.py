@@ -71,9 +71,8 @@ class ApertureModule(nn.Module):
             f_target: (B,) effective f-number wanted; where it is not smaller, the image stays.
         """
         if not self.has_map:
-            opened = self._opened if self.preset == "paper" else self._opened_as_released
             opens = (f_target < f_source)[:, None, None, None]
-            return torch.where(opens, opened(image, f_source, f_target), image)
+            return torch.where(opens, self._opened(image, f_source, f_target), image)
         diameter = self.defocus(image, deviation)
         added = added_blur(diameter, f_source[:, None, None], f_target[:, None, None])
         return DiscBank(image).blurred(added[:, None])
@@ -84,11 +83,7 @@ class ApertureModule(nn.Module):
         return self.preset == "compact"
 
     def defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Circle of confusion of each pixel of the source (B, H, W) [pixel]; see `usable_defocus`.
-
-        Raises:
-            ValueError: If the preset has no such map.
-        """
+        """Circle of confusion of the source (B, H, W) [pixel]; see `usable_defocus`."""
         return usable_defocus(self.estimate_defocus(image, deviation), image)
 
     def estimate_defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
@@ -99,26 +94,21 @@ class ApertureModule(nn.Module):
         """
         if not isinstance(self.network, DefocusMap):
             raise ValueError(f"`preset` (={self.preset!r}) must be 'compact' to have a defocus map")
-        return self.network.diameter(image, deviation)
+        return to_diameter(self.network(image, deviation))
 
     def _opened(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
-        # One scalar per image is divided out before the network and multiplied in after it. So it
-        # sees every exposure alike and commutes with exposure, like the compact one.
-        scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
         f_numbers = torch.stack([f_source, f_target], dim=1).float()
         # Eighteen normalisations in a row: bfloat16 would change half of the residual.
         with torch.autocast(image.device.type, enabled=False):
+            if self.preset == "ncs":
+                return image + self.network(image.float(), f_numbers)  # type: ignore[no-any-return]
+            # One scalar per image is divided out before the network and multiplied in after it. So
+            # it sees every exposure alike and commutes with exposure, like the compact one.
+            scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
             residual = self.network((image / scale).float(), f_numbers)
             # A picture without detail has a constant residual; without it, it stays as it is.
             flat = self.network(image.new_zeros(len(image), 4, 1, 1).float(), f_numbers)
-        opened: Tensor = image + (residual - flat) * scale
-        return opened
-
-    def _opened_as_released(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
-        f_numbers = torch.stack([f_source, f_target], dim=1).float()
-        with torch.autocast(image.device.type, enabled=False):
-            opened: Tensor = image + self.network(image.float(), f_numbers)
-        return opened
+        return image + (residual - flat) * scale  # type: ignore[no-any-return]
 
 
 def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:
@@ -225,10 +215,6 @@ class DefocusMap(nn.Module):
         size = features.shape[-2:]
         fine = F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
         return fine[:, 0, :height, :width]
-
-    def diameter(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Diameter of the circle of confusion of each pixel (B, H, W), in pixels of `image`."""
-        return to_diameter(self(image, deviation))
 
 
 def to_diameter(log_blur: Tensor) -> Tensor:

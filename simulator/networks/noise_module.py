@@ -36,19 +36,9 @@ _LARGEST = 5.0
 _LEVEL = 8.0
 
 
-class Size(NamedTuple):
-    """Channels of each level, the finest first, and residual blocks on the coarsest."""
-
-    widths: tuple[int, ...]
-    blocks: int
-
-
-#: The family; each level has half the resolution of the one before.
-SIZES = {
-    "nano": Size((16, 24, 32), 2),
-    "compact": Size((32, 48, 80, 96), 2),
-    "large": Size((48, 96, 176, 256), 2),
-}
+#: The family: channels of each level, the finest first, each with half the resolution of the one
+#: before.
+SIZES = {"nano": (16, 24, 32), "compact": (32, 48, 80, 96), "large": (48, 96, 176, 256)}
 
 
 class Stabiliser(NamedTuple):
@@ -107,16 +97,14 @@ class Denoiser(nn.Module):
 
     def __init__(self, size: str = "compact") -> None:
         super().__init__()
-        widths, blocks = SIZES[size]
+        widths = SIZES[size]
         self.stride = 2 ** (len(widths) - 1)
         self.head = nn.Conv2d(16, widths[0], 3, padding=1)
         self.encode = nn.ModuleList(ResidualBlock(w, bias=True) for w in widths[:-1])
         self.down = nn.ModuleList(
             nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in itertools.pairwise(widths)
         )
-        self.coarsest = nn.Sequential(
-            *(ResidualBlock(widths[-1], bias=True) for _ in range(blocks))
-        )
+        self.coarsest = nn.Sequential(*(ResidualBlock(widths[-1], bias=True) for _ in range(2)))
         self.up = nn.ModuleList(
             nn.ConvTranspose2d(coarse, fine, 2, stride=2)
             for fine, coarse in itertools.pairwise(widths)
@@ -157,11 +145,7 @@ class Denoiser(nn.Module):
     def uncorrected(self, image: Tensor, far: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """The network alone; a pixel depends on those within 80 pixels, and on place modulo 8.
 
-        Args:
-            image: See `forward`; may be a part of a frame.
-            far: `surroundings` there.
-            shot: See `forward`.
-            read: See `forward`.
+        `image` may be a part of a frame; `far` is its `surroundings`.
         """
         height, width = image.shape[-2:]
         stabiliser = Stabiliser.of(shot, read)
@@ -231,13 +215,7 @@ def _coarse_mean(x: Tensor, cells: int) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """``x + conv(relu(conv(x)))``, 3 x 3.
-
-    Args:
-        width: Channels.
-        dilation: Of the first convolution.
-        bias: Whether the convolutions have biases.
-    """
+    """``x + conv(relu(conv(x)))``, 3 x 3, the first dilated."""
 
     def __init__(self, width: int, *, dilation: int = 1, bias: bool = False) -> None:
         super().__init__()

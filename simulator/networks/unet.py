@@ -37,15 +37,6 @@ MULTIPLE = 16
 _STOPS_OF_F22 = 9
 
 
-def _checked(variant: Variant, widths: Sequence[int]) -> tuple[int, ...]:
-    """`widths` as a tuple, of a known variant."""
-    check_word("variant", variant, get_args(Variant))
-    checked, least = tuple(widths), 2 if variant == "paper" else 5
-    if len(checked) < least or not all(isinstance(w, int) and w >= 1 for w in checked):
-        raise ValueError(f"`widths` (={widths!r}) must be {least} or more integers >= 1")
-    return checked
-
-
 def _left(variant: Variant, widths: tuple[int, ...]) -> tuple[int, ...]:
     """Channels per level on the way up, coarsest first: the paper's, or one level finer in ncs."""
     return widths[-2::-1] if variant == "paper" else (*widths[-3::-1], widths[0])
@@ -85,8 +76,7 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
 
     Args:
         x: (B, C, H, W), any H, W >= 1.
-        scale: (B, C), of each sample and channel.
-        shift: (B, C).
+        scale, shift: (B, C), of each sample and channel.
         eps: Added to the variance, which is the biased one, > 0.
 
     Returns:
@@ -107,8 +97,8 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
 
 def _leaky_level(inputs: int, outputs: int) -> nn.Sequential:
     """Two convolutions, each with LeakyReLU."""
-    layers = [(convolution(i, outputs), nn.LeakyReLU(LEAK)) for i in (inputs, outputs)]
-    return nn.Sequential(*(layer for pair in layers for layer in pair))
+    first, second = (convolution(channels, outputs) for channels in (inputs, outputs))
+    return nn.Sequential(first, nn.LeakyReLU(LEAK), second, nn.LeakyReLU(LEAK))
 
 
 def _normalised_level(inputs: int, outputs: int) -> nn.Sequential:
@@ -134,9 +124,6 @@ class UNet(nn.Module):
         widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1; by
             default `WIDTHS`.
 
-    Raises:
-        ValueError: If an argument is none of these.
-
     Source: Brooks et al. 2019, Unprocessing Images for Learned Raw Denoising. Two things differ
     from what its authors released: two convolutions a level, not three, and replicated borders.
 
@@ -146,7 +133,8 @@ class UNet(nn.Module):
 
     def __init__(self, variant: Variant = "paper", *, widths: Sequence[int] | None = None) -> None:
         super().__init__()
-        widths = _checked(variant, WIDTHS.get(variant, ()) if widths is None else widths)
+        check_word("variant", variant, get_args(Variant))
+        widths = WIDTHS[variant] if widths is None else tuple(widths)
         self.variant, left = variant, _left(variant, widths)
         level = _leaky_level if variant == "paper" else _normalised_level
         self.encoder = nn.ModuleList(
@@ -218,10 +206,6 @@ class ApertureNorm(nn.Module):
 
     ``A(x) = (w_s [n1, n2] + b_s) * (x - mean(x)) / std(x) + (w_m [n1, n2] + b_m)``, per channel,
     mean and deviation over the map. The paper's variant starts at b_s = 1, b_m = 0.
-
-    Args:
-        width: Channels, >= 1.
-        variant: Of the network.
     """
 
     def __init__(self, width: int, variant: Variant = "paper") -> None:
@@ -243,13 +227,7 @@ class NormalisedConvolution(nn.Module):
     """Convolution and aperture normalisation.
 
     The paper's has no bias, as the normalisation cancels it, and replicated borders; the authors'
-    weights have one, and borders are zero.
-
-    Args:
-        inputs: Input channels, >= 1.
-        outputs: Output channels, >= 1.
-        kernel: 3 or 1.
-        variant: Of the network.
+    weights have one, and borders are zero. `kernel` is 3 or 1.
     """
 
     def __init__(
@@ -294,8 +272,8 @@ class SkipAttention(nn.Module):
     variant only this function is computed, and learnt; the released one computes the maps.
 
     Args:
-        width: Channels of skip and of gate, >= 1.
-        inner: Channels inside, >= 1.
+        width: Channels of skip and of gate.
+        inner: Channels inside.
         variant: Of the network.
     """
 
@@ -363,9 +341,6 @@ class AttentionUNet(nn.Module):
         variant: ``"paper"`` or ``"ncs"``.
         widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1.
 
-    Raises:
-        ValueError: If an argument is none of these.
-
     Source: Ouyang et al. 2021, Neural Camera Simulators, section 3.3; its figure's unstated sizes
     as in Oktay et al. 2018, Attention U-Net (half the channels inside the spatial attention).
 
@@ -378,8 +353,8 @@ class AttentionUNet(nn.Module):
         self, variant: Variant = "paper", *, widths: Sequence[int] = ATTENTION_WIDTHS
     ) -> None:
         super().__init__()
-        widths = _checked(variant, widths)
-        self.variant = variant
+        check_word("variant", variant, get_args(Variant))
+        self.variant, widths = variant, tuple(widths)
         fine, coarse = widths[-2::-1], widths[:0:-1]
         # Released: inside the attention of the finest level there are as many as outside.
         inner = _left(variant, widths) if variant == "ncs" else [max(f // 2, 1) for f in fine]
@@ -409,15 +384,8 @@ class AttentionUNet(nn.Module):
 
         Returns:
             (B, 4, H, W), to be added to the image.
-
-        Raises:
-            ValueError: If `f_numbers` is not a pair for each image.
         """
-        batch, _, height, width = image.shape
-        if f_numbers.shape != (batch, 2):
-            shape = tuple(f_numbers.shape)
-            raise ValueError(f"`f_numbers` (of shape {shape}) must have shape ({batch}, 2)")
-        paper = self.variant == "paper"
+        paper, (height, width) = self.variant == "paper", image.shape[-2:]
         x = image if paper else _padded(image)
         if paper:
             aperture = f_numbers.to(image) / F_NUMBER_UNIT

@@ -63,11 +63,7 @@ def data_folder() -> Path | None:
 
 
 def as_path(path: object) -> Path:
-    """`path` as a `Path`.
-
-    Raises:
-        ValueError: If it is neither text nor a path.
-    """
+    """`path` as a `Path`; a `ValueError` if it is neither text nor a path."""
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise ValueError(f"`path` (={path!r}) must be a file's name: a str or a pathlib.Path")
     return Path(path)
@@ -77,8 +73,7 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
     """Why a picture must not be decoded: it claims far more pixels than its file can hold.
 
     Args:
-        height: Rows that the file claims.
-        width: Columns that it claims.
+        height, width: That the file claims.
         size: Length of the file [byte].
         per_byte: Most pixels that each byte of the file may stand for.
 
@@ -184,8 +179,7 @@ def write_results(
 
     Args:
         path: File to write; its folder is made where missing.
-        rows: One mapping per row, JSON-ready; scalars and arrays of numpy and torch become numbers
-            and lists.
+        rows: One mapping per row; scalars and arrays of numpy and torch become numbers and lists.
         meta: As `result_meta` returns it, plus whatever describes this measurement.
 
     Returns:
@@ -231,10 +225,9 @@ def versions() -> dict[str, str]:
 
 
 def _version(distribution: str) -> str | None:
-    try:
+    with suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    return None
 
 
 def _plain(value: Any) -> Any:
@@ -260,11 +253,8 @@ def _commit() -> str | None:
     # An installed copy may lie inside somebody else's repository.
     if top is None or Path(top).resolve() != root:
         return None
-    commit = _git(root, "rev-parse", "--verify", "--quiet", "HEAD")
-    if commit is None:
-        return None
-    changed = _git(root, "status", "--porcelain", "--untracked-files=no")
-    return f"{commit}+changes" if changed else commit
+    wanted = ("--always", "--abbrev=40", "--exclude=*", "--dirty=+changes")
+    return _git(root, "describe", *wanted)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
