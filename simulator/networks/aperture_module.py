@@ -112,12 +112,7 @@ class ApertureModule(nn.Module):
 
 
 def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:
-    """The map that pictures are blurred by: zero where the picture shows no defocus.
-
-    Args:
-        diameter: (B, H, W) as `ApertureModule.estimate_defocus` gives it [pixel].
-        image: (B, 4, H, W) that it was estimated from.
-    """
+    """The map (B, H, W) that `image` is blurred by: zero where that shows no defocus."""
     return BLUR_FACTOR * dead_zone(diameter) * is_defocused(diameter, image)[:, None, None]
 
 
@@ -127,10 +122,6 @@ def is_defocused(diameter: Tensor, image: Tensor) -> Tensor:
     Blur up to 1.5 pixels is hard to tell from softness, and a false map costs a sharp picture more
     than a missed one costs a blurred picture. So a picture counts as in focus throughout unless a
     twentieth of its detail (weighed by local contrast) is blurred by more than `IN_FOCUS`.
-
-    Args:
-        diameter: (B, H, W) estimated circle of confusion [pixel].
-        image: (B, 4, H, W).
     """
     grey = image.mean(dim=1, keepdim=True)
     mean = box_mean(grey, _USABLE_WINDOW)
@@ -174,10 +165,6 @@ class DefocusMap(nn.Module):
     Defocus removes fine detail first: the energies of neighbouring difference-of-disc bands,
     relative to the contrast of the neighbourhood, tell by how much. They do not depend on the
     exposure. The network works at half the resolution (pixel unshuffle).
-
-    Args:
-        width: Channels of the network.
-        dilations: Dilation of each residual block.
     """
 
     def __init__(self, width: int = 48, dilations: tuple[int, ...] = (1, 2, 4, 1)) -> None:
@@ -195,14 +182,9 @@ class DefocusMap(nn.Module):
                 block.second.weight.mul_(0.3)  # type: ignore[operator, union-attr]
 
     def forward(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Logarithm of the blur, ``log(diameter + 0.3)``.
+        """``log(diameter + 0.3)`` of the blur (B, H, W), the diameter in pixels of `image`.
 
-        Args:
-            image: (B, 4, H, W) raw with little noise, any exposure; H, W >= 1.
-            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
-
-        Returns:
-            (B, H, W); the diameter is in pixels of `image`.
+        `deviation` (B, 4, H, W) is that of the noise which was removed from `image`.
         """
         height, width = image.shape[-2:]
         features = F.pad(

@@ -46,11 +46,8 @@ class Stabiliser(NamedTuple):
 
     ``z = 2 y / (sqrt(shot y + c) + sqrt(c))`` with ``c = read + 3/8 shot^2``: the generalised
     Anscombe transform less its value at 0, in a form that stays exact as shot goes to 0, where it
-    becomes ``y / sigma``. Below 0 it goes on as a straight line.
-
-    Args:
-        shot: (B, 4, 1, 1) slope of the noise variance.
-        root: (B, 4, 1, 1) ``sqrt(c)``, above 0.
+    becomes ``y / sigma``. Below 0 it goes on as a straight line. `root` is ``sqrt(c)``, above 0;
+    both are (B, 4, 1, 1).
     """
 
     shot: Tensor
@@ -89,10 +86,7 @@ class Denoiser(nn.Module):
     The network sees the stabilised picture less its mean over 17 x 17 pixels, how that mean
     differs from the one over 65 x 65, the level itself, and how linear the stabilisation is.
     What it takes away is corrected such that the mean over about 136 x 136 pixels stays: noise has
-    a mean of zero, so nothing else may be taken on average.
-
-    Args:
-        size: Name in `SIZES`.
+    a mean of zero, so nothing else may be taken on average. `size` is a name in `SIZES`.
     """
 
     def __init__(self, size: str = "compact") -> None:
@@ -122,15 +116,12 @@ class Denoiser(nn.Module):
         nn.init.zeros_(self.tail.weight)  # it starts by changing nothing
 
     def forward(self, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """Noise-reduced image.
+        """Noise-reduced image (B, 4, H, W), float32.
 
         Args:
             image: (B, 4, H, W) noisy raw, any exposure; H, W >= 1.
             shot: (B, 4) slope of the noise variance, on the same scale.
             read: (B, 4) noise variance at zero signal.
-
-        Returns:
-            (B, 4, H, W) float32.
         """
         clean = self.uncorrected(image, self.surroundings(image, shot, read), shot, read)
         # In training a residual that is the same everywhere must cost something.
@@ -266,15 +257,12 @@ class NoiseModule(nn.Module):
         return round(counter.get_total_flops() / side**2)
 
     def forward(self, exposed: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """The raw with little noise; one without noise (shot = read = 0) as it is.
+        """The raw with little noise, float32; one without noise (shot = read = 0) as it is.
 
         Args:
             exposed: (B, 4, H, W) raw on the scale of the target.
             shot: (B, 4) slope of its noise variance on that scale.
             read: (B, 4) noise variance at zero signal.
-
-        Returns:
-            (B, 4, H, W) float32.
         """
         if self.commutes:
             result = self.network(exposed, shot, read)
@@ -287,10 +275,7 @@ class NoiseModule(nn.Module):
 
 
 def _sample(image: Tensor) -> Tensor:
-    """Standard normals (1, 4, H, W) for an image (B, 4, H, W); the same for every one of its size.
-
-    Results of the noise module are shared between captures of all seeds.
-    """
+    """Standard normals (1, 4, H, W), the same for every image of this size: results are shared."""
     normals = frame_normals(int(noise_keys(_SAMPLE_SEED)[0]), tuple(image.shape[1:]))
     return torch.from_numpy(normals)[None].to(image.device)
 

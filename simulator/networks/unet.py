@@ -73,14 +73,7 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
     A flat map, and so every 1 x 1 map, becomes exactly `shift`. Convolutions leave deviations of
     1e-7 in a flat image; each normalisation would multiply them by up to ``1 / sqrt(eps)`` = 300,
     and after three layers they would be the image. Deviations below `FLAT` are that rounding.
-
-    Args:
-        x: (B, C, H, W), any H, W >= 1.
-        scale, shift: (B, C), of each sample and channel.
-        eps: Added to the variance, which is the biased one, > 0.
-
-    Returns:
-        (B, C, H, W), the dtype of `x`; statistics are at least float32.
+    `x` is (B, C, H, W), `scale` and `shift` are (B, C); statistics are at least float32.
 
     >>> flat = torch.full((1, 1, 3, 3), 0.1)
     >>> instance_norm(flat, torch.ones(1, 1), torch.full((1, 1), 0.25)).unique().item()
@@ -154,14 +147,10 @@ class UNet(nn.Module):
             self.tail = nn.Conv2d(widths[0], 4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Residual of a raw.
+        """Residual (B, 4, H, W) of a raw, to be added to it.
 
-        Args:
-            x: (B, 8, H, W), any H, W >= 1: the raw and its noise-level map, or for ``"ncs"`` the
-                raw and the same with a sample of its noise.
-
-        Returns:
-            (B, 4, H, W), to be added to the raw.
+        `x` is (B, 8, H, W), any H, W >= 1: the raw and its noise-level map, or for ``"ncs"`` the
+        raw and the same with a sample of its noise.
         """
         paper, (height, width) = self.variant == "paper", x.shape[-2:]
         x = x if paper else _padded(x)
@@ -188,9 +177,6 @@ def light_of_aperture(f_number: Tensor) -> Tensor:
     """The number that stands for an f-number in the authors' code: 1 at f/22, twice that a stop.
 
     Thirds of stops go linearly between: 1, 4/3, 5/3, 2.
-
-    Args:
-        f_number: (B,) effective f-numbers, such as sqrt(2) ** 9 for f/22.
 
     >>> light = light_of_aperture(torch.tensor([2.0 ** (9 / 2), 2.0 ** (26 / 6), 4.0]))
     >>> [round(value, 5) for value in light.tolist()]
@@ -270,11 +256,6 @@ class SkipAttention(nn.Module):
     zero, so that of A is ``w_m [n1, n2] + b_m`` whatever the image, the convolution in front and
     the scale; the sum of the two is again one linear function of the f-numbers. In the paper's
     variant only this function is computed, and learnt; the released one computes the maps.
-
-    Args:
-        width: Channels of skip and of gate.
-        inner: Channels inside.
-        variant: Of the network.
     """
 
     def __init__(self, width: int, inner: int, variant: Variant = "paper") -> None:
@@ -376,14 +357,9 @@ class AttentionUNet(nn.Module):
                 self.tail.bias.zero_()  # type: ignore[union-attr]
 
     def forward(self, image: Tensor, f_numbers: Tensor) -> Tensor:
-        """Residual of an image.
+        """Residual (B, 4, H, W) of an image (B, 4, H, W) of order one, to be added to it.
 
-        Args:
-            image: (B, 4, H, W), any H, W >= 1, of order one.
-            f_numbers: (B, 2), effective f-numbers of source and target, in [0.5, 1024].
-
-        Returns:
-            (B, 4, H, W), to be added to the image.
+        `f_numbers` (B, 2) are the effective ones of source and target, in [0.5, 1024].
         """
         paper, (height, width) = self.variant == "paper", image.shape[-2:]
         x = image if paper else _padded(image)

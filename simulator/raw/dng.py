@@ -52,10 +52,7 @@ _STRIP_ROWS = 32
 class OwnRecord:
     """A note of `write_dng` in the EXIF comment: values that the standard tags would round.
 
-    Args:
-        settings: Exact exposure settings.
-        box_factor: Sensor pixels averaged per side into one pixel.
-        colour_matrix_source: Where the colour matrix comes from; empty for the neutral default.
+    The source of the colour matrix is empty for the neutral default.
     """
 
     settings: CameraSettings
@@ -264,13 +261,9 @@ def _pack_directory(tags: Mapping[str, Tag], offset: int) -> bytes:
 
 
 def tiff_head(tags: Mapping[str, Tag], exif: Mapping[str, Tag], size: int) -> bytes:
-    """A little-endian TIFF file of one strip of pixels, up to where the strip begins.
+    """A little-endian TIFF file of one strip of `size` bytes, up to where the strip begins.
 
-    Args:
-        tags: Its directory. The position and length of the strip and of the EXIF directory are
-            filled in.
-        exif: Its EXIF directory.
-        size: Length of the strip [byte].
+    The positions of the strip and of the EXIF directory are filled in.
     """
 
     def directory(strip_at: int, exif_at: int) -> bytes:

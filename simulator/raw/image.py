@@ -105,6 +105,11 @@ class RawImage:
 def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
     """Bayer mosaic of digital numbers to a packed raw.
 
+    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
+
+        R  G1
+        G2 B
+
     Args:
         mosaic: (2H, 2W) digital numbers, any integer or float dtype. An odd last row or column is
             dropped.
@@ -112,11 +117,6 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
 
     Returns:
         (4, H, W) float32, planes R, G1, G2, B; black-subtracted, 1.0 at sensor white.
-
-    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
-
-        R  G1
-        G2 B
     """
     if mosaic.ndim != 2 or min(mosaic.shape) < 2:
         raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
@@ -142,11 +142,7 @@ def unpack_mosaic(
 ) -> np.ndarray:
     """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`.
 
-    Args:
-        data: The packed raw.
-        camera: See `pack_mosaic`.
-        first: First packed row of the part that is wanted.
-        last: Where that part ends; by default with the frame.
+    Of packed rows `first` to `last`, by default of all.
     """
     planes = data.detach().float().cpu().contiguous().numpy()
     _, height, width = planes.shape

@@ -1,9 +1,4 @@
-"""Pairs of captures, and crops for the noise stage, as batches: the same step gives the same batch.
-
-A picture for the noise stage is light at the pitch of the photosites, seen through the colour
-filter array, or a recorded mosaic with little noise. Averages over k x k samples of a plane, as of
-a frame that was reduced, are among its crops.
-"""
+"""Pairs of captures, and crops for the noise stage, as batches: a step always gives the same."""
 
 from __future__ import annotations
 
@@ -98,17 +93,8 @@ def draw_sequences(
 class ReferencePairs:
     """Pairs of one stage, photographed by the reference camera whenever they are asked for.
 
-    The pairs are chosen once, at construction. Light behind every aperture is rendered once; a
-    batch then costs the exposure and the noise of its crops. The noise is new every time: a pair
-    that is shown twice was photographed twice.
-
-    Args:
-        sequences: Scenes and settings.
-        camera: The body.
-        stage: Stage to train, see `simulator.reference.sequences.select_pairs`.
-        seed: Seed of pairs, crops and noise.
-        blurred_light: Rendered light to share between stages; filled as needed.
-        progress: Called while the light is rendered, with the share that is done.
+    Light behind every aperture is rendered once, into `blurred_light`, which stages may share. The
+    noise is new every time: a pair that is shown twice was photographed twice.
 
     Raises:
         ValueError: If the sequences hold no pair for this stage.
@@ -149,9 +135,6 @@ class ReferencePairs:
             size: Pairs.
             crop: Height and width of the crops [packed pixel].
             process: Rank among several processes, each of which gets pairs of its own.
-
-        Raises:
-            ValueError: If a scene is smaller than `crop`.
         """
         rng = np.random.default_rng([self.seed, len(self.stage), step, process])
         chosen = rng.integers(len(self.pairs), size=size)
@@ -279,12 +262,14 @@ class NoiseBatch(NamedTuple):
 
 
 class DetailCrops:
-    """Batches of the noise stage.
+    """Batches of the noise stage, at ISO 50 to 25,600 of one of the cameras.
+
+    Half of the crops have read noise of 0.4 to 7 times as much, as other sensors have. Averages
+    over k x k samples of a plane, as of a frame that was reduced, are among the crops.
 
     Args:
         pictures: Sources, at least one of 16 packed pixels a side or more.
-        cameras: Cameras whose noise is added, each at ISO 50 to 25,600; half of the crops have
-            read noise of 0.4 to 7 times as much, as other sensors have.
+        cameras: Cameras whose noise is added.
         seed: Seed of everything drawn.
     """
 

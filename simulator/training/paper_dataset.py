@@ -73,13 +73,7 @@ Balance = tuple[float, float, float]
 
 
 def packed_camera(name: str) -> CameraProfile:
-    """The built-in camera `name` with the levels of the dataset, and its noise on that scale.
-
-    Args:
-        name: ``"nikon_z6"`` or ``"canon_70d"``.
-
-    Raises:
-        ValueError: If the dataset does not have the camera.
+    """The built-in camera ``"nikon_z6"`` or ``"canon_70d"`` with the levels of the dataset.
 
     >>> packed_camera("canon_70d").black_level
     (2048.0, 2048.0, 2048.0, 2048.0)
@@ -114,11 +108,10 @@ class PackedCapture:
         return self.nlf or self.camera.nlf(self.settings.iso)
 
     def read(self) -> RawImage:
-        """Read the capture from its file.
+        """Read the capture from its file; nothing pickled is loaded.
 
         Raises:
-            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers;
-                pickled objects are refused.
+            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers.
         """
         try:
             array = np.load(self.file, allow_pickle=False)
@@ -148,12 +141,7 @@ class PackedCapture:
 
 @dataclass(frozen=True)
 class CapturedSequence:
-    """Captures of one static scene with different settings.
-
-    Args:
-        name: Folder of the sequence.
-        captures: The captures in the order of the table, read when they are asked for.
-    """
+    """Captures of one static scene with different settings, in the order of the table."""
 
     name: str
     captures: tuple[PackedCapture, ...]
@@ -298,18 +286,14 @@ def _white_balances(table: Path) -> dict[PurePosixPath, Balance]:
 
 
 def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImage]) -> None:
-    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``.
+    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``, in a new folder.
 
     The table has the columns that the authors' script for the camera writes. It records an exposure
-    time as a camera does: one within 3 % of a nominal stop is read back as that stop.
-
-    Args:
-        folder: Where to; new or empty.
-        raws: At least one capture, all of one `packed_camera`: the files do not state levels.
+    time as a camera does: one within 3 % of a nominal stop is read back as that stop. All captures
+    must be of one `packed_camera`: the files do not state levels.
 
     Raises:
-        ValueError: If `folder` holds something already, there is no capture, or a camera is not
-            one that the dataset has.
+        ValueError: If `folder` holds something already, or `raws` is empty or of another camera.
     """
     folder = Path(folder).expanduser()
     if folder.exists() and any(folder.iterdir()):
@@ -387,12 +371,10 @@ def split_dataset(
 def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pair]:
     """The pairs that a stage is trained on (paper, section 4.2).
 
-    Args:
-        sequences: The sequences to choose from.
-        stage: ``"exposure"`` or ``"baseline"``: any two captures of a sequence. ``"noise"``: the
-            same f-number, a target at ISO 400 or less with at most a quarter of the source's noise
-            variance at mid grey. ``"aperture"``: a target that is more open, and for a tenth of
-            the pairs one that is as open.
+    ``"exposure"`` and ``"baseline"``: any two captures of a sequence. ``"noise"``: the same
+    f-number, a target at ISO 400 or less with at most a quarter of the source's noise variance at
+    mid grey. ``"aperture"``: a target that is more open, and for a tenth of the pairs one that is
+    as open.
 
     Raises:
         ValueError: If there is no such pair.
@@ -422,13 +404,7 @@ def _is_cleaner(source: PackedCapture, target: PackedCapture) -> bool:
 
 
 class CapturedPairs:
-    """Pairs of one stage; the same step gives the same batch.
-
-    Args:
-        sequences: Real captures.
-        stage: See `captured_pairs`.
-        seed: Seed of pairs and crops.
-    """
+    """Pairs of one stage of `captured_pairs`; the same step gives the same batch."""
 
     def __init__(self, sequences: Sequence[CapturedSequence], stage: str, *, seed: int = 0) -> None:
         self.sequences, self.stage, self.seed = sequences, stage, seed
@@ -476,10 +452,7 @@ class CapturedPairs:
 
 
 class CapturedNoiseLoss(nn.Module):
-    """L1 of the exposed and denoised source against the target, as in the paper.
-
-    Source pixels above 0.99 are left out.
-    """
+    """L1 of the exposed and denoised source against the target; pixels above 0.99 do not count."""
 
     def __init__(self, modules: Any) -> None:
         super().__init__()
@@ -507,14 +480,8 @@ def train_on_captures(
 ) -> Path:
     """Trains the stages of `config` on real captures, as `train_and_save` does on simulated ones.
 
-    Args:
-        config: A training of preset ``"paper"``, ``"pc"`` or ``"dl"``; its camera, body and scenes
-            do not matter.
-        sequences: To train on.
-        path: File name of the weights; checkpoints go into its folder.
-        command: The command line that does it again, for the card.
-        device: ``"cpu"`` or ``"cuda"``.
-        progress: Called every few steps.
+    The preset is ``"paper"``, ``"pc"`` or ``"dl"``; camera, body and scenes of `config` do not
+    matter.
 
     Returns:
         The file of the weights.

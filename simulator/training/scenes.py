@@ -133,16 +133,10 @@ def detail_split(group: str) -> Split:
 def detail_pictures(
     split: Split, *, data: Path | None, drawn: int | None = None, seed: int = 0
 ) -> list[DetailPicture]:
-    """The pictures of a split.
+    """The pictures of a split: of the folder of real files `data`, if given, and drawn ones.
 
-    Args:
-        split: ``"train"``, ``"validation"`` or ``"test"``.
-        data: Folder of real files; None uses drawn pictures only. What is missing in it is logged.
-        drawn: Dead leaves, and as many charts and smooth pictures; 60 to train on, else 8.
-        seed: Seed of the drawn pictures.
-
-    Raises:
-        ValueError: If `split` is no split.
+    Of each kind (dead leaves, charts, smooth pictures) `drawn` are drawn; 60 to train on, else 8.
+    What is missing in the folder is logged.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     pictures: list[DetailPicture] = []
@@ -324,13 +318,12 @@ def reference_scenes(
             whatever `number` is.
         size: Height and width [packed pixels], half as many as photosites; pictures that are
             smaller keep their size, and are left out below 128 and below `size`, which is logged.
-        data: Folder of real files (see docs/networks.md), for radiance maps and further
-            photographs; None leaves them out.
+        data: Folder of real files (see docs/networks.md), for radiance maps and more photographs.
         seed: Seed of the procedural groups; part of their names.
 
     Raises:
         FileNotFoundError: If there is no folder `data`.
-        ValueError: If an argument is invalid.
+        ValueError: If another argument is invalid.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     check_integer("number", number, 0, MOST_GROUPS)
@@ -402,11 +395,7 @@ def _scene(
 
 
 def packed_pitch(camera: CameraProfile) -> float:
-    """Distance between packed pixels of `camera` [m], twice the sensor's.
-
-    Raises:
-        ValueError: If the camera does not know it.
-    """
+    """Distance between packed pixels of `camera` [m], twice the sensor's, which must be known."""
     if camera.pixel_pitch_um is None:
         raise ValueError(
             f"`pixel_pitch_um` (=None) of camera {camera.name!r} must be known where there is depth"
@@ -522,13 +511,8 @@ def mosaic_scenes(
     """The middle of real raws at low ISO: flat art and far views, in focus throughout.
 
     For the aperture: their noise is small, but it is there, so they are no truth to denoise. They
-    cannot be defocused, as each plane has but a quarter of the photosites.
-
-    Args:
-        split: See `reference_scenes`; groups are split by `detail_split`.
-        camera: Camera that photographs them; their colours are left as they were recorded.
-        data: Folder of real files.
-        size: Height and width [packed pixels], at most.
+    cannot be defocused, as each plane has but a quarter of the photosites. At most `size` packed
+    pixels a side; colours are left as they were recorded.
     """
     for picture in recorded_mosaics(data, split):
         height, width = picture.light.shape[1:]
@@ -552,9 +536,6 @@ def assumed_illuminance(name: str) -> float:
     """Light [lux] assumed for a picture of unknown scale, in `ILLUMINANCE`, by a hash of its name.
 
     The assumption is log-uniform, and drawn for each view, so that a few maps cover the range.
-
-    >>> assumed_illuminance("lab-090") == assumed_illuminance("lab-090")
-    True
     """
     low, high = EV100_RANGE
     fraction = (assumed_ev100(name) - low) / (high - low)
@@ -567,17 +548,10 @@ def draped_scenes(
 ) -> Iterator[ReferenceScene]:
     """Scenes without depth laid over procedural depth, `copies` of each, in its source group.
 
-    Dead leaves have texture everywhere; real pictures also have smooth surfaces with sharp edges,
-    and a network that learns the map of defocus from leaves alone takes the smooth ones for
-    blurred. A picture that is in focus throughout, laid over depth, shows what defocus does to such
-    surfaces.
-
-    Args:
-        scenes: Scenes to drape; passed over are those with depth, those with a blur of their own,
-            and those that are not at the pitch of the photosites.
-        camera: Camera in whose pixels blur is stated.
-        copies: Depths per scene; every third has everything in focus.
-        seed: Seed of the depths.
+    A network that learns the map of defocus from dead leaves alone, which have texture everywhere,
+    takes smooth surfaces for blurred. Real pictures that are in focus, laid over depth, show what
+    defocus does to such surfaces. Every third has everything in focus. Passed over are scenes with
+    depth, those with a blur of their own, and those that are not at the pitch of the photosites.
     """
     number = 0
     for scene in scenes:
@@ -610,11 +584,7 @@ def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> lis
     that has one. The lens is focused on the front (95 % of the picture are farther) or on
     the median depth, and its focal length chosen such that the circle of confusion at f/11 reaches
     6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is the larger).
-
-    Args:
-        camera: Camera in whose colours light is stated, and in whose pixels blur is.
-        data: Folder that holds ``depth_cones``; without it only ``stereo_motorcycle``, which is
-            inside scikit-image's wheel.
+    One is inside scikit-image's wheel, the other in ``depth_cones`` of the folder `data`.
     """
     wheel = resources.files("skimage.data")
     with wheel.joinpath("motorcycle_left.png").open("rb") as stream, Image.open(stream) as picture:

@@ -255,8 +255,7 @@ def train_and_save(
         command: The command line that does it again, for the card.
         device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
         tensorboard: Whether to log to ``tensorboard`` in that folder.
-        make_scenes: Gives the scenes of a split; not called for a noise module alone.
-        make_pictures: Gives the pictures of a split for the noise stage.
+        make_scenes, make_pictures: Give the scenes of a split, and its noise stage's pictures.
         progress: Called while scenes are rendered and every few steps.
 
     Returns:
@@ -337,11 +336,7 @@ def save_trained(
 
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:
-    """Accelerate's plumbing for this training.
-
-    Raises:
-        ImportError: If the extra ``train`` is not installed.
-    """
+    """Accelerate's plumbing for this training; an `ImportError` without the extra ``train``."""
     try:
         from accelerate import Accelerator
         from accelerate.state import AcceleratorState
@@ -365,10 +360,7 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
 
 
 class _Source:
-    """Scenes, pictures and pairs of one split, made when a stage asks for them.
-
-    Light that is rendered for a stage serves the next.
-    """
+    """Scenes, pictures and pairs of one split, made when a stage asks for them."""
 
     def __init__(
         self,
@@ -449,24 +441,11 @@ def train_stage(
     identity: Any,
     progress: Progress = no_progress,
 ) -> Clock:
-    """Trains `trained` until the stage's budget is used up.
+    """Trains `trained`, which `loss` holds, until the stage's budget is used up.
 
-    A stage that was interrupted resumes from its last checkpoint, at most 20 s back. Batches are
-    drawn by step, so where the budget is in steps it goes on as if it had not been interrupted.
-
-    Args:
-        name: Of the stage, for log and checkpoint.
-        loss: Maps a `Batch` to a mapping with ``"loss"``; holds `trained`.
-        trained: The module whose parameters change.
-        pairs: Where the batches come from.
-        stage: Budget, batch, crop and learning rate.
-        accelerator: Devices, precision, processes.
-        checkpoint: File of the state.
-        identity: JSON value; a checkpoint of another training is not taken over.
-        progress: Called every few steps with the share of the stage that is done, in [0, 1].
-
-    Returns:
-        Steps and seconds that were used.
+    A stage that was interrupted resumes from its last `checkpoint`, at most 20 s back, if that is
+    of the same `identity` (a JSON value). Batches are drawn by step, so where the budget is in
+    steps it goes on as if it had not been interrupted.
 
     Raises:
         ValueError: If the loss is not finite.
@@ -530,13 +509,9 @@ def _resume(
 
 @dataclass
 class Clock:
-    """Steps and time that a stage has used of its budget.
+    """Steps and seconds that a stage has used of its budget.
 
-    Args:
-        stage: The budget.
-        on_cpu: Whether minutes are processor minutes of this process or wall-clock minutes.
-        step: Steps so far.
-        seconds: Time so far.
+    On a CPU, minutes are processor minutes of this process, else wall-clock minutes.
     """
 
     stage: StageConfig
@@ -621,10 +596,6 @@ def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
 
     Several captures of each crop tell what is systematic from what is noise. The first half of the
     crops fills the tables; the second half tells how far single crops are from them.
-
-    Args:
-        noise: In evaluation mode.
-        crops: Of the validation split.
     """
     half = _CROPS // 2
     measured = [_measure(noise, crops, index) for index in range(_CROPS)]

@@ -48,11 +48,9 @@ def cache_dir() -> Path:
 
 
 def cache_key(kind: str, parts: Any) -> str:
-    """Key of a result: its kind, and a hash of all that it depends on and the package's version.
+    """Key of a result: its kind (a folder), and a hash of the package's version and `parts`.
 
-    Args:
-        kind: Name of a folder, such as ``"scenes"``.
-        parts: JSON value; the order of names does not matter.
+    These are a JSON value of all that the result depends on.
 
     >>> cache_key("a", {"b": 1, "c": 2}) == cache_key("a", {"c": 2, "b": 1})
     True

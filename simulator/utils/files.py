@@ -47,9 +47,8 @@ _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image"
 def data_folder() -> Path | None:
     """The folder of real files for tests and measurements.
 
-    Returns:
-        The folder that ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data``
-        beside the checkout, or None if that is not there.
+    It is what ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data`` beside the
+    checkout, or None if that is not there.
 
     Raises:
         FileNotFoundError: If the folder that is named is not there.
@@ -151,16 +150,12 @@ def sibling(path: str | Path, suffix: str) -> Path:
 
 
 def result_meta(command: str, seed: int | None) -> dict[str, Any]:
-    """Where a measurement comes from: the ``meta`` of every result file.
+    """Where a measurement comes from: the ``meta`` of every result file, JSON-ready.
 
-    Args:
-        command: The command line that writes the file again.
-        seed: Seed of the run; None where nothing is random.
-
-    Returns:
-        A JSON-ready dict with the keys ``command``, ``commit`` (hash of the checkout, ending in
-        ``+changes`` where files differ from it; None outside a checkout), ``seed``, ``date`` (UTC,
-        ISO 8601), ``machine`` (``cpu``, ``cores``, ``threads``, ``gpu``) and ``versions``.
+    Its keys are ``command`` (the command line that writes the file again), ``commit`` (hash of the
+    checkout, ending in ``+changes`` where files differ from it; None outside a checkout), ``seed``,
+    ``date`` (UTC, ISO 8601), ``machine`` (``cpu``, ``cores``, ``threads``, ``gpu``) and
+    ``versions``.
     """
     return {
         "command": command,

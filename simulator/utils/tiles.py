@@ -80,14 +80,10 @@ class Tile:
 def make_tiles(
     height: int, width: int, *, halo: int, tile: int = TILE, needed: Tensor | None = None
 ) -> list[Tile]:
-    """Tiles that cover a frame, or its needed pixels, at little cost.
+    """Tiles that cover a frame, or its `needed` pixels (H, W), at little cost.
 
-    Args:
-        height, width: Of the frame.
-        halo: Multiple of 4 [pixel].
-        tile: Largest side of a tile, a multiple of 4 [pixel]; a frame that is no larger than one
-            tile and a halo is one tile.
-        needed: (H, W) bool, the pixels to cover; by default all.
+    `halo` and `tile`, the largest side, are multiples of 4 [pixel]; a frame that is no larger than
+    one tile and a halo is one tile.
     """
     if height <= tile + halo and width <= tile + halo:
         tile = 4 * ((max(height, width) + 3) // 4)
@@ -136,14 +132,10 @@ def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
 
 
 def varying(image: Tensor, margin: int = 0) -> Tensor:
-    """Mask of where a picture is not constant; constant parts carry neither noise nor detail.
+    """(H, W) bool: where `image` (C, H, W) is not constant, in cells of 16 x 16 pixels.
 
-    Args:
-        image: (C, H, W).
-        margin: Pixels around varying cells that also count as varying, a multiple of 16.
-
-    Returns:
-        (H, W) bool, in cells of 16 x 16 pixels.
+    Constant parts carry neither noise nor detail. `margin`, a multiple of 16, is how many pixels
+    around varying cells also count.
     """
     height, width = image.shape[-2:]
     high = F.max_pool2d(image, _CELL, ceil_mode=True)
@@ -175,9 +167,6 @@ def in_tiles(
         tile: Side of a tile, a multiple of 4 [pixel].
         needed: (H, W) bool, the pixels that need the function; by default all.
         fallback: Values of all other pixels, of the result's shape; given with `needed`.
-
-    Returns:
-        The result of `function` on the whole images; `fallback` where it is not needed.
     """
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)
