@@ -25,7 +25,8 @@ from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
 from ae_env.scenes.load import SceneNetworks
 from ae_env.scorers import make_scorer
-from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
+from ae_env.scorers.captures import prepare_scene
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator import get_camera
 from simulator.utils.files import write_atomically
 

@@ -29,7 +29,7 @@ from benchmarks.harness import (
 )
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.networks.aperture_module import ApertureModule
-from simulator.optics.disc_bank import DiscBank, added_blur
+from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
 

@@ -55,7 +55,7 @@ Source = RawImage | PreparedScene | HasPrepared
 _NOISE_HALO, _MAP_HALO = 80, 56
 #: Size of the raw that a network's time is measured on [packed pixel].
 _TIMED = 128
-#: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
+#: How far the largest disc of `simulator.optics.discs` reaches [pixel].
 _DISC_REACH = 16
 
 

@@ -20,7 +20,7 @@ from agents.evaluation.intervals import (
     score_interval,
 )
 from agents.policy_names import is_metering
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,7 +128,7 @@ class EvaluationResult:
         scenes: Scene of each episode.
         speed: Image speed of each episode [frame heights per second], ``(E,)``.
         defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
-        movement: Fields of each episode's `simulator.optics.motion_path.Movement`, ``(E, 4)``.
+        movement: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
         other_scores: Mean score of the states that each policy chose under scorers that nothing was
             trained on: by scorer, then by policy.
     """
@@ -157,7 +157,7 @@ class EvaluationResult:
         return "score" if self.plan is None else self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
-        """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
+        """What blur depends on, as arguments of `ae_env.scorers.captures.prepare_scene`."""
         known = {"speed": self.speed, "defocus": self.defocus}
         found: dict[str, Any] = {
             n: 0.0 if v is None else float(v[episode]) for n, v in known.items()

@@ -21,7 +21,7 @@ from benchmarks.harness import Row, clipped, data_root, pivot, sections
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
-from simulator.optics.disc_bank import DiscBank, added_blur
+from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
 

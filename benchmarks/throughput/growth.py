@@ -25,7 +25,7 @@ from simulator import (
     RawImage,
     get_camera,
 )
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 from simulator.radiance.procedural import dead_leaves
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.

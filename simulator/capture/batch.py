@@ -23,7 +23,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, noise_balance, record
 from simulator.capture.statistics import LightStatistics
 from simulator.noise.generator import Noise, noise_keys, single_normals
-from simulator.optics.blur import Blur, blur_many
+from simulator.optics.discs import Blur, blur_many
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 

@@ -18,8 +18,8 @@ import torch
 from simulator.capture.layout import Layout
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction, top_up_table
-from simulator.optics.blur import kernel_energy
-from simulator.optics.motion_path import Path
+from simulator.optics.discs import kernel_energy
+from simulator.optics.motion import Path
 from simulator.raw.develop import ABOVE_WHITE
 
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,

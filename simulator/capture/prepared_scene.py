@@ -28,7 +28,7 @@ from simulator.capture.sensor import Transitions, exposed_light, noise_balance, 
 from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.generator import Noise, check_noise, sweep_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
-from simulator.optics.motion_path import ALONG_ROWS, Movement, Path
+from simulator.optics.motion import ALONG_ROWS, Movement, Path
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.checks import check_number

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from simulator.networks.noise_module import ResidualBlock
 from simulator.networks.unet import AttentionUNet
-from simulator.optics.blur import box_mean, disc_blur
-from simulator.optics.disc_bank import DiscBank, added_blur
+from simulator.optics.discs import DiscBank, added_blur, box_mean, disc_blur
 from simulator.utils.checks import check_word
 
 AperturePreset = Literal["compact", "paper", "ncs"]

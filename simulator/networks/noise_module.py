@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet
 from simulator.noise.generator import frame_normals, noise_keys
-from simulator.optics.blur import box_mean
+from simulator.optics.discs import box_mean
 from simulator.utils.checks import check_word
 
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]

@@ -170,7 +170,7 @@ def missing_variance(
     bright = signal.float().clamp(min=0.0)
     missing = (bright * shot).add_(read)
     if remaining_variance is not None:
-        missing += (1.0 - remaining_variance) * (bright * source_shot + source_read)
+        missing = missing + (1.0 - remaining_variance) * (bright * source_shot + source_read)
     return missing
 
 

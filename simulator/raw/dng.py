@@ -20,10 +20,11 @@ import numpy as np
 import tifffile
 from tifffile import DATATYPE
 
+from simulator import __version__
 from simulator.raw.image import RawImage, unpack_mosaic
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_type
-from simulator.utils.files import as_path, package_version, write_atomically
+from simulator.utils.files import as_path, write_atomically
 
 #: Begins the Software tag of every DNG written here.
 SOFTWARE_NAME = "ae-env"
@@ -124,7 +125,7 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
         "SamplesPerPixel": Tag(DATATYPE.SHORT, [1]),
         "RowsPerStrip": Tag(DATATYPE.LONG, [height]),
         "PlanarConfiguration": Tag(DATATYPE.SHORT, [1]),
-        "Software": Tag(DATATYPE.ASCII, f"{SOFTWARE_NAME} {package_version()}"),
+        "Software": Tag(DATATYPE.ASCII, f"{SOFTWARE_NAME} {__version__}"),
         "DateTime": Tag(DATATYPE.ASCII, _date(raw)),
         "CFARepeatPatternDim": Tag(DATATYPE.SHORT, [2, 2]),
         "CFAPattern": Tag(DATATYPE.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),

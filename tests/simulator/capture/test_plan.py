@@ -24,7 +24,7 @@ from simulator.capture.statistics import (
     Residual,
     ResidualStatistics,
 )
-from simulator.optics.motion_path import Path
+from simulator.optics.motion import Path
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)

@@ -25,7 +25,7 @@ from simulator.networks.aperture_module import (
     to_diameter,
     usable_defocus,
 )
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 from simulator.optics.thin_lens import Lens
 
 
