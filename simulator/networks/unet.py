@@ -88,17 +88,15 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
     return torch.addcmul(shift.to(wide)[:, :, None, None], centred, gain).to(x.dtype)
 
 
-def _leaky_level(inputs: int, outputs: int) -> nn.Sequential:
-    """Two convolutions, each with LeakyReLU."""
-    first, second = (convolution(channels, outputs) for channels in (inputs, outputs))
-    return nn.Sequential(first, nn.LeakyReLU(LEAK), second, nn.LeakyReLU(LEAK))
-
-
-def _normalised_level(inputs: int, outputs: int) -> nn.Sequential:
-    """Two convolutions, borders zero, each with batch normalisation and ReLU."""
+def _level(inputs: int, outputs: int, variant: Variant) -> nn.Sequential:
+    """Two convolutions with LeakyReLU; or, borders zero, with batch normalisation and ReLU."""
     layers: list[nn.Module] = []
     for channels in (inputs, outputs):
-        layers += [nn.Conv2d(channels, outputs, 3, padding=1), nn.BatchNorm2d(outputs), nn.ReLU()]
+        if variant == "paper":
+            layers += [convolution(channels, outputs), nn.LeakyReLU(LEAK)]
+        else:
+            plain = nn.Conv2d(channels, outputs, 3, padding=1)
+            layers += [plain, nn.BatchNorm2d(outputs), nn.ReLU()]
     return nn.Sequential(*layers)
 
 
@@ -129,15 +127,14 @@ class UNet(nn.Module):
         check_word("variant", variant, get_args(Variant))
         widths = WIDTHS[variant] if widths is None else tuple(widths)
         self.variant, left = variant, _left(variant, widths)
-        level = _leaky_level if variant == "paper" else _normalised_level
         self.encoder = nn.ModuleList(
-            level(previous, width) for previous, width in zip((8, *widths), widths, strict=False)
+            _level(previous, width, variant)
+            for previous, width in zip((8, *widths), widths, strict=False)
         )
+        skips, below = widths[-2::-1], (widths[-1], *left[:-1])
         self.decoder = nn.ModuleList(
-            level(skip + below, width)
-            for skip, below, width in zip(
-                widths[-2::-1], (widths[-1], *left[:-1]), left, strict=True
-            )
+            _level(skip + coarse, width, variant)
+            for skip, coarse, width in zip(skips, below, left, strict=True)
         )
         if variant == "paper":
             self.tail = convolution(widths[0], 4)

@@ -56,10 +56,8 @@ def build_modules(preset: str) -> nn.ModuleDict:
 def list_pretrained() -> list[str]:
     """Names of the weights that come with the package."""
     folder = resources.files("simulator").joinpath("pretrained")
-    if not folder.is_dir():
-        return []
-    files = [f.name for f in folder.iterdir()]
-    return sorted(name.removesuffix(".json") for name in files if name.endswith(".json"))
+    names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
+    return sorted(name.removesuffix(".json") for name in names if name.endswith(".json"))
 
 
 def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, Any]) -> None:

@@ -293,11 +293,8 @@ def _profile(
 
 def _match(make: str, model: str) -> CameraProfile | None:
     wanted = normalised_model(make, model)
-    for name in list_cameras():
-        profile = get_camera(name)
-        if normalised_model(profile.make, profile.model) == wanted:
-            return profile
-    return None
+    profiles = (get_camera(name) for name in list_cameras())
+    return next((p for p in profiles if normalised_model(p.make, p.model) == wanted), None)
 
 
 def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None:

@@ -237,12 +237,10 @@ class DetailPicture:
     light: Tensor
     nlf: NoiseLevelFunction = _CLEAN
 
-    def __post_init__(self) -> None:
-        if self.light.ndim != 3 or self.light.shape[0] not in (3, 4):
-            raise ValueError(
-                f"`light` (shape {tuple(self.light.shape)}) of {self.name!r} must be (3, H, W) "
-                "or (4, H, W)"
-            )
+    @property
+    def photosites(self) -> int:
+        """Samples per packed pixel and side: a recorded mosaic is packed already."""
+        return 1 if self.light.shape[0] == 4 else 2
 
 
 class NoiseBatch(NamedTuple):
@@ -287,7 +285,7 @@ class DetailCrops:
         self._shares = weights / weights.sum()
         self.pairs = list(pictures)
         #: Side of the largest crop that there is [packed pixel].
-        self.largest = max(min(p.light.shape[1:]) // _photosites(p) for p in self.pairs)
+        self.largest = max(min(p.light.shape[1:]) // p.photosites for p in self.pairs)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> NoiseBatch:
         """`size` crops of one step, see `ReferencePairs.batch`."""
@@ -318,7 +316,11 @@ class DetailCrops:
                 continue
             planes, nlf = made
             camera = self.cameras[int(rng.integers(len(self.cameras)))]
-            shot, read = _noise(camera, rng)
+            known = camera.nlf(float(np.exp2(rng.uniform(*_ISO))))
+            shot, read = np.array(known.shot), np.array(known.read)
+            if rng.random() < 0.5:  # a sensor like it
+                shot = shot * np.exp(rng.normal(0.0, 0.4))
+                read = read * np.exp(rng.uniform(-1.0, 2.0))
             shot, read = shot / k**2, read / k**2
             level = float(np.exp2(rng.uniform(*_LEVEL)))
             scale = level / max(float(planes.mean()), 1e-12)
@@ -331,22 +333,17 @@ class DetailCrops:
             return planes * scale, shots, reads, camera, k
 
 
-def _photosites(picture: DetailPicture) -> int:
-    """Samples of a picture per packed pixel and side: a recorded mosaic is packed already."""
-    return 1 if picture.light.shape[0] == 4 else 2
-
-
 def _planes(
     picture: DetailPicture, crop: int, k: int, rng: np.random.Generator
 ) -> tuple[Tensor, NoiseLevelFunction] | None:
     """A crop averaged by k, its mean arbitrary, and the noise in it; None if it is too small."""
-    mosaic, side = picture.light.shape[0] == 4, crop * k * _photosites(picture)
+    side = crop * k * picture.photosites
     height, width = picture.light.shape[1:]
     if side > min(height, width):
         return None
     top, left = (int(rng.integers(n - side + 1)) for n in (height, width))
     part = picture.light[:, top : top + side, left : left + side]
-    if mosaic:  # flipping packed planes would not be flipping the mosaic
+    if picture.photosites == 1:  # flipping packed planes would not be flipping the mosaic
         if rng.random() < 0.5:
             part = part.transpose(-2, -1)[[0, 2, 1, 3]]
         return average_planes(part, k), picture.nlf.scaled(1.0 / k**2)
@@ -369,16 +366,6 @@ def _other_colours(light: Tensor, rng: np.random.Generator) -> Tensor:
     gains = np.exp2([rng.uniform(-1.6, 0.4), 0.0, rng.uniform(-1.6, 0.4)])
     matrix = torch.from_numpy((mix * gains[:, None]).astype(np.float32))
     return torch.einsum("ij,jhw->ihw", matrix, light).clamp(min=0.0)
-
-
-def _noise(camera: CameraProfile, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(shot, read), each (4,) float64, of a camera at a random ISO, or of one like it."""
-    nlf = camera.nlf(float(np.exp2(rng.uniform(*_ISO))))
-    shot, read = np.array(nlf.shot), np.array(nlf.read)
-    if rng.random() < 0.5:
-        shot = shot * np.exp(rng.normal(0.0, 0.4))
-        read = read * np.exp(rng.uniform(-1.0, 2.0))
-    return shot, read
 
 
 def _recorded(

@@ -301,12 +301,10 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
     if not raws:
         raise ValueError("`raws` (=[]) must hold at least one capture")
     name = raws[0].camera.name
-    known, nikon = _layout_of(packed_camera(name)), name == "nikon_z6"
+    known, nikon = packed_camera(name), name == "nikon_z6"
     for camera in (raw.camera for raw in raws):
-        if _layout_of(camera) != known:
-            raise ValueError(
-                f"`raws` (one of {_layout_of(camera)}) must all be of packed_camera({name!r})"
-            )
+        if _layout_of(camera) != _layout_of(known):
+            raise ValueError(f"`raws` (one of {_layout_of(camera)}) must all be of {known}")
     rows: list[list[object]] = [[*COLUMNS, *(["wb"] if nikon else []), "noiseprofile"]]
     for index, raw in enumerate(raws):
         stem = f"capture_{index:03d}"

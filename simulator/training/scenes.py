@@ -150,7 +150,14 @@ def detail_pictures(
             pictures.append(DetailPicture(path.stem, group, "radiance", clipped))
         pictures += photograph_pictures(data, split)
         pictures += recorded_mosaics(data, split)
-        pictures += _linear(data, split)
+        for path, group in _files(data, "intel_tau_small", (".png",), split):
+            import cv2
+
+            frame = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            light = np.ascontiguousarray(frame[:, :, ::-1].transpose(2, 0, 1), np.float32)
+            pictures.append(
+                DetailPicture(path.stem, group, "linear", torch.from_numpy(light / 65535.0))
+            )
     pictures += _drawings(split, _DRAWN[split] if drawn is None else drawn, seed)
     return pictures
 
@@ -189,17 +196,6 @@ def recorded_mosaics(data: Path, split: Split) -> Iterator[DetailPicture]:
         slope, offset = (float(v) for v in meta["dng_tags"]["NoiseProfile"].strip("()").split(","))
         noise = NoiseLevelFunction((slope,) * 4, (offset,) * 4)
         yield DetailPicture(path.name, group, "mosaic", light, noise)
-
-
-def _linear(data: Path, split: Split) -> Iterator[DetailPicture]:
-    """Demosaicked linear frames."""
-    for path, group in _files(data, "intel_tau_small", (".png",), split):
-        import cv2
-
-        image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
-        light = image[:, :, ::-1].transpose(2, 0, 1).astype(np.float32) / 65535.0
-        light = np.ascontiguousarray(light)
-        yield DetailPicture(path.stem, group, "linear", torch.from_numpy(light))
 
 
 def _files(
