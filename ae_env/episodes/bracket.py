@@ -16,7 +16,7 @@ from ae_env.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from simulator.capture.batch import FrameStatistics
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.optics.motion import Taps, path_blur_apart
 from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
 from simulator.settings import exposure_ratio

@@ -33,7 +33,7 @@ from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.noise.generator import Noise
+from simulator.capture.sensor import Noise
 from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.

@@ -24,7 +24,7 @@ from ae_env.scorers.composite import CompositeScorer, is_own
 from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
 from ae_env.scorers.terms import Sharpness, TermScores
 from simulator.camera import CameraProfile
-from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction

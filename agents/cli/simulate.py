@@ -74,8 +74,8 @@ def simulate(
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
     from simulator import CameraSettings
-    from simulator.capture.plan import check_tolerance
-    from simulator.noise.generator import check_noise
+    from simulator.capture.exposure import check_tolerance
+    from simulator.capture.sensor import check_noise
 
     check_noise(noise)
     check_tolerance(tolerance)
@@ -142,7 +142,7 @@ def sweep(
     from ae_env.rendering import contact_sheet
     from ae_env.scenes import Scene
     from simulator import write_dng
-    from simulator.capture.plan import check_tolerance
+    from simulator.capture.exposure import check_tolerance
 
     check_depth(depth, weights)
     check_tolerance(tolerance)

@@ -12,7 +12,7 @@ from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.score_table import ScoreTables, prepare_scene, source_noises
 from ae_env.scorers.terms import Highlights, Noise, Shadows, TermScores
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import clip_and_quantise
 from simulator.optics.motion import Movement
 from tests.ae_env.environments import make_env
