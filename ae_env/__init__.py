@@ -13,6 +13,8 @@ from ae_env.utils.packages import check_package
 
 check_package("simulator")
 
+from simulator import __version__ as __version__  # noqa: E402  (checked first)
+
 if TYPE_CHECKING:
     from ae_env import lighting as lighting
     from ae_env import wrappers as wrappers
@@ -56,8 +58,6 @@ if TYPE_CHECKING:
     from ae_env.wrappers import VectorContinuousActions as VectorContinuousActions
     from ae_env.wrappers import VectorControlActions as VectorControlActions
     from ae_env.wrappers import VectorRelativeActions as VectorRelativeActions
-
-__version__ = "0.2.0"
 
 #: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {

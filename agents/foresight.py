@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import decode_settings
-from agents.metering.reading import SATURATED_STEP_EV, Floats, MatchedReadings, Reading, frame_ev100
+from agents.metering.reading import (
+    SATURATED_STEP_EV,
+    Floats,
+    Reading,
+    ZoneMatcher,
+    frame_ev100,
+    zone_signals,
+)
 from agents.policy import Observations, PolicyContext
 
 Ints = NDArray[np.int64]
@@ -105,8 +112,8 @@ class Foresight:
     """
 
     def __init__(self, context: PolicyContext, tracker: LightTracker) -> None:
-        self.grid, self._tracker = context.grid, tracker
-        self._matched = MatchedReadings(context.camera)
+        self.grid, self._camera, self._tracker = context.grid, context.camera, tracker
+        self._matcher = ZoneMatcher()
         #: Frames from the one in hand to the first that has this decision's ISO, time, aperture.
         self.leads = tuple(1 + delay for delay in context.delays)
         self._actions: list[Ints] = []  # the newest last
@@ -115,10 +122,12 @@ class Foresight:
         """Take in one frame of each camera, and what a light meter reads in it.
 
         Returns:
-            That reading; where the frame clips, from what it shows (`MatchedReadings`).
+            That reading; where the frame clips, from what it shows (`ZoneMatcher`).
         """
-        reading = self._matched.update(reading, observations)
-        self._tracker.update(reading, frame_ev100(observations))
+        zones = zone_signals(observations["raw"], self._camera)
+        exposed_at = frame_ev100(observations)
+        reading = self._matcher.match(reading, zones, exposed_at)
+        self._tracker.update(reading, exposed_at)
         if not self._actions:  # what the first frame was taken with stays until a decision is there
             self._actions = [self._shown(observations)] * max(self.leads)
         return reading

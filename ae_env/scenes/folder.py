@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import csv
 import glob
-import hashlib
 import logging
 import math
 import re
@@ -21,6 +20,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -32,13 +32,14 @@ from simulator.radiance.light import camera_from_srgb, mean_anchor
 from simulator.radiance.maps import (
     RADIANCE_SUFFIXES,
     assumed_ev100,
+    hash_fraction,
     map_views,
     near_one,
     read_radiance,
 )
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw
-from simulator.utils.checks import check_flag, check_number, check_word
+from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 
@@ -53,7 +54,7 @@ TRAIN_SHARE = 0.7
 BURST_SECONDS = 30.0
 #: Shots up to this far apart [s] are of one subject if they look alike.
 SESSION_SECONDS = 300.0
-#: From this similarity on, two shots look alike (see `similarity`).
+#: From this Bhattacharyya coefficient of their histograms on (1 if equal), two shots look alike.
 ALIKE = 0.5
 #: Most file names in a log line about files that were skipped.
 _MOST_NAMES = 5
@@ -90,10 +91,8 @@ class FolderOptions:
         for value in lux.values() if isinstance(lux, Mapping) else [lux]:
             if value is not None:
                 check_number("illuminance", value, 1e-6, 1e9, more=" lux")
-        if self.kind is not None and not isinstance(self.kind, str):
-            raise ValueError(f"`kind` (={self.kind!r}) must be a name or None")
-        if self.hard is not None:
-            check_flag("hard", self.hard)
+        check_type("kind", self.kind, str, None)
+        check_type("hard", self.hard, bool, None)
         if self.median_speed is not None:
             check_number("median_speed", self.median_speed, 0.0, 1e6, more=" frame heights / s")
         if self.ev100 is not None:
@@ -105,17 +104,18 @@ class FolderOptions:
         if isinstance(lux, Mapping):
             lux = lux.get(path.name)
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
-        given["illuminance"] = lux
-        if not _is_raw(path):
-            given["ev100"] = self.ev100
+        given |= {"illuminance": lux, "ev100": None if _is_raw(path) else self.ev100}
         return {name: value for name, value in given.items() if value is not None}
+
+
+NOTHING_KNOWN = FolderOptions()
 
 
 # -- scenes ---------------------------------------------------------------------------------------
 
 
 def folder_scenes(
-    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
+    spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
     """The scenes of a split among the user's files.
 
@@ -131,14 +131,16 @@ def folder_scenes(
     """
     base, files = find_files(spec)
     named = _named_groups(sorted({base, *(p.parent for p in files)}))
-    if request.split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
-        raise _too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    groups = {path: named.get(path.resolve()) or _sub_folder(path, base) for path in files}
-    return _read_files(spec, base, groups, options or FolderOptions(), request, hint=_HOW_TO_SKIP)
+    _check_training_groups(spec, request.split, len(files), "at most ")
+    groups = {path: named.get(path.resolve()) for path in files}
+    for path in files:
+        if groups[path] is None and path.parent != base:
+            groups[path] = path.parent.relative_to(base).as_posix()
+    return _read_files(spec, base, groups, options, request, hint=_HOW_TO_SKIP)
 
 
 def sequence_scenes(
-    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
+    spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
     """The frames of every sequence of a split, one sequence after the other.
 
@@ -156,7 +158,6 @@ def sequence_scenes(
         ValueError: If there are no raws, one cannot be read, there are no sequences of the split,
             or unreadable raws were to be skipped: all later frames would come too early.
     """
-    options = options or FolderOptions()
     if options.on_error == "skip":
         raise ValueError(
             "`on_error` (='skip') must be 'stop' for a sequence: without a raw all later ones "
@@ -170,8 +171,7 @@ def sequence_scenes(
             f"`scenes` (={{'sequence': {str(spec)!r}}}) must hold raws ({_RAW_ENDINGS}): radiance "
             "maps have no settings of their own"
         )
-    if request.split == "train" and len(folders) < FEWEST_GROUPS_TO_SPLIT:
-        raise _too_few_groups(spec, str(len(folders)))  # before any time is spent on reading
+    _check_training_groups(spec, request.split, len(folders))
     names = {folder: folder.relative_to(base).as_posix() for folder in folders}
     own = base.resolve().name
     if base in names and own and own not in names.values():
@@ -260,21 +260,6 @@ def _is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
 
 
-def _sub_folder(path: Path, base: Path) -> str | None:
-    """The sub-folder of `base` that a file is in; None for a file in `base` itself."""
-    return None if path.parent == base else path.parent.relative_to(base).as_posix()
-
-
-def _scene_names(base: Path, files: Sequence[Path]) -> dict[Path, str]:
-    """Scene ids: the path below `base` without its ending, with it where two would be equal."""
-    stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
-    times = Counter(stems)
-    return {
-        p: stem if times[stem] == 1 else p.relative_to(base).as_posix()
-        for p, stem in zip(files, stems, strict=True)
-    }
-
-
 # -- reading --------------------------------------------------------------------------------------
 
 
@@ -287,25 +272,26 @@ def _read_files(
     *,
     hint: str = "",
 ) -> list[Scene]:
-    """The scenes of a split in files.
+    """The scenes of a split in files below `base`, which messages call `spec`.
 
     Args:
-        spec: Their name, for messages.
-        base: The folder that they are under.
         groups: Source group of each; where it is None the file itself, or shots that belong to it.
-        options: See `folder_scenes`.
-        request: See `folder_scenes`.
         hint: End of the error of a file that cannot be read, where there are others.
     """
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}  # of raws without a group
     skipped: list[str] = []
-    names = _scene_names(base, list(groups))
+    # Scene ids: the path below `base` without its ending, with it where two would be equal.
+    places = {path: path.relative_to(base) for path in groups}
+    times = Counter(place.with_suffix("") for place in places.values())
     logger.info("reading %d scene files of %s", len(groups), spec)
     with progress_bar("reading scene files", len(groups)) as advance:
         for path, group in groups.items():
+            place = places[path]
+            unique = times[place.with_suffix("")] == 1
+            name = (place.with_suffix("") if unique else place).as_posix()
             try:
-                scenes += _read_file(path, names[path], group, options, request, shots)
+                scenes += _read_file(path, name, group, options, request, shots)
             except (ValueError, OSError) as error:  # it may also have vanished since it was listed
                 if options.on_error == "stop":
                     more = hint if len(groups) > 1 else ""
@@ -361,21 +347,19 @@ def radiance_scenes(
     ev100: float | None = None,
     **fields: Any,
 ) -> Iterator[Scene]:
-    """The scenes of one radiance map, all in one source group.
+    """The scenes of one radiance map, all in one source group; see `map_views`.
 
-    A radiance map is linear but relative: nothing in it says how many lux it shows. Its views are
-    therefore put at an EV100 between 3 and 14 drawn by a stable hash of the source group (an
-    assumption, stated in each scene's `source`), and their `illuminance` is None unless given.
-    Both panoramas and other pictures have about 256 packed pixels a side, as the bundled scenes
-    have, before `Scene.resized`; see `map_views`.
+    A radiance map is linear but relative: nothing in it says how many lux it shows. Unless that is
+    known, its views are put at the `assumed_ev100` of the source group, as each scene's `source`
+    says.
 
     Args:
         path: The file.
-        request: Camera and size; without a resolution the views have 256 packed pixels a side.
+        request: Camera and size.
         name: Prefix of the scene ids.
         group: Source group.
         ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
-            their relative brightness), if known; see `assumed_ev100`.
+            their relative brightness), if known.
         **fields: Further arguments of `Scene.from_radiance`.
     """
     file = Path(path).name
@@ -444,11 +428,6 @@ def describe(raw: RawImage) -> Shot:
     )
 
 
-def similarity(first: Shot, second: Shot) -> float:
-    """Bhattacharyya coefficient of two shots' histograms: 1 if equal, 0 if nothing is shared."""
-    return float(np.sqrt(first.histogram * second.histogram).sum())
-
-
 def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
     """Source group of each raw, found from its time and its colours.
 
@@ -474,25 +453,22 @@ def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
         taken = shots[i].time if timed else None
         return shots[i].camera, taken or datetime.min, i
 
-    groups = [""] * len(shots)
-    previous: int | None = None
-    for i in sorted(range(len(shots)), key=order):
-        same = previous is not None and _same_subject(shots[previous], shots[i])
-        groups[i] = groups[previous] if same and previous is not None else names[i]
-        previous = i
+    groups = list(names)
+    for before, i in pairwise(sorted(range(len(shots)), key=order)):
+        if _same_subject(shots[before], shots[i]):
+            groups[i] = groups[before]
     return groups
 
 
 def _same_subject(first: Shot, second: Shot) -> bool:
     if first.camera != second.camera:
         return False
-    if first.time is None or second.time is None:
-        pause = math.nan
-    else:
+    pause = math.nan  # unknown
+    if first.time is not None and second.time is not None:
         pause = abs((second.time - first.time).total_seconds())
-    if pause <= BURST_SECONDS:
-        return True
-    return not pause > SESSION_SECONDS and similarity(first, second) >= ALIKE
+    if pause <= BURST_SECONDS or pause > SESSION_SECONDS:
+        return pause <= BURST_SECONDS
+    return float(np.sqrt(first.histogram * second.histogram).sum()) >= ALIKE
 
 
 def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
@@ -506,13 +482,8 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
         table = folder / "groups.csv"
         if not table.is_file():
             continue
-        try:
-            with table.open(newline="", encoding="utf-8-sig") as stream:
-                reader = csv.DictReader(stream)
-                rows, columns = list(reader), reader.fieldnames
-        except (csv.Error, OSError, UnicodeError) as error:
-            raise ValueError(f"{str(table)!r} must be a CSV file in UTF-8: {error}") from error
-        if not {"file", "group"} <= set(columns or ()):
+        rows, columns = read_table(table)
+        if not {"file", "group"} <= set(columns):
             raise ValueError(
                 f"{str(table)!r} (columns {columns}) must have the columns `file` and `group`"
             )
@@ -525,6 +496,20 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
                 )
             groups[(folder / name).resolve()] = group
     return groups
+
+
+def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
+    """Rows and column names of a CSV file.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream)
+            return list(reader), list(reader.fieldnames or ())
+    except (csv.Error, OSError, UnicodeError) as error:
+        raise ValueError(f"{str(path)!r} must be a CSV file in UTF-8: {error}") from error
 
 
 def split_groups(groups: Sequence[str]) -> dict[str, str]:
@@ -540,9 +525,7 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
     names = sorted(set(groups))
     if len(names) < FEWEST_GROUPS_TO_SPLIT:
         return dict.fromkeys(names, "test")
-    draws = {
-        n: int.from_bytes(hashlib.sha256(n.encode()).digest()[:8], "big") / 2**64 for n in names
-    }
+    draws = {name: hash_fraction(name) for name in names}
     split = {n: "train" if draws[n] < TRAIN_SHARE else "test" for n in names}
     if len(set(split.values())) == 1:
         nearest = min(names, key=lambda n: abs(draws[n] - TRAIN_SHARE))
@@ -564,8 +547,7 @@ def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[S
     if split == "all":
         return scenes
     parts = split_groups([scene.group for scene in scenes])
-    if split == "train" and "train" not in parts.values():
-        raise _too_few_groups(spec, str(len(parts)))
+    _check_training_groups(spec, split, len(parts))
     left_out = sum(part != split for part in parts.values())
     if left_out:
         logger.warning(
@@ -575,14 +557,15 @@ def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[S
     return [scene for scene in scenes if parts[scene.group] == split]
 
 
-def _too_few_groups(spec: str | Path, number: str) -> ValueError:
-    """The error where `spec` has only `number` source groups, too few to train on."""
-    return ValueError(
-        f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that some "
-        f"can be held out; {str(spec)!r} has {number}. Train on scenes='bundled' and use these "
-        "with split='test' (zero-shot) or split='all'; if files are grouped wrongly, name the "
-        "groups in a groups.csv (columns file, group) beside them"
-    )
+def _check_training_groups(spec: str | Path, split: str, count: int, most: str = "") -> None:
+    """Raises a `ValueError` if `spec` has too few source groups to train on."""
+    if split == "train" and count < FEWEST_GROUPS_TO_SPLIT:
+        raise ValueError(
+            f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that "
+            f"some can be held out; {str(spec)!r} has {most}{count}. Train on scenes='bundled' and "
+            "use these with split='test' (zero-shot) or split='all'; if files are grouped wrongly, "
+            "name the groups in a groups.csv (columns file, group) beside them"
+        )
 
 
 def log_groups(where: str, scenes: Sequence[Scene]) -> None:

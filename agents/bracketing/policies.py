@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.grid import ExposureGrid
 from ae_env.merging import LOG_FLOOR, SATURATED, WORST_EV, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
+from ae_env.tasks import FRAME_GAP
 from agents.policy import Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
 from simulator.camera import CameraProfile
@@ -76,7 +76,7 @@ class Schedules:
         box_factor: int,
     ) -> None:
         self.grid, self.budget, self.max_frames = grid, budget, max_frames
-        exposures = np.array([s.exposure_time for s in grid])
+        self._exposures = exposures = np.array([s.exposure_time for s in grid])
         found = [(-1,) * max_frames]
         for count in range(1, max_frames + 1):
             for chosen in itertools.combinations_with_replacement(range(len(grid)), count):
@@ -89,10 +89,10 @@ class Schedules:
         nlfs = [camera.nlf(s.iso).scaled(1.0 / box_factor**2) for s in grid]
         self.shot = np.array([np.mean(n.shot) for n in nlfs])
         self.read = np.array([np.mean(n.read) for n in nlfs])
-        self._weights = lru_cache(maxsize=64)(self._weights_of)
-        self._noise = lru_cache(maxsize=256)(self._noise_of)
+        self.precision = lru_cache(maxsize=64)(self._precision)
+        self.noise_error = lru_cache(maxsize=256)(self._noise_error)
 
-    def precision(self, reference: float) -> tuple[Floats, Floats]:
+    def _precision(self, reference: float) -> tuple[Floats, Floats]:
         """Inverse variance of the merged luminance, and each frame's share of it.
 
         Args:
@@ -101,9 +101,6 @@ class Schedules:
         Returns:
             (M, L), and (M, K, L).
         """
-        return self._weights(float(reference))
-
-    def _weights_of(self, reference: float) -> tuple[Floats, Floats]:
         luminance = np.exp2(BINS + reference)
         gain = np.exp2(-self.grid.ev100)[:, None]
         signal = gain * luminance
@@ -115,18 +112,15 @@ class Schedules:
         share = each / np.maximum(total, 1e-300)[:, None]
         return total, share.astype(np.float32)
 
-    def noise_error(self, reference: float, floor: float) -> Floats:
+    def _noise_error(self, reference: float, floor: float) -> Floats:
         """(M, L) expected error of merged samples [EV]; `WORST_EV` where all frames are white.
 
         Args:
             reference: EV100 that `BINS` are relative to.
             floor: log2 of the luminance below which errors count less; to the nearest stop.
         """
-        return self._noise(float(reference), round(floor))
-
-    def _noise_of(self, reference: float, floor: int) -> Floats:
         total, _ = self.precision(reference)
-        luminance, dark = np.exp2(BINS + reference), 2.0**floor
+        luminance, dark = np.exp2(BINS + reference), 2.0 ** round(floor)
         deviation = 1.0 / np.sqrt(np.maximum(total, 1e-300))
         error = np.zeros_like(total)
         for normal in _NORMALS:
@@ -162,11 +156,9 @@ class Schedules:
         """
         counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
         more = self.frames - len(taken)
-        exposures = np.array([s.exposure_time for s in self.grid])
-        needed = (self.counts - counts) @ exposures + FRAME_GAP * np.maximum(more - 1, 0)
+        needed = (self.counts - counts) @ self._exposures + FRAME_GAP * np.maximum(more - 1, 0)
         fits = needed <= time_left + _SLACK
-        holds: NDArray[np.bool_] = (self.counts >= counts).all(axis=1) & fits
-        return holds
+        return np.asarray((self.counts >= counts).all(axis=1) & fits)
 
     def next_state(self, schedule: int, taken: Ints, alone: Floats) -> int:
         """The state of `schedule` to take next, the best by `alone`; -1 when all are taken.
@@ -217,9 +209,8 @@ class Bracketing(Policy):
                 "bracketing policies are for ae_env/ExposureBracket-v0 (`ae-env evaluate --preset "
                 "bracket`)"
             )
-        if context.observation_space["raw"].dtype != np.uint8 or (
-            "histogram" in context.observation_space.spaces
-        ):
+        space = context.observation_space
+        if space["raw"].dtype != np.uint8 or "histogram" in space.spaces:
             raise ValueError("bracketing policies need `observation`='uint8'")
         limits = context.bracket
         self.schedules = Schedules(
@@ -240,16 +231,15 @@ class Bracketing(Policy):
         aperture, time, speed = decode_settings(observations["settings"])
         ev100 = aperture + time - (speed - 5.0)
         # Nominal settings are rounded, so the state is the nearest one of this ISO.
-        isos = np.log2(np.array([s.iso for s in self.context.grid]) / 3.125)
-        apart = np.abs(self.context.grid.ev100 - ev100[:, None]) + 10 * np.abs(
-            isos - speed[:, None]
-        )
+        grid = self.context.grid
+        isos = np.log2(np.array([s.iso for s in grid]) / 3.125)
+        apart = np.abs(grid.ev100 - ev100[:, None]) + 10 * np.abs(isos - speed[:, None])
         states = apart.argmin(axis=1)
         for i, frames in enumerate(self._frames):
             if not self._done[i]:
                 frames.append((int(states[i]), observations["raw"][i].copy()))
         new = np.isnan(self._reference)
-        self._reference[new] = self.context.grid.ev100[states[new]]
+        self._reference[new] = grid.ev100[states[new]]
 
     def taken(self, camera: int) -> Ints:
         """States of the frames that a camera has taken, without the viewfinder's."""
@@ -273,8 +263,8 @@ class Bracketing(Policy):
         scale = float(gains.max())
         light, precision = merge(signals, torch.from_numpy(gains / scale)[None], shot, read)
         limit = -float(np.log2(gains.min()))
-        flat = light.flatten().double().numpy() / scale, precision.flatten().double().numpy()
-        return flat[0], flat[1] * scale**2, limit
+        luminance, known = (part.flatten().double().numpy() for part in (light, precision))
+        return luminance / scale, known * scale**2, limit
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
@@ -466,20 +456,16 @@ class Planner(Bracketing):
         errors = self.schedules.errors(reference, reference + _FLOOR, self.light(camera), blur)
         fits = self.schedules.completions(taken, time_left)
         best = int(np.where(fits, errors, np.inf).argmin())
-        state = self.schedules.next_state(best, taken, self._of_one(errors))
+        alone = np.full(self.stop, np.inf)  # error of single frames; inf where none fits
+        single = np.flatnonzero(self.schedules.frames == 1)
+        alone[self.schedules.states[single, 0]] = errors[single]
+        state = self.schedules.next_state(best, taken, alone)
         return self.stop if state < 0 else state
 
     def light(self, camera: int) -> Floats:
         """(L,) shares of the samples in `BINS`, as the frames so far show them."""
         described = describe(*self.merged(camera), float(self._reference[camera]))
         return described.sum(axis=0, dtype=np.float64)
-
-    def _of_one(self, errors: Floats) -> Floats:
-        """(S,) errors of single frames; those that do not fit into the budget are worst."""
-        found = np.full(self.stop, np.inf)
-        single = np.flatnonzero(self.schedules.frames == 1)
-        found[self.schedules.states[single, 0]] = errors[single]
-        return found
 
 
 def blur_error(pixels: Floats) -> Floats:
@@ -514,7 +500,7 @@ def run_brackets(
     Raises:
         UserCodeError: If the policy raises, or returns something else than actions.
     """
-    name = policy.name if name is None else name
+    name = name or policy.name
     names = ("quality", "log_error", "unseen", "frames", "time_left")
     found: dict[str, list[NDArray[Any]]] = {key: [] for key in (*names, "group", "seconds")}
     episodes = RolloutPlan.of_each_scene(scenes_of(envs), count=count, seed=seed, most=most)

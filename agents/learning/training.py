@@ -59,7 +59,7 @@ class AgentConfig(Configuration):
     def _check(self) -> AgentConfig:
         from ae_env.options import EnvOptions
 
-        hyperparameters = self.hyperparameters()
+        hyperparameters: Any = self.hyperparameters()
         if self.agent == "forecaster":
             for name in sorted(self.model_fields_set - {"agent", "training"}):
                 unused = type(self).model_fields[name].get_default(call_default_factory=True)
@@ -77,9 +77,8 @@ class AgentConfig(Configuration):
                 f"environment: `observation` (={options.observation!r}) must be one of "
                 f"{list(taken)}, which is what the agent's network takes"
             )
-        check_batch = getattr(hyperparameters, "check_batch", None)
-        if check_batch is not None:
-            check_batch(self.num_envs)
+        if self.agent == "ppo":
+            hyperparameters.check_batch(self.num_envs)
         try:
             json.dumps(self.card())
         except TypeError as error:  # raises before the training, not when the agent is saved
@@ -99,11 +98,7 @@ class AgentConfig(Configuration):
             raise ValueError(one_line(error, "training.", kind)) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
-        """The same training with another seed.
-
-        Raises:
-            ValueError: If the seed is out of range.
-        """
+        """The same training with another seed, which is checked."""
         changed = self.model_copy(update={"training": {**self.training, "seed": seed}})
         changed.hyperparameters()
         return changed
@@ -117,8 +112,7 @@ def load_config(path: str | Path) -> AgentConfig:
     """The configuration in a YAML file.
 
     Raises:
-        ValueError: If the file is missing or not YAML, or an entry is unknown or out of range; the
-            message names the file and the entry.
+        ValueError: If it is no such file; the message names the file and the entry.
     """
     return load_yaml(path, AgentConfig)
 
@@ -147,10 +141,8 @@ def train_agent(
 ) -> Path:
     """Trains an agent and writes it to ``out.safetensors`` and ``out.json``.
 
-    Beside them, ``out.csv`` is its learning curve (`LearningCurve`).
-
-    A training that was interrupted goes on from its checkpoint, ``out.checkpoint``; one that is
-    complete is not repeated.
+    Beside them, ``out.csv`` is its learning curve (`LearningCurve`). A training that was
+    interrupted goes on from ``out.checkpoint``; one that is complete is not repeated.
 
     Args:
         config: The training.
@@ -189,12 +181,10 @@ def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
 
     import ae_env  # noqa: F401  (registers the environment)
 
-    options = dict(config.environment)
+    options = {**config.environment, "autoreset_mode": "SAME_STEP"}
     if config.max_episode_steps is not None:
         options["max_episode_steps"] = config.max_episode_steps
-    return gym.make_vec(
-        config.task, num_envs=config.num_envs, autoreset_mode="SAME_STEP", **options
-    )
+    return gym.make_vec(config.task, num_envs=config.num_envs, **options)
 
 
 @contextmanager
@@ -248,7 +238,8 @@ class LearningCurve:
     def __call__(self, done: int, total: int, values: dict[str, float]) -> None:
         """Take in what the training reports after `done` of `total` frames."""
         # What another training left here, or this one after its checkpoint.
-        while self._rows and not self._goes_on(done, values):
+        names = {"frames", *values}
+        while self._rows and (self._rows[-1]["frames"] >= done or self._rows[-1].keys() != names):
             self._rows.pop()
         self._recent.append(values)
         last = self._rows[-1]["frames"] if self._rows else 0
@@ -264,11 +255,6 @@ class LearningCurve:
             shown = {name: f"{value:.6g}" for name, value in row.items()}
             writer.writerow({**shown, "frames": int(row["frames"])})
         write_atomically(self.path, text.getvalue())
-
-    def _goes_on(self, done: int, values: dict[str, float]) -> bool:
-        """Whether the last row is of this training, from before `done` frames."""
-        last = self._rows[-1]
-        return last["frames"] < done and last.keys() == {"frames", *values}
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:
@@ -309,13 +295,12 @@ def train_in_parallel(
 ) -> None:
     """Trains every job that is not trained yet, each in a process of its own.
 
+    After Ctrl-C the same call resumes from the checkpoints.
+
     Args:
         jobs: Agents to train.
-        workers: Processes at a time, each with its share of the cores; by default one per core.
+        workers: See `run_in_parallel`.
         progress: Called with the job's name, frames done, frames in all, and losses.
-
-    Raises:
-        KeyboardInterrupt: After Ctrl-C; the same call resumes from the checkpoints.
     """
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
     run_in_parallel(_train, waiting, workers=workers, progress=progress)

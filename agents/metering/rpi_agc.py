@@ -15,12 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.metering.programs import (
-    PRIORITY_TIME,
-    ProgramOptions,
-    StateChooser,
-    check_used,
-)
+from agents.metering.programs import PRIORITY_TIME, ProgramOptions, StateChooser, check_used
 from agents.metering.reading import GREEN, TARGET_SIGNAL, Floats, frame_ev100, linear_signal
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import MANUAL_PROGRAMS
@@ -148,11 +143,7 @@ class LibcameraAgc:
         self._filter = ExposureFilter(num_cameras, speed, startup_frames)
 
     def update(
-        self,
-        zones: Floats,
-        histogram: Floats,
-        exposure: Floats,
-        lux: Floats | float = DEFAULT_LUX,
+        self, zones: Floats, histogram: Floats, exposure: Floats, lux: Floats | float = DEFAULT_LUX
     ) -> Floats:
         """Takes in one frame of each camera; returns the exposure [s] that is wanted, ``(N,)``.
 
@@ -233,10 +224,7 @@ class ExposureFilter:
     """
 
     def __init__(
-        self,
-        num_cameras: int,
-        speed: float = SPEED,
-        startup_frames: int = STARTUP_FRAMES,
+        self, num_cameras: int, speed: float = SPEED, startup_frames: int = STARTUP_FRAMES
     ) -> None:
         self.exposure = np.full(num_cameras, np.nan)
         self.speed, self.startup_frames = speed, startup_frames

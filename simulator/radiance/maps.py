@@ -5,6 +5,7 @@ A radiance map is linear but relative: nothing in it says how many lux it shows.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import math
@@ -95,19 +96,15 @@ def map_views(
     """
     height, width = image.shape[1:]
     is_panorama = abs(width / height - 2.0) <= 0.01
+    available = min(height, width)
+    size = native_size(resolution) if is_panorama else native_size(resolution, available)
     if is_panorama:
         available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
-        size = native_size(resolution)
-    else:
-        available = min(height, width)
-        size = native_size(resolution, available)
-    sampled = True
-    if available >= 2 * size:
+    sampled = available >= 2 * size
+    if sampled:
         size = 2 * size
     elif native and resolution and available >= 2 * resolution:
-        size = available // 2 * 2
-    else:
-        sampled = False
+        sampled, size = True, available // 2 * 2
     if is_panorama:
         return {f"-{round(a):03d}": perspective(image, a, size) for a in AZIMUTHS}, sampled
     return {"": _central_square(image, size)}, sampled
@@ -128,15 +125,15 @@ def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
     return resolution * max(1, size // max(resolution, 1))
 
 
-def assumed_ev100(group: str) -> float:
-    """EV100 of a map of unknown light, in [3, 14], by a hash of its source group.
+def hash_fraction(name: str) -> float:
+    """A number in [0, 1) that `name` alone decides."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
 
-    >>> assumed_ev100("forest") == assumed_ev100("forest")
-    True
-    """
-    fraction = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+
+def assumed_ev100(group: str) -> float:
+    """EV100 of a map of unknown light, in [3, 14], by a hash of its source group."""
     low, high = EV100_RANGE
-    return round(low + fraction * (high - low), 2)
+    return round(low + hash_fraction(group) * (high - low), 2)
 
 
 def perspective(
@@ -210,24 +207,20 @@ def _read_hdr(path: Path) -> np.ndarray:
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
     content = path.read_bytes()
-    _refuse_lies(path, *_hdr_size(content), len(content))
-    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
+    claim = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
+    if claim:
+        _refuse_lies(path, int(claim[1]), int(claim[2]), len(content))
+    level = cv2.utils.logging.setLogLevel(0)  # the error below says it all
+    image = None
     try:
         flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    except cv2.error as error:
-        raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+        with contextlib.suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     finally:
         cv2.utils.logging.setLogLevel(level)
     if image is None or image.dtype != np.float32:
         raise ValueError(f"radiance map {str(path)!r} must be a complete Radiance RGBE file")
     return image[:, :, ::-1].transpose(2, 0, 1)
-
-
-def _hdr_size(content: bytes) -> tuple[int, int]:
-    """Rows and columns that a Radiance file claims; 0 where it does not say."""
-    found = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
-    return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
 def _refuse_lies(path: Path, height: int, width: int, size: int) -> None:
@@ -264,14 +257,12 @@ def _read_exr(path: Path) -> np.ndarray:
             f"radiance map {str(path)!r} must be a complete OpenEXR file, but OpenEXR says: {error}"
         ) from error
     names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
-    missing = sorted({n for n in names if n not in channels})
-    if missing:
+    planes = [np.asarray(channels[n], np.float32) for n in names if n in channels]
+    if len(planes) != 3 or len({p.shape for p in planes}) != 1:
         raise ValueError(
-            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G, B or Y"
+            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G and B of the "
+            "same size, or Y"
         )
-    planes = [np.asarray(channels[n], np.float32) for n in names]
-    if len({p.shape for p in planes}) != 1:
-        raise ValueError(f"radiance map {str(path)!r} must have R, G and B of the same size")
     return np.stack(planes)
 
 

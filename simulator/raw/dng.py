@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from simulator import __version__
 from simulator.raw.image import RawImage, unpack_mosaic
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_type
-from simulator.utils.files import as_path, package_version, write_atomically
+from simulator.utils.files import as_path, write_atomically
 
 #: Begins the Software tag of every DNG written here.
 SOFTWARE_NAME = "ae-env"
@@ -129,7 +130,7 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
         "SamplesPerPixel": Tag(TiffType.SHORT, [1]),
         "RowsPerStrip": Tag(TiffType.LONG, [height]),
         "PlanarConfiguration": Tag(TiffType.SHORT, [1]),
-        "Software": Tag(TiffType.ASCII, f"{SOFTWARE_NAME} {package_version()}"),
+        "Software": Tag(TiffType.ASCII, f"{SOFTWARE_NAME} {__version__}"),
         "DateTime": Tag(TiffType.ASCII, _date(raw)),
         "CFARepeatPatternDim": Tag(TiffType.SHORT, [2, 2]),
         "CFAPattern": Tag(TiffType.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),

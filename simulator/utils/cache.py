@@ -23,8 +23,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from simulator import __version__
 from simulator.utils.checks import check_integer
-from simulator.utils.files import package_version, write_atomically
+from simulator.utils.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: Environment variable that names another cache folder.
@@ -56,7 +57,7 @@ def cache_key(kind: str, parts: Any) -> str:
     >>> cache_key("a", {"b": 1, "c": 2}) == cache_key("a", {"c": 2, "b": 1})
     True
     """
-    content = {"package": package_version(), "parts": parts}
+    content = {"package": __version__, "parts": parts}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return f"{kind}/{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 
-from simulator.utils.files import package_version, write_atomically
+from simulator import __version__
+from simulator.utils.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: Least time between two checkpoints of a training [s].
@@ -73,7 +74,7 @@ class Checkpoint:
     ) -> None:
         self.path, self.state, self.writes = path, state, writes
         # Through JSON, as tuples compare unequal to the lists that they come back as.
-        described = {"version": package_version(), "training": identity}
+        described = {"version": __version__, "training": identity}
         self.identity = json.dumps(described, sort_keys=True)
         self._saved = time.monotonic()
 

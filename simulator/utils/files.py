@@ -18,6 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from simulator import __version__
+
 #: Environment variable that names the folder of real files.
 DATA_VARIABLE = "AE_ENV_DATA"
 
@@ -38,8 +40,6 @@ MAX_PIXELS_PER_BYTE = 1024
 #: The same for a radiance map; a flat one in OpenEXR's DWAB compression has over 3000.
 MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 
-#: Distribution that the three packages are installed as.
-_PACKAGE = "ae-env"
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
 
@@ -219,24 +219,13 @@ def machine() -> dict[str, Any]:
     }
 
 
-@functools.cache
-def package_version() -> str:
-    """Version of this package; ``"0"`` where it is run without being installed."""
-    return _version(_PACKAGE) or "0"
-
-
 def versions() -> dict[str, str]:
     """Version of Python, of this package and of the installed libraries that numbers depend on."""
-    found = {name: _version(name) for name in (_PACKAGE, *_LIBRARIES)}
-    known = {name: version for name, version in found.items() if version is not None}
-    return {"python": platform.python_version(), **known}
-
-
-def _version(distribution: str) -> str | None:
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    found = {"python": platform.python_version(), "ae-env": __version__}
+    for name in _LIBRARIES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
 
 
 def _plain(value: Any) -> Any:

@@ -14,8 +14,8 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from ae_env import ExposureGrid, Scene
-from ae_env.episodes.bracket import displaced
 from ae_env.merging import log_error, merge
+from ae_env.tasks import displaced
 from simulator.camera import get_camera
 from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import WHITE_SIGNAL, reference_settings

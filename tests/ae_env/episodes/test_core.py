@@ -15,7 +15,8 @@ import torch
 from ae_env.episodes import core as core_module
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
-from ae_env.scorers.score_table import ScoreTables, prepare_scene
+from ae_env.scorers.captures import prepare_scene
+from ae_env.scorers.score_table import ScoreTables
 from simulator.camera import get_camera
 from simulator.capture.sensor import exposed_light, frame_normals, noise_keys
 from simulator.noise.noise_level_function import ReadNoise

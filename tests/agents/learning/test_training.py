@@ -52,10 +52,7 @@ def test_shipped_configs(path: Path) -> None:
     ("text", "message"),
     [
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
-        (
-            "agent: dqn",
-            r"agent \(='dqn'\): Input should be 'regression', 'ppo' or 'forecaster'",
-        ),
+        ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression', 'ppo' or 'forecaster'"),
         ("", r"is empty: it must map entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\): unknown.*mean `n_steps`"),

@@ -6,11 +6,12 @@ import pytest
 from agents.metering.meters import make_meter
 from agents.metering.reading import (
     EVTracker,
-    MatchedReadings,
     Reading,
     ReferenceFrames,
+    ZoneMatcher,
     frame_ev100,
     light_change,
+    zone_signals,
 )
 
 #: Stripes from 5 stops below to 2 stops above a grey card, and a flat one.
@@ -20,6 +21,10 @@ RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
 
 def _reading(ev, saturated=0.0, black=False):
     return Reading(np.array([ev]), np.array([saturated]), np.array([black]))
+
+
+def _match(matcher, reading, frame, camera):
+    return matcher.match(reading, zone_signals(frame["raw"], camera), frame_ev100(frame))
 
 
 def test_tracker_jumps_far_averages_near_and_respects_bounds():
@@ -68,22 +73,22 @@ def test_another_light_is_noticed_at_once(context, photograph):
 def test_a_jump_is_read_from_the_shadows(context, photograph, stops):
     """The light is known: 9 EV before, and so much more in two frames after, as the first's."""
     meter, state = make_meter("average", context.camera), context.grid.nearest(9.0)
-    matched = MatchedReadings(context.camera)
+    matched = ZoneMatcher()
     before = photograph(STRIPES, 9.0, state)
-    first = matched.update(meter(before), before)
+    first = _match(matched, meter(before), before, context.camera)
     for late in (state, context.grid.nearest(11.0), context.grid.nearest(9.0 + stops)):
         after = photograph(STRIPES, 9.0 + stops, late)
-        reading = matched.update(meter(after), after)
+        reading = _match(matched, meter(after), after, context.camera)
         assert reading.ev100 - first.ev100 == pytest.approx(stops, abs=0.1)
         assert reading.saturated[0] <= 0.02
 
 
 def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
     meter, state = make_meter("average", context.camera), context.grid.nearest(9.0)
-    matched = MatchedReadings(context.camera)
+    matched = ZoneMatcher()
     for light in (9.0, 15.0):
         frame = photograph(np.ones((64, 64)), light, state)
-        plain, reading = meter(frame), matched.update(meter(frame), frame)
+        plain, reading = meter(frame), _match(matched, meter(frame), frame, context.camera)
         np.testing.assert_array_equal(reading.ev100, plain.ev100)
         np.testing.assert_array_equal(reading.saturated, plain.saturated)
     assert reading.saturated[0] == 1.0
