@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +65,8 @@ def score_interval(
         resamples: Number of resamples.
         seed: Seed of the resampling; policies compared under one seed see the same groups.
     """
-    zero = np.zeros_like(np.atleast_2d(gains)[:1])
-    return difference_interval(gains, zero, span, resamples=resamples, seed=seed)
+    nothing = np.zeros((1, len(span)))
+    return difference_interval(gains, nothing, span, resamples=resamples, seed=seed)
 
 
 def difference_interval(
@@ -178,17 +179,15 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
         seeds = max(scores[names[k]].num_seeds for k in (i, j))
         return Interval(value, low, high, len(span), seeds)
 
-    tiers = _tiers(len(names), difference) if widths is not None else [None] * len(names)
-    return [
-        Rank(
-            name,
-            scores[name],
-            tiers[i],
-            difference(i, 0) if i else None,
-            difference(i, i + 1) if i + 1 < len(names) else None,
-        )
-        for i, name in enumerate(names)
-    ]
+    ranks: list[Rank] = []
+    leader, tier = 0, None if widths is None else 1
+    for i, name in enumerate(names):
+        if tier is not None and i > leader and difference(i, leader).significant:
+            leader, tier = i, tier + 1
+        to_best = difference(i, 0) if i else None
+        to_next = difference(i, i + 1) if i + 1 < len(names) else None
+        ranks.append(Rank(name, scores[name], tier, to_best, to_next))
+    return ranks
 
 
 def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:
@@ -200,21 +199,9 @@ def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:
     ]
     errors = np.zeros((len(gains), len(gains)))
     largest = np.zeros(resamples)
-    for i in range(len(gains)):
-        for j in range(i + 1, len(gains)):
-            change = drawn[i] - drawn[j]
-            error = change.std(ddof=1)
-            errors[i, j] = errors[j, i] = error
-            if error > _ROUNDING:
-                np.maximum(largest, np.abs(change - change.mean()) / error, out=largest)
+    for i, j in combinations(range(len(gains)), 2):
+        change = drawn[i] - drawn[j]
+        error = errors[i, j] = errors[j, i] = change.std(ddof=1)
+        if error > _ROUNDING:
+            np.maximum(largest, np.abs(change - change.mean()) / error, out=largest)
     return errors * float(np.quantile(largest, LEVEL))
-
-
-def _tiers(count: int, difference: Callable[[int, int], Interval]) -> list[int | None]:
-    tiers: list[int | None] = []
-    leader, tier = 0, 1
-    for i in range(count):
-        if i > leader and difference(i, leader).significant:
-            leader, tier = i, tier + 1
-        tiers.append(tier)
-    return tiers

@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from simulator.capture.sensor import frame_normals, noise_keys
 from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet
-from simulator.noise.generator import frame_normals, noise_keys
 from simulator.optics.discs import box_mean
 from simulator.utils.checks import check_word
 

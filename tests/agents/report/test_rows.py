@@ -75,10 +75,7 @@ def test_best_meter_differences_and_histogram():
     share = np.mean([result.grid[s].iso == 400 for s in result.oracle_states])
     assert histogram["iso"]["400"] == pytest.approx(share)
     kinds = made.scores_by_kind(result)
-    assert [(kind, own["groups"]) for kind, own in kinds.items()] == [
-        ("snow", 10),
-        ("photograph", 10),
-    ]
+    assert {kind: own["groups"] for kind, own in kinds.items()} == {"snow": 10, "photograph": 10}
     assert kinds["snow"]["oracle"] == pytest.approx(1.0)
 
 
