@@ -14,7 +14,7 @@ from skimage.color import rgb2xyz
 from ae_env.scenes import Scene
 from simulator import CameraSettings, NoiseLevelFunction, get_camera
 from simulator.camera import CameraProfile
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import camera_from_srgb, temperature_tint
 from simulator.raw.image import RawImage
 from tests.strategies import SEEDS, lights

@@ -10,7 +10,7 @@ from agents.evaluation.jobs import run_plan
 from agents.evaluation.plan import EvaluationPlan, load_plan, plan_scenes
 from agents.evaluation.result import overall_ranking
 from agents.report import ae_bench
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from tests.agents.report.results import made_brackets
 
 PLAN = EvaluationPlan(
