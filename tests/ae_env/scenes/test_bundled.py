@@ -23,7 +23,6 @@ from ae_env.scenes.load import _LOADED
 from ae_env.scenes.measured_depth import depth_scenes
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
-from simulator.radiance import depth
 from simulator.radiance.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
@@ -196,20 +195,6 @@ PITCH = 11.88e-6  # packed pixels of the Nikon Z6
 
 def drawn_depth(seed: int, size: int = 48, focus: str = "middle") -> DepthDrawing:
     return draw_depth(np.random.default_rng(seed), size, focus)
-
-
-def test_a_thing_hides_what_is_farther_and_nothing_else() -> None:
-    ramp = np.repeat(np.linspace(-4.0, 4.0, 48, dtype=np.float32)[None], 48, axis=0)
-    visible = 0
-    for seed in range(12):
-        blur, surface = ramp.copy(), np.zeros((48, 48), int)
-        depth._put_thing(np.random.default_rng(seed), blur, surface, 1, 0.0)
-        seen = surface == 1
-        assert (blur[seen] < ramp[seen]).all()  # larger is farther
-        np.testing.assert_array_equal(blur[~seen], ramp[~seen])
-        assert not seen[ramp < -2.0].any()  # no thing is slanted by more than 1.8 pixels
-        visible += seen.any()
-    assert visible >= 6
 
 
 def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:

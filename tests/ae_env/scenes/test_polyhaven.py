@@ -120,16 +120,6 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
     assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
 
 
-def test_the_seed_draws_views_and_level(an_asset):
-    asset = an_asset(panorama(lambda lon, lat: 1.5 + np.cos(5 * lon) * np.cos(lat)))
-    first, again, other = (
-        [(s.illuminance, s.light.sum().item()) for s in asset_views(asset, CAMERA, size=16, seed=n)]
-        for n in (0, 0, 1)
-    )
-    assert first == again
-    assert not {lux for lux, _ in first} & {lux for lux, _ in other}
-
-
 def test_maps_that_are_cut_say_so(an_asset):
     gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
     assert cut_values(gradient) == []
