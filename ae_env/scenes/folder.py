@@ -125,9 +125,8 @@ def folder_scenes(
         options: Facts about the files that the caller knows.
 
     Raises:
-        ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
-            if no file can), or the split is ``"train"`` and there are too few groups to hold any
-            out.
+        ValueError: If a file cannot be read (with ``on_error="skip"`` only if no file can), or
+            there are too few groups to train on.
     """
     base, files = find_files(spec)
     named = _named_groups(sorted({base, *(p.parent for p in files)}))
@@ -145,9 +144,9 @@ def sequence_scenes(
     """The frames of every sequence of a split, one sequence after the other.
 
     The raws of one folder, in the natural order of their names, are one sequence and one source
-    group; its name is the folder's below `spec`. Each raw's light is known through its own
-    settings: it may change from frame to frame. Raws in `spec` itself are named after it, or ``.``
-    where a folder below has that name.
+    group, called as the folder below `spec`. Each raw's light is known through its own settings: it
+    may change from frame to frame. Raws in `spec` itself are named after it, or ``.`` where a
+    folder below has that name.
 
     Args:
         spec: A folder, searched with its sub-folders, or a glob.
@@ -155,8 +154,7 @@ def sequence_scenes(
         options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
 
     Raises:
-        ValueError: If there are no raws, one cannot be read, there are no sequences of the split,
-            or unreadable raws were to be skipped: all later frames would come too early.
+        ValueError: If there are no raws, one cannot be read, or there are too few to train on.
     """
     if options.on_error == "skip":
         raise ValueError(
@@ -184,9 +182,7 @@ def sequence_scenes(
 def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
     """First and last frame, (F,) int64 each, of the sequence that each of F frames belongs to.
 
-    Args:
-        scenes: As `sequence_scenes` returns them: those of one sequence follow each other. A scene
-            of none is one of its own.
+    Those of one sequence follow each other. A scene of none is one of its own.
     """
     names = [scene.sequence or scene.scene_id for scene in scenes]
     begins = [i for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
@@ -199,13 +195,10 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
-    """The raws and radiance maps that `spec` names, and the folder they are under.
+    """The raws and radiance maps that `spec` names, in natural order, and their folder.
 
     Args:
         spec: A file, a folder (searched with its sub-folders; hidden ones left out) or a glob.
-
-    Returns:
-        The base folder and the files, sorted in natural order (``IMG_2`` before ``IMG_10``).
 
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
@@ -301,16 +294,12 @@ def _read_files(
     if skipped:
         rest = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
         text = "; ".join(skipped[:_MOST_NAMES] + rest)
+        text = f"{len(skipped)} of {len(groups)} scene files skipped ({text})"
         if not scenes:
-            raise ValueError(
-                f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all "
-                f"{len(skipped)} were skipped ({text})"
-            )
-        total = len(groups)
-        logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)
+            raise ValueError(f"`scenes` (={str(spec)!r}) must hold a file that can be read: {text}")
+        logger.warning("%s: %s", spec, text)
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
     scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
-    log_groups(str(spec), scenes)
     return scenes_of_split(spec, scenes, request.split)
 
 
@@ -439,13 +428,6 @@ def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
       similarity of their colour and brightness histograms at least 0.5.
 
     Anything else starts a new group, named after its first shot.
-
-    Args:
-        names: Name of each shot.
-        shots: Time and colours of each.
-
-    Returns:
-        The group of each, in the order given.
     """
     timed = all(shot.time is not None for shot in shots)
 
@@ -472,11 +454,7 @@ def _same_subject(first: Shot, second: Shot) -> bool:
 
 
 def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
-    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``.
-
-    Raises:
-        ValueError: If such a file lacks a column, leaves one empty or names a missing file.
-    """
+    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``."""
     groups: dict[Path, str] = {}
     for folder in folders:
         table = folder / "groups.csv"
@@ -499,11 +477,7 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
 
 
 def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
-    """Rows and column names of a CSV file.
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
+    """Rows and column names of a CSV file; a `ValueError` if it cannot be read."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.DictReader(stream)
@@ -518,9 +492,6 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
     Below 15 groups all are ``"test"``: too few to hold out. From 15 on a hash of the group's name
     decides, 70 % to training, so that adding a file moves no other. Should the hash leave one side
     empty, the group nearest to the threshold changes sides.
-
-    >>> set(split_groups(["a", "b"]).values())
-    {'test'}
     """
     names = sorted(set(groups))
     if len(names) < FEWEST_GROUPS_TO_SPLIT:
@@ -534,20 +505,20 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
 
 
 def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
-    """The scenes whose source group is in `split`.
-
-    Args:
-        spec: Name of the scenes, for the error.
-        scenes: Scenes of all splits.
-        split: ``"train"``, ``"test"`` or ``"all"``.
+    """The scenes whose source group is in `split`; the log tells the groups and how many are not.
 
     Raises:
         ValueError: If `split` is ``"train"`` and there are too few groups.
     """
+    members: dict[str, list[str]] = {}
+    for scene in scenes:
+        members.setdefault(scene.group, []).append(scene.scene_id)
+    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
+    logger.info("%s: %d source groups (%s)", spec, len(members), text)
     if split == "all":
         return scenes
-    parts = split_groups([scene.group for scene in scenes])
-    _check_training_groups(spec, split, len(parts))
+    _check_training_groups(spec, split, len(members))
+    parts = split_groups(list(members))
     left_out = sum(part != split for part in parts.values())
     if left_out:
         logger.warning(
@@ -566,12 +537,3 @@ def _check_training_groups(spec: str | Path, split: str, count: int, most: str =
             "use these with split='test' (zero-shot) or split='all'; if files are grouped wrongly, "
             "name the groups in a groups.csv (columns file, group) beside them"
         )
-
-
-def log_groups(where: str, scenes: Sequence[Scene]) -> None:
-    """Logs the scenes of each source group."""
-    members: dict[str, list[str]] = {}
-    for scene in scenes:
-        members.setdefault(scene.group, []).append(scene.scene_id)
-    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
-    logger.info("%s: %d source groups (%s)", where, len(members), text)

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError, model_validator
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.networks import Progress, Session
 from agents.learning.regression import RegressionTraining, train_regression
-from agents.learning.weights import describe_agent, load_agent, save_agent
+from agents.learning.weights import load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
@@ -157,8 +157,16 @@ def train_agent(
     if is_trained(config, out):
         return out
     training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
-    curve = LearningCurve(sibling(out, ".csv"))
-    with _logged(curve, progress, tensorboard) as report, ExitStack() as stack:
+    takers: list[Progress] = [LearningCurve(sibling(out, ".csv"))]
+    takers += [] if progress is None else [progress]
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        for take in takers:
+            take(done, total, values)
+
+    with ExitStack() as stack:
+        if tensorboard is not None:
+            takers.insert(0, stack.enter_context(_tensorboard(tensorboard)))
         session, context = Session(checkpoint, report, device, config.card()), None
         if isinstance(training, ForecasterTraining):
             network: Any = train_forecaster(training, session)
@@ -171,7 +179,7 @@ def train_agent(
                 from agents.learning.ppo import train_ppo
 
                 network = train_ppo(envs, training, session)
-    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
+    save_agent(out, config.agent, network, network.width, context, config.card())
     checkpoint.unlink(missing_ok=True)
     return out
 
@@ -188,19 +196,8 @@ def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
 
 
 @contextmanager
-def _logged(
-    curve: LearningCurve, progress: Progress | None, folder: Path | None
-) -> Iterator[Progress]:
-    """What takes each report: the curve, TensorBoard's log in `folder`, and `progress`."""
-    takers: list[Progress] = [curve] if progress is None else [curve, progress]
-
-    def report(done: int, total: int, values: dict[str, float]) -> None:
-        for take in takers:
-            take(done, total, values)
-
-    if folder is None:
-        yield report
-        return
+def _tensorboard(folder: Path) -> Iterator[Progress]:
+    """Takes each report for TensorBoard's log in `folder`."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -211,8 +208,7 @@ def _logged(
             writer.add_scalar(f"train/{name}", value, done)
 
     with SummaryWriter(str(folder)) as writer:
-        takers.insert(0, log)
-        yield report
+        yield log
 
 
 class LearningCurve:

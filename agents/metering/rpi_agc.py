@@ -247,14 +247,9 @@ class ExposureFilter:
 
 
 def zone_factor(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
-    """Factor that brings the weighted mean of the zones to `wanted`, ``(N,)``.
+    """Factor that brings the weighted mean of `zones` (N, 15) to the signals `wanted`, ``(N,)``.
 
     A zone that saturates gives no more, so the factor is raised in several passes.
-
-    Args:
-        zones: Mean signal of each zone, ``(N, 15)``.
-        weights: ``(15,)``.
-        wanted: ``(N,)``.
     """
     factor = np.ones(len(zones))
     done = np.zeros(len(zones), bool)

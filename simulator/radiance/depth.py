@@ -130,7 +130,7 @@ def draw_layout(name: str, height: int, width: int) -> Layout:
 
 
 def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[float, np.ndarray]:
-    """Focus distance and depth at which a scene has `blur`.
+    """Focus distance [m] and depth (H, W) float32 [m] at which a scene has `blur`.
 
     Solves the thin-lens relation ``c = f**2 / (N (s - f)) * (z - s) / z`` (c signed, on the sensor)
     for the focus distance s and the depths z, at `FOCAL_LENGTH` and `F_NUMBER`.
@@ -139,9 +139,6 @@ def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[fl
         blur: (H, W) signed circle of confusion [packed pixels].
         far: Inverse distance [1/m] where `blur` is largest.
         pixel_pitch: Distance between packed pixels [m].
-
-    Returns:
-        Focus distance [m] and (H, W) float32 depth [m].
     """
     # With inverse distances D = 1/z, F = 1/s: c = f^2 / N * (F - D) / (1 - f F).
     scale = FOCAL_LENGTH**2 / (F_NUMBER * pixel_pitch)
@@ -192,11 +189,7 @@ def _put_thing(
     level: float,
     sides: tuple[float, float] = _SIDES,
 ) -> tuple[tuple[slice, slice], tuple[slice, slice], np.ndarray, np.ndarray]:
-    """Adds one thing to `blur` and `surface`, wherever it is the nearest.
-
-    Returns:
-        Its rows and columns in the frame and in itself, where it is seen there, and its tone.
-    """
+    """Adds one thing: its place in the frame and in itself, where it is seen, its tone."""
     size = blur.shape[0]
     side = int(rng.uniform(*sides) * size)
     top, left = (int(rng.integers(-side // 3, size - 2 * side // 3)) for _ in range(2))

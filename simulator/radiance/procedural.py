@@ -75,15 +75,12 @@ def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np
 
 
 def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = None) -> np.ndarray:
-    """Reflectance of a dead-leaves picture.
+    """Reflectance of a dead-leaves picture, (3, size, size) float32 linear sRGB in [0.005, 0.97].
 
     Args:
         rng: Source of all randomness.
         size: Height and width [pixels].
         style: Appearance of the leaves.
-
-    Returns:
-        (3, size, size) float32 reflectance in linear sRGB, in [0.005, 0.97].
     """
     style = LeafStyle() if style is None else style
     leaves = _draw_leaves(rng, size, style)

@@ -17,7 +17,7 @@ from agents.learning.regression import (
     Replay,
     train_regression,
 )
-from agents.learning.weights import describe_agent, save_agent
+from agents.learning.weights import save_agent
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 
@@ -44,7 +44,7 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path, observati
     context = PolicyContext.from_envs(envs)
     training = TRAINING.model_copy(update={"total_timesteps": 24, "batch_size": 12})
     network = train_ppo(envs, training)
-    save_agent(tmp_path / "ppo", "ppo", network, describe_agent(network.width, context, {}))
+    save_agent(tmp_path / "ppo", "ppo", network, network.width, context, {})
     loaded = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
     assert isinstance(loaded, PPOPolicy)
     ours = PPOPolicy(context, network=network)

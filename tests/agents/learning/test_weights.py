@@ -25,8 +25,8 @@ def make_network(context: PolicyContext) -> ScoreRegressor:
 @pytest.fixture
 def agent(context: PolicyContext, tmp_path: Path) -> Path:
     path = tmp_path / "regression-0.5"
-    description = agent_weights.describe_agent(8, context, {"agent": "regression"})
-    agent_weights.save_agent(path, "regression", make_network(context), description)
+    training = {"agent": "regression"}
+    agent_weights.save_agent(path, "regression", make_network(context), 8, context, training)
     return path
 
 
@@ -43,15 +43,14 @@ def test_round_trip(agent: Path, context: PolicyContext) -> None:
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
     next(network.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="must be finite"):
-        agent_weights.save_agent(agent, "regression", network, card)
+        agent_weights.save_agent(agent, "regression", network, 8, context, {})
     assert load_file(sibling(agent, ".safetensors")).keys() == on_disk.keys()
 
 
 def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
     module["again"] = module["a"]
-    description = {"width": 2, "context": {}, "training": {}}
-    agent_weights.save_agent(tmp_path / "m", "ppo", module, description)
+    agent_weights.save_agent(tmp_path / "m", "ppo", module, 2, None, {})
     assert len(load_file(tmp_path / "m.safetensors")) == 4
     tensors, _ = agent_weights.load_agent(tmp_path / "m", "ppo")
     assert set(tensors) == set(module.state_dict())
