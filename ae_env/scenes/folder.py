@@ -17,7 +17,7 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
@@ -211,12 +211,7 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
         raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
-    files = [
-        p
-        for p in found
-        if p.suffix.lower() in (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
-        and not any(part.startswith(".") for part in p.relative_to(base).parts)
-    ]
+    files = visible_files(base, found, (*RAW_SUFFIXES, *RADIANCE_SUFFIXES))
     if not files:
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):
@@ -241,6 +236,12 @@ def _listed(spec: str | Path) -> tuple[Path, list[Path]]:
         raise ValueError(f"`scenes` (={str(spec)!r}) must name an existing file, folder or glob")
     first = next((i for i, p in enumerate(path.parts) if glob.has_magic(p)), -1)
     return Path(*path.parts[:first]), [p for p in matches if p.is_file()]
+
+
+def visible_files(folder: Path, paths: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
+    """Those of the `paths` that end in one of `suffixes`, and are not hidden in `folder`."""
+    fitting = [path for path in paths if path.suffix.lower() in suffixes]
+    return [p for p in fitting if not any(n.startswith(".") for n in p.relative_to(folder).parts)]
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:

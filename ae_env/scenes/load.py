@@ -410,24 +410,23 @@ class SceneNetworks:
 
         def make() -> torch.Tensor:
             logger.info("estimating the defocus of scene %s", scene.scene_id)
-            return self._small_map(scene, resolution, crop)
+            fine, shorter, used = scene, min(scene.light.shape[1:]), resolution
+            if resolution is not None and crop == "box":
+                used = shorter // resolution * resolution
+            if used is not None and used + 2 * _MARGIN < shorter:
+                fine = scene.resized(used + 2 * _MARGIN, "native")
+            # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
+            prepared = self._simulator.prepare(fine.prepared, tolerance=0.0)
+            fine = replace(fine, defocus_map=self._simulator.estimate_defocus(prepared))
+            found = fine.resized(used, "native").resized(resolution, crop).defocus_map
+            assert found is not None
+            return found
 
         numbers = {"map": [MAP_VERSION, DEAD_ZONE], "resolution": resolution, "crop": crop}
-        found = self._cached("defocus_maps", scene, make, shape=small.light.shape[1:], **numbers)
-        return replace(small, defocus_map=found)
-
-    def _small_map(self, scene: Scene, resolution: int | None, crop: Crop) -> torch.Tensor:
-        shorter = min(scene.light.shape[1:])
-        factor = 1 if resolution is None or crop == "native" else shorter // resolution
-        used = None if resolution is None else factor * resolution
-        if used is not None and used + 2 * _MARGIN < shorter:
-            scene = scene.resized(used + 2 * _MARGIN, "native")
-        # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
-        prepared = self._simulator.prepare(scene.prepared, tolerance=0.0)
-        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(prepared))
-        found = fine.resized(used, "native").resized(resolution, crop).defocus_map
-        assert found is not None
-        return found
+        shape = small.light.shape[1:]
+        return replace(
+            small, defocus_map=self._cached("defocus_maps", scene, make, shape=shape, **numbers)
+        )
 
     def _cached(
         self, kind: str, scene: Scene, make: Callable[[], torch.Tensor], **numbers: Any

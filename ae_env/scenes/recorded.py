@@ -28,7 +28,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, merge
-from ae_env.scenes.folder import read_table, scenes_of_split
+from ae_env.scenes.folder import read_table, scenes_of_split, visible_files
 from ae_env.scenes.scene import Scene, SceneRequest
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -347,12 +347,8 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
     if not folder.is_dir():
         raise ValueError(f"`scenes` (='recorded:{folder}') must name an existing folder")
     tables = _read_tables(folder)
-    found = [
-        _recorded(folder, path, tables, known)
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in (*RAW_SUFFIXES, *PICTURE_SUFFIXES)
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
+    found = [_recorded(folder, path, tables, known) for path in paths]
     if not found:
         raise ValueError(
             f"`scenes` (='recorded:{folder}') must hold captures: raws "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -244,13 +243,10 @@ class LearningCurve:
         means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
         self._rows.append({"frames": done, **means})
         self._recent = []
-        text = io.StringIO()
-        writer = csv.DictWriter(text, self._rows[-1], lineterminator="\n")
-        writer.writeheader()
+        lines = [["frames", *values]]
         for row in self._rows:
-            shown = {name: f"{value:.6g}" for name, value in row.items()}
-            writer.writerow({**shown, "frames": int(row["frames"])})
-        write_atomically(self.path, text.getvalue())
+            lines.append([str(int(row["frames"])), *(f"{row[name]:.6g}" for name in values)])
+        write_atomically(self.path, "".join(",".join(line) + "\n" for line in lines))
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:

@@ -96,22 +96,6 @@ def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> No
     assert max(np.abs(e).max() for e in errors.values()) < 5.0
 
 
-def test_hard_kinds_are_what_they_say(unseen: list[Scene]) -> None:
-    for scene in unseen:
-        reflectance = scene.light[1] / WHITE
-        if scene.kind == "snow":
-            assert 0.7 <= reflectance.median() <= 0.95
-            assert 0.6 <= reflectance.mean() <= 0.95
-        if scene.kind == "night":
-            assert 1 <= (scene.illuminance or 0.0) <= 50
-            assert reflectance.max() > 5
-            assert (scene.light.amax(dim=0) > 1).float().mean() < 0.08
-        if scene.kind == "back_light":
-            assert 0.1 < (reflectance > 1.0).float().mean() < 0.75
-        if scene.kind == "spot_light":
-            assert reflectance.median() < 0.02
-
-
 def test_a_scene_is_the_same_wherever_it_is_asked_for(unseen: list[Scene]) -> None:
     small = load_scenes("bundled:small", "all", camera=CAMERA)
     assert len({s.group for s in small}) == 2 * 2 * 8
@@ -123,21 +107,13 @@ def test_a_scene_is_the_same_wherever_it_is_asked_for(unseen: list[Scene]) -> No
         assert scene.reference == by_id[scene.scene_id].reference
 
 
-def test_drawing_depends_on_the_generator_alone() -> None:
-    for kind in list_kinds():
-        first, second, other = (draw(kind, np.random.default_rng(i), 64) for i in (5, 5, 6))
-        assert np.array_equal(first.light, second.light)
-        assert first.illuminance == second.illuminance
-        assert not np.array_equal(first.light, other.light)
-        assert first.light.dtype == np.float32
+def test_unknown_kinds_and_sizes_are_named() -> None:
     rng = np.random.default_rng(0)
-    for call, arguments, message in (
-        (draw, ("nights",), "did you mean 'night'"),
-        (draw_depth, (32, "fron"), r"`focus`.*did you mean 'front'"),
-        (draw_depth, (8,), "`size`"),
-    ):
+    with pytest.raises(ValueError, match="did you mean 'night'"):
+        draw("nights", rng)
+    for arguments, message in (((32, "fron"), "`focus`"), ((8,), "`size`")):
         with pytest.raises(ValueError, match=message):
-            call(*([*arguments, rng] if call is draw else [rng, *arguments]))
+            draw_depth(rng, *arguments)
 
 
 def test_unprocess_inverts_tone_and_gamma() -> None:
