@@ -360,25 +360,22 @@ def radiance_scenes(
             ev100 = assumed_ev100(group)
             fields.setdefault("source", f"{file}; light of unknown scale, EV100 assumed")
     fields.setdefault("source", file)
-    try:
-        views, sampled = map_views(image, request.resolution, native=request.crop == "native")
-        if not sampled:
-            logger.info(
-                "radiance map %s: fewer pixels than photosites, so planes share their places", file
-            )
-        matrix, _ = camera_from_srgb(request.camera)
-        greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
-        levels = [-math.log2(mean_anchor(green)) for green in greens]
-        for (ending, view), level in zip(views.items(), levels, strict=True):
-            if ev100 is not None:  # one scale for the whole map: a darker view stays darker
-                fields["ev100"] = ev100 + level - float(np.mean(levels))
-            scene_id = name + ending
-            scene = Scene.from_radiance(
-                view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
-            )
-            yield request.sized(scene)
-    except ValueError as error:
-        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
+    views, sampled = map_views(image, request.resolution, native=request.crop == "native")
+    if not sampled:
+        logger.info(
+            "radiance map %s: fewer pixels than photosites, so planes share their places", file
+        )
+    matrix, _ = camera_from_srgb(request.camera)
+    greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
+    levels = [-math.log2(mean_anchor(green)) for green in greens]
+    for (ending, view), level in zip(views.items(), levels, strict=True):
+        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
+            fields["ev100"] = ev100 + level - float(np.mean(levels))
+        scene_id = name + ending
+        scene = Scene.from_radiance(
+            view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
+        )
+        yield request.sized(scene)
 
 
 # -- source groups and the split ----------------------------------------------------------------

@@ -190,11 +190,6 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
         )
     for name in spec:
         check_word("scenes", name, (where, *known))
-    if spec[where] in NAMED:
-        raise ValueError(
-            f"`scenes` (={dict(spec)!r}): {where!r} must be a file, folder or glob; give the name "
-            f"{spec[where]!r} itself for those scenes"
-        )
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 
@@ -351,9 +346,8 @@ def simulate_source_raw(
 
 def check_weights(name: str) -> None:
     """Raises a `ValueError` unless `name` is that of weights or the path of some; reads none."""
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"`simulator` (={name!r}) must be None, or the name or path of weights")
-    if name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file():
+    is_text = isinstance(name, str) and name != ""
+    if is_text and (name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file()):
         return
     from simulator.networks.weights import list_pretrained
 

@@ -19,6 +19,7 @@ from agents.learning.regression import RegressionTraining, train_regression
 from agents.learning.weights import load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
+from simulator.utils.checks import check_word
 from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
@@ -68,14 +69,10 @@ class AgentConfig(Configuration):
             options = EnvOptions.from_kwargs(self.environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
             options.make_lighting()
+            taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
+            check_word("observation", options.observation, taken)  # that its network takes
         except ValueError as error:
             raise ValueError(f"environment: {error}") from error
-        taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
-        if options.observation not in taken:
-            raise ValueError(
-                f"environment: `observation` (={options.observation!r}) must be one of "
-                f"{list(taken)}, which is what the agent's network takes"
-            )
         if self.agent == "ppo":
             hyperparameters.check_batch(self.num_envs)
         try:

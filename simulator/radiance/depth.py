@@ -12,6 +12,7 @@ such a scene can teach about defocus, and then converted to metres for a lens of
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 
@@ -97,7 +98,7 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     light = _soften(picture, rng.uniform(0.05, 0.09))
     illuminance = float(f"{log_uniform(rng, 1.0, 20_000.0):.4g}")
     drawing = Drawing(light, illuminance, temperature_tint(rng.uniform(-0.1, 1.0)))
-    far = float(log_uniform(rng, 0.02, 1.0))
+    far = math.exp(rng.uniform(math.log(0.02), math.log(1.0)))
     return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
 
 
@@ -270,7 +271,7 @@ def _add_highlights(rng: np.random.Generator, light: np.ndarray, surface: np.nda
     """Adds small discs of 5 to 100 times white to `light`, each on one thing only, at its depth."""
     size = surface.shape[0]
     for _ in range(int(rng.integers(3, 30))):
-        radius, value = rng.uniform(0.5, 3.0), log_uniform(rng, 5.0, 100.0)
+        radius, value = rng.uniform(0.5, 3.0), math.exp(rng.uniform(math.log(5.0), math.log(100.0)))
         y, x = rng.uniform(4.0, size - 5.0, 2)
         colour = np.exp2(rng.normal(0.0, 0.3, 3)) * [1.0, 0.0, 1.0] + [0.0, 1.0, 0.0]
         row, column = round(y), round(x)

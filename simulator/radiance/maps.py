@@ -152,8 +152,6 @@ def perspective(
         size: Height and width of the view [pixels].
         field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
     """
-    if not 0.0 < field_of_view <= 150.0:
-        raise ValueError(f"`field_of_view` (={field_of_view!r}) must be in (0, 150] degrees")
     half = math.tan(math.radians(field_of_view) / 2.0)
     per_radian = panorama.shape[2] / (2.0 * math.pi)
     dense = max(1, math.ceil(per_radian / (size / (2.0 * half))))

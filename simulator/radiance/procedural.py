@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from simulator.radiance.light import temperature_tint
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import check_word
 from simulator.utils.compute import kernel
 
 #: Part of every cache key: raise it with any change of the drawings.
@@ -246,9 +246,7 @@ def draw(
     Raises:
         ValueError: If there is no such kind; the message proposes the nearest name.
     """
-    if kind not in _KINDS:
-        hint = did_you_mean(kind, _KINDS)
-        raise ValueError(f"`kind` (={kind!r}) must be one of {list_kinds()}{hint}")
+    check_word("kind", kind, tuple(_KINDS))
     drawing = _KINDS[kind](rng, size)
     return replace(drawing, light=_lens(drawing.light)) if lens else drawing
 

@@ -128,8 +128,6 @@ def test_unprocess_inverts_tone_and_gamma() -> None:
     gamma = np.where(flat <= 0.0031308, 12.92 * flat, 1.055 * flat ** (1 / 2.4) - 0.055)
     again = 3 * gamma**2 - 2 * gamma**3  # the smooth step of Brooks et al. 2019
     assert np.abs(again * 255 - shown).max() <= 0.51
-    with pytest.raises(ValueError, match="`image`"):
-        unprocess(np.zeros((4, 4)), rng)
 
 
 def test_cached_scenes_equal_fresh_ones(

@@ -255,7 +255,7 @@ def test_small_folder_is_zero_shot(tmp_path: Path) -> None:
         ([*MINE, *MINE], r"`scene_id` \(='all'\) must be unique"),
         ({"lux": 3}, "must have a 'path'"),
         ({"path": "x", "illuminace": 3}, "did you mean 'illuminance'"),
-        ({"path": "bundled", "kind": "snow"}, "give the name"),
+        ({"path": "bundled", "kind": "snow"}, "must name an existing file"),
     ],
 )
 def test_errors_name_the_value_and_the_rule(spec: object, words: str) -> None:

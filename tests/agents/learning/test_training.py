@@ -67,7 +67,7 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: forecaster\nnum_envs: 3", r"`num_envs` is not used"),
         (
             "agent: ppo\nenvironment: {observation: linear}",
-            r"`observation`.*must be one of \['uint8', 'statistics'\]",
+            "`observation`.*must be one of 'uint8', 'statistics'",
         ),
     ],
 )
