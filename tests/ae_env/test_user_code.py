@@ -102,5 +102,5 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: s
     left = [name for name in set(sys.modules) - before if name.startswith("ae_env_user_")]
     assert len(left) == ("class" in message)  # what failed to load is not kept
     for path, name in ((tmp_path / "none.py", "Mine"), (file, "")):
-        with pytest.raises(ValueError, match=ARGUMENT):
+        with pytest.raises(ValueError, match=r"`thing` \(='mine.py:Mine'\)"):
             load_from_file(str(path), name, ARGUMENT)
