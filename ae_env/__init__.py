@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ae_env.registration import register_envs
 
+from simulator import __version__ as __version__  # noqa: E402  (checked first)
+
 if TYPE_CHECKING:
     from ae_env import lighting as lighting
     from ae_env import wrappers as wrappers
@@ -55,8 +57,6 @@ if TYPE_CHECKING:
     from ae_env.wrappers import VectorContinuousActions as VectorContinuousActions
     from ae_env.wrappers import VectorControlActions as VectorControlActions
     from ae_env.wrappers import VectorRelativeActions as VectorRelativeActions
-
-__version__ = "0.2.0"
 
 #: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {

@@ -26,8 +26,7 @@ import ae_env  # noqa: F401  registers the environment
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
-from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import prepare_scene
+from ae_env.scorers.captures import describe_captures, prepare_scene
 from benchmarks.harness import Benchmark, Part, Report, Row, pivot, recorded, rounded, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop

@@ -11,13 +11,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ae_env.episodes.lookup import LookupBatch
-from ae_env.episodes.scores import AutoExposure, FindTransitions
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.observation import (
     HISTOGRAM_BINS,
@@ -29,11 +28,12 @@ from ae_env.observation import (
 )
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
+from ae_env.scorers.captures import in_episode, prepare_scene
 from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
+from ae_env.scorers.score_table import ScoreTable
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.noise.generator import Noise
+from simulator.capture.sensor import Noise, Transitions
 from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
@@ -72,8 +72,14 @@ class Frames:
     raw: np.ndarray
 
 
-class Task(Protocol):
+class Task:
     """What an action does and what a frame is worth, as functions of running episodes.
+
+    Here every action takes a frame, moves nothing else, and no episode ends by itself; a task gives
+    at least `measure`, `reward` and `score_table`.
+
+    Args:
+        episodes: The episodes, with their scenes and options.
 
     Attributes:
         num_actions: Number of actions; those below the number of states take a frame there.
@@ -81,12 +87,16 @@ class Task(Protocol):
         in_chunks: Whether `measure` reads so much that it takes small batches.
     """
 
-    num_actions: int
-    outputs: tuple[str, ...]
-    in_chunks: bool
+    outputs: tuple[str, ...] = ()
+    in_chunks = False
+
+    def __init__(self, episodes: Episodes) -> None:
+        self.episodes = episodes
+        self.num_actions = len(episodes.grid)
 
     def spaces(self) -> dict[str, gym.Space[Any]]:
         """Spaces of `observation`."""
+        return {}
 
     def initial(self, env_indices: np.ndarray, options: Sequence[Mapping[str, Any]] | None) -> None:
         """Sets up the episodes that were drawn for `env_indices` (K,) with the reset's options."""
@@ -95,7 +105,9 @@ class Task(Protocol):
         """Drops what was worked out under these `Episodes.light_index`."""
 
     def allowed(self, env_indices: np.ndarray) -> np.ndarray:
-        """(B, A) bool: actions that each of the episodes allows now."""
+        """(B, A) bool: actions that the episodes allow now; all of them before the first reset."""
+        scenes, begun = self.episodes.scene[env_indices], self.episodes.begun[env_indices, None]
+        return self.episodes.allowed[scenes] | ~begun
 
     def transition(
         self, env_indices: np.ndarray, actions: np.ndarray
@@ -105,15 +117,19 @@ class Task(Protocol):
         Returns:
             (K,) bool, which of them take a frame; and the episodes whose `displaced` changed.
         """
+        return np.ones(len(env_indices), bool), env_indices[:0]
 
     def terminal(self, env_indices: np.ndarray, takes: np.ndarray) -> np.ndarray:
         """(K,) bool: which episodes have ended, after the actions of which `takes` took a frame."""
+        return ~takes
 
     def displaced(self, env_index: int) -> Scene | None:
         """The scene of an episode where its subject has moved since the first frame; else None."""
+        return None
 
     def observation(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
         """What is observed beside the latest frame, (B, ...) by name."""
+        return {}
 
     def measure(
         self,
@@ -132,21 +148,25 @@ class Task(Protocol):
             gains: (B,) light relative to the scenes' own.
             rows: (B, R) light of each row relative to that, or None; see `Captures`.
         """
+        raise NotImplementedError
 
     def reward(
         self, env_indices: np.ndarray, columns: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Terms of the reward by name, and the reward (B,); `columns` become those of the info."""
+        raise NotImplementedError
 
     def columns(self) -> dict[str, np.ndarray]:
         """The task's own columns of the episodes, by name, n long: a pickle holds them."""
+        return {}
 
     def score_table(self, env_index: int) -> ScoreTable:
         """Expected scores of all states in the current frame of environment `env_index`."""
+        raise NotImplementedError
 
 
-#: Constructor of a task, from the episodes, the source of their frames, the scorer, and light and
-#: exposures behind frames where rewards are expectations.
+#: Light and exposures behind the frames of scenes (B,) at states (B,): `CaptureBatch.transitions`.
+FindTransitions = Callable[[np.ndarray, np.ndarray], Transitions]
 #: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
 #: and exposures behind frames where rewards are expectations.
 MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
@@ -169,7 +189,7 @@ class EpisodeCore:
         self,
         options: EnvOptions,
         num_envs: int,
-        make_task: MakeTask = AutoExposure,
+        make_task: MakeTask,
         scenes: Sequence[Scene] | None = None,
     ) -> None:
         self.options, self._make_task = options, make_task

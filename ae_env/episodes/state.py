@@ -76,7 +76,7 @@ class Episode:
 
     @property
     def moves(self) -> dict[str, Any]:
-        """Arguments of `ae_env.scorers.score_table.prepare_scene` that blur depends on."""
+        """Arguments of `ae_env.scorers.captures.prepare_scene` that blur depends on."""
         return {"speed": self.speed, "defocus": self.defocus, "movement": self.movement}
 
 
@@ -269,18 +269,14 @@ class Episodes:
     def _chosen(self, options: Mapping[str, Any]) -> dict[str, int]:
         """The entries of the options of a reset as integers."""
         found = {name: options[name] for name in OPTIONS if options.get(name) is not None}
-        wanted = found.get("scene")
-        if isinstance(wanted, str) and wanted in self._index:
-            found["scene"] = self._index[wanted]
-        hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
-        ids = f", or a scene id, such as {self._ids[0]!r}{hint}"
-        limits = {
-            "scene": (len(self._ids) - 1, ids),
-            "state": (len(self.grid) - 1, ""),
-            "frame": (MAX_FRAME, ""),
-        }
+        limits = {"scene": len(self._ids), "state": self.allowed.shape[1], "frame": MAX_FRAME + 1}
         for name, value in found.items():
-            most, rule = limits[name]
+            rule = ""
+            if name == "scene":
+                hint = did_you_mean(value, self._ids) if isinstance(value, str) else ""
+                rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
+                value = self._index.get(value, value) if isinstance(value, str) else value
+            most = limits[name] - 1
             found[name] = check_integer(f"options[{name!r}]", value, 0, most, more=rule)
         return found
 

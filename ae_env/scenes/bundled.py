@@ -18,7 +18,7 @@ import torch
 
 from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.depth import draw_layout
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
 from simulator.radiance.procedural import (

@@ -13,8 +13,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
-from simulator.capture.layout import Layout
-from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor

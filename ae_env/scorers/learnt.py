@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils import fuse_conv_bn_eval
 
-from ae_env.scorers.protocol import Captures, DependsOn, Domain
+from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.utils.user_files import UserCodeError
 from simulator.utils.cache import cache_dir
 from simulator.utils.checks import check_integer

@@ -7,9 +7,8 @@
 | `measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy`; `shim`, |
 | | `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
-| `fidelity.py` | `fidelity` |
+| `fidelity.py` | `fidelity`, `keypoints`, `matches` |
 | `learnt.py` | `nima_aesthetic`, `nima_technical`, `classifier`, ``pyiqa:METRIC`` |
-| `opencv.py` | `keypoints`, `matches` |
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.captures import Scorer
+from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
     AnalyticExposure,
@@ -33,7 +33,7 @@ from ae_env.scorers.defects import (
     AnalyticWhiteBalance,
     Defects,
 )
-from ae_env.scorers.fidelity import Fidelity
+from ae_env.scorers.fidelity import Fidelity, Keypoints, Matches
 from ae_env.scorers.learnt import Classifier, NimaAesthetic, NimaTechnical, PyiqaMetric
 from ae_env.scorers.measures import (
     BlindNoise,
@@ -47,10 +47,7 @@ from ae_env.scorers.measures import (
     WellExposedness,
     Zhang,
 )
-from ae_env.scorers.opencv import Keypoints, Matches
-from ae_env.scorers.protocol import Scorer
 from ae_env.scorers.terms import (
-    Balanced,
     Banding,
     Brightness,
     Highlights,

@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.grid import ExposureGrid
 from ae_env.merging import LOG_FLOOR, SATURATED, WORST_EV, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
+from ae_env.tasks import FRAME_GAP
 from agents.policy import Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
 from simulator.camera import CameraProfile

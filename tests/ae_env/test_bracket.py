@@ -14,10 +14,10 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from ae_env import ExposureGrid, Scene
-from ae_env.episodes.bracket import displaced
 from ae_env.merging import log_error, merge
+from ae_env.tasks import displaced
 from simulator.camera import get_camera
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import WHITE_SIGNAL, reference_settings
 from tests.ae_env.environments import SMALL, assert_equal, check_parity, make_env, make_envs
 

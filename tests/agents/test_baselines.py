@@ -77,7 +77,6 @@ def test_a_recording_is_replayed_on_its_own_raws(tmp_path, delay):
 
 def test_a_folder_without_raws_is_refused(context, tmp_path):
     (tmp_path / "notes.txt").write_text("not a raw")
-    with pytest.raises(ValueError, match="`path`"):
-        make_policy(f"recorded:{tmp_path}", context)
-    with pytest.raises(ValueError, match="must be a folder of raws"):
-        make_policy(f"recorded:{tmp_path / 'nowhere'}", context)
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ValueError, match="`path`"):
+            make_policy(f"recorded:{folder}", context)

@@ -28,33 +28,32 @@ def test_every_listed_name_makes_a_policy(context):
     ("name", "message"),
     [
         ("matrx:P", r"did you mean 'matrix:P'"),
-        ("matrix:Q", r"must be one of .*:tuned_blind"),
-        ("oracle:P", r"must be one of"),
-        ("no_such_pkg.mod:Class", r"no module 'no_such_pkg'"),
-        ("agents.baselines:Rundom", r"no class 'Rundom' there; found .*Random, BestFixed, Oracle"),
-        ("agents.evaluation.metrics:flicker", r"must name a class"),
-        ("agents.evaluation.intervals:Interval", r"not a policy, it has no `reset` and `act`"),
-        ("mine.py", r"must name a class of the file"),
-        ("spot?compensatio=1", r"'spot\?compensatio=1'\): .*the option 'compensatio'.*mean 'comp"),
-        ("spot?meter=matrix", r"does not take the option 'meter'"),
-        ("oracle?state=3", r"does not take the option 'state'; it takes none"),
-        ("spot?compensation=.nan", r"`compensation` \(=nan\) must be a number in \[-32, 32\]"),
-        ("spot?damping=1", r"`damping` \(=1\) must be below 1"),
-        ("spot:A?iso=100", r"`iso` \(=100(\.0)?\) is an option of program M only, not of A"),
-        ("ppo:runs/ppo-*", r"is a pattern, so several agents: .*`training_seeds`"),
-        ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\) must be a folder"),
-        ("spot?", r"options are written name\?key=value&key=value"),
-        ("spot?damping=[1]", r"option 'damping' \(='\[1\]'\) must be a YAML scalar"),
-        ("spot?damping=0&damping=0", r"option 'damping' is given twice"),
-        ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\).*did you mean 'shadows'"),
-        ("rpi-agc", r"did you mean 'rpi_agc'"),
-        ("regression:video?ensemble=true", r"does not take the option 'ensemble'"),
-        ("bracket:mine", r"must be one of .*bracket:planned"),
-        ("recorded", r"must be a folder of raws: 'recorded:FOLDER'"),
+        ("matrix:Q", r"tuned_blind"),
+        ("oracle:P", r"oracle:clairvoyant"),
+        ("bracket:mine", r"bracket:planned"),
+        ("rpi-agc", r"'rpi_agc'"),
+        ("no_such_pkg.mod:Class", r"'no_such_pkg'"),
+        ("agents.baselines:Rundom", r"'Rundom' .*Random, BestFixed, Oracle"),
+        ("agents.evaluation.metrics:flicker", r"class"),
+        ("agents.evaluation.intervals:Interval", r"reset and act"),
+        ("mine.py", r"class"),
+        ("spot?compensatio=1", r"'compensatio'.*mean 'compensation'"),
+        ("spot?meter=matrix", r"'meter'"),
+        ("oracle?state=3", r"'state'"),
+        ("spot?compensation=.nan", r"`compensation` \(=nan\)"),
+        ("spot?damping=1", r"`damping` \(=1\)"),
+        ("spot:A?iso=100", r"`iso` \(=100(\.0)?\)"),
+        ("ppo:runs/ppo-*", r"`training_seeds`"),
+        ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\)"),
+        ("recorded", r"recorded:FOLDER"),
+        ("spot?", r"name\?key=value&key=value"),
+        ("spot?damping=[1]", r"'damping' \(='\[1\]'\)"),
+        ("spot?damping=0&damping=0", r"'damping'.* twice"),
+        ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\)"),
     ],
 )
 def test_bad_names_and_options_say_what_is_wrong(context, name, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"^`policy` .*{message}"):
         make_policy(name, context)
 
 
@@ -105,12 +104,8 @@ def test_own_file(context, photograph, tmp_path):
         policy.reset(2)
         assert policy.name.endswith(f"Constant{name}")
         assert policy.act(frame).tolist() == [state, state]
-    for name, message in (
-        ("Mine", r"no class 'Mine' there; found Helper, Constant"),
-        ("Forgetful", r"Forgetful is not a policy, it has no `act`"),
-        ("Duck", r"Duck is not a policy, it has no `act`"),
-    ):
-        with pytest.raises(ValueError, match=message):
+    for name, message in (("Mine", "Helper"), ("Forgetful", "act"), ("Duck", "act")):
+        with pytest.raises(ValueError, match=f"`policy` .*{name}.*{message}"):
             make_policy(f"{file}:{name}", context)
     file.write_text("import a_module_that_is_not_there\n")
     with pytest.raises(ValueError, match="a_module_that_is_not_there") as caught:

@@ -61,9 +61,7 @@ def test_what_is_unfinished_is_removed(folder: Path, context: PolicyContext) -> 
 
 def test_names_are_checked_first(folder: Path, context: PolicyContext) -> None:
     policy = make_policy("random", context)
-    for wrong in ("mine", "a/mine-v0"):  # Minari's namespaces have two letters or more
-        with pytest.raises(ValueError, match=rf"`out` \(='{wrong}'\) must be a name of Minari"):
-            record_dataset(policy, "random", TASK, SMALL, wrong, episodes=1)
     record_dataset(policy, "random", TASK, SMALL, "mine-v0", episodes=1)
-    with pytest.raises(ValueError, match=r"`out` \(='mine-v0'\) is there already"):
-        record_dataset(policy, "random", TASK, SMALL, "mine-v0", episodes=1)
+    for wrong in ("mine", "a/mine-v0", "mine-v0"):  # namespaces have two letters or more; is there
+        with pytest.raises(ValueError, match=rf"`out` \(='{wrong}'\)"):
+            record_dataset(policy, "random", TASK, SMALL, wrong, episodes=1)

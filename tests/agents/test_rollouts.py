@@ -18,16 +18,13 @@ STATES = {
 def test_recorded_grids_are_trained_for_on_their_own_states(tmp_path: Path) -> None:
     """The default grid has 64 states, which a policy for eight cannot use."""
     write_raws(tmp_path / "a")
-    for spec in (f"recorded:{tmp_path}", {"recorded": str(tmp_path)}):
+    named = f"recorded:{tmp_path}"
+    for spec in (named, {"recorded": str(tmp_path)}):
         assert training_arguments(spec, 36) == ({"scenes": "bundled", "grid": STATES}, True)
     assert training_arguments(str(tmp_path), 36) == ({"scenes": "bundled"}, True)
     assert training_arguments("bundled") == ({"scenes": "bundled"}, False)
-
-
-def test_what_was_named_besides_the_scenes_stays(tmp_path: Path) -> None:
-    write_raws(tmp_path / "a")
-    judged = {"scenes": f"recorded:{tmp_path}", "split": "test", "grid": "video"}
-    assert fitting_arguments(judged, 36) == {**judged, "scenes": "bundled"}
+    judged = {"scenes": named, "split": "test", "grid": "video"}
+    assert fitting_arguments(judged, 36) == {**judged, "scenes": "bundled"}  # what is named stays
 
 
 def test_a_fitted_policy_is_recorded_on_a_recorded_grid(

@@ -27,7 +27,7 @@ from simulator import (
     get_camera,
 )
 from simulator.camera import CameraProfile
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.networks.aperture_module import BLUR_FACTOR, DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 from simulator.radiance.light import camera_from_srgb, temperature_tint
