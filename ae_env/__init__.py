@@ -12,6 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 from ae_env.registration import register_envs
 
+
+def _check_simulator() -> None:
+    """The packages that are installed together have common names: whose it is is checked."""
+    own, spec = Path(__file__).resolve().parents[1] / "simulator", find_spec("simulator")
+    folders = [] if spec is None else [*(spec.submodule_search_locations or [spec.origin])]
+    found = next(iter(folders), None)
+    if found is None or Path(found).resolve() != own:
+        raise ImportError(
+            f"ae-env needs its own package 'simulator' ({own}), but Python finds {found}: "
+            "rename the other one, or take its folder off sys.path (PYTHONPATH, the working folder)"
+        )
+
+
+_check_simulator()
+
 from simulator import __version__ as __version__  # noqa: E402  (checked first)
 
 if TYPE_CHECKING:
@@ -99,17 +114,4 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-def _check_simulator() -> None:
-    """The packages that are installed together have common names: whose it is is checked."""
-    own, spec = Path(__file__).resolve().parents[1] / "simulator", find_spec("simulator")
-    folders = [] if spec is None else [*(spec.submodule_search_locations or [spec.origin])]
-    found = next(iter(folders), None)
-    if found is None or Path(found).resolve() != own:
-        raise ImportError(
-            f"ae-env needs its own package 'simulator' ({own}), but Python finds {found}: "
-            "rename the other one, or take its folder off sys.path (PYTHONPATH, the working folder)"
-        )
-
-
-_check_simulator()
 register_envs()
