@@ -20,7 +20,7 @@ from scipy.stats import spearmanr
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.measures import luma_of
-from agents.cli.console import console
+from agents.cli.console import print_line
 from benchmarks.harness import Benchmark, Part, Report, Row, pivot, table
 from simulator import develop, exposure_ratio, get_camera
 from simulator.optics.discs import disc_blur
@@ -219,7 +219,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
     for name, knots in maps.items():
         columns = ", ".join(repr(column) for column in zip(*knots, strict=True))
-        console.print(f'"{name}": ({columns}),', soft_wrap=True, highlight=False, markup=False)
+        print_line(f'"{name}": ({columns}),')
     rows = [row for test in tests for row in test["rows"]]
     fits = [
         {"part": "map", "name": n, "knots": knots, "in_use": KNOTS[n]} for n, knots in maps.items()

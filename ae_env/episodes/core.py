@@ -32,8 +32,7 @@ from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.score_table import ScoreTable
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions
-from simulator.noise.generator import Noise
+from simulator.capture.sensor import Noise, Transitions
 from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.

@@ -13,13 +13,12 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
-from simulator.capture.layout import Layout
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
@@ -27,6 +26,9 @@ from simulator.optics.discs import HALO, Blur, DiscBank, disc_blur, kernel_energ
 from simulator.optics.motion import Path, Taps, motion_blur, path_blur, path_blur_apart, path_taps
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
+
+if TYPE_CHECKING:
+    from simulator.capture.prepared_scene import Layout
 
 #: Memory that the cached blurred light of one scene may take, and that its cached opened light may
 #: [byte].

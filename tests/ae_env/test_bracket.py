@@ -14,7 +14,7 @@ from ae_env import ExposureGrid, Scene
 from ae_env.merging import log_error, merge
 from ae_env.tasks import displaced
 from simulator.camera import get_camera
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import WHITE_SIGNAL, reference_settings
 from tests.ae_env.environments import check_parity, make_env
 

@@ -15,8 +15,7 @@ from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
 from ae_env.scorers.captures import prepare_scene
 from simulator.camera import get_camera
-from simulator.capture.sensor import exposed_light
-from simulator.noise.generator import frame_normals, noise_keys
+from simulator.capture.sensor import exposed_light, frame_normals, noise_keys
 from simulator.noise.noise_level_function import ReadNoise
 from tests.ae_env.environments import assert_equal, make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene

@@ -18,7 +18,7 @@ from simulator.capture import blurred_light as module
 from simulator.capture.batch import CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.exposure import Exposure
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.discs import DIAMETERS, HALO, DiscBank, added_blur, disc_blur
