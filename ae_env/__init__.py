@@ -6,12 +6,28 @@ Importing it registers the tasks, such as ``ae_env/AutoExposure-v0``, and loads 
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ae_env.registration import register_envs
-from ae_env.utils.packages import check_package
 
-check_package("simulator")
+
+def _check_simulator() -> None:
+    """The packages that are installed together have common names: whose it is is checked."""
+    own, spec = Path(__file__).resolve().parents[1] / "simulator", find_spec("simulator")
+    folders = [] if spec is None else [*(spec.submodule_search_locations or [spec.origin])]
+    found = next(iter(folders), None)
+    if found is None or Path(found).resolve() != own:
+        raise ImportError(
+            f"ae-env needs its own package 'simulator' ({own}), but Python finds {found}: "
+            "rename the other one, or take its folder off sys.path (PYTHONPATH, the working folder)"
+        )
+
+
+_check_simulator()
+
+from simulator import __version__ as __version__  # noqa: E402  (checked first)
 
 if TYPE_CHECKING:
     from ae_env import lighting as lighting
@@ -56,8 +72,6 @@ if TYPE_CHECKING:
     from ae_env.wrappers import VectorContinuousActions as VectorContinuousActions
     from ae_env.wrappers import VectorControlActions as VectorControlActions
     from ae_env.wrappers import VectorRelativeActions as VectorRelativeActions
-
-__version__ = "0.2.0"
 
 #: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {

@@ -1,4 +1,4 @@
-"""`ae_env/AutoExposure-v0`, one episode at a time."""
+"""`ae_env/AutoExposure-v0`: what its frames are worth, and the environment of one episode."""
 
 from __future__ import annotations
 
@@ -8,24 +8,287 @@ from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
+import torch
 
-from ae_env.episodes.core import EpisodeCore, Frames, MakeTask, check_actions
+from ae_env.episodes.core import EpisodeCore, FindTransitions, Frames, MakeTask, Task, check_actions
 from ae_env.episodes.lookup import RECORDED
-from ae_env.episodes.scores import AutoExposure
-from ae_env.episodes.state import Episode, check_options
+from ae_env.episodes.state import Episode, Episodes, check_options
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
-from ae_env.scorers.score_table import ScoreTable
+from ae_env.scorers.captures import Captures, describe_captures, reads_pixels
+from ae_env.scorers.composite import CompositeScorer, depends_on
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator.camera import CameraProfile
-from simulator.capture.batch import MODULES
+from simulator.capture.batch import MODULES, FrameSource, FrameStatistics
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_seed, check_word
 
 logger = logging.getLogger(__name__)
 
 Observation = dict[str, np.ndarray]
+#: From so many new captures on, each is scored alone; below, all states of their lights are.
+_MANY = 8
+#: Memory for score tables [byte]: some eight thousand of 64 states.
+TABLES_BYTES = 2**25
 _FIRST = np.array([0])
+
+
+class AutoExposure(Task):
+    """Scores each frame, takes the costs off, and compares it with the oracle.
+
+    Parts of the score that look at no frame are cached in static light, and so are expectations.
+
+    Args:
+        episodes: The episodes, with their scenes and options.
+        captures: What records their frames.
+        scorer: Rates the frames.
+        transitions: Light and exposures behind frames, `CaptureBatch.transitions`, where parts that
+            are measured on frames are replaced by their expectation; else None.
+
+    Attributes:
+        tables: Where expectations of all states are worked out.
+    """
+
+    def __init__(
+        self,
+        episodes: Episodes,
+        captures: FrameSource,
+        scorer: CompositeScorer,
+        transitions: FindTransitions | None,
+    ) -> None:
+        super().__init__(episodes)
+        self._captures, self._transitions, self.scorer = captures, transitions, scorer
+        options, expected = episodes.options, transitions is not None
+        self.tables = ScoreTables(
+            episodes.grid,
+            episodes.camera,
+            scorer,
+            noise=bool(options.noise),
+            tolerance=options.tolerance,
+        )
+        self._terms = terms = self.tables.term_scores
+        # Some expectation has no closed form.
+        self._reads_tables = expected and not terms.closed_form
+        self._reads_images = not expected and not terms.closed_form
+        reads_codes = bool(terms.parts) and not expected
+        self.outputs = ("signals",) if self._reads_images else ()
+        if reads_codes or "flicker" in options.costs:  # else no code of every sample is made
+            self.outputs += ("codes",)
+        torch_parts = {} if terms.torch_terms is None else terms.torch_terms.parts
+        self.in_chunks = self._reads_images or any(map(reads_pixels, torch_parts.values()))
+        # By `Episodes.light_index` and state; and which have been scored.
+        count, states = len(episodes.begun), len(episodes.grid)
+        lights = len(episodes.scenes) + count
+        self._known = [n for n, part in torch_parts.items() if depends_on(part) != "image"]
+        self._scores = np.zeros((lights, states, len(self._known)))
+        self._scored = np.zeros((lights, states), bool)
+        self._light_scores: dict[int, dict[str, np.ndarray]] = {}  # by scene
+        self._means = np.full((lights, states, 3), np.nan)
+        self._tables: LruCache[ScoreTable] = LruCache(max(TABLES_BYTES, 128 * count * states))
+
+    def forget(self, lights: np.ndarray) -> None:
+        """Makes the scores under these `Episodes.light_index` unknown."""
+        self._scored[lights] = False
+        self._means[lights] = np.nan
+
+    def measure(
+        self,
+        env_indices: np.ndarray,
+        frames: FrameStatistics,
+        outputs: Mapping[str, np.ndarray],
+        gains: np.ndarray,
+        rows: np.ndarray | None,
+    ) -> dict[str, np.ndarray]:
+        """Scores (B,) by ``score:`` and part, and ``image_mean`` where a cost needs it."""
+        columns: dict[str, np.ndarray] = {}
+        if not self._reads_tables:
+            scores = self._score(env_indices, frames, outputs, gains, rows)
+            columns = {f"score:{name}": values for name, values in scores.items()}
+        if "flicker" in self.episodes.options.costs:
+            flat = outputs["codes"].reshape(len(env_indices), -1)
+            columns["image_mean"] = flat.sum(axis=1, dtype=np.int64) / (255.0 * flat.shape[1])
+        return columns
+
+    def reward(
+        self, env_indices: np.ndarray, columns: dict[str, np.ndarray]
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Terms of the reward by name, and the reward (B,): the score minus weighted costs.
+
+        Takes the scores and the image means out of `columns`, and adds the oracle's.
+        """
+        options, states = self.episodes.options, self.episodes.state[env_indices]
+        tables: list[ScoreTable] = []
+        if self._reads_tables or options.with_oracle:
+            tables = [self.score_table(env_index) for env_index in env_indices.tolist()]
+        if self._reads_tables:  # the expectation takes captures to work out
+            pairs = list(zip(tables, states.tolist(), strict=True))
+            terms = {n: np.array([t.parts[n][s] for t, s in pairs]) for n in self.scorer.parts}
+            terms["score"] = np.array([table.mean[state] for table, state in pairs])
+        else:
+            terms = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
+            terms["score"] = self.scorer.totals(terms)
+        reward = terms["score"].copy()
+        for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
+            terms[name] = cost
+            reward -= options.costs[name] * cost
+        if options.with_oracle:
+            best = np.array([t.mean[t.oracle] for t in tables])
+            columns["oracle_state"] = np.array([t.oracle for t in tables])
+            columns["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
+        return terms, reward
+
+    def _costs(self, env_indices: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
+        """(B,) each; 0 in the first frame of an episode."""
+        episodes, costs = self.episodes, self.episodes.options.costs
+        found: dict[str, np.ndarray] = {}
+        first = episodes.previous[env_indices] < 0
+        if means is not None:
+            change = np.abs(means - episodes.image_mean[env_indices])
+            found["flicker"] = np.where(first, 0.0, change)
+            episodes.image_mean[env_indices] = means
+        if "switch" in costs:
+            now = episodes.grid.controls(episodes.state[env_indices])
+            before = episodes.grid.controls(np.where(first, 0, episodes.previous[env_indices]))
+            found["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
+        return found
+
+    def score_table(self, env_index: int) -> ScoreTable:
+        """Expected scores of all states in the current frame of environment `env_index`."""
+        episodes, lighting = self.episodes, self.episodes.lighting
+        episode = episodes[env_index]
+        gain: float | np.ndarray = 1.0
+        rows = None
+        if lighting.within_frame:
+            moment: tuple[float, ...] = (episode.frame, episode.phase)
+        else:
+            gain = episodes.gain(env_index, 0.0)[0]
+            moment = (gain,)
+        # All that a table depends on: tables of episodes that were seen before are cached.
+        key = (episode.scene, episode.speed, episode.defocus, episode.movement, moment)
+        table = self._tables.get(key)
+        if table is None:
+            if lighting.within_frame:
+                gain, rows = episodes.gains_by_state(env_index)
+            prepared = self._captures.prepared_scene(episodes.light_index.item(env_index))
+            scene = episodes.scenes[episode.scene]
+            table = self.tables.table(scene, gain=gain, row_gain=rows, prepared=prepared)
+            self._tables.put(key, table, table.nbytes)
+        return table
+
+    # -- scores of captures -------------------------------------------------------------------
+
+    def _score(
+        self,
+        env_indices: np.ndarray,
+        frames: FrameStatistics,
+        outputs: Mapping[str, np.ndarray],
+        gains: np.ndarray,
+        rows: np.ndarray | None,
+    ) -> dict[str, np.ndarray]:
+        """Scores (B,) of the captures of `env_indices` by part; the arguments are `measure`'s."""
+        episodes, terms = self.episodes, self._terms
+        boxes = episodes.box_factor[episodes.scene[env_indices]]
+        source_noise = frames.source_noise * np.square(boxes)[:, None, None]
+        captures: Captures | None = None
+        if self._reads_images or not episodes.static or terms.reads_captures:
+            captures = self._describe(env_indices, gains, rows, source_noise)
+        if episodes.static:
+            scores = self._known_scores(env_indices, gains, source_noise)
+        else:
+            assert captures is not None
+            scores = terms.torch_scores(None, captures, "light", "blur")
+        if terms.parts:
+            states = episodes.state[env_indices]
+            if self._transitions is None:
+                means = terms.measured(outputs["codes"], states, source_noise)
+            else:
+                means = self._expected_means(env_indices, self._transitions, boxes, rows)
+            scores |= terms.score(means, captures)
+        if self._reads_images and captures is not None:
+            shown = torch.from_numpy(outputs["signals"]).clamp(0.0, 1.0)
+            scores |= terms.torch_scores(shown, captures, "image")
+        return scores
+
+    def _known_scores(
+        self, env_indices: np.ndarray, gains: np.ndarray, source_noise: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Scores in static light of the parts that look at no frame, cached."""
+        lights = self.episodes.light_index[env_indices]
+        states = self.episodes.state[env_indices]
+        new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
+        if len(new) >= _MANY:
+            described = self._describe(env_indices[new], gains[new], None, source_noise[new])
+            found = self._terms.torch_scores(None, described, "light", "blur")
+            self._scores[lights[new], states[new]] = np.stack(list(found.values()), axis=1)
+            self._scored[lights[new], states[new]] = True
+        else:  # one by one takes longer than all states of a light at once
+            for index, light in zip(env_indices[new].tolist(), lights[new].tolist(), strict=True):
+                found = self._scores_of_light(self.episodes.scene.item(index), light)
+                self._scores[light] = np.stack([found[name] for name in self._known], axis=1)
+                self._scored[light] = True
+        return dict(zip(self._known, self._scores[lights, states].T, strict=True))
+
+    def _scores_of_light(self, scene: int, light: int) -> dict[str, np.ndarray]:
+        """Scores (S,) of the parts that look at no frame; some depend on the scene alone.
+
+        Blur averages the noise of a source, so only scores of light without noise are cached.
+        """
+        shown, prepared = self.episodes.scenes[scene], self._captures.prepared_scene(light)
+        of_light = self._light_scores.get(scene)
+        if of_light is None:
+            of_light = self._terms.closed_form_terms(shown, prepared, "light")
+            if prepared.nlf.is_zero:
+                self._light_scores[scene] = of_light
+        return of_light | self._terms.closed_form_terms(shown, prepared, "blur")
+
+    def _expected_means(
+        self,
+        env_indices: np.ndarray,
+        transitions: FindTransitions,
+        boxes: np.ndarray,
+        rows: np.ndarray | None,
+    ) -> np.ndarray:
+        """`TermScores.expected` of the captures; in static light, cached."""
+        episodes = self.episodes
+        lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
+        missing = np.isnan(self._means[lights, states, 0]) | (not episodes.static)
+        if missing.any():
+            exposed = transitions(lights[missing], states[missing])
+            some = None if rows is None else rows[missing]
+            found = self._terms.expected(exposed, states[missing], boxes[missing], some)
+            self._means[lights[missing], states[missing]] = found
+        return self._means[lights, states]
+
+    def _describe(
+        self,
+        env_indices: np.ndarray,
+        gains: np.ndarray,
+        rows: np.ndarray | None,
+        source_noise: np.ndarray,
+    ) -> Captures:
+        episodes = self.episodes
+        scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
+        light = noises = None
+        if not self.in_chunks:
+            light = torch.empty(1).expand(len(env_indices), *scenes[0].light.shape)
+        if source_noise.any():
+            noises = [NoiseLevelFunction(tuple(s), tuple(r)) for s, r in source_noise.tolist()]
+        return describe_captures(
+            scenes,
+            [episodes.grid[state] for state in episodes.state[env_indices].tolist()],
+            episodes.camera,
+            speed=episodes.speed[env_indices],
+            defocus=episodes.defocus[env_indices],
+            movements=[episodes[index].movement for index in env_indices.tolist()],
+            gain=gains,
+            row_gain=rows,
+            light=light,
+            source_noise=noises,
+            noisy=self.tables.noise,
+        )
 
 
 class AutoExposureBase(SpecProperty):
@@ -228,7 +491,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
-    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise.generator`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
+    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.capture.sensor`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |

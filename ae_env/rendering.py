@@ -14,11 +14,12 @@ from PIL import Image, ImageDraw, ImageFont
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
 from ae_env.scenes.scene import Scene
+from ae_env.scorers.captures import prepare_scene
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.registry import make_scorer
-from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator.camera import CameraProfile
-from simulator.optics.motion_path import ALONG_ROWS, Movement
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.develop import develop
 from simulator.settings import CameraSettings, format_exposure_time
 
@@ -364,13 +365,8 @@ def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
     """Corners of a five-pointed star."""
     angles = np.arange(10) * np.pi / 5
     radii = np.where(np.arange(10) % 2, 0.4 * radius, radius)
-    return list(
-        zip(
-            (x + radii * np.sin(angles)).tolist(),
-            (y - radii * np.cos(angles)).tolist(),
-            strict=True,
-        )
-    )
+    corners = np.stack([x + radii * np.sin(angles), y - radii * np.cos(angles)], axis=1)
+    return [(column, row) for column, row in corners.tolist()]
 
 
 def _fitting_font(draw: ImageDraw.ImageDraw, line: str, size: int, width: int) -> Any:

@@ -71,10 +71,9 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     )
     with tempfile.TemporaryDirectory() as folder:
         results = run_plan(plan, folder)
-    (rank,) = overall_ranking(results)
-    gains = {light: results[light].group_gains(rank.policy) for light in LIGHTS}
-    row: Row = {"variant": variant, "score": rank.score.value, "ci95": rank.score.pair}
-    row["by_light"] = {k: float(g.mean(axis=0).sum() / s.sum()) for k, (g, s) in gains.items()}
+    rank = overall_ranking(results).iloc[0]
+    row: Row = {"variant": variant, "score": rank.normalised_score, "ci95": rank.ci95}
+    row["by_light"] = {light: results[light].normalised(rank.policy) for light in LIGHTS}
     return row | {"training_s": seconds, "curve": load_curve(sibling(out, ".csv"))}
 
 

@@ -141,7 +141,8 @@ def ratio_rows(scene: str, frames: dict[int, RawImage]) -> list[Row]:
 
 def _blocks(data: np.ndarray, reduce: Any = np.mean) -> np.ndarray:
     height, width = (n - n % BLOCK for n in data.shape[1:])
-    return block_reduce(data[:, :height, :width].astype(np.float64), (1, BLOCK, BLOCK), reduce)
+    reduced: Any = block_reduce
+    return reduced(data[:, :height, :width].astype(np.float64), (1, BLOCK, BLOCK), reduce)
 
 
 def denoised_scenes(source: RawImage) -> dict[str, PreparedScene]:
@@ -167,7 +168,8 @@ def transition_rows(
     exposed = found["exposure only"][0]
     # Rows and columns [packed pixel] by which the simulation must move to lie on the real frame.
     greens = (np.sqrt(np.clip(frame[1], 0.0, 1.0)) for frame in (real, exposed.numpy()))
-    shift = phase_cross_correlation(*greens, upsample_factor=20)[0]
+    registered: Any = phase_cross_correlation
+    shift = registered(*greens, upsample_factor=20)[0]
     whole = round(float(shift[0])), round(float(shift[1]))
     ratio = exposure_ratio(source.settings, target)
     own_variance = ratio**2 * noise_variance(source.data, source.noise)

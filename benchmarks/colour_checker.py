@@ -118,12 +118,11 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
     # light, vignetting and the camera's linearity drop out; veiling glare does not.
     luminance = lab_to_luminance(linear_srgb_to_lab(linear))
     even = linear * (lab_to_luminance(lab) / luminance)[:, None]
+    delta_e: Any = deltaE_ciede2000
     errors = {
-        "delta_e_2000": deltaE_ciede2000(shown, lab),
-        "delta_e_2000_without_gamut_clip": deltaE_ciede2000(
-            linear_srgb_to_lab(linear * scale), lab
-        ),
-        "delta_e_2000_at_published_luminance": deltaE_ciede2000(linear_srgb_to_lab(even), lab),
+        "delta_e_2000": delta_e(shown, lab),
+        "delta_e_2000_without_gamut_clip": delta_e(linear_srgb_to_lab(linear * scale), lab),
+        "delta_e_2000_at_published_luminance": delta_e(linear_srgb_to_lab(even), lab),
     }
     rows = []
     for k, i in enumerate(order):

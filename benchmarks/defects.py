@@ -19,10 +19,10 @@ from scipy.optimize import nnls
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.measures import luma_of
-from agents.cli.console import console
+from agents.cli.console import print_line
 from benchmarks.harness import Part, Report, Row, benchmark, interval, pivot, table
 from simulator import develop, exposure_ratio, get_camera
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 from simulator.raw.develop import GREY_CARD_SIGNAL
 
 CAMERA = "nikon_z6"
@@ -203,7 +203,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
     for name, knots in maps.items():
         columns = ", ".join(repr(column) for column in zip(*knots, strict=True))
-        console.print(f'"{name}": ({columns}),', soft_wrap=True, highlight=False, markup=False)
+        print_line(f'"{name}": ({columns}),')
     rows = [row for test in tests for row in test["rows"]]
     fits = [
         {"part": "map", "name": n, "knots": knots, "in_use": KNOTS[n]} for n, knots in maps.items()

@@ -239,7 +239,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         row: Row = {"part": "summary", "method": name, "cases": len(own), "gain_db": gains.mean()}
         row |= {"gain_db_10_percent": gains.quantile(0.1), "gain_db_worst": gains.min()}
         row |= {"to_bm3d_db": differences.mean(), "ci95": interval(differences)}
-        row |= own[["green_kept", "milliseconds"]].median().to_dict()
+        row |= {key: own[key].median() for key in ("green_kept", "milliseconds")}
         summary.append(row | {"flat": shifts.get(name)})
     means = cases.groupby(["iso", "ev", "method"], sort=False)["gain_db"].mean().reset_index()
     means = means.sort_values(["iso", "ev"], ascending=[True, False], kind="stable")

@@ -32,11 +32,13 @@ from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator import CameraProfile
 from simulator.reference.camera import ReferenceScene
+from simulator.utils import files as result_files
 from simulator.utils.cache import Store, cache_key
-from simulator.utils.files import data_folder as data_root
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
+#: The folder of real files, if there is one.
+data_root = result_files.data_folder
 #: Content of the cells by heading; or as text: ``"heading = content | heading = content"``.
 Columns = str | Mapping[str, Cell]
 #: Significant digits of numbers in result files.
@@ -114,7 +116,7 @@ class Report:
         figures: Pictures by file name beside the page (``"throughput.png"``), or by path.
     """
 
-    rows: Sequence[Row]
+    rows: Sequence[Mapping[Any, Any]]
     tables: Mapping[str, str] = field(default_factory=dict)
     meta: Mapping[str, Any] = field(default_factory=dict)
     figures: Mapping[str | Path, Figure] = field(default_factory=dict)
@@ -330,12 +332,12 @@ def columns_of(columns: Columns) -> Mapping[str, Cell]:
     return {heading: content for heading, _, content in pairs}
 
 
-def _words(row: Row) -> Row:
+def _words(row: Mapping[Any, Any]) -> Row:
     answers = ("no", "yes")
     return {k: answers[bool(v)] if isinstance(v, bool | np.bool_) else v for k, v in row.items()}
 
 
-def table(rows: Iterable[Row], columns: Columns) -> str:
+def table(rows: Iterable[Mapping[Any, Any]], columns: Columns) -> str:
     """A Markdown table with a line for each row, see `agents.report.evaluation.to_markdown`.
 
     Columns that are empty in every row are left out; what is true or false is "yes" or "no".
@@ -343,7 +345,7 @@ def table(rows: Iterable[Row], columns: Columns) -> str:
     return to_markdown(map(_words, rows), columns_of(columns), missing="")
 
 
-def pivot(rows: Iterable[Row], line: Columns, group: Cell, contents: Columns) -> str:
+def pivot(rows: Iterable[Mapping[Any, Any]], line: Columns, group: Cell, contents: Columns) -> str:
     """A Markdown table with a line for each value of one thing and columns for those of another.
 
     Args:

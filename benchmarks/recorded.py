@@ -164,9 +164,8 @@ def _compared(
                 state["noise_error_stops"] = abs(float(np.log2(ours / theirs)))
             states.append(state)
         frame = pd.DataFrame(states)
-        stops = pd.cut(
-            np.log2(ratios)[others], [*STOPS.values(), np.inf], False, labels=list(STOPS)
-        )
+        bounds, apart = [*STOPS.values(), np.inf], np.log2(ratios)[others]
+        stops = pd.Series(pd.cut(apart, bounds, False, labels=list(STOPS)))
         by_stops = frame.groupby(stops, observed=False)[["psnr_db", "ceiling_db"]].median()
         row: Row = {"method": method, "states": len(others) + 1, "source_state": str(grid[source])}
         row |= {"known_share": float(known.float().mean()), **frame.median()}

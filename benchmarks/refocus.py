@@ -28,7 +28,7 @@ from benchmarks.harness import (
     table,
 )
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
-from simulator.optics.disc_bank import DiscBank, added_blur
+from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
 

@@ -27,8 +27,7 @@ import ae_env  # noqa: F401  registers the environment
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
-from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import prepare_scene
+from ae_env.scorers.captures import describe_captures, prepare_scene
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, recorded, ssim, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
@@ -185,8 +184,8 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
             found.append(row)
     rows = []
     known_pairs = pd.DataFrame(found).dropna().groupby(["scorer", "reference"], sort=False)
-    for (name, reference), own in known_pairs:
-        row = {"scorer": name, "reference": reference, "num_scenes": len(own)}
+    for (one, reference), own in known_pairs:
+        row = {"scorer": one, "reference": reference, "num_scenes": len(own)}
         for key in ("spearman", "pearson"):
             row |= {key: own[key].mean(), f"{key}_sd": own[key].std(ddof=0)}
         rows.append(row | {"positive": float((own["spearman"] > 0).mean())})

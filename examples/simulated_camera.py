@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.scenes import Scene
-from ae_env.scorers.score_table import prepare_scene
+from ae_env.scorers.captures import prepare_scene
 from simulator.camera import CameraProfile
 from simulator.raw.image import unpack_mosaic
 from simulator.settings import CameraSettings

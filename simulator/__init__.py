@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from simulator.settings import incident_ev100 as incident_ev100
     from simulator.settings import sensor_signal as sensor_signal
 
+#: Version of the three packages, which are installed together.
+__version__ = "0.2.0"
+
 #: Module of each public name; loaded when the name is first used, so that importing is fast.
 _MODULES = {
     "camera": ["BayerPattern", "CameraProfile", "get_camera", "list_cameras"],

@@ -23,7 +23,7 @@ from simulator.camera import CameraProfile, get_camera
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 from simulator.raw.develop import develop, develop_inverse
 from simulator.raw.image import check_packed
 from simulator.settings import CameraSettings

@@ -25,7 +25,14 @@ from simulator.capture.blurred_light import (
 )
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
-from simulator.capture.sensor import Transitions, exposed_light, record
+from simulator.capture.sensor import (
+    Noise,
+    Transitions,
+    check_noise,
+    exposed_light,
+    record,
+    sweep_keys,
+)
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
@@ -38,7 +45,6 @@ from simulator.networks.noise_module import (
     smoothed,
     variance_map,
 )
-from simulator.noise.generator import Noise, check_noise, sweep_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
@@ -55,7 +61,7 @@ Source = RawImage | PreparedScene | HasPrepared
 _NOISE_HALO, _MAP_HALO = 80, 56
 #: Size of the raw that a network's time is measured on [packed pixel].
 _TIMED = 128
-#: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
+#: How far the largest disc of `simulator.optics.discs` reaches [pixel].
 _DISC_REACH = 16
 
 

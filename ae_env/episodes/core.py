@@ -8,16 +8,14 @@ are the functions of a `Task`.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ae_env.episodes.lookup import LookupBatch
-from ae_env.episodes.scores import AutoExposure, FindTransitions
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.observation import (
     HISTOGRAM_BINS,
@@ -29,26 +27,19 @@ from ae_env.observation import (
 )
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
+from ae_env.scorers.captures import in_episode, prepare_scene
 from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
+from ae_env.scorers.score_table import ScoreTable
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.noise.generator import Noise
-from simulator.optics.disc_bank import DIAMETERS
+from simulator.capture.sensor import Noise, Transitions
+from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
 LIGHT_CACHE_BYTES = 256 * 2**20
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
-#: How the noise is made, by the environment's argument.
-_NOISES: dict[bool | str, Noise | None] = {
-    False: None,
-    True: "bank",
-    "bank": "bank",
-    "exact": "exact",
-    "sensor": "sensor",
-}
 #: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
 _DTYPES = {"codes": np.uint8, "signals": np.float32, "numbers": np.uint16}
 _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": "numbers"}
@@ -72,8 +63,14 @@ class Frames:
     raw: np.ndarray
 
 
-class Task(Protocol):
+class Task:
     """What an action does and what a frame is worth, as functions of running episodes.
+
+    Here every action takes a frame, moves nothing else, and no episode ends by itself; a task gives
+    at least `measure`, `reward` and `score_table`.
+
+    Args:
+        episodes: The episodes, with their scenes and options.
 
     Attributes:
         num_actions: Number of actions; those below the number of states take a frame there.
@@ -81,12 +78,16 @@ class Task(Protocol):
         in_chunks: Whether `measure` reads so much that it takes small batches.
     """
 
-    num_actions: int
-    outputs: tuple[str, ...]
-    in_chunks: bool
+    outputs: tuple[str, ...] = ()
+    in_chunks = False
+
+    def __init__(self, episodes: Episodes) -> None:
+        self.episodes = episodes
+        self.num_actions = len(episodes.grid)
 
     def spaces(self) -> dict[str, gym.Space[Any]]:
         """Spaces of `observation`."""
+        return {}
 
     def initial(self, env_indices: np.ndarray, options: Sequence[Mapping[str, Any]] | None) -> None:
         """Sets up the episodes that were drawn for `env_indices` (K,) with the reset's options."""
@@ -95,7 +96,9 @@ class Task(Protocol):
         """Drops what was worked out under these `Episodes.light_index`."""
 
     def allowed(self, env_indices: np.ndarray) -> np.ndarray:
-        """(B, A) bool: actions that each of the episodes allows now."""
+        """(B, A) bool: actions that the episodes allow now; all of them before the first reset."""
+        scenes, begun = self.episodes.scene[env_indices], self.episodes.begun[env_indices, None]
+        return self.episodes.allowed[scenes] | ~begun
 
     def transition(
         self, env_indices: np.ndarray, actions: np.ndarray
@@ -105,15 +108,19 @@ class Task(Protocol):
         Returns:
             (K,) bool, which of them take a frame; and the episodes whose `displaced` changed.
         """
+        return np.ones(len(env_indices), bool), env_indices[:0]
 
     def terminal(self, env_indices: np.ndarray, takes: np.ndarray) -> np.ndarray:
         """(K,) bool: which episodes have ended, after the actions of which `takes` took a frame."""
+        return ~takes
 
     def displaced(self, env_index: int) -> Scene | None:
         """The scene of an episode where its subject has moved since the first frame; else None."""
+        return None
 
     def observation(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
         """What is observed beside the latest frame, (B, ...) by name."""
+        return {}
 
     def measure(
         self,
@@ -132,21 +139,25 @@ class Task(Protocol):
             gains: (B,) light relative to the scenes' own.
             rows: (B, R) light of each row relative to that, or None; see `Captures`.
         """
+        raise NotImplementedError
 
     def reward(
         self, env_indices: np.ndarray, columns: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Terms of the reward by name, and the reward (B,); `columns` become those of the info."""
+        raise NotImplementedError
 
     def columns(self) -> dict[str, np.ndarray]:
         """The task's own columns of the episodes, by name, n long: a pickle holds them."""
+        return {}
 
     def score_table(self, env_index: int) -> ScoreTable:
         """Expected scores of all states in the current frame of environment `env_index`."""
+        raise NotImplementedError
 
 
-#: Constructor of a task, from the episodes, the source of their frames, the scorer, and light and
-#: exposures behind frames where rewards are expectations.
+#: `CaptureBatch.transitions`: light and exposures behind the frames of scenes (B,) at states (B,).
+FindTransitions = Callable[[np.ndarray, np.ndarray], Transitions]
 #: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
 #: and exposures behind frames where rewards are expectations.
 MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
@@ -169,7 +180,7 @@ class EpisodeCore:
         self,
         options: EnvOptions,
         num_envs: int,
-        make_task: MakeTask = AutoExposure,
+        make_task: MakeTask,
         scenes: Sequence[Scene] | None = None,
     ) -> None:
         self.options, self._make_task = options, make_task
@@ -189,34 +200,30 @@ class EpisodeCore:
         if options.recorded is not None:  # a recorded capture is its own expectation
             self._captures = LookupBatch(self.scenes, self._prepared, self.camera)
         else:
-            frame_bytes = 16 * options.resolution**2
+            noise: Noise | None = "bank" if options.noise is True else options.noise or None
+            light_bytes = num_envs * self._cached_frames() * 16 * options.resolution**2
             batch = self._captures = CaptureBatch(
                 self._prepared,
                 len(self.scenes) + num_envs,
                 states,
                 self.camera,
-                noise=_NOISES[options.noise],
-                cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
+                noise=noise,
+                cache_light=light_bytes <= LIGHT_CACHE_BYTES,
             )
             transitions = batch.transitions if options.reward == "expected" else None
         self.task = make_task(episodes, self._captures, scorer, transitions)
         self.num_actions = self.task.num_actions
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._arguments(), *self._progress())
+        return _restored, self._restorable(None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeCore:
-        progress = copy.deepcopy(self._progress(), memo)
-        return _restored({**self._arguments(), "scenes": self.scenes}, *progress)
+        return _restored(*self._restorable(self.scenes))
 
-    def _arguments(self) -> dict[str, Any]:
-        """Arguments of the constructor."""
-        count = len(self.episodes.begun)
-        return {"options": self.options, "num_envs": count, "make_task": self._make_task}
-
-    def _progress(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Where the episodes are."""
-        return self.episodes.columns(), self.task.columns()
+    def _restorable(self, scenes: Sequence[Scene] | None) -> tuple[Any, ...]:
+        """Arguments of `_restored`, which copies the columns."""
+        arguments = self.options, len(self.episodes.begun), self._make_task, scenes
+        return arguments, self.episodes.columns(), self.task.columns()
 
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
@@ -264,13 +271,7 @@ class EpisodeCore:
         rngs: Sequence[np.random.Generator],
         options: Sequence[Mapping[str, Any]] | None = None,
     ) -> None:
-        """Draws new episodes for `env_indices` (K,); those that ran there end.
-
-        Args:
-            env_indices: The environments.
-            rngs: K generators.
-            options: See `Episodes.draw`.
-        """
+        """Draws new episodes for `env_indices` (K,), as `Episodes.draw`; those there end."""
         drawn = self.episodes.draw(rngs, options)
         self._forget(env_indices)
         self.episodes.begin(env_indices, drawn)
@@ -384,22 +385,20 @@ class EpisodeCore:
         env_index = light_index - len(self.scenes)
         if env_index < 0:
             return self._prepared_at_rest(light_index)
-        episode = self.episodes[env_index]
-        displaced = self.task.displaced(env_index)
+        episode, displaced = self.episodes[env_index], self.task.displaced(env_index)
         if displaced is None:
             return in_episode(self._prepared_at_rest(episode.scene), **episode.moves)
-        return self._with_tolerance(prepare_scene(displaced, self.camera, **episode.moves))
+        prepared = prepare_scene(displaced, self.camera, **episode.moves)
+        return prepared.changed(tolerance=self.options.tolerance)
 
     def _prepared_at_rest(self, scene: int) -> PreparedScene:
         prepared = self._at_rest.get(scene)
         if prepared is None:
-            prepared = self._with_tolerance(prepare_scene(self.scenes[scene], self.camera))
+            prepared = prepare_scene(self.scenes[scene], self.camera)
+            prepared = prepared.changed(tolerance=self.options.tolerance)
             if prepared.aperture_blur is None:  # which caches too much light to stay for long
                 self._at_rest[scene] = prepared
         return prepared
-
-    def _with_tolerance(self, prepared: PreparedScene) -> PreparedScene:
-        return prepared.changed(tolerance=self.options.tolerance)
 
     # -- what is known of an episode ----------------------------------------------------------
 
@@ -442,9 +441,9 @@ def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _restored(
-    arguments: dict[str, Any], episodes: dict[str, np.ndarray], task: dict[str, np.ndarray]
+    arguments: tuple[Any, ...], episodes: dict[str, np.ndarray], task: dict[str, np.ndarray]
 ) -> EpisodeCore:
-    core = EpisodeCore(**arguments)
+    core = EpisodeCore(*arguments)
     core.episodes.resume(episodes)
     for name, values in core.task.columns().items():
         values[:] = task[name]

@@ -17,7 +17,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 from simulator.utils.checks import check_integer, did_you_mean
 
 #: Share of the episodes in which nothing moves.
@@ -76,7 +76,7 @@ class Episode:
 
     @property
     def moves(self) -> dict[str, Any]:
-        """Arguments of `ae_env.scorers.score_table.prepare_scene` that blur depends on."""
+        """Arguments of `ae_env.scorers.captures.prepare_scene` that blur depends on."""
         return {"speed": self.speed, "defocus": self.defocus, "movement": self.movement}
 
 
@@ -213,7 +213,8 @@ class Episodes:
         """
         chosen = [self._chosen(one) for one in options or ()]  # errors come before any draw
         uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
-        which, start, moving, speed, defocus, phase, seed, *motion = uniforms
+        which, start, moving, speed, defocus, phase, seed, direction, turn, *own = uniforms
+        apart, subject_speed, subject_direction = own
         place = (which * len(self._firsts)).astype(np.int64)
         frame = np.zeros(len(rngs), np.int64)
         for i, one in enumerate(chosen):
@@ -227,10 +228,22 @@ class Episodes:
         discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
         discs = _fixed_or_drawn(self.options.depth, discs)
         own_blur = self._own_blur[scene] * 64.0 / self.options.resolution
+        # Either may rest where both could move: a camera on a tripod, a subject that waits.
+        moves = moving >= STATIC_SHARE
+        subject_moves = moves & self._has_subject[scene] & (apart < SUBJECT_SHARE)
+        shakes = moves & ~(subject_moves & (apart < ALONE_SHARE))
+        if self.options.motion != "random":  # one speed of the whole image
+            subject_moves = np.zeros(len(scene), bool)
+        median = self._median_speed[scene]
+        shake, subject = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
         return {
             "scene": self._shown_at(scene, frame),
             "state": state,
-            **self._draw_motion(scene, moving, speed, *motion),
+            "speed": _fixed_or_drawn(self.options.motion, shakes * shake * median),
+            "direction": 2.0 * math.pi * direction,
+            "turn": TURN_SIGMA * ndtri(turn),
+            "subject_speed": subject_moves * subject * median,
+            "subject_direction": 2.0 * math.pi * subject_direction,
             "defocus": discs,
             "focus_drive": np.hypot(discs, own_blur),
             "phase": phase,
@@ -238,49 +251,17 @@ class Episodes:
             "frame": frame,
         }
 
-    def _draw_motion(
-        self,
-        scene: np.ndarray,
-        moving: np.ndarray,
-        speed: np.ndarray,
-        direction: np.ndarray,
-        turn: np.ndarray,
-        apart: np.ndarray,
-        subject_speed: np.ndarray,
-        subject_direction: np.ndarray,
-    ) -> dict[str, np.ndarray]:
-        """Columns of the motion in `scene` (K,), from K uniform numbers each."""
-        speeds = self._median_speed[scene]
-        shake, own = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
-        # Either may rest where both could move: a camera on a tripod, a subject that waits.
-        moves = moving >= STATIC_SHARE
-        subject_moves = moves & self._has_subject[scene] & (apart < SUBJECT_SHARE)
-        shakes = moves & ~(subject_moves & (apart < ALONE_SHARE))
-        if self.options.motion != "random":  # one speed of the whole image
-            subject_moves = np.zeros(len(scene), bool)
-        return {
-            "speed": _fixed_or_drawn(self.options.motion, shakes * shake * speeds),
-            "direction": 2.0 * math.pi * direction,
-            "turn": TURN_SIGMA * ndtri(turn),
-            "subject_speed": subject_moves * own * speeds,
-            "subject_direction": 2.0 * math.pi * subject_direction,
-        }
-
     def _chosen(self, options: Mapping[str, Any]) -> dict[str, int]:
         """The entries of the options of a reset as integers."""
         found = {name: options[name] for name in OPTIONS if options.get(name) is not None}
-        wanted = found.get("scene")
-        if isinstance(wanted, str) and wanted in self._index:
-            found["scene"] = self._index[wanted]
-        hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
-        ids = f", or a scene id, such as {self._ids[0]!r}{hint}"
-        limits = {
-            "scene": (len(self._ids) - 1, ids),
-            "state": (len(self.grid) - 1, ""),
-            "frame": (MAX_FRAME, ""),
-        }
+        limits = {"scene": len(self._ids), "state": self.allowed.shape[1], "frame": MAX_FRAME + 1}
         for name, value in found.items():
-            most, rule = limits[name]
+            rule = ""
+            if name == "scene":
+                hint = did_you_mean(value, self._ids) if isinstance(value, str) else ""
+                rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
+                value = self._index.get(value, value) if isinstance(value, str) else value
+            most = limits[name] - 1
             found[name] = check_integer(f"options[{name!r}]", value, 0, most, more=rule)
         return found
 
@@ -362,15 +343,10 @@ class Episodes:
     # -- the light of the current frames ------------------------------------------------------
 
     def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure in the current frame of an episode, relative to its scene's own.
-
-        Args:
-            env_index: Which episode.
-            exposure_time: Time the shutter is open [s].
+        """Light of an exposure [s] in the current frame of an episode, relative to its scene's own.
 
         Returns:
-            That of the frame, and (R,) that of each row relative to it; None where all rows have
-            the same.
+            That of the frame, and (R,) that of each row relative to it, or None (`Lighting.rows`).
         """
         frame, phase = self.frame.item(env_index), self.phase.item(env_index)
         if not self.lighting.within_frame:
@@ -382,11 +358,7 @@ class Episodes:
     def gains(
         self, env_indices: np.ndarray, exposure_times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """`gain` of one exposure of each of `env_indices` (B,).
-
-        Returns:
-            (B,) and (B, R); None where all rows of all frames are alike.
-        """
+        """`gain` of one exposure of each of `env_indices` (B,): (B,), and (B, R) or None."""
         pairs = zip(env_indices.tolist(), exposure_times.tolist(), strict=True)
         return _stacked([self.gain(env_index, time) for env_index, time in pairs])
 
@@ -398,11 +370,7 @@ class Episodes:
 
 
 def check_options(options: Any, *more: str) -> dict[str, Any]:
-    """The options of a reset as a dictionary of its own.
-
-    Args:
-        options: The options of `reset`: None or a mapping.
-        more: Names that are allowed beside those of `OPTIONS`.
+    """The options of a reset, None or a mapping of names in `OPTIONS` and `more`, as a dictionary.
 
     Raises:
         ValueError: If there is another name, or it is no mapping.

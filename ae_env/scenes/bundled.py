@@ -18,7 +18,7 @@ import torch
 
 from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.depth import draw_layout
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
 from simulator.radiance.procedural import (
@@ -74,8 +74,6 @@ def bundled_scenes(
 ) -> SceneSet:
     """The bundled scenes of a split, from the cache where they have been made before.
 
-    Else those of one split are drawn when they are needed (`DrawnScenes`).
-
     Args:
         request: Split, camera, resolution and crop; without a resolution they have 256 pixels.
         size: ``"small"``: only `SMALL_GROUPS` groups of each kind and split; ``"large"``:
@@ -85,40 +83,33 @@ def bundled_scenes(
     if request.split == "all":
         halves = [replace(request, split=split) for split in ("train", "test")]
         return SceneSet([s for half in halves for s in bundled_scenes(half, size=size, part=part)])
-    kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
-    key = cache_key(
-        "scenes",
-        {
-            "generator": GENERATOR_VERSION,
-            "format": _FORMAT,
-            "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
-            "photographs": [p.name for p in PHOTOGRAPHS],
-            "camera": request.camera.name,
-            "colour_matrix": request.camera.colour_matrix,
-            "split": request.split,
-            "resolution": request.resolution,
-            "crop": request.crop,
-            "size": size if request.split == "train" or size == "small" else "normal",
-            "part": part,
-        },
-    )
-    found = _stored(key, request.camera, request.resolution)
+    key = {
+        "generator": GENERATOR_VERSION,
+        "format": _FORMAT,
+        "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
+        "photographs": [p.name for p in PHOTOGRAPHS],
+        "camera": request.camera.name,
+        "colour_matrix": request.camera.colour_matrix,
+        "split": request.split,
+        "resolution": request.resolution,
+        "crop": request.crop,
+        "size": size if request.split == "train" or size == "small" else "normal",
+        "part": part,
+    }
+    key_of_all = cache_key("scenes", key)
+    found = _stored(key_of_all, request.camera, request.resolution)
     if found is not None:
         return SceneSet(found)
+    kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
     groups = list(_groups(request, size, kinds))
-    return DrawnScenes(f"the bundled scenes ({request.split})", groups, key)
+    return DrawnScenes(f"the bundled scenes ({request.split})", groups, key_of_all)
 
 
 # -- drawing --------------------------------------------------------------------------------------
 
 
 class SceneGroup(NamedTuple):
-    """Scenes that are drawn together.
-
-    Args:
-        scene_ids: Their names.
-        draw: Draws them, always the same ones.
-    """
+    """Names of scenes that are drawn together, and what draws them, always the same ones."""
 
     scene_ids: Sequence[str]
     draw: Callable[[], Iterable[Scene]]
@@ -128,12 +119,7 @@ class DrawnScenes(SceneSet):
     """Scenes whose names are known, and each of which is drawn when it is first needed.
 
     The first is drawn at once, so that what cannot be drawn is an error here. When the last one is
-    there, all are stored for the next process. A pickled copy has all of them.
-
-    Args:
-        name: What they are, in messages.
-        groups: What draws them, in order.
-        key: The key in the cache that they are stored under.
+    there, all are stored under `key` for the next process. A pickled copy has all of them.
     """
 
     def __init__(self, name: str, groups: Sequence[SceneGroup], key: str) -> None:
@@ -199,30 +185,20 @@ def _draw_procedural(kind: str, index: int, name: str, request: SceneRequest) ->
     drawing = draw(kind, np.random.default_rng([zlib.crc32(kind.encode()), index]))
     speed = MOTION_SPEED if kind == "motion" else DEFAULT_SPEED
     facts = {"kind": kind, "hard": kind in HARD_KINDS, "median_speed": speed}
-    return [_scene(drawing, name, name, "procedural, ae-env (MIT)", request, **facts)]
+    return [_scene(drawing, request, scene_id=name, source="procedural, ae-env (MIT)", **facts)]
 
 
 def _draw_photograph(photograph: Photograph, request: SceneRequest) -> list[Scene]:
-    source = f"scikit-image {photograph.file}: {photograph.credit}"
+    facts = {"group": photograph.name, "kind": KINDS[-1]}
+    facts["source"] = f"scikit-image {photograph.file}: {photograph.credit}"
     drawings = zip(photograph.scene_ids, photograph_drawings(photograph), strict=True)
-    return [
-        _scene(drawing, name, photograph.name, source, request, kind=KINDS[-1])
-        for name, drawing in drawings
-    ]
+    return [_scene(drawing, request, scene_id=name, **facts) for name, drawing in drawings]
 
 
-def _scene(
-    drawing: Drawing, name: str, group: str, source: str, request: SceneRequest, **facts: Any
-) -> Scene:
+def _scene(drawing: Drawing, request: SceneRequest, **facts: Any) -> Scene:
+    light, lux, illuminant = drawing.light, drawing.illuminance, drawing.illuminant
     scene = Scene.from_radiance(
-        drawing.light,
-        request.camera,
-        scene_id=name,
-        group=group,
-        illuminance=drawing.illuminance,
-        illuminant=drawing.illuminant,
-        source=source,
-        **facts,
+        light, request.camera, illuminance=lux, illuminant=illuminant, **facts
     )
     return add_layout(scene).resized(request.resolution, request.crop)
 
@@ -240,11 +216,9 @@ def cached_scenes(
 ) -> list[Scene]:
     """Scenes without noise of `camera`, from the cache where they have been made before.
 
-    All of them have a layout, or none.
-
     Args:
         key: Of all that they depend on (`simulator.utils.cache.cache_key`).
-        make: Makes them, all of one size.
+        make: Makes them, all of one size, all with a layout or none.
         camera: In whose colours they are.
         resolution: Packed pixels a side; None for `NATIVE_SIZE`.
     """
@@ -296,11 +270,7 @@ def _stored(key: str, camera: CameraProfile, resolution: int | None) -> list[Sce
         layouts = [None] * len(facts) if stored is None else map(_from_bytes, stored)
         return [
             Scene.from_array(
-                own.float(),
-                CameraSettings(*row.pop("reference")),
-                camera,
-                layout=layout,
-                **row,
+                own.float(), CameraSettings(*row.pop("reference")), camera, layout=layout, **row
             )
             for row, own, layout in zip(facts, light, layouts, strict=True)
         ]

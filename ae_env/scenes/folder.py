@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import csv
 import glob
-import hashlib
 import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -32,13 +32,14 @@ from simulator.radiance.light import camera_from_srgb, mean_anchor
 from simulator.radiance.maps import (
     RADIANCE_SUFFIXES,
     assumed_ev100,
+    hash_fraction,
     map_views,
     near_one,
     read_radiance,
 )
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw
-from simulator.utils.checks import check_flag, check_number, check_word
+from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 
@@ -53,7 +54,7 @@ TRAIN_SHARE = 0.7
 BURST_SECONDS = 30.0
 #: Shots up to this far apart [s] are of one subject if they look alike.
 SESSION_SECONDS = 300.0
-#: From this similarity on, two shots look alike (see `similarity`).
+#: From this Bhattacharyya coefficient of their histograms on (1 if equal), two shots look alike.
 ALIKE = 0.5
 #: Most file names in a log line about files that were skipped.
 _MOST_NAMES = 5
@@ -90,10 +91,8 @@ class FolderOptions:
         for value in lux.values() if isinstance(lux, Mapping) else [lux]:
             if value is not None:
                 check_number("illuminance", value, 1e-6, 1e9, more=" lux")
-        if self.kind is not None and not isinstance(self.kind, str):
-            raise ValueError(f"`kind` (={self.kind!r}) must be a name or None")
-        if self.hard is not None:
-            check_flag("hard", self.hard)
+        check_type("kind", self.kind, str, None)
+        check_type("hard", self.hard, bool, None)
         if self.median_speed is not None:
             check_number("median_speed", self.median_speed, 0.0, 1e6, more=" frame heights / s")
         if self.ev100 is not None:
@@ -105,17 +104,18 @@ class FolderOptions:
         if isinstance(lux, Mapping):
             lux = lux.get(path.name)
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
-        given["illuminance"] = lux
-        if not _is_raw(path):
-            given["ev100"] = self.ev100
+        given |= {"illuminance": lux, "ev100": None if _is_raw(path) else self.ev100}
         return {name: value for name, value in given.items() if value is not None}
+
+
+NOTHING_KNOWN = FolderOptions()
 
 
 # -- scenes ---------------------------------------------------------------------------------------
 
 
 def folder_scenes(
-    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
+    spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
     """The scenes of a split among the user's files.
 
@@ -125,27 +125,28 @@ def folder_scenes(
         options: Facts about the files that the caller knows.
 
     Raises:
-        ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
-            if no file can), or the split is ``"train"`` and there are too few groups to hold any
-            out.
+        ValueError: If a file cannot be read (with ``on_error="skip"`` only if no file can), or
+            there are too few groups to train on.
     """
     base, files = find_files(spec)
     named = _named_groups(sorted({base, *(p.parent for p in files)}))
-    if request.split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
-        raise _too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    groups = {path: named.get(path.resolve()) or _sub_folder(path, base) for path in files}
-    return _read_files(spec, base, groups, options or FolderOptions(), request, hint=_HOW_TO_SKIP)
+    _check_training_groups(spec, request.split, len(files), "at most ")
+    groups = {path: named.get(path.resolve()) for path in files}
+    for path in files:
+        if groups[path] is None and path.parent != base:
+            groups[path] = path.parent.relative_to(base).as_posix()
+    return _read_files(spec, base, groups, options, request, hint=_HOW_TO_SKIP)
 
 
 def sequence_scenes(
-    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
+    spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
     """The frames of every sequence of a split, one sequence after the other.
 
     The raws of one folder, in the natural order of their names, are one sequence and one source
-    group; its name is the folder's below `spec`. Each raw's light is known through its own
-    settings: it may change from frame to frame. Raws in `spec` itself are named after it, or ``.``
-    where a folder below has that name.
+    group, called as the folder below `spec`. Each raw's light is known through its own settings: it
+    may change from frame to frame. Raws in `spec` itself are named after it, or ``.`` where a
+    folder below has that name.
 
     Args:
         spec: A folder, searched with its sub-folders, or a glob.
@@ -153,10 +154,8 @@ def sequence_scenes(
         options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
 
     Raises:
-        ValueError: If there are no raws, one cannot be read, there are no sequences of the split,
-            or unreadable raws were to be skipped: all later frames would come too early.
+        ValueError: If there are no raws, one cannot be read, or there are too few to train on.
     """
-    options = options or FolderOptions()
     if options.on_error == "skip":
         raise ValueError(
             "`on_error` (='skip') must be 'stop' for a sequence: without a raw all later ones "
@@ -170,8 +169,7 @@ def sequence_scenes(
             f"`scenes` (={{'sequence': {str(spec)!r}}}) must hold raws ({_RAW_ENDINGS}): radiance "
             "maps have no settings of their own"
         )
-    if request.split == "train" and len(folders) < FEWEST_GROUPS_TO_SPLIT:
-        raise _too_few_groups(spec, str(len(folders)))  # before any time is spent on reading
+    _check_training_groups(spec, request.split, len(folders))
     names = {folder: folder.relative_to(base).as_posix() for folder in folders}
     own = base.resolve().name
     if base in names and own and own not in names.values():
@@ -184,9 +182,7 @@ def sequence_scenes(
 def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
     """First and last frame, (F,) int64 each, of the sequence that each of F frames belongs to.
 
-    Args:
-        scenes: As `sequence_scenes` returns them: those of one sequence follow each other. A scene
-            of none is one of its own.
+    Those of one sequence follow each other. A scene of none is one of its own.
     """
     names = [scene.sequence or scene.scene_id for scene in scenes]
     begins = [i for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
@@ -199,13 +195,10 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
-    """The raws and radiance maps that `spec` names, and the folder they are under.
+    """The raws and radiance maps that `spec` names, in natural order, and their folder.
 
     Args:
         spec: A file, a folder (searched with its sub-folders; hidden ones left out) or a glob.
-
-    Returns:
-        The base folder and the files, sorted in natural order (``IMG_2`` before ``IMG_10``).
 
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
@@ -218,12 +211,7 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
         raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
-    files = [
-        p
-        for p in found
-        if p.suffix.lower() in (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
-        and not any(part.startswith(".") for part in p.relative_to(base).parts)
-    ]
+    files = visible_files(base, found, (*RAW_SUFFIXES, *RADIANCE_SUFFIXES))
     if not files:
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):
@@ -250,6 +238,12 @@ def _listed(spec: str | Path) -> tuple[Path, list[Path]]:
     return Path(*path.parts[:first]), [p for p in matches if p.is_file()]
 
 
+def visible_files(folder: Path, paths: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
+    """Those of the `paths` that end in one of `suffixes`, and are not hidden in `folder`."""
+    fitting = [path for path in paths if path.suffix.lower() in suffixes]
+    return [p for p in fitting if not any(n.startswith(".") for n in p.relative_to(folder).parts)]
+
+
 def _natural(path: Path) -> list[tuple[int, int, str]]:
     """Sort key in which numbers count as numbers."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
@@ -258,21 +252,6 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 def _is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
-
-
-def _sub_folder(path: Path, base: Path) -> str | None:
-    """The sub-folder of `base` that a file is in; None for a file in `base` itself."""
-    return None if path.parent == base else path.parent.relative_to(base).as_posix()
-
-
-def _scene_names(base: Path, files: Sequence[Path]) -> dict[Path, str]:
-    """Scene ids: the path below `base` without its ending, with it where two would be equal."""
-    stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
-    times = Counter(stems)
-    return {
-        p: stem if times[stem] == 1 else p.relative_to(base).as_posix()
-        for p, stem in zip(files, stems, strict=True)
-    }
 
 
 # -- reading --------------------------------------------------------------------------------------
@@ -287,25 +266,26 @@ def _read_files(
     *,
     hint: str = "",
 ) -> list[Scene]:
-    """The scenes of a split in files.
+    """The scenes of a split in files below `base`, which messages call `spec`.
 
     Args:
-        spec: Their name, for messages.
-        base: The folder that they are under.
         groups: Source group of each; where it is None the file itself, or shots that belong to it.
-        options: See `folder_scenes`.
-        request: See `folder_scenes`.
         hint: End of the error of a file that cannot be read, where there are others.
     """
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}  # of raws without a group
     skipped: list[str] = []
-    names = _scene_names(base, list(groups))
+    # Scene ids: the path below `base` without its ending, with it where two would be equal.
+    places = {path: path.relative_to(base) for path in groups}
+    times = Counter(place.with_suffix("") for place in places.values())
     logger.info("reading %d scene files of %s", len(groups), spec)
     with progress_bar("reading scene files", len(groups)) as advance:
         for path, group in groups.items():
+            place = places[path]
+            unique = times[place.with_suffix("")] == 1
+            name = (place.with_suffix("") if unique else place).as_posix()
             try:
-                scenes += _read_file(path, names[path], group, options, request, shots)
+                scenes += _read_file(path, name, group, options, request, shots)
             except (ValueError, OSError) as error:  # it may also have vanished since it was listed
                 if options.on_error == "stop":
                     more = hint if len(groups) > 1 else ""
@@ -315,16 +295,12 @@ def _read_files(
     if skipped:
         rest = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
         text = "; ".join(skipped[:_MOST_NAMES] + rest)
+        text = f"{len(skipped)} of {len(groups)} scene files skipped ({text})"
         if not scenes:
-            raise ValueError(
-                f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all "
-                f"{len(skipped)} were skipped ({text})"
-            )
-        total = len(groups)
-        logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)
+            raise ValueError(f"`scenes` (={str(spec)!r}) must hold a file that can be read: {text}")
+        logger.warning("%s: %s", spec, text)
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
     scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
-    log_groups(str(spec), scenes)
     return scenes_of_split(spec, scenes, request.split)
 
 
@@ -361,21 +337,19 @@ def radiance_scenes(
     ev100: float | None = None,
     **fields: Any,
 ) -> Iterator[Scene]:
-    """The scenes of one radiance map, all in one source group.
+    """The scenes of one radiance map, all in one source group; see `map_views`.
 
-    A radiance map is linear but relative: nothing in it says how many lux it shows. Its views are
-    therefore put at an EV100 between 3 and 14 drawn by a stable hash of the source group (an
-    assumption, stated in each scene's `source`), and their `illuminance` is None unless given.
-    Both panoramas and other pictures have about 256 packed pixels a side, as the bundled scenes
-    have, before `Scene.resized`; see `map_views`.
+    A radiance map is linear but relative: nothing in it says how many lux it shows. Unless that is
+    known, its views are put at the `assumed_ev100` of the source group, as each scene's `source`
+    says.
 
     Args:
         path: The file.
-        request: Camera and size; without a resolution the views have 256 packed pixels a side.
+        request: Camera and size.
         name: Prefix of the scene ids.
         group: Source group.
         ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
-            their relative brightness), if known; see `assumed_ev100`.
+            their relative brightness), if known.
         **fields: Further arguments of `Scene.from_radiance`.
     """
     file = Path(path).name
@@ -386,25 +360,22 @@ def radiance_scenes(
             ev100 = assumed_ev100(group)
             fields.setdefault("source", f"{file}; light of unknown scale, EV100 assumed")
     fields.setdefault("source", file)
-    try:
-        views, sampled = map_views(image, request.resolution, native=request.crop == "native")
-        if not sampled:
-            logger.info(
-                "radiance map %s: fewer pixels than photosites, so planes share their places", file
-            )
-        matrix, _ = camera_from_srgb(request.camera)
-        greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
-        levels = [-math.log2(mean_anchor(green)) for green in greens]
-        for (ending, view), level in zip(views.items(), levels, strict=True):
-            if ev100 is not None:  # one scale for the whole map: a darker view stays darker
-                fields["ev100"] = ev100 + level - float(np.mean(levels))
-            scene_id = name + ending
-            scene = Scene.from_radiance(
-                view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
-            )
-            yield request.sized(scene)
-    except ValueError as error:
-        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
+    views, sampled = map_views(image, request.resolution, native=request.crop == "native")
+    if not sampled:
+        logger.info(
+            "radiance map %s: fewer pixels than photosites, so planes share their places", file
+        )
+    matrix, _ = camera_from_srgb(request.camera)
+    greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
+    levels = [-math.log2(mean_anchor(green)) for green in greens]
+    for (ending, view), level in zip(views.items(), levels, strict=True):
+        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
+            fields["ev100"] = ev100 + level - float(np.mean(levels))
+        scene_id = name + ending
+        scene = Scene.from_radiance(
+            view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
+        )
+        yield request.sized(scene)
 
 
 # -- source groups and the split ----------------------------------------------------------------
@@ -444,11 +415,6 @@ def describe(raw: RawImage) -> Shot:
     )
 
 
-def similarity(first: Shot, second: Shot) -> float:
-    """Bhattacharyya coefficient of two shots' histograms: 1 if equal, 0 if nothing is shared."""
-    return float(np.sqrt(first.histogram * second.histogram).sum())
-
-
 def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
     """Source group of each raw, found from its time and its colours.
 
@@ -460,13 +426,6 @@ def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
       similarity of their colour and brightness histograms at least 0.5.
 
     Anything else starts a new group, named after its first shot.
-
-    Args:
-        names: Name of each shot.
-        shots: Time and colours of each.
-
-    Returns:
-        The group of each, in the order given.
     """
     timed = all(shot.time is not None for shot in shots)
 
@@ -474,45 +433,33 @@ def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
         taken = shots[i].time if timed else None
         return shots[i].camera, taken or datetime.min, i
 
-    groups = [""] * len(shots)
-    previous: int | None = None
-    for i in sorted(range(len(shots)), key=order):
-        same = previous is not None and _same_subject(shots[previous], shots[i])
-        groups[i] = groups[previous] if same and previous is not None else names[i]
-        previous = i
+    groups = list(names)
+    for before, i in pairwise(sorted(range(len(shots)), key=order)):
+        if _same_subject(shots[before], shots[i]):
+            groups[i] = groups[before]
     return groups
 
 
 def _same_subject(first: Shot, second: Shot) -> bool:
     if first.camera != second.camera:
         return False
-    if first.time is None or second.time is None:
-        pause = math.nan
-    else:
+    pause = math.nan  # unknown
+    if first.time is not None and second.time is not None:
         pause = abs((second.time - first.time).total_seconds())
-    if pause <= BURST_SECONDS:
-        return True
-    return not pause > SESSION_SECONDS and similarity(first, second) >= ALIKE
+    if pause <= BURST_SECONDS or pause > SESSION_SECONDS:
+        return pause <= BURST_SECONDS
+    return float(np.sqrt(first.histogram * second.histogram).sum()) >= ALIKE
 
 
 def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
-    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``.
-
-    Raises:
-        ValueError: If such a file lacks a column, leaves one empty or names a missing file.
-    """
+    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``."""
     groups: dict[Path, str] = {}
     for folder in folders:
         table = folder / "groups.csv"
         if not table.is_file():
             continue
-        try:
-            with table.open(newline="", encoding="utf-8-sig") as stream:
-                reader = csv.DictReader(stream)
-                rows, columns = list(reader), reader.fieldnames
-        except (csv.Error, OSError, UnicodeError) as error:
-            raise ValueError(f"{str(table)!r} must be a CSV file in UTF-8: {error}") from error
-        if not {"file", "group"} <= set(columns or ()):
+        rows, columns = read_table(table)
+        if not {"file", "group"} <= set(columns):
             raise ValueError(
                 f"{str(table)!r} (columns {columns}) must have the columns `file` and `group`"
             )
@@ -527,22 +474,27 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
     return groups
 
 
+def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
+    """Rows and column names of a CSV file; a `ValueError` if it cannot be read."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream)
+            return list(reader), list(reader.fieldnames or ())
+    except (csv.Error, OSError, UnicodeError) as error:
+        raise ValueError(f"{str(path)!r} must be a CSV file in UTF-8: {error}") from error
+
+
 def split_groups(groups: Sequence[str]) -> dict[str, str]:
     """``"train"`` or ``"test"`` for each group.
 
     Below 15 groups all are ``"test"``: too few to hold out. From 15 on a hash of the group's name
     decides, 70 % to training, so that adding a file moves no other. Should the hash leave one side
     empty, the group nearest to the threshold changes sides.
-
-    >>> set(split_groups(["a", "b"]).values())
-    {'test'}
     """
     names = sorted(set(groups))
     if len(names) < FEWEST_GROUPS_TO_SPLIT:
         return dict.fromkeys(names, "test")
-    draws = {
-        n: int.from_bytes(hashlib.sha256(n.encode()).digest()[:8], "big") / 2**64 for n in names
-    }
+    draws = {name: hash_fraction(name) for name in names}
     split = {n: "train" if draws[n] < TRAIN_SHARE else "test" for n in names}
     if len(set(split.values())) == 1:
         nearest = min(names, key=lambda n: abs(draws[n] - TRAIN_SHARE))
@@ -551,21 +503,20 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
 
 
 def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
-    """The scenes whose source group is in `split`.
-
-    Args:
-        spec: Name of the scenes, for the error.
-        scenes: Scenes of all splits.
-        split: ``"train"``, ``"test"`` or ``"all"``.
+    """The scenes whose source group is in `split`; the log tells the groups and how many are not.
 
     Raises:
         ValueError: If `split` is ``"train"`` and there are too few groups.
     """
+    members: dict[str, list[str]] = {}
+    for scene in scenes:
+        members.setdefault(scene.group, []).append(scene.scene_id)
+    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
+    logger.info("%s: %d source groups (%s)", spec, len(members), text)
     if split == "all":
         return scenes
-    parts = split_groups([scene.group for scene in scenes])
-    if split == "train" and "train" not in parts.values():
-        raise _too_few_groups(spec, str(len(parts)))
+    _check_training_groups(spec, split, len(members))
+    parts = split_groups(list(members))
     left_out = sum(part != split for part in parts.values())
     if left_out:
         logger.warning(
@@ -575,20 +526,12 @@ def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[S
     return [scene for scene in scenes if parts[scene.group] == split]
 
 
-def _too_few_groups(spec: str | Path, number: str) -> ValueError:
-    """The error where `spec` has only `number` source groups, too few to train on."""
-    return ValueError(
-        f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that some "
-        f"can be held out; {str(spec)!r} has {number}. Train on scenes='bundled' and use these "
-        "with split='test' (zero-shot) or split='all'; if files are grouped wrongly, name the "
-        "groups in a groups.csv (columns file, group) beside them"
-    )
-
-
-def log_groups(where: str, scenes: Sequence[Scene]) -> None:
-    """Logs the scenes of each source group."""
-    members: dict[str, list[str]] = {}
-    for scene in scenes:
-        members.setdefault(scene.group, []).append(scene.scene_id)
-    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
-    logger.info("%s: %d source groups (%s)", where, len(members), text)
+def _check_training_groups(spec: str | Path, split: str, count: int, most: str = "") -> None:
+    """Raises a `ValueError` if `spec` has too few source groups to train on."""
+    if split == "train" and count < FEWEST_GROUPS_TO_SPLIT:
+        raise ValueError(
+            f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that "
+            f"some can be held out; {str(spec)!r} has {most}{count}. Train on scenes='bundled' and "
+            "use these with split='test' (zero-shot) or split='all'; if files are grouped wrongly, "
+            "name the groups in a groups.csv (columns file, group) beside them"
+        )

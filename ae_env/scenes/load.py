@@ -54,17 +54,13 @@ from simulator.raw.image import RawImage
 from simulator.reference.camera import ReferenceCamera
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.checks import check_number, check_word, did_you_mean
+from simulator.utils.checks import check_type, check_word, did_you_mean
 from simulator.utils.files import sibling
 
 logger = logging.getLogger(__name__)
 
 #: Names of the scenes that come with the package.
-BUNDLED: dict[str, Size] = {
-    "bundled": "normal",
-    "bundled:small": "small",
-    "bundled:large": "large",
-}
+BUNDLED: dict[str, Size] = {"bundled": "normal", "bundled:small": "small", "bundled:large": "large"}
 #: Those of one kind, or of the hard part.
 BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
 #: Views into Poly Haven's panoramas, alone and with as many procedural scenes.
@@ -105,12 +101,10 @@ def load_scenes(
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
             made them has split them.
-        camera: In whose colours bundled scenes and radiance maps are made. A raw brings its own
-            camera.
+        camera: In whose colours scenes are made. A raw brings its own camera.
         resolution: Packed pixels a side; None keeps each scene's own size.
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
-        resize: Called with each scene at its finest resolution, `resolution` and `crop`; see
-            `SceneNetworks.resized` for another than the default.
+        resize: Called with each scene at its finest resolution, `resolution` and `crop`.
         grid: States of recorded grids; by default all that their captures have.
 
     Returns:
@@ -121,16 +115,21 @@ def load_scenes(
             or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
-    if not isinstance(camera, CameraProfile):
-        hint = "; `simulator.get_camera` gives one by name"
-        raise ValueError(f"`camera` (={camera!r}) must be a CameraProfile{hint}")
+    check_type("camera", camera, CameraProfile)
     request = SceneRequest(split, camera, resolution, crop, resize)
     scenes: Sequence[Scene]
     recorded = RecordedOptions.of(spec)
     if recorded is not None:
         scenes = recorded_scenes(recorded, request, grid or recorded.grid)
+    elif isinstance(spec, Mapping):
+        path, options = _options(spec)
+        scenes = (sequence_scenes if "sequence" in spec else folder_scenes)(path, request, options)
+    elif isinstance(spec, Path):
+        scenes = folder_scenes(spec, request)
+    elif isinstance(spec, str):
+        scenes = _by_name(spec, request)
     else:
-        scenes = _requested(spec, request)
+        scenes = _sized_list(spec, "scenes", request)
     if not scenes:
         raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
     name, count = Counter(scene.scene_id for scene in scenes).most_common(1)[0]
@@ -143,19 +142,6 @@ def has_frames(spec: object) -> bool:
     """Whether the scenes of `spec` may be frames that follow each other."""
     sequence = isinstance(spec, Mapping) and "sequence" in spec
     return sequence or RecordedOptions.of(spec) is not None
-
-
-def _requested(spec: Any, request: SceneRequest) -> Sequence[Scene]:
-    """The scenes of anything but a recorded grid."""
-    if isinstance(spec, Mapping):
-        load = sequence_scenes if "sequence" in spec else folder_scenes
-        path, options = _options(spec)
-        return load(path, request, options)
-    if isinstance(spec, Path):
-        return folder_scenes(spec, request)
-    if isinstance(spec, str):
-        return _by_name(spec, request)
-    return _sized_list(spec, "scenes", request)
 
 
 def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
@@ -173,9 +159,9 @@ def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
         if _ATTRIBUTE.fullmatch(spec) and not ours:
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
             if callable(found):
-                known = {name: getattr(request, name) for name in ("split", "camera", "resolution")}
                 names = inspect.signature(found).parameters
-                found = found(**{name: value for name, value in known.items() if name in names})
+                known = [n for n in ("split", "camera", "resolution") if n in names]
+                found = found(**{name: getattr(request, name) for name in known})
             return _sized_list(found, spec, request)
         hint = did_you_mean(spec, NAMED, cutoff=0.7)
         if hint or ours:
@@ -204,11 +190,6 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
         )
     for name in spec:
         check_word("scenes", name, (where, *known))
-    if spec[where] in NAMED:
-        raise ValueError(
-            f"`scenes` (={dict(spec)!r}): {where!r} must be a file, folder or glob; give the name "
-            f"{spec[where]!r} itself for those scenes"
-        )
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 
@@ -219,8 +200,7 @@ def _sized_list(found: Any, name: str, request: SceneRequest) -> list[Scene]:
             "is a name, a path or a mapping"
         )
     for i, scene in enumerate(found):
-        if not isinstance(scene, Scene):
-            raise ValueError(f"{name}[{i}] (={type(scene).__name__}) must be a Scene")
+        check_type(f"{name}[{i}]", scene, Scene)
     return [request.sized(scene) for scene in found]
 
 
@@ -243,26 +223,27 @@ def environment_scenes(
     """The scenes of `load_scenes`, with what networks find in them, for an environment.
 
     Those with a name, and recorded ones whose files have not changed, stay in memory for the next
-    environment with the same arguments. Bundled ones that must be drawn are when they are needed.
+    environment with the same arguments. Bundled ones are drawn when they are needed.
 
     Args:
         spec, split, camera, resolution, crop, grid: See `load_scenes`.
-        from_raw: Whether a scene without noise is known through one raw of it only
-            (`simulate_source_raw`).
+        from_raw: Whether a scene without noise is known through one raw of it only.
         finds_defocus: Whether a defocus map is estimated where a scene has none.
         simulator: Weights of the networks; None for none, so that noise stays.
         noise: False denoises the light of scenes.
-
-    Raises:
-        ValueError: As `load_scenes`; if the light of a scene is unknown and cannot be estimated; or
-            if recorded scenes are in a list, where their captures would be simulated.
     """
     needs_networks = finds_defocus or from_raw
     recorded = RecordedOptions.of(spec)
-    own = (finds_defocus, simulator, noise) if needs_networks else ()
-    key = _memory_key(spec, recorded, grid, split, camera, resolution, crop, from_raw, *own)
+    key: tuple[Any, ...] | None = (split, camera, resolution, crop, from_raw)
+    key += (finds_defocus, simulator, noise) if needs_networks else ()
     if needs_networks and simulator not in (None, *SIZES):
         key = None  # a user's weights may have other content next time
+    elif recorded is not None:
+        key += (grid, tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files))
+    elif isinstance(spec, str) and spec in NAMED:
+        key += (spec,)
+    else:
+        key = None
     known = None if key is None else _LOADED.get(key)
     if known is not None:
         return known
@@ -272,15 +253,8 @@ def environment_scenes(
     else:
         networks = None if simulator is None else SceneNetworks(simulator)
         resize = networks.resized if networks is not None and finds_defocus else Scene.resized
-        found = load_scenes(
-            recorded or spec,
-            split,
-            camera=camera,
-            resolution=resolution,
-            crop=crop,
-            resize=resize,
-            grid=grid,
-        )
+        size: dict[str, Any] = {"resolution": resolution, "crop": crop, "resize": resize}
+        found = load_scenes(recorded or spec, split, camera=camera, grid=grid, **size)
         if recorded is None and any(scene.recorded is not None for scene in found):
             raise ValueError(
                 "`scenes` must name the folder of recorded scenes ('recorded:FOLDER') to show "
@@ -290,19 +264,9 @@ def environment_scenes(
             found = [simulate_source_raw(s) if s.noise_free else s for s in found]
         scenes = SceneSet(_prepare(scene, networks, finds_defocus, noise) for scene in found)
     if key is not None:
-        tensors = [t for t in (scenes[0].light, scenes[0].recorded) if t is not None]
-        _LOADED.put(key, scenes, len(scenes) * sum(tensor.nbytes for tensor in tensors))
+        held = [t.nbytes for t in (scenes[0].light, scenes[0].recorded) if t is not None]
+        _LOADED.put(key, scenes, len(scenes) * sum(held))
     return scenes
-
-
-def _memory_key(
-    spec: SceneSpec, recorded: RecordedOptions | None, grid: ExposureGrid | None, *others: Any
-) -> tuple[Any, ...] | None:
-    """Key of scenes that stay in memory: with a name, or recorded; None for all others."""
-    if recorded is not None:
-        times = tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files)
-        return (grid, times, *others)
-    return (spec, *others) if isinstance(spec, str) and spec in NAMED else None
 
 
 def _prepare(
@@ -332,45 +296,39 @@ def simulate_source_raw(
     """`scene` as one simulated raw of it tells; its illuminance stays known.
 
     The reference camera takes the raw as an average meter would have it, at an ISO drawn between
-    100 and 6400. It replaces the scene: noise, white highlights and all. What is simulated from it
-    is the neural simulator's estimate, as in the paper.
+    100 and 6400: noise, white highlights and all. Captures are simulated from it by the neural
+    simulator, as in the paper.
 
     Args:
         scene: Without noise.
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
-        iso: ISO of the raw; drawn by default.
+        iso: ISO of the raw; drawn by default from `iso_range`, log-uniformly.
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
             default.
-        iso_range: What the ISO is drawn from, log-uniformly.
+        iso_range: See `iso`.
 
     Raises:
-        ValueError: If the scene carries noise, as a raw does; if it is black nearly everywhere, so
-            that no meter can expose it; or for settings out of range.
+        ValueError: If the scene carries noise, or is too dark for a meter.
     """
-    low, high = (check_number(f"iso_range[{i}]", iso_range[i], 1.0, 1e7) for i in (0, 1))
-    if low > high:
-        raise ValueError(f"`iso_range` (={iso_range!r}) must be ascending")
-    if iso is not None:
-        check_number("iso", iso, 1.0, 1e7)
-    if ev is not None:
-        check_number("ev", ev, -20.0, 20.0)
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")
     number = zlib.crc32(scene.scene_id.encode())
     rng = np.random.default_rng([number, seed])
-    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log((low, high)))), rng.uniform(*EV_RANGE)
+    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log(iso_range))), rng.uniform(*EV_RANGE)
     iso, ev = float(drawn_iso if iso is None else iso), float(drawn_ev if ev is None else ev)
     try:
         ratio = mean_anchor(scene.light[1:3]) * 2.0**ev
     except ValueError as error:
-        raise ValueError(
-            f"`scene` (={scene.scene_id!r}) is too dark for a meter: its green is 0 nearly "
-            "everywhere"
-        ) from error
+        dark = "is too dark for a meter: its green is 0 nearly everywhere"
+        raise ValueError(f"`scene` (={scene.scene_id!r}) {dark}") from error
     unit = CameraSettings(iso, 1.0, F_NUMBER)
     exposure = scene.reference.log2_exposure + np.log2(ratio)
     settings = replace(unit, exposure_time=float(2.0 ** (exposure - unit.log2_exposure)))
-    raw = _recorded_raw(scene, settings, ratio, noise_generator(seed, number, iso, ev))
+    k, camera = scene.box_factor, scene.camera
+    light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
+    noise = noise_generator(seed, number, iso, ev)
+    taken = ReferenceCamera(camera, box_factor=k).record(light, settings.iso, noise)
+    raw = RawImage(taken, settings, camera, white_balance=scene.white_balance, box_factor=k)
     known = Scene.from_raw(raw, scene_id=scene.scene_id)
     return replace(
         scene,
@@ -383,34 +341,21 @@ def simulate_source_raw(
     )
 
 
-def _recorded_raw(
-    scene: Scene, settings: CameraSettings, ratio: float, noise: torch.Generator
-) -> RawImage:
-    """What the reference camera records of a scene whose light is `ratio` times as much."""
-    k = scene.box_factor
-    light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
-    taken = ReferenceCamera(scene.camera, box_factor=k).record(light, settings.iso, noise)
-    return RawImage(taken, settings, scene.camera, white_balance=scene.white_balance, box_factor=k)
-
-
 # -- networks: noise and defocus of scenes, estimated once, before any episode --------------------
 
 
 def check_weights(name: str) -> None:
     """Raises a `ValueError` unless `name` is that of weights or the path of some; reads none."""
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"`simulator` (={name!r}) must be None, or the name or path of weights")
-    if name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file():
+    is_text = isinstance(name, str) and name != ""
+    if is_text and (name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file()):
         return
     from simulator.networks.weights import list_pretrained
 
     known = sorted({DEFAULT_SIMULATOR, *list_pretrained()})
     if name not in known:
-        if name.endswith(".safetensors"):
-            raise ValueError(f"`simulator` (={name!r}): there is no such file")
         raise ValueError(
             f"`simulator` (={name!r}) must be None, one of {known} or the path of a .safetensors "
-            f"file{did_you_mean(name, known)}"
+            f"file that exists{did_you_mean(name, known)}"
         )
 
 
@@ -451,8 +396,7 @@ class SceneNetworks:
 
         Args:
             scene: At its finest resolution; a map that it has already stays.
-            resolution: See `Scene.resized`.
-            crop: See `Scene.resized`.
+            resolution, crop: See `Scene.resized`.
         """
         small = scene.resized(resolution, crop)
         if small.defocus_map is not None:
@@ -460,36 +404,29 @@ class SceneNetworks:
 
         def make() -> torch.Tensor:
             logger.info("estimating the defocus of scene %s", scene.scene_id)
-            return self._small_map(scene, resolution, crop)
+            fine, shorter, used = scene, min(scene.light.shape[1:]), resolution
+            if resolution is not None and crop == "box":
+                used = shorter // resolution * resolution
+            if used is not None and used + 2 * _MARGIN < shorter:
+                fine = scene.resized(used + 2 * _MARGIN, "native")
+            # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
+            prepared = self._simulator.prepare(fine.prepared, tolerance=0.0)
+            fine = replace(fine, defocus_map=self._simulator.estimate_defocus(prepared))
+            found = fine.resized(used, "native").resized(resolution, crop).defocus_map
+            assert found is not None
+            return found
 
         numbers = {"map": [MAP_VERSION, DEAD_ZONE], "resolution": resolution, "crop": crop}
-        found = self._cached("defocus_maps", scene, make, shape=small.light.shape[1:], **numbers)
-        return replace(small, defocus_map=found)
-
-    def _small_map(self, scene: Scene, resolution: int | None, crop: Crop) -> torch.Tensor:
-        shorter = min(scene.light.shape[1:])
-        factor = 1 if resolution is None or crop == "native" else shorter // resolution
-        used = None if resolution is None else factor * resolution
-        if used is not None and used + 2 * _MARGIN < shorter:
-            scene = scene.resized(used + 2 * _MARGIN, "native")
-        # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
-        prepared = self._simulator.prepare(scene.prepared, tolerance=0.0)
-        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(prepared))
-        found = fine.resized(used, "native").resized(resolution, crop).defocus_map
-        assert found is not None
-        return found
+        shape = small.light.shape[1:]
+        return replace(
+            small, defocus_map=self._cached("defocus_maps", scene, make, shape=shape, **numbers)
+        )
 
     def _cached(
-        self,
-        kind: str,
-        scene: Scene,
-        make: Callable[[], torch.Tensor],
-        *,
-        shape: Sequence[int],
-        **numbers: Any,
+        self, kind: str, scene: Scene, make: Callable[[], torch.Tensor], **numbers: Any
     ) -> torch.Tensor:
         """The result of `make` for `scene`, from the cache where its inputs were the same."""
         modules = [m for m in (self._simulator.noise, self._simulator.aperture) if m is not None]
         inputs = {"light": scene.light, "denoised": scene.denoised}
         nlf = [scene.nlf.shot, scene.nlf.read]
-        return self._results.result(kind, modules, inputs, make, shape=shape, nlf=nlf, **numbers)
+        return self._results.result(kind, modules, inputs, make, nlf=nlf, **numbers)

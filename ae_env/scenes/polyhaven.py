@@ -16,7 +16,7 @@ import logging
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -106,24 +106,19 @@ class Asset(Configuration):
         return f"{self.name}_1k.hdr"
 
     @property
-    def cached(self) -> Path:
-        """Where `download` puts the file."""
-        return cache_dir() / _FOLDER / self.file_name
-
-    @property
     def given(self) -> Path | None:
         """The file in the folder of real files; None where it is not there."""
         data, own = data_folder(), self.file or f"hdri_pool/{self.name}.hdr"
-        known = [] if data is None else [data / own, data / _FOLDER / self.file_name]
-        return next((path for path in known if self._is_at(path)), None)
+        return None if data is None else self._first_of(data / own, data / _FOLDER / self.file_name)
 
     @property
     def path(self) -> Path | None:
         """The file, in the folder of real files or in the cache; None where it is in neither."""
-        return self.given or (self.cached if self._is_at(self.cached) else None)
+        return self.given or self._first_of(cache_dir() / _FOLDER / self.file_name)
 
-    def _is_at(self, path: Path) -> bool:
-        return path.is_file() and path.stat().st_size == self.bytes
+    def _first_of(self, *paths: Path) -> Path | None:
+        found = (path for path in paths if path.is_file() and path.stat().st_size == self.bytes)
+        return next(found, None)
 
 
 class _AssetList(Configuration):
@@ -137,11 +132,7 @@ def list_assets() -> tuple[Asset, ...]:
 
 
 def split_assets(name: str, split: str) -> list[Asset]:
-    """The assets of a split, whose maps are there.
-
-    Args:
-        name: What the scenes are called in the error.
-        split: ``"train"``, ``"test"`` or ``"all"``.
+    """The assets of a split, whose maps are there; errors call the scenes `name`.
 
     Raises:
         FileNotFoundError: If maps are missing; the message names the command that fetches them.
@@ -164,9 +155,6 @@ def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0
         request: Split, camera and size.
         views: Views of each map, at least 1.
         seed: Of the views' directions, their fields of view and the level of the light.
-
-    Raises:
-        FileNotFoundError: If maps are missing; the message names the command that fetches them.
     """
     assets = split_assets("polyhaven", request.split)
     camera, plain = request.camera, request.resize is Scene.resized
@@ -178,25 +166,16 @@ def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0
     # Kinds and levels of light may be edited without the files.
     key |= {"kinds": [[a.kind, *ILLUMINANCE[a.kind]] for a in assets]}
     size = native_size(request.resolution)
-    make = partial(_make, assets, camera, size, resolution, crop, views, seed)
+
+    def make() -> Iterator[Scene]:
+        logger.info("cutting %d views from each of %d panoramas", views, len(assets))
+        for asset in assets:
+            for scene in asset_views(asset, camera, size=size, views=views, seed=seed):
+                yield add_layout(scene).resized(resolution, crop)
+
     side = size if resolution is None else resolution
     scenes = cached_scenes(cache_key("scenes", key), make, camera, side)
     return scenes if plain else [request.sized(scene) for scene in scenes]
-
-
-def _make(
-    assets: Sequence[Asset],
-    camera: CameraProfile,
-    size: int,
-    resolution: int | None,
-    crop: Crop,
-    views: int,
-    seed: int,
-) -> Iterator[Scene]:
-    logger.info("cutting %d views from each of %d panoramas", views, len(assets))
-    for asset in assets:
-        for scene in asset_views(asset, camera, size=size, views=views, seed=seed):
-            yield add_layout(scene).resized(resolution, crop)
 
 
 def asset_views(
@@ -211,7 +190,10 @@ def asset_views(
     if path is None:
         raise FileNotFoundError(f"`asset` (={asset.name!r}) must be there: ae-env scenes download")
     panorama = read_radiance(path)
-    seen = _cells(panorama)
+    # Light is summed over cells of a few pixels.
+    height, width = (n // _CELL for n in panorama.shape[1:])
+    cells = panorama[:, : height * _CELL, : width * _CELL]
+    seen = cells.reshape(3, height, _CELL, width, _CELL).mean(axis=(2, 4))
     rng = np.random.default_rng([zlib.crc32(asset.name.encode()), seed])
     low, high = np.log(ILLUMINANCE[asset.kind])
     most = max(incident_light(seen, a, p) for p in _TURNED for a in range(0, 360, 30))
@@ -277,37 +259,25 @@ def light_around(panorama: np.ndarray, views: int = 72, field_of_view: float = 6
 
 def cut_values(panorama: np.ndarray) -> list[str]:
     """What a panorama (3, H, W) does not show: ``"highlights are cut"``, ``"shadows are cut"``."""
-    found = []
     brightest = panorama.max(axis=0)
-    if int((brightest == brightest.max()).sum()) >= _CUT_PIXELS:
-        found.append("highlights are cut")
-    if float((brightest <= 0.0).mean()) >= _CUT_SHARE:
-        found.append("shadows are cut")
-    return found
-
-
-def _cells(panorama: np.ndarray) -> np.ndarray:
-    """The panorama averaged over cells, which light is summed over."""
-    height, width = (n // _CELL for n in panorama.shape[1:])
-    cut = panorama[:, : height * _CELL, : width * _CELL]
-    return np.asarray(cut.reshape(3, height, _CELL, width, _CELL).mean(axis=(2, 4)))
+    highlights = (brightest == brightest.max()).sum() >= _CUT_PIXELS
+    shadows = (brightest <= 0.0).mean() >= _CUT_SHARE
+    cut = {"highlights are cut": highlights, "shadows are cut": shadows}
+    return [name for name, is_cut in cut.items() if is_cut]
 
 
 def download(
     *, url: str = URL, timeout: float = _TIMEOUT, progress: Callable[[int, int, str], None] | None
 ) -> list[Path]:
-    """Fetches the maps that are missing or damaged into the cache; those that are there stay.
+    """Fetches the maps that are missing or damaged into the cache, and returns their files.
 
-    A file is put in place when it is complete and its hash is the list's, so a download that was
-    stopped goes on where it was. The environment's proxy (``HTTPS_PROXY``) is used.
+    A file is put in place when it is complete and its hash is the list's. The environment's proxy
+    (``HTTPS_PROXY``) is used.
 
     Args:
         url: Folder that serves ``NAME_1k.hdr``.
         timeout: Seconds in which the server must answer, and go on answering.
         progress: Called with the bytes that are there, all bytes, and the name of the next map.
-
-    Returns:
-        The files that were fetched.
 
     Raises:
         ImportError: If the extra ``hdr`` is not installed.
@@ -336,7 +306,9 @@ def download(
     for asset in assets:
         if progress is not None:
             progress(done, total, asset.name)
-        if asset.given is None and not _is_whole(asset, pooch.file_hash):
+        cached = folder / asset.file_name
+        whole = cached.is_file() and pooch.file_hash(str(cached)) == asset.sha256
+        if asset.given is None and not whole:
             try:
                 fetched.append(Path(store.fetch(asset.file_name, downloader=fetch)))
             except (RequestException, ValueError) as error:
@@ -348,11 +320,6 @@ def download(
     if progress is not None:
         progress(done, total, "")
     return fetched
-
-
-def _is_whole(asset: Asset, file_hash: Callable[[str], str]) -> bool:
-    """Whether the cache has the file, with the hash of the list."""
-    return asset.cached.is_file() and file_hash(str(asset.cached)) == asset.sha256
 
 
 def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene], maps: int) -> list[Scene]:

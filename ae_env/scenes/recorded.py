@@ -14,7 +14,6 @@ file or folder.
 
 from __future__ import annotations
 
-import csv
 import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,7 +21,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +28,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, merge
-from ae_env.scenes.folder import log_groups, scenes_of_split
+from ae_env.scenes.folder import read_table, scenes_of_split, visible_files
 from ae_env.scenes.scene import Scene, SceneRequest
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -103,15 +101,17 @@ class RecordedOptions:
 
     @classmethod
     def of(cls, spec: object) -> RecordedOptions | None:
-        """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing.
-
-        Raises:
-            ValueError: If it has an unknown entry, or names no folder.
-        """
+        """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing."""
         if isinstance(spec, RecordedOptions):
             return spec
         if isinstance(spec, str) and spec.startswith(PREFIX):
-            spec = _of_text(spec)
+            folder, mark, given = spec.removeprefix(PREFIX).partition("?")
+            pairs = [part.partition("=")[::2] for part in given.split("&")] if mark else []
+            try:
+                spec = {KEY: folder, **{name: parse_number(text) for name, text in pairs}}
+            except ValueError as error:
+                form = f"must be written {PREFIX}FOLDER?iso=100&f_number=4"
+                raise ValueError(f"`scenes` (={spec!r}) {form}: {error}") from None
         if not isinstance(spec, Mapping) or KEY not in spec:
             return None
         for name in spec:
@@ -140,7 +140,7 @@ class RecordedOptions:
         noises: dict[float, NoiseLevelFunction] = {}
         for iso, file in sorted(by_iso.items()):
             raw = _read(file)
-            noises[iso] = raw.camera.nlf(iso) if raw.nlf is None else raw.nlf
+            noises[iso] = raw.nlf or raw.camera.nlf(iso)
         return replace(raw.camera, nlf_by_iso=noises, segments=())
 
     def camera(self, default: CameraProfile) -> CameraProfile:
@@ -150,22 +150,6 @@ class RecordedOptions:
             default: Whose noise developed pictures are assumed to have.
         """
         return self._body or replace(default, colour_matrix=None, colour_matrix_source="")
-
-
-def _of_text(spec: str) -> dict[str, Any]:
-    """The mapping that ``recorded:FOLDER?iso=100&f_number=4`` stands for."""
-    folder, mark, given = spec.removeprefix(PREFIX).partition("?")
-    found: dict[str, Any] = {KEY: folder}
-    for part in given.split("&") if mark else ():
-        name, _, text = part.partition("=")
-        try:
-            found[name] = parse_number(text)
-        except ValueError:
-            raise ValueError(
-                f"`scenes` (={spec!r}) must be written {PREFIX}FOLDER?iso=100&f_number=4: "
-                f"{part!r} is no setting"
-            ) from None
-    return found
 
 
 # -- scenes ---------------------------------------------------------------------------------------
@@ -183,8 +167,7 @@ def recorded_scenes(
             forbidden (`Scene.allowed`).
 
     Raises:
-        ValueError: If a capture cannot be read or has another size than its scene's others, two
-            are of one state, or a scene has fewer than two states.
+        ValueError: If a capture cannot be read, or a scene's captures are no grid of one size.
     """
     camera = options.camera(request.camera)
     scenes: list[Scene] = []
@@ -202,7 +185,6 @@ def recorded_scenes(
             f"forbidden there: {name!r} lacks {missing.sum()} of {len(grid)}, "
             f"the first is {grid[int(missing.argmax())]}"
         )
-    log_groups(str(options.folder), scenes)
     return scenes_of_split(options.folder, scenes, request.split)
 
 
@@ -233,15 +215,14 @@ def _states(
 def _raws_of_one_size(
     states: Mapping[int, RecordedFile], camera: CameraProfile
 ) -> Iterator[tuple[int, RawImage]]:
-    first: tuple[str, torch.Size] | None = None
+    size: torch.Size | None = None
     for state, file in states.items():
         raw = _read(file, camera)
-        size = raw.data.shape[1:]
-        first = first or (str(file.path), size)
-        if size != first[1]:
+        size = size or raw.data.shape
+        if raw.data.shape != size:
             raise ValueError(
-                f"recorded file {str(file.path)!r} ({tuple(size)} packed pixels) must be "
-                f"of the size of {first[0]!r}, {tuple(first[1])}"
+                f"recorded file {str(file.path)!r} ({tuple(raw.data.shape[1:])} packed pixels) "
+                f"must be of the size of its scene's others, {tuple(size[1:])}"
             )
         yield state, raw
 
@@ -258,7 +239,7 @@ def merged_scene(
 
     Args:
         name: Its name, and its source group.
-        raws: Captures of one size with their state of `grid`; one at a time is held.
+        raws: Captures with their state of `grid`; one at a time is held.
         grid: The states.
         camera: The body, with the noise of its ISO speeds.
         resize: Brings each capture to its size, before they are merged.
@@ -276,8 +257,8 @@ def merged_scene(
             sampled=True,
         )
         frames[state] = resize(capture)
-    shape = next(iter(frames.values())).light.shape
-    recorded, allowed = torch.zeros(len(grid), *shape), np.zeros(len(grid), bool)
+    recorded = torch.zeros(len(grid), *next(iter(frames.values())).light.shape)
+    allowed = np.zeros(len(grid), bool)
     for state, frame in frames.items():
         recorded[state], allowed[state] = frame.light, True
     return replace(
@@ -309,12 +290,7 @@ def _merged(frames: Sequence[Scene]) -> Scene:
 
 
 def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
-    """The capture of `file`, of a raw as `read_raw` reads it, of a picture developed back.
-
-    Args:
-        file: The file.
-        camera: Whose noise a picture has; a raw brings its own.
-    """
+    """The capture of `file`; a picture is developed back and has the noise of `camera`."""
     try:
         if not file.is_picture:
             return read_raw(file.path, settings=file.settings)
@@ -359,10 +335,10 @@ class RecordedFile:
 
 
 def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
-    """Every capture under `folder`, by scene, frame and settings.
+    """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
     Args:
-        folder: Searched with its sub-folders; hidden ones left out.
+        folder: Searched with its sub-folders.
         known: Settings by name that the files do not state; those that they do come first.
 
     Raises:
@@ -370,13 +346,9 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
     """
     if not folder.is_dir():
         raise ValueError(f"`scenes` (='recorded:{folder}') must name an existing folder")
-    tables = _Tables(folder)
-    found = [
-        _recorded(folder, path, tables, known)
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in (*RAW_SUFFIXES, *PICTURE_SUFFIXES)
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    tables = _read_tables(folder)
+    paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
+    found = [_recorded(folder, path, tables, known) for path in paths]
     if not found:
         raise ValueError(
             f"`scenes` (='recorded:{folder}') must hold captures: raws "
@@ -387,27 +359,30 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
 
 
 def _recorded(
-    folder: Path, path: Path, tables: _Tables, known: Mapping[str, float]
+    folder: Path,
+    path: Path,
+    tables: Mapping[Path | str, dict[str, float]],
+    known: Mapping[str, float],
 ) -> RecordedFile:
     """`path` with its settings, and with what is left of its name once those are taken out."""
     parts = [*path.relative_to(folder).parts[:-1], path.stem]
-    places = [path, *path.parents][: len(parts)][::-1]  # of each part, the file last
     settings: dict[str, float] = {}
     left: list[str] = []
-    states: list[int] = []  # the parts that state a setting
-    for number, (part, place) in enumerate(zip(parts, places, strict=True)):
+    last = -1  # part that states a setting
+    for number, part in enumerate(parts):
         named, rest = settings_in_name(part)
-        row = tables.row(place)
+        place = [path, *path.parents][len(parts) - 1 - number]
+        row = _table_row(tables, place)
         if named or row:
             settings |= named | row
-            states.append(number)
+            last = number
         left.append("" if row else rest)
     try:
         if len(settings) < len(_SETTINGS):
             stated = _in_file(path)
             if not settings and stated:
                 left[-1] = ""  # a file of one state, whatever its name
-                states.append(len(parts) - 1)
+                last = len(parts) - 1
             settings = {**known, **stated, **settings}
         taken_at = CameraSettings(*(settings[name] for name in _SETTINGS))
     except KeyError:
@@ -421,15 +396,15 @@ def _recorded(
     except ValueError as error:
         raise ValueError(f"recorded file {str(path)!r}: {error}") from error
     names = [name for name in left if name] or [folder.resolve().name]
-    subject = [name for name in left[max(states, default=-1) + 1 :] if name] or names
+    subject = [name for name in left[last + 1 :] if name] or names
     frames = [match for name in names if (match := _FRAME.fullmatch(name))]
-    still = [name for name in names if not _FRAME.fullmatch(name)]
+    still = "/".join(name for name in names if not _FRAME.fullmatch(name))
     return RecordedFile(
         path=path,
         settings=taken_at,
         scene="/".join(names),
-        group="/".join(name for name in subject if not _FRAME.fullmatch(name)) or "/".join(still),
-        sequence=("/".join(still) or folder.resolve().name) if frames else "",
+        group="/".join(name for name in subject if not _FRAME.fullmatch(name)) or still,
+        sequence=(still or folder.resolve().name) if frames else "",
         frame=int(frames[-1][1]) if frames else 0,
     )
 
@@ -463,37 +438,31 @@ def settings_in_name(name: str) -> tuple[dict[str, float], str]:
 # -- settings in tables and files -----------------------------------------------------------------
 
 
-class _Tables:
-    """Settings by file or folder, of all tables in a folder."""
+def _read_tables(folder: Path) -> dict[Path | str, dict[str, float]]:
+    """Settings of all tables in a folder, by the place of a file or folder, and by its name."""
+    found: dict[Path | str, dict[str, float]] = {}
+    for pattern in _TABLES:
+        for table in sorted(folder.rglob(pattern)):
+            for name, settings in _rows(table):
+                known = found.setdefault(table.parent / name, settings)
+                if known != settings:
+                    raise ValueError(
+                        f"{str(table)!r} must have one row for {name!r}: two say {known} and "
+                        f"{settings}"
+                    )
+                found[name] = settings
+    return found
 
-    def __init__(self, folder: Path) -> None:
-        self._by_place: dict[Path, dict[str, float]] = {}
-        self._by_name: dict[str, dict[str, float]] = {}
-        for pattern in _TABLES:
-            for table in sorted(folder.rglob(pattern)):
-                for name, settings in _rows(table):
-                    place = table.parent / name
-                    if self._by_place.setdefault(place, settings) != settings:
-                        raise ValueError(
-                            f"{str(table)!r} must have one row for {name!r}: two say "
-                            f"{self._by_place[place]} and {settings}"
-                        )
-                    self._by_name[name] = settings
 
-    def row(self, place: Path) -> dict[str, float]:
-        """Settings that a table gives the file or folder `place`; a folder anywhere by its name."""
-        found = self._by_place.get(place) or self._by_place.get(place.with_suffix(""))
-        return found or (self._by_name.get(place.name, {}) if not place.suffix else {})
+def _table_row(tables: Mapping[Path | str, dict[str, float]], place: Path) -> dict[str, float]:
+    """Settings that a table gives the file or folder `place`; a folder anywhere by its name."""
+    found = tables.get(place) or tables.get(place.with_suffix(""))
+    return found or (tables.get(place.name, {}) if not place.suffix else {})
 
 
 def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
     """Name and settings of each row of a table."""
-    try:
-        with table.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            rows, columns = list(reader), list(reader.fieldnames or ())
-    except (csv.Error, OSError, UnicodeError) as error:
-        raise ValueError(f"{str(table)!r} must be a CSV file in UTF-8: {error}") from error
+    rows, columns = read_table(table)
     names = {
         what: next((c for c in known if c in columns), None) for what, known in _COLUMNS.items()
     }
@@ -533,12 +502,8 @@ def _in_file(path: Path) -> dict[str, float]:
             tags = picture.getexif().get_ifd(ExifTags.IFD.Exif)
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
         return {}  # said where its pixels are read
-    names = {
-        "iso": ExifTags.Base.ISOSpeedRatings,
-        "exposure_time": ExifTags.Base.ExposureTime,
-        "f_number": ExifTags.Base.FNumber,
-    }
-    values = {name: tags.get(tag) for name, tag in names.items()}
+    names = (ExifTags.Base.ISOSpeedRatings, ExifTags.Base.ExposureTime, ExifTags.Base.FNumber)
+    values = {what: tags.get(tag) for what, tag in zip(_SETTINGS, names, strict=True)}
     numbers = {n: v[0] if isinstance(v, tuple) else v for n, v in values.items() if v}
     return {name: float(value) for name, value in numbers.items() if float(value) > 0}
 
@@ -547,41 +512,30 @@ def _in_file(path: Path) -> dict[str, float]:
 
 
 def recorded_grid(files: Sequence[RecordedFile]) -> ExposureGrid:
-    """The grid of every ISO, exposure time and f-number that some capture was taken at.
-
-    Raises:
-        ValueError: If it would have more than `MOST_STATES`.
-    """
-    values = [_distinct([getattr(file.settings, name) for file in files]) for name in _SETTINGS]
-    count = len(values[0]) * len(values[1]) * len(values[2])
-    if count > MOST_STATES:
+    """The grid of every ISO, exposure time and f-number that some capture was taken at."""
+    values: list[list[float]] = []
+    for name in _SETTINGS:
+        values.append([])
+        for value in sorted(getattr(file.settings, name) for file in files):
+            if not values[-1] or value > values[-1][-1] * (1.0 + SAME):
+                values[-1].append(value)  # of those that are the same, the first
+    isos, times, f_numbers = map(len, values)
+    if isos * times * f_numbers > MOST_STATES:
         raise ValueError(
-            f"the recorded captures have {len(values[0])} ISO speeds, {len(values[1])} exposure "
-            f"times and {len(values[2])} f-numbers, {count} combinations; at most {MOST_STATES}: "
-            "give the `grid` that you want"
+            f"the recorded captures have {isos} ISO speeds, {times} exposure times and {f_numbers} "
+            f"f-numbers, {isos * times * f_numbers} combinations; at most {MOST_STATES}: give the "
+            "`grid` that you want"
         )
-    return ExposureGrid(*values)
-
-
-def _distinct(values: Sequence[float]) -> tuple[float, ...]:
-    """Ascending; of those that are the same, the first."""
-    found: list[float] = []
-    for value in sorted(values):
-        if not found or value > found[-1] * (1.0 + SAME):
-            found.append(value)
-    return tuple(found)
+    return ExposureGrid(*map(tuple, values))
 
 
 def state_of(settings: CameraSettings, grid: ExposureGrid) -> int | None:
     """Index of the state of `grid` with these settings; None where it has none."""
+    wanted = (settings.iso, settings.exposure_time, settings.f_number)
     indices = []
-    for value, known in zip(
-        (settings.iso, settings.exposure_time, settings.f_number),
-        (grid.isos, grid.exposure_times, grid.f_numbers),
-        strict=True,
-    ):
-        nearest = min(range(len(known)), key=lambda i: abs(known[i] / value - 1.0))
-        if abs(known[nearest] / value - 1.0) > SAME:
+    for value, known in zip(wanted, (grid.isos, grid.exposure_times, grid.f_numbers), strict=True):
+        off = [abs(one / value - 1.0) for one in known]
+        if min(off) > SAME:
             return None
-        indices.append(nearest)
+        indices.append(off.index(min(off)))
     return grid.index(*indices)

@@ -13,8 +13,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
-from simulator.capture.layout import Layout
-from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
@@ -22,7 +21,7 @@ from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
 from simulator.settings import CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
-from simulator.utils.checks import check_integer, check_number, check_word
+from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
 #: Median image speed of a moving episode [frame heights / s].
 DEFAULT_SPEED = 0.125
@@ -160,13 +159,12 @@ class Scene:
         Args:
             f_number: Effective f-number.
         """
-        growth = max(1.0, self.reference.effective_f_number / f_number)
-        return 0.0 if self.defocus_map is None else self._own_blur * growth
+        return self._blur_at_reference * max(1.0, self.reference.effective_f_number / f_number)
 
     @cached_property
-    def _own_blur(self) -> float:
-        assert self.defocus_map is not None
-        return float(self.defocus_map.double().square().mean().sqrt())
+    def _blur_at_reference(self) -> float:
+        found = self.defocus_map
+        return 0.0 if found is None else float(found.double().square().mean().sqrt())
 
     @cached_property
     def ev100(self) -> float:
@@ -227,46 +225,27 @@ class Scene:
         return _checked(scene)
 
     @classmethod
-    def from_raw(
-        cls,
-        raw: RawImage,
-        *,
-        scene_id: str,
-        group: str | None = None,
-        illuminance: float | None = None,
-        kind: str = "raw",
-        **fields: Any,
-    ) -> Scene:
-        """A scene from a raw photograph: its light, its noise, its saturated pixels.
-
-        Saturated pixels are neutral (`simulator.raw.develop`), so that they stay so when they
-        are darkened.
+    def from_raw(cls, raw: RawImage, *, scene_id: str, kind: str = "raw", **fields: Any) -> Scene:
+        """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
         Args:
             raw: The photograph; its settings become the reference.
             scene_id: Unique name.
-            group: Source group; `scene_id` by default.
-            illuminance: Light on the subject [lux], if it was measured.
             kind: Sort of scene.
-            **fields: Further fields of `Scene`.
+            **fields: Further arguments of `from_array`, such as an `illuminance` that was measured.
 
         Raises:
             ValueError: If neither the raw nor its camera knows the noise.
         """
         saturated = raw.saturated
+        fields |= {"scene_id": scene_id, "kind": kind, "saturated": saturated, "sampled": True}
         return cls.from_array(
             neutral_highlights(raw, saturated),
             raw.settings,
             raw.camera,
-            scene_id=scene_id,
-            group=group,
             nlf=raw.noise,
-            illuminance=illuminance,
             white_balance=raw.white_balance,
-            kind=kind,
             box_factor=raw.box_factor,
-            saturated=saturated,
-            sampled=True,
             **fields,
         )
 
@@ -276,8 +255,6 @@ class Scene:
         rgb: torch.Tensor | np.ndarray,
         camera: CameraProfile,
         *,
-        scene_id: str,
-        group: str | None = None,
         illuminance: float | None = None,
         ev100: float = DEFAULT_EV100,
         illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
@@ -290,8 +267,6 @@ class Scene:
         Args:
             rgb: (3, H, W), or (3, 2H, 2W) with `sampled`: linear light; see `camera_light`.
             camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
-            scene_id: Unique name.
-            group: Source group; `scene_id` by default.
             illuminance: Light on the subject [lux], under which 1.0 is a perfectly white surface;
                 None where the scale is unknown.
             ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped
@@ -300,28 +275,13 @@ class Scene:
             kind: Sort of scene.
             sampled: Whether the pixels of `rgb` are photosites; otherwise each becomes a packed
                 pixel, all four planes of it at one place.
-            **fields: Further fields of `Scene`.
+            **fields: Further arguments of `from_array`, at least `scene_id`.
         """
         light, reference, white_balance = camera_light(
-            rgb,
-            camera,
-            illuminance=illuminance,
-            ev100=ev100,
-            illuminant=illuminant,
-            sampled=sampled,
+            rgb, camera, illuminance, ev100, illuminant, sampled=sampled
         )
-        return cls.from_array(
-            light,
-            reference,
-            camera,
-            scene_id=scene_id,
-            group=group,
-            illuminance=illuminance,
-            white_balance=white_balance,
-            kind=kind,
-            sampled=sampled,
-            **fields,
-        )
+        fields |= {"illuminance": illuminance, "kind": kind, "sampled": sampled}
+        return cls.from_array(light, reference, camera, white_balance=white_balance, **fields)
 
     def resized(self, resolution: int | None, crop: Crop = "box") -> Scene:
         """The central square of this scene at `resolution` packed pixels a side.
@@ -332,10 +292,10 @@ class Scene:
                 ``"native"`` cuts R x R pixels out of the middle, ``k = 1``.
 
         Returns:
-            The scene with ``nlf / k**2`` and ``box_factor * k``; a pixel counts as saturated if
-            any pixel averaged into it was. `defocus_map` is the root of the mean square, as second
-            moments add, divided by k: in pixels of the new light. The defocus of `layout` is the
-            mean, its subject where that has most of a pixel.
+            The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
+            was averaged into it was. `defocus_map` is the root mean square, as second moments add,
+            divided by k. The defocus of `layout` is the mean, its subject where that has most of a
+            pixel.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
@@ -343,13 +303,9 @@ class Scene:
         check_word("crop", crop, get_args(Crop))
         if resolution is None:
             return self
-        check_integer("resolution", resolution, 1)
         height, width = self.light.shape[1:]
-        if min(height, width) < resolution:
-            raise ValueError(
-                f"scene {self.scene_id!r} ({height} x {width} packed) must be at least "
-                f"`resolution` (={resolution}) on both sides"
-            )
+        size = f"; scene {self.scene_id!r} has {height} x {width} packed pixels"
+        check_integer("resolution", resolution, 1, min(height, width), more=size)
         k = min(height, width) // resolution if crop == "box" else 1
         if k == 1 and height == width == resolution:
             return self
@@ -382,9 +338,8 @@ class Scene:
         """
         if k == 1:
             return self
+        check_integer("k", k, 1, min(self.light.shape[1:]))
         height, width = (side // k for side in self.light.shape[1:])
-        if not min(height, width):
-            raise ValueError(f"`k` (={k!r}) must be at most the sides of scene {self.scene_id!r}")
         tiles = (height, k, width, k)
 
         def mean(planes: torch.Tensor) -> torch.Tensor:  # (..., H, W) to (..., H / k, W / k)
@@ -421,14 +376,12 @@ def _checked(scene: Scene) -> Scene:
     for name in ("scene_id", "group", "kind"):
         if not isinstance(getattr(scene, name), str) or not getattr(scene, name):
             raise ValueError(f"`{name}` (={getattr(scene, name)!r}) must be a non-empty string")
-    types: dict[str, Any] = {"camera": CameraProfile, "reference": CameraSettings}
-    types |= {"nlf": NoiseLevelFunction, "layout": Layout | None}
-    types |= dict.fromkeys(("saturated", "denoised", "defocus_map"), torch.Tensor | None)
-    for name, kind in types.items():
-        found = getattr(scene, name)
-        if not isinstance(found, kind):
-            shown = found if isinstance(found, str) else type(found).__name__
-            raise ValueError(f"`{name}` (={shown!r}) must be a {getattr(kind, '__name__', kind)}")
+    check_type("camera", scene.camera, CameraProfile)
+    check_type("reference", scene.reference, CameraSettings)
+    check_type("nlf", scene.nlf, NoiseLevelFunction)
+    check_type("layout", scene.layout, Layout, None)
+    for name in ("saturated", "denoised", "defocus_map"):
+        check_type(name, getattr(scene, name), torch.Tensor, None)
     if scene.illuminance is not None:
         check_number("illuminance", scene.illuminance, 1e-300, 1e300, more=" lux")
     gains = tuple(float(gain) for gain in scene.white_balance)
@@ -436,15 +389,14 @@ def _checked(scene: Scene) -> Scene:
         raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
     check_number("median_speed", scene.median_speed, 0.0, 1e300)
     check_integer("box_factor", scene.box_factor, 1)
-    size, mask, blur = scene.light.shape[1:], scene.saturated, scene.defocus_map
-    denoised = scene.denoised
+    size, denoised = scene.light.shape[1:], scene.denoised
+    mask, blur = scene.saturated, scene.defocus_map
     if denoised is not None:
         denoised = check_packed("denoised", denoised)
-    maps = {"saturated": mask, "defocus_map": blur}
-    maps["layout"] = None if scene.layout is None else scene.layout.defocus
-    maps["denoised"] = None if denoised is None else denoised[0]
+    layout = None if scene.layout is None else scene.layout.defocus
+    maps = {"saturated": mask, "defocus_map": blur, "layout": layout, "denoised": denoised}
     for name, found in maps.items():
-        if found is not None and found.shape != size:
+        if found is not None and found.shape[-2:] != size:
             shapes = f"{tuple(found.shape)} must be that of `light`, {tuple(size)}"
             raise ValueError(f"`{name}`: height and width {shapes}")
     if mask is not None and mask.dtype != torch.bool:
@@ -452,10 +404,8 @@ def _checked(scene: Scene) -> Scene:
     if blur is not None and not bool((torch.isfinite(blur) & (blur >= 0)).all()):
         raise ValueError("`defocus_map` must be finite and >= 0 everywhere")
     allowed, frames = scene.allowed, scene.recorded
-    if allowed is not None and (allowed.dtype != np.bool_ or allowed.ndim != 1):
-        raise ValueError(f"`allowed` ({allowed.dtype}, shape {allowed.shape}) must be bool, (S,)")
-    if allowed is not None and not allowed.any():
-        raise ValueError("`allowed` must allow a state")
+    if allowed is not None and (allowed.dtype != np.bool_ or allowed.ndim != 1 or not any(allowed)):
+        raise ValueError("`allowed` must be bool, (S,), and allow a state")
     if frames is not None and (allowed is None or frames.shape != (len(allowed), 4, *size)):
         raise ValueError("`recorded` must be (S, 4, H, W) with one frame for each of `allowed`")
     return replace(
@@ -468,12 +418,11 @@ def _checked(scene: Scene) -> Scene:
 
 
 class SceneSet(Sequence[Scene]):
-    """Scenes in a fixed order; those that must be drawn first are drawn when they are needed.
+    """Scenes in a fixed order; bundled ones are drawn when they are needed.
 
-    All names are known at once, so whoever holds a set need not know which kind it is: `load` the
-    scenes that are about to be used, several at a time, and ask `loaded` which are there already.
-    Indexing and iterating load what they need. Where some are not there yet, all are alike in what
-    they have: those that are there tell whether any has a layout.
+    All names are known at once. `load` the scenes that are about to be used, several at a time;
+    indexing and iterating load what they need. All scenes of a set that draws are alike: those that
+    are `loaded` tell whether any has a layout.
 
     Args:
         scenes: All of them, in order.
@@ -524,9 +473,8 @@ class SceneRequest:
     Args:
         split: ``"train"``, ``"test"`` or ``"all"``.
         camera: Camera in whose colours light is stated, unless a raw brings its own.
-        resolution: Packed pixels a side; None keeps each scene's own size.
-        crop: See `Scene.resized`.
-        resize: Brings each scene to `resolution`, as `Scene.resized` does.
+        resolution, crop: See `Scene.resized`.
+        resize: Brings each scene to that size, as `Scene.resized` does.
     """
 
     split: Split

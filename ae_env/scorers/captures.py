@@ -1,4 +1,7 @@
-"""Descriptions of captures for scorers: of any captures, and of every state of a scene."""
+"""What a scorer is, and `Captures`: the facts about the images that it scores.
+
+Captures are described for any batch of frames, or for every state of a scene at once.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +9,203 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from ae_env.scenes.scene import Scene
-from ae_env.scorers.protocol import Captures, PixelBlur, layout_blur, stacked
 from simulator.camera import CameraProfile
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.motion_path import ALONG_ROWS, Movement
+from simulator.optics.discs import DIAMETERS
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.cache import LruCache
 
-#: Memory that the captures of a state take, about [byte].
-_STATE_BYTES = 1000
+#: Memory for cached descriptions of captures [byte], some 1000 scenes at 64 states, and what those
+#: of one state take, about.
+_MEMORY_BYTES, _STATE_BYTES = 2**26, 1000
+
+ColourMatrix = tuple[tuple[float, float, float], ...]
+Domain = Literal["raw", "srgb"]
+#: Input that decides a score: ``"image"``, the recorded image with its noise; ``"light"``, the
+#: noise-free light on the sensor; ``"blur"``, also (or only) the extent of the blur, which changes
+#: from episode to episode. The last two have a closed form and need no noise seeds; in static light
+#: they are computed once per episode.
+DependsOn = Literal["image", "light", "blur"]
+
+
+@runtime_checkable
+class Scorer(Protocol):
+    """Rates images between 0 and 1; higher is better.
+
+    A scorer has ``domain``, ``"raw"`` or ``"srgb"``, and may have ``depends_on``, by default
+    ``"image"``. Called with images (B, C, H, W) in [0, 1] (C = 4 for raw, 3 for sRGB) and the
+    `Captures` they come from, it returns (B,) in [0, 1]. A scorer with ``depends_on`` ``"light"``
+    or ``"blur"`` reads the captures only and is called with ``images=None``.
+    """
+
+    domain: Domain
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of the images."""
+
+
+def reads_pixels(scorer: Scorer) -> bool:
+    """Whether `scorer` looks at images or at the light of a scene; True unless it says otherwise.
+
+    Those with ``reads_pixels = False`` see the settings, the exposure and the blur only.
+    """
+    return bool(getattr(scorer, "reads_pixels", True))
+
+
+class PixelBlur(NamedTuple):
+    """Blur of B captures whose pixels differ in it.
+
+    Args:
+        levels: (B, K) float64, extents that pixels of a capture have [pixel of the frame].
+        shares: (B, K) float64, shares of the pixels that have them; they sum to 1.
+    """
+
+    levels: torch.Tensor
+    shares: torch.Tensor
+
+    @property
+    def rms_px(self) -> torch.Tensor:
+        """(B,) root mean square extent over the pixels [pixel of the frame]."""
+        return self.levels.square().mul_(self.shares).sum(dim=1).sqrt_()
+
+
+@dataclass(frozen=True, eq=False)
+class Captures:
+    """The facts about a batch of B captures besides their pixels.
+
+    Args:
+        settings: Settings of each capture, B long.
+        scene_ids: Scene of each capture, B long.
+        scene_light: (B, 4, H, W) linear light of the scenes at their reference settings.
+        ratio: (B,) float64, exposure ratio from that reference to the capture.
+        nlf: Noise of a native sensor pixel at the settings, B long.
+        proper_ev: (B,) float64, EV100 of the right exposure: that of the incident light, or, where
+            it is unknown, the one at which the mean of the recorded green is 0.12.
+        blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the
+            root mean square over the pixels, where they differ.
+        white_balance: (B, 3) gains of R, G, B.
+        colour_matrices: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where
+            unknown.
+        row_gain: (B, H) float64, light of each row relative to the frame's mean, which is in
+            `ratio` and `proper_ev`: the bands of flickering light. None where every row of every
+            capture has the same.
+        source_noise: Noise that the source of each capture brings, of a native pixel, B long; None
+            where all come from light without noise.
+        noisy: Whether the captures have noise.
+        pixel_blur: How many pixels have which extent of blur; None where all have `blur_px`.
+    """
+
+    settings: Sequence[CameraSettings]
+    scene_ids: Sequence[str]
+    scene_light: torch.Tensor
+    ratio: torch.Tensor
+    nlf: Sequence[NoiseLevelFunction]
+    proper_ev: torch.Tensor
+    blur_px: torch.Tensor
+    white_balance: torch.Tensor
+    colour_matrices: Sequence[ColourMatrix | None]
+    row_gain: torch.Tensor | None = None
+    source_noise: Sequence[NoiseLevelFunction] | None = None
+    noisy: bool = True
+    pixel_blur: PixelBlur | None = None
+
+    def __len__(self) -> int:
+        return len(self.settings)
+
+    @cached_property
+    def light(self) -> torch.Tensor:
+        """(B, 4, H, W) noise-free signal at the settings, before blur and clip; white is 1."""
+        light = self.scene_light * self.ratio.to(self.scene_light.dtype)[:, None, None, None]
+        if self.row_gain is None:
+            return light
+        return light * self.row_gain.to(light.dtype)[:, None, :, None]
+
+    def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
+        """Variance of a native pixel's noise in the captures, at the recorded `signal`.
+
+        The camera's own at the settings, or the source's where it brought more.
+
+        Args:
+            signal: (B, 4, ...), at least 0, white is 1.
+        """
+        variance = torch.zeros_like(signal)
+        if not self.noisy:
+            return variance
+        for noises in (self.nlf, self.source_noise or ()):
+            if noises:
+                shape = (len(self), 4, *[1] * (signal.ndim - 2))
+                shot = torch.tensor([n.shot for n in noises]).reshape(shape).to(signal)
+                read = torch.tensor([n.read for n in noises]).reshape(shape).to(signal)
+                variance = variance.maximum(signal * shot + read)
+        return variance
+
+    @cached_property
+    def ev100(self) -> torch.Tensor:
+        """(B,) float64, EV100 of the settings, with the effective f-numbers."""
+        return torch.tensor([-s.log2_exposure for s in self.settings], dtype=torch.float64)
+
+    @property
+    def frame_height(self) -> int:
+        """Height of the packed frame [pixel]."""
+        return self.scene_light.shape[-2]
+
+
+# -- a scene in an episode ------------------------------------------------------------------------
+
+
+def prepare_scene(
+    scene: Scene,
+    camera: CameraProfile,
+    *,
+    speed: float = 0.0,
+    defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
+) -> PreparedScene:
+    """`scene` as `camera` sees it in an episode.
+
+    Args:
+        scene: The scene.
+        camera: The body that takes the captures.
+        speed: Image speed [frame heights per second].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
+        movement: Directions of the image's motion, and the subject's own.
+    """
+    prepared = replace(scene.prepared, camera=camera)
+    return in_episode(prepared, speed=speed, defocus=defocus, movement=movement)
+
+
+def in_episode(
+    prepared: PreparedScene, *, speed: float, defocus: float, movement: Movement
+) -> PreparedScene:
+    """A scene's `prepared` in an episode; the arguments are those of `prepare_scene`."""
+    pixels = defocus * prepared.light.shape[-2] / 64.0
+    return prepared.changed(image_speed=speed, defocus=pixels, movement=movement)
+
+
+def source_noises(
+    prepared: PreparedScene, states: Sequence[CameraSettings], gain: float | np.ndarray
+) -> list[NoiseLevelFunction] | None:
+    """`Captures.source_noise` of captures of `prepared` in the light `gain`, one or (S,)."""
+    if prepared.nlf.is_zero:
+        return None
+    found = []
+    for state, own in zip(states, np.broadcast_to(gain, len(states)).tolist(), strict=True):
+        exposure = prepared.exposure(state, gain=own)
+        left = exposure.remaining_variance
+        share = prepared.box_factor**2 * (1.0 if left is None else float(left.mean()))
+        found.append(exposure.source_noise.scaled(share))
+    return found
+
+
+# -- descriptions ---------------------------------------------------------------------------------
 
 
 def describe_captures(
@@ -54,13 +239,16 @@ def describe_captures(
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
-    aperture_blurs = np.array([4.0 / s.effective_f_number for s in settings])
-    discs = defocus * aperture_blurs * height / 64.0
-    blur = np.hypot(speed * times * height, discs)
+    discs = defocus * _aperture_blurs(settings) * height / 64.0
     own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
-    blur = np.hypot(blur, own)  # exactly `blur` where they are 0
+    # Exactly the others' where `own` is 0.
+    blur = np.hypot(np.hypot(speed * times * height, discs), own)
     moves = [ALONG_ROWS] * len(scenes) if movements is None else movements
-    pixel_blur = _pixel_blur(scenes, moves, blur, speed=speed, times=times, discs=discs, own=own)
+    pixel_blur = None
+    if discs.any() or any(move.subject_speed for move in moves):
+        numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
+        each = zip(scenes, moves, speed.tolist(), numbers, strict=True)
+        pixel_blur = _stacked([layout_blur(*one) for one in each], blur)
     nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
     return Captures(
@@ -80,27 +268,52 @@ def describe_captures(
     )
 
 
-def _pixel_blur(
-    scenes: Sequence[Scene],
-    moves: Sequence[Movement],
-    blur: np.ndarray,
-    *,
-    speed: np.ndarray,
-    times: np.ndarray,
-    discs: np.ndarray,
-    own: Sequence[float],
+def layout_blur(
+    scene: Scene, movement: Movement, speed: float, numbers: np.ndarray
 ) -> PixelBlur | None:
-    """How many pixels have which blur; None where all pixels of each capture have `blur`."""
-    parts: list[PixelBlur | None] = []
-    if discs.any() or any(move.subject_speed for move in moves):
-        numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
-        parts = [
-            layout_blur(scene, move, speed=v, times=t, discs=d, own=o)
-            for scene, move, v, (t, d, o) in zip(
-                scenes, moves, speed.tolist(), numbers, strict=True
-            )
-        ]
-    return stacked(parts, blur)
+    """Blur of S captures of a scene with a layout; None where all pixels have the same.
+
+    Args:
+        scene: The scene.
+        movement: Directions of the image's motion, and the subject's own.
+        speed: Image speed [frame heights per second].
+        numbers: (3, S) exposure times [s], diameters of the largest disc of defocus [pixel], and
+            blur that the scene brings itself [pixel].
+    """
+    layout, height, (times, discs, own) = scene.layout, scene.light.shape[-2], numbers
+    if layout is None or not (discs.any() or movement.subject_speed):
+        return None
+    counted = layout.shares
+    own_square = own**2
+    rest = ((speed * times * height) ** 2 + own_square)[:, None]
+    if movement.subject_speed:
+        extent = movement.subject_extent(speed, times) * height
+        rest = np.where(counted.subject, (extent**2 + own_square)[:, None], rest)
+    levels = np.minimum(np.multiply.outer(discs, counted.defocus), DIAMETERS[-1])  # as in the frame
+    levels *= levels
+    levels += rest
+    np.sqrt(levels, out=levels)  # (S, K)
+    shares = torch.from_numpy(counted.share).expand(len(times), -1)
+    return PixelBlur(torch.from_numpy(levels), shares)
+
+
+def _stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlur | None:
+    """One of B captures from one of each; where it is None, all pixels have `blur_px` (B,)."""
+    most = max((part.levels.shape[1] for part in parts if part is not None), default=0)
+    if not most:
+        return None
+    levels, shares = torch.zeros(2, len(parts), most, dtype=torch.float64)
+    for i, part in enumerate(parts):
+        if part is None:
+            levels[i, 0], shares[i, 0] = float(blur_px[i]), 1.0
+        else:
+            count = part.levels.shape[1]
+            levels[i, :count], shares[i, :count] = part.levels[0], part.shares[0]
+    return PixelBlur(levels, shares)
+
+
+def _aperture_blurs(settings: Sequence[CameraSettings]) -> np.ndarray:
+    return np.array([4.0 / s.effective_f_number for s in settings])
 
 
 @dataclass(frozen=True)
@@ -109,17 +322,17 @@ class _AtRest:
 
     scene: weakref.ref[Scene]
     captures: Captures
-    times: np.ndarray
-    aperture_blurs: np.ndarray
 
     @cached_property
-    def blurs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Times, aperture blurs and own blur where states differ in them, and which each has."""
-        own = self.captures.blur_px.numpy()
-        numbers = np.stack([self.times, self.aperture_blurs, own], axis=1)
+    def blurs(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3, K) times, aperture blurs and own blur of states that differ in them, and (S,) which
+        of them each state has.
+        """
+        states = self.captures.settings
+        times = [state.exposure_time for state in states]
+        numbers = np.stack([times, _aperture_blurs(states), self.captures.blur_px.numpy()], axis=1)
         few, alike = np.unique(numbers, axis=0, return_inverse=True)
-        times, aperture_blurs, own = few.T.copy()
-        return times, aperture_blurs, own, alike.reshape(-1)
+        return few.T.copy(), alike.reshape(-1)
 
 
 class SceneCaptures:
@@ -127,42 +340,36 @@ class SceneCaptures:
 
     Args:
         camera: The body.
-        max_bytes: Memory of its cache.
+        states: The settings of the S states.
+        noisy: Whether captures have noise.
         copies: Whether scorers get a copy of the light.
     """
 
-    def __init__(self, camera: CameraProfile, max_bytes: int, *, copies: bool) -> None:
-        self.camera, self.copies = camera, copies
-        self._at_rest: LruCache[_AtRest] = LruCache(max_bytes)
+    def __init__(
+        self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool, copies: bool
+    ) -> None:
+        self.camera, self.states, self.noisy, self.copies = camera, states, noisy, copies
+        self._at_rest: LruCache[_AtRest] = LruCache(_MEMORY_BYTES)
 
     def describe(
         self,
         scene: Scene,
-        states: Sequence[CameraSettings],
-        *,
-        speed: float = 0.0,
-        defocus: float = 0.0,
-        movement: Movement = ALONG_ROWS,
+        prepared: PreparedScene,
+        part: slice = slice(None),
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
-        source_noise: Sequence[NoiseLevelFunction] | None = None,
-        noisy: bool = True,
     ) -> Captures:
-        """Captures of consecutive states of a grid.
+        """Captures of some of the states.
 
         Args:
             scene: The scene.
-            states: S states that follow each other in the grid.
-            speed: Image speed [frame heights per second].
-            defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
-            movement: Directions of the image's motion, and the subject's own.
+            prepared: As it is in the episode.
+            part: Which of the states.
             gain: Light relative to the scene's own, one or (S,).
-            row_gain: (S, H), see `describe_captures`.
-            source_noise: See `Captures`.
-            noisy: See `Captures`.
+            row_gain: (S, H) light of each row relative to that, see `Captures`.
         """
-        known = self._known(scene, states)
-        blur, alike = self.blur(scene, states, speed=speed, defocus=defocus, movement=movement)
+        known, states = self._known(scene, part), self.states[part]
+        blur, alike = self.blur(scene, prepared, part)
         pixel_blur: PixelBlur | None = None
         if isinstance(blur, PixelBlur):
             pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
@@ -170,71 +377,59 @@ class SceneCaptures:
         else:
             blur_px = blur[alike]
         light: dict[str, Any] = {}
+        if isinstance(gain, np.ndarray):
+            gain = gain[part]
         if isinstance(gain, np.ndarray) or gain != 1.0:
             light["ratio"] = torch.from_numpy(known.captures.ratio.numpy() * gain)
             light["proper_ev"] = torch.from_numpy(known.captures.proper_ev.numpy() + np.log2(gain))
+        own_light = scene.clean_light.clone() if self.copies else scene.clean_light
         return replace(
             known.captures,
-            scene_light=self._light(scene, len(states)),
+            scene_light=own_light.expand(len(states), -1, -1, -1),
             blur_px=blur_px,
-            row_gain=None if row_gain is None else torch.from_numpy(row_gain),
-            source_noise=source_noise,
-            noisy=noisy,
+            row_gain=None if row_gain is None else torch.from_numpy(row_gain[part]),
+            source_noise=source_noises(prepared, states, gain),
+            noisy=self.noisy,
             pixel_blur=pixel_blur,
             **light,
         )
 
     def blur(
-        self,
-        scene: Scene,
-        states: Sequence[CameraSettings],
-        *,
-        speed: float = 0.0,
-        defocus: float = 0.0,
-        movement: Movement = ALONG_ROWS,
+        self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)
     ) -> tuple[torch.Tensor | PixelBlur, torch.Tensor]:
         """The extents of blur that there are, of few states: the ISO blurs nothing.
 
         Returns:
             (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
-            of the K each of `states` has. The arguments are those of `describe`.
+            of the K each state has. The arguments are those of `describe`.
         """
-        times, aperture_blurs, own, alike = self._known(scene, states).blurs
-        height = scene.light.shape[-2]
-        discs = defocus * aperture_blurs * height / 64.0
+        numbers, alike = self._known(scene, part).blurs
+        speed, movement, height = prepared.image_speed, prepared.movement, scene.light.shape[-2]
+        times, aperture_blurs, own = numbers
+        # In steps of a 64-pixel frame, as episodes state it: to the bit as in `describe_captures`.
+        discs = (prepared.defocus * 64.0 / height) * aperture_blurs * height / 64.0
         found: torch.Tensor | PixelBlur | None = layout_blur(
-            scene, movement, speed=speed, times=times, discs=discs, own=own
+            scene, movement, speed, np.stack([times, discs, own])
         )
         if found is None:
             found = torch.from_numpy(np.hypot(np.hypot(speed * times * height, discs), own))
         return found, torch.from_numpy(alike)
 
-    def _known(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:
+    def _known(self, scene: Scene, part: slice) -> _AtRest:
+        states = self.states[part]
         key = (id(scene), states[0], len(states))
         known = self._at_rest.get(key)
         if known is None or known.scene() is not scene:  # an id may be given out again
-            known = self._described(scene, states)
+            nothing = np.zeros(len(states))
+            captures = describe_captures(
+                [scene] * len(states),
+                states,
+                self.camera,
+                speed=nothing,
+                defocus=nothing,
+                gain=nothing + 1.0,
+                light=torch.empty(0),  # keeps no scene alive
+            )
+            known = _AtRest(weakref.ref(scene), captures)
             self._at_rest.put(key, known, _STATE_BYTES * len(states))
         return known
-
-    def _described(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:
-        nothing = np.zeros(len(states))
-        captures = describe_captures(
-            [scene] * len(states),
-            states,
-            self.camera,
-            speed=nothing,
-            defocus=nothing,
-            gain=np.ones(len(states)),
-            light=torch.empty(0),  # keeps no scene alive
-        )
-        return _AtRest(
-            weakref.ref(scene),
-            captures,
-            np.array([s.exposure_time for s in states]),
-            np.array([4.0 / s.effective_f_number for s in states]),
-        )
-
-    def _light(self, scene: Scene, count: int) -> torch.Tensor:
-        light = scene.clean_light.clone() if self.copies else scene.clean_light
-        return light.expand(count, -1, -1, -1)

@@ -1,4 +1,4 @@
-"""`CompositeScorer`: the weighted mean of other scorers, each of which is checked."""
+"""Scorers that are made of others: `CompositeScorer`, their weighted mean, and `Balanced`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from ae_env.scorers.protocol import Captures, ColourMatrix, DependsOn, Domain, Scorer
+from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, Scorer
+from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
 from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop
 
@@ -135,6 +136,36 @@ class CompositeScorer:
                 f"scorer {type(self).__name__!r}: `combine` returned {found}: rule is [0, 1]"
             )
         return np.minimum(np.maximum(totals, 0.0), 1.0)
+
+
+class Balanced(CompositeScorer):
+    """The default scorer: a photograph is as good as its worst fault allows.
+
+    Product of the five terms, each to its weight, times ``(1 - fh^4) (1 - fs^4)``, fh and fs the
+    shares of blown and blocked pixels: a frame that is all white or all black scores near 0.
+    """
+
+    def __init__(self) -> None:
+        parts: dict[str, Scorer] = {
+            "brightness": Brightness(),
+            "highlights": Highlights(),
+            "shadows": Shadows(),
+            "noise": Noise(),
+            "sharpness": Sharpness(),
+        }
+        super().__init__(parts, dict(zip(parts, (0.30, 0.15, 0.10, 0.20, 0.25), strict=True)))
+
+    def combine(self, scores: Mapping[str, Any]) -> Any:
+        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
+        # The logarithm of arrays by NumPy: torch's threads do not survive a fork.
+        log: Any = torch.log if torch.is_tensor(scores["highlights"]) else np.log
+        blown = -Highlights.scale * log(scores["highlights"])
+        blocked = -Shadows.scale * log(scores["shadows"])
+        # Rounding may leave a share above 1.
+        score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
+        for name, weight in self.weights.items():
+            score = score * scores[name] ** weight
+        return score
 
 
 def developed(

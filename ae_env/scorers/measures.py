@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_avg_pool2d, pad
 
-from ae_env.scorers.protocol import Captures, DependsOn, Domain
+from ae_env.scorers.captures import Captures, DependsOn, Domain
 
 #: R, G, B shares of luma (ITU-R BT.601), of gamma-encoded values: an 8-bit camera's grey.
 LUMA_SHARES = (0.299, 0.587, 0.114)

@@ -27,6 +27,11 @@ from simulator.utils.checks import check_word
 DepthKind = Literal["distance", "disparity"]
 #: Metres for each unit of a PNG, as depth cameras write them.
 PNG_METRES = 1e-3
+#: What is said where the estimate of the blur finds none.
+NOTHING_FOUND = (
+    "nothing was found out of focus, so nothing changed: blur below 1.5 pixels cannot be told from "
+    "sharpness"
+)
 
 
 def refocus(

@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.grid import ExposureGrid
 from ae_env.merging import LOG_FLOOR, SATURATED, WORST_EV, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
+from ae_env.tasks import FRAME_GAP
 from agents.policy import Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
 from simulator.camera import CameraProfile
@@ -51,7 +51,9 @@ def bin_of(place: Floats) -> Ints:
 class Schedules:
     """All schedules of a grid, and what they are worth.
 
-    Luminance is in units of that which makes an exposure at EV100 0 white.
+    Luminance is in units of that which makes an exposure at EV100 0 white. A schedule has `states`
+    (M, K), -1 for none, each `counts` times (M, S), so many `frames` (M,), the `longest` of so long
+    (M,) [s]; the first is no frame at all.
 
     Args:
         grid: The states.
@@ -59,12 +61,6 @@ class Schedules:
         budget: Time of all frames together [s].
         max_frames: Frames of a schedule at most.
         box_factor: Photosites averaged a side into one pixel.
-
-    Attributes:
-        states: (M, K) int64, the states of each, -1 for none; the first is no frame at all.
-        counts: (M, S) how often each has each state.
-        frames: (M,) how many frames each has.
-        longest: (M,) its longest exposure [s].
     """
 
     def __init__(
@@ -76,7 +72,7 @@ class Schedules:
         box_factor: int,
     ) -> None:
         self.grid, self.budget, self.max_frames = grid, budget, max_frames
-        exposures = np.array([s.exposure_time for s in grid])
+        self._exposures = exposures = np.array([s.exposure_time for s in grid])
         found = [(-1,) * max_frames]
         for count in range(1, max_frames + 1):
             for chosen in itertools.combinations_with_replacement(range(len(grid)), count):
@@ -89,21 +85,11 @@ class Schedules:
         nlfs = [camera.nlf(s.iso).scaled(1.0 / box_factor**2) for s in grid]
         self.shot = np.array([np.mean(n.shot) for n in nlfs])
         self.read = np.array([np.mean(n.read) for n in nlfs])
-        self._weights = lru_cache(maxsize=64)(self._weights_of)
-        self._noise = lru_cache(maxsize=256)(self._noise_of)
+        self.precision = lru_cache(maxsize=64)(self._precision)
+        self.noise_error = lru_cache(maxsize=256)(self._noise_error)
 
-    def precision(self, reference: float) -> tuple[Floats, Floats]:
-        """Inverse variance of the merged luminance, and each frame's share of it.
-
-        Args:
-            reference: EV100 that `BINS` are relative to.
-
-        Returns:
-            (M, L), and (M, K, L).
-        """
-        return self._weights(float(reference))
-
-    def _weights_of(self, reference: float) -> tuple[Floats, Floats]:
+    def _precision(self, reference: float) -> tuple[Floats, Floats]:
+        """Inverse variance (M, L) of merged luminance, and each frame's share of it (M, K, L)."""
         luminance = np.exp2(BINS + reference)
         gain = np.exp2(-self.grid.ev100)[:, None]
         signal = gain * luminance
@@ -115,18 +101,13 @@ class Schedules:
         share = each / np.maximum(total, 1e-300)[:, None]
         return total, share.astype(np.float32)
 
-    def noise_error(self, reference: float, floor: float) -> Floats:
+    def _noise_error(self, reference: float, floor: float) -> Floats:
         """(M, L) expected error of merged samples [EV]; `WORST_EV` where all frames are white.
 
-        Args:
-            reference: EV100 that `BINS` are relative to.
-            floor: log2 of the luminance below which errors count less; to the nearest stop.
+        `floor` is log2 of the luminance below which errors count less, to the nearest stop.
         """
-        return self._noise(float(reference), round(floor))
-
-    def _noise_of(self, reference: float, floor: int) -> Floats:
         total, _ = self.precision(reference)
-        luminance, dark = np.exp2(BINS + reference), 2.0**floor
+        luminance, dark = np.exp2(BINS + reference), 2.0 ** round(floor)
         deviation = 1.0 / np.sqrt(np.maximum(total, 1e-300))
         error = np.zeros_like(total)
         for normal in _NORMALS:
@@ -140,7 +121,7 @@ class Schedules:
 
         Args:
             reference: EV100 that `BINS` are relative to.
-            floor: See `noise_error`.
+            floor: log2 of the luminance below which errors count less.
             light: (L,) share of the samples in each of `BINS`.
             blur: (S,) error that the blur of each state makes [EV].
         """
@@ -154,28 +135,15 @@ class Schedules:
         return np.minimum(both, WORST_EV) @ light.astype(np.float32)
 
     def completions(self, taken: Ints, time_left: float) -> NDArray[np.bool_]:
-        """(M,) bool: schedules that hold the frames `taken` so far and fit into the time left.
-
-        Args:
-            taken: States of the frames so far.
-            time_left: Time left [s].
-        """
+        """(M,) bool: schedules that hold the states `taken` and fit into the `time_left` [s]."""
         counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
         more = self.frames - len(taken)
-        exposures = np.array([s.exposure_time for s in self.grid])
-        needed = (self.counts - counts) @ exposures + FRAME_GAP * np.maximum(more - 1, 0)
+        needed = (self.counts - counts) @ self._exposures + FRAME_GAP * np.maximum(more - 1, 0)
         fits = needed <= time_left + _SLACK
-        holds: NDArray[np.bool_] = (self.counts >= counts).all(axis=1) & fits
-        return holds
+        return np.asarray((self.counts >= counts).all(axis=1) & fits)
 
     def next_state(self, schedule: int, taken: Ints, alone: Floats) -> int:
-        """The state of `schedule` to take next, the best by `alone`; -1 when all are taken.
-
-        Args:
-            schedule: Index of the schedule.
-            taken: States of the frames so far.
-            alone: (S,) error of each state alone.
-        """
+        """The next state of `schedule`, of the least error `alone` (S,); -1 when all are taken."""
         left = self.counts[schedule].copy()
         np.subtract.at(left, taken, 1)
         wanted = np.flatnonzero(left > 0)
@@ -217,9 +185,8 @@ class Bracketing(Policy):
                 "bracketing policies are for ae_env/ExposureBracket-v0 (`ae-env evaluate --preset "
                 "bracket`)"
             )
-        if context.observation_space["raw"].dtype != np.uint8 or (
-            "histogram" in context.observation_space.spaces
-        ):
+        space = context.observation_space
+        if space["raw"].dtype != np.uint8 or "histogram" in space.spaces:
             raise ValueError("bracketing policies need `observation`='uint8'")
         limits = context.bracket
         self.schedules = Schedules(
@@ -240,26 +207,24 @@ class Bracketing(Policy):
         aperture, time, speed = decode_settings(observations["settings"])
         ev100 = aperture + time - (speed - 5.0)
         # Nominal settings are rounded, so the state is the nearest one of this ISO.
-        isos = np.log2(np.array([s.iso for s in self.context.grid]) / 3.125)
-        apart = np.abs(self.context.grid.ev100 - ev100[:, None]) + 10 * np.abs(
-            isos - speed[:, None]
-        )
+        grid = self.context.grid
+        isos = np.log2(np.array([s.iso for s in grid]) / 3.125)
+        apart = np.abs(grid.ev100 - ev100[:, None]) + 10 * np.abs(isos - speed[:, None])
         states = apart.argmin(axis=1)
         for i, frames in enumerate(self._frames):
             if not self._done[i]:
                 frames.append((int(states[i]), observations["raw"][i].copy()))
         new = np.isnan(self._reference)
-        self._reference[new] = self.context.grid.ev100[states[new]]
+        self._reference[new] = grid.ev100[states[new]]
 
     def taken(self, camera: int) -> Ints:
         """States of the frames that a camera has taken, without the viewfinder's."""
         return np.array([state for state, _ in self._frames[camera][1:]], np.int64)
 
     def merged(self, camera: int) -> tuple[Floats, Floats, float]:
-        """Luminance of each sample in all frames of a camera, its inverse variance, and the limit.
+        """Luminance of each sample in all frames of a camera, and its inverse variance, both flat.
 
-        Returns:
-            Two flat arrays, and log2 of the luminance that the shortest exposure shows white.
+        The third is log2 of the luminance that the shortest exposure shows white.
         """
         states = [state for state, _ in self._frames[camera]]
         codes = np.stack([raw for _, raw in self._frames[camera]])
@@ -273,8 +238,8 @@ class Bracketing(Policy):
         scale = float(gains.max())
         light, precision = merge(signals, torch.from_numpy(gains / scale)[None], shot, read)
         limit = -float(np.log2(gains.min()))
-        flat = light.flatten().double().numpy() / scale, precision.flatten().double().numpy()
-        return flat[0], flat[1] * scale**2, limit
+        luminance, known = (part.flatten().double().numpy() for part in (light, precision))
+        return luminance / scale, known * scale**2, limit
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
@@ -295,13 +260,7 @@ class Bracketing(Policy):
         return actions
 
     def choose(self, camera: int, time_left: float, speed: float) -> int:
-        """The next state of one camera, or `stop`.
-
-        Args:
-            camera: Index of the camera.
-            time_left: Time left [s].
-            speed: Speed of its shake [frame heights per second].
-        """
+        """The next state of a camera, or `stop`; `speed` of its shake [frame heights / s]."""
         raise NotImplementedError(f"{type(self).__name__} must implement `choose`")
 
 
@@ -347,13 +306,12 @@ class Hasinoff(Bracketing):
     Of all schedules that fit into the time, the one whose merged signal-to-noise ratio is largest
     where it is smallest over the range of the scene's light (Hasinoff et al., CVPR 2010). The range
     is that of the viewfinder's frame; where that is clipped it reaches `headroom` above white. The
-    schedule knows no motion, so exposures are at most `longest`. `fit` finds both on training
-    scenes, where they are not given.
+    schedule knows no motion, so exposures are at most `longest`.
 
     Args:
         context: The camera.
-        headroom: Stops; None fits it.
-        longest: Longest exposure time [s]; None fits it.
+        headroom: Stops; None: `fit` finds it on training scenes.
+        longest: Longest exposure time [s]; None likewise.
     """
 
     def __init__(
@@ -429,11 +387,8 @@ def describe(
 ) -> NDArray[np.float32]:
     """(3, L) histograms over `BINS`: of clear samples, of white ones, of those in the noise.
 
-    White samples count where they begin, at `limit`; those in the noise at the noise.
-
-    Args:
-        light, precision, limit: Of `Bracketing.merged`.
-        reference: EV100 that `BINS` are relative to.
+    White samples count where they begin, at `limit`; those in the noise at the noise. See
+    `Bracketing.merged`; `BINS` are relative to `reference` [EV100].
     """
     white = precision <= 0.0
     deviation = 1.0 / np.sqrt(np.maximum(precision, 1e-300))
@@ -466,20 +421,16 @@ class Planner(Bracketing):
         errors = self.schedules.errors(reference, reference + _FLOOR, self.light(camera), blur)
         fits = self.schedules.completions(taken, time_left)
         best = int(np.where(fits, errors, np.inf).argmin())
-        state = self.schedules.next_state(best, taken, self._of_one(errors))
+        alone = np.full(self.stop, np.inf)  # error of single frames; inf where none fits
+        single = np.flatnonzero(self.schedules.frames == 1)
+        alone[self.schedules.states[single, 0]] = errors[single]
+        state = self.schedules.next_state(best, taken, alone)
         return self.stop if state < 0 else state
 
     def light(self, camera: int) -> Floats:
         """(L,) shares of the samples in `BINS`, as the frames so far show them."""
         described = describe(*self.merged(camera), float(self._reference[camera]))
         return described.sum(axis=0, dtype=np.float64)
-
-    def _of_one(self, errors: Floats) -> Floats:
-        """(S,) errors of single frames; those that do not fit into the budget are worst."""
-        found = np.full(self.stop, np.inf)
-        single = np.flatnonzero(self.schedules.frames == 1)
-        found[self.schedules.states[single, 0]] = errors[single]
-        return found
 
 
 def blur_error(pixels: Floats) -> Floats:
@@ -510,11 +461,8 @@ def run_brackets(
     Returns:
         ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each
         episode, and the ``seconds`` that each decision took on average.
-
-    Raises:
-        UserCodeError: If the policy raises, or returns something else than actions.
     """
-    name = policy.name if name is None else name
+    name = name or policy.name
     names = ("quality", "log_error", "unseen", "frames", "time_left")
     found: dict[str, list[NDArray[Any]]] = {key: [] for key in (*names, "group", "seconds")}
     episodes = RolloutPlan.of_each_scene(scenes_of(envs), count=count, seed=seed, most=most)

@@ -1,4 +1,7 @@
-"""Shared by the commands: the console, progress bars, common options and their checks."""
+"""Shared by the commands: the terminal, progress bars, common options and their checks.
+
+Help must come at once: no module of a command imports anything heavy, see `main`.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-console = Console()
+terminal = Console()
 
-# -- options of several commands: no module of a command imports anything heavy, see main.py ------
+# -- options of several commands ------------------------------------------------------------------
 
 MAX_SEED = 2**63 - 1
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
@@ -74,31 +77,28 @@ TOLERANCE = 0.1
 @contextmanager
 def progress_bars() -> Iterator[Any]:
     """Progress bars with time left, in a log a line each; yields a function that opens one."""
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("[dim]{task.fields[note]}"),
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.TextColumn("{task.percentage:>3.0f}%"),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("[dim]{task.fields[note]}"),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as display:
+    shown = terminal.is_terminal
+    with progress.Progress(*columns, console=terminal, disable=not shown) as display:
 
         @contextmanager
         def bar(title: str) -> Iterator[Any]:
             task = display.add_task(title, total=None, note="")
-            if not console.is_terminal:
+            if not shown:
                 print_line(f"{title} ...")
 
-            def move(done: int, total: int, note: str = "") -> None:
+            def move(done: float, total: float, note: str | Mapping[str, float] = "") -> None:
+                if not isinstance(note, str):
+                    note = ", ".join(f"{name} {value:.3f}" for name, value in note.items())
                 display.update(task, completed=done, total=total, note=note)
 
             yield move
@@ -108,7 +108,7 @@ def progress_bars() -> Iterator[Any]:
 
 def print_line(text: str) -> None:
     """Prints a line as it is: names in it are no markup, and it is not wrapped."""
-    console.print(text, highlight=False, soft_wrap=True, markup=False)
+    terminal.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def print_files(files: Mapping[str, Path]) -> None:
@@ -185,8 +185,8 @@ def make_folder(
 
     Args:
         path: The folder.
-        name: The option that names it.
-        file: The file in the folder that the option names, if it names one.
+        name: The option that names it, or names `file` in it.
+        file: The file.
         make: False only checks that it could be made.
 
     Raises:
@@ -209,26 +209,24 @@ def make_folder(
 
 
 def check_outputs(*read: Path | None, **files: tuple[Path | None, str]) -> None:
-    """Checks that each file has its ending, is none that is read and can be written; makes nothing.
+    """Checks that files have their endings, are none that is read, and can be written.
 
-    Whoever writes a file makes its folder: an error before leaves none.
+    It makes nothing: whoever writes a file makes its folder, and an error before leaves none.
 
     Args:
         read: Files that are read, the raw first.
         files: By the name of the option, the file or None, and its ending.
-
-    Raises:
-        ValueError: Otherwise; says which.
     """
     for name, (path, suffix) in files.items():
-        if path is not None and path.suffix.lower() != suffix:
+        if path is None:
+            continue
+        if path.suffix.lower() != suffix:
             raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
         for i, own in enumerate(read):
-            if path is not None and own is not None and path.resolve() == own.resolve():
+            if own is not None and path.resolve() == own.resolve():
                 what = "the raw itself" if i == 0 else "a file that is read"
                 raise ValueError(f"`{name}` (={str(path)!r}) must not be {what}")
-        if path is not None:
-            make_folder(path.parent, name=name, file=path, make=False)
+        make_folder(path.parent, name=name, file=path, make=False)
 
 
 def torch_device(name: str) -> str:

@@ -11,14 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from agents.cli.console import (
-    Seed,
-    console,
-    make_folder,
-    print_files,
-    print_line,
-    progress_bars,
-)
+from agents.cli import console
+from agents.cli.console import print_files, print_line, progress_bars
 
 scenes = typer.Typer(no_args_is_help=True)
 
@@ -60,7 +54,9 @@ def download(
 
     with progress_bars() as progress, progress("maps") as task:
         fetched = download(url=url or URL, progress=task)
-    console.print(f"{len(fetched)} of {len(list_assets())} maps were fetched, all are there")
+    console.terminal.print(
+        f"{len(fetched)} of {len(list_assets())} maps were fetched, all are there"
+    )
     print_line("try next: ae-env quickstart --scenes polyhaven --out real_scenes")
 
 
@@ -76,7 +72,7 @@ def record(
     scenes: Annotated[str | None, typer.Option(help="Scenes to draw from.")] = None,
     split: Annotated[str | None, typer.Option(help="train (default), test or all.")] = None,
     episodes: Annotated[int, typer.Option(help="How many.", min=1, max=1_000_000)] = 200,
-    seed: Seed = 0,
+    seed: console.Seed = 0,
 ) -> None:
     """Record episodes of a policy as a Minari dataset.
 
@@ -96,12 +92,9 @@ def record(
 
     check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))
     check_dataset_id(out)
+    options: dict[str, Any] = {"split": "train"} | ({} if env is None else load_preset(env))
     given = {"split": split, "scenes": scenes}
-    options: dict[str, Any] = {
-        "split": "train",
-        **({} if env is None else load_preset(env)),
-        **{name: value for name, value in given.items() if value is not None},
-    }
+    options |= {name: value for name, value in given.items() if value is not None}
     task = f"ae_env/{task}"
     with closing(gym.make_vec(f"ae_env:{task}", num_envs=1, **options)) as envs:
         acting = make_policy(policy, PolicyContext.from_envs(envs))
@@ -116,7 +109,7 @@ def record(
                 acting, policy, task, options, out, episodes=episodes, seed=seed, progress=bar
             )
     mean = sum(one.rewards.sum() for one in dataset.iterate_episodes()) / dataset.total_steps
-    console.print(f"{dataset.total_steps:,} steps, mean reward {mean:.3f}")
+    console.terminal.print(f"{dataset.total_steps:,} steps, mean reward {mean:.3f}")
     print_line(f'read it with: minari.load_dataset("{out}")')
 
 
@@ -150,7 +143,7 @@ def score_tables(
     camera: Annotated[str, typer.Option(help="Camera for radiance maps.")] = "nikon_z6",
     weights: TakesNoiseOut = "compact",
     captures: Annotated[bool, typer.Option(help="Also write the captures.")] = False,
-    seed: Seed = 0,
+    seed: console.Seed = 0,
 ) -> None:
     """Score every exposure state of many raws or radiance maps; writes Parquet, shard by shard.
 
@@ -174,35 +167,18 @@ def score_tables(
     ExposureGrid.from_spec(grid), make_scorer(scorer), get_camera(camera)
     if weights != "none":
         check_weights(weights)
-    plan = ShardPlan.of(
-        what,
-        out,
-        per_shard=per_shard,
-        resolution=resolution,
-        camera=camera,
-        grid=grid,
-        scorer=scorer,
-        weights=weights,
-        captures=captures,
-        seed=seed,
-    )
-    make_folder(out)
+    options: dict[str, Any] = {"resolution": resolution, "camera": camera, "grid": grid}
+    options |= {"per_shard": per_shard, "scorer": scorer, "weights": weights}
+    plan = ShardPlan.of(what, out, **options, captures=captures, seed=seed)
+    console.make_folder(out)
     begun = perf_counter()
     with progress_bars() as progress, progress("shards") as task:
         made = run(plan, on, task, workers)
-    _print_shards(made, out, perf_counter() - begun)
-
-
-def _print_shards(made: list[Any], out: Path, seconds: float) -> None:
-    """Says what became of the files.
-
-    Raises:
-        RuntimeError: If none of them could be made a scene.
-    """
     if not made:
         print_line("every shard was there already")
         return
     scenes, bad = (sum(int(one[name]) for one in made) for name in ("scenes", "bad"))
+    seconds = perf_counter() - begun
     print_line(f"{scenes} scenes in {seconds:.1f} s, {bad} files that could not be read")
     if bad:
         print_line(f"which and why: {out}/bad-*.jsonl")
@@ -232,7 +208,7 @@ def cache(
     table.add_column("bytes", justify="right")
     for kind, (files, size) in usage.items():
         table.add_row(kind.replace("_", " "), f"{files:,}", f"{size:,}")
-    console.print(table)
+    console.terminal.print(table)
     print_line(f"folder: {disk.folder}")
 
 
@@ -252,7 +228,7 @@ def warm_up() -> None:
         task(len(_CASES), len(_CASES) + 1, "raw files and the viewer")
         _use_rest()
         task(len(_CASES) + 1, len(_CASES) + 1)
-    console.print("try next: ae-env quickstart")
+    console.terminal.print("try next: ae-env quickstart")
 
 
 def _play(name: str, arguments: dict[str, Any]) -> None:
@@ -269,14 +245,15 @@ def _play(name: str, arguments: dict[str, Any]) -> None:
 
 
 def _use_rest() -> None:
-    """Does what those environments do not: raw files, the viewer, blur along rows, painting."""
+    """Compiles what those environments do not use: raw files, the viewer, blur along rows."""
     import numpy as np
     import torch
 
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.optics.blur import Blur, blur_many, disc_blur, motion_blur
+    from simulator.optics.discs import Blur, blur_many, disc_blur
+    from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw
 
     library = find_scenes(DEFAULT_SCENES)

@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from agents.cli.console import (
-    MAX_SEED,
-    Device,
-    OnError,
-    Policies,
-    command_line,
-    console,
-    make_folder,
-    print_files,
-    progress_bars,
-    scene_files,
-    torch_device,
-)
+from agents.cli import console
 
 if TYPE_CHECKING:
-    from agents.evaluation.intervals import Rank
+    import pandas as pd
+
     from agents.evaluation.plan import EvaluationPlan
     from agents.evaluation.result import EvaluationResult
 
 logger = logging.getLogger(__name__)
 
-#: Options that are arguments of the environment, and those of the condition; the only one that a
-#: benchmark takes; and those that an evaluation of brackets takes.
+#: Options that are arguments of the environment, those of the condition, and of the episodes; the
+#: only one that a benchmark takes; and those that an evaluation of brackets takes.
 _ENVIRONMENT = ("scenes", "split", "grid", "observation", "sensors", "resolution", "scorer")
-_CONDITION = ("lighting", "delay")
+_CONDITION, _EPISODES = ("lighting", "delay"), ("episodes", "frames", "seed")
 _OF_BENCHMARKS: tuple[str, ...] = ("observation",)
 _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 
@@ -72,7 +60,7 @@ Frames = Annotated[int | None, typer.Option(help="Frames per episode.", min=1)]
 Append = Annotated[Path | None, typer.Option(help="Benchmark table (CSV) to add the results to.")]
 Author = Annotated[str, typer.Option(help="For --append: who made the policy.")]
 FirstSeed = Annotated[
-    int | None, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)
+    int | None, typer.Option(help="Seed of everything random.", min=0, max=console.MAX_SEED)
 ]
 Workers = Annotated[
     int | None, typer.Option(help="Processes; by default one per core if it pays.", min=1)
@@ -80,11 +68,12 @@ Workers = Annotated[
 
 
 def evaluate(
-    policy: Policies = None,
+    context: typer.Context,
+    policy: console.Policies = None,
     preset: Preset = None,
     env: Environment = None,
     scenes: Scenes = None,
-    on_error: OnError = "stop",
+    on_error: console.OnError = "stop",
     split: Split = None,
     grid: Grid = None,
     scorer: Scorer = None,
@@ -100,7 +89,7 @@ def evaluate(
     author: Author = "",
     seed: FirstSeed = None,
     workers: Workers = None,
-    device: Device = "cpu",
+    device: console.Device = "cpu",
 ) -> None:
     """Compare policies on the same episodes; a second run resumes the first.
 
@@ -109,40 +98,27 @@ def evaluate(
 
     Example: `ae-env evaluate --preset quick --policy matrix:tuned --policy average`
     """
-    options = {
-        "scenes": scenes,
-        "split": split,
-        "grid": grid,
-        "scorer": scorer,
-        "observation": observation,
-        "sensors": sensors,
-        "resolution": resolution,
-        "lighting": lighting,
-        "delay": delay,
-        "episodes": episodes,
-        "frames": frames,
-        "seed": seed,
-    }
-    given = {name: value for name, value in options.items() if value is not None}
+    options = (*_ENVIRONMENT, *_CONDITION, *_EPISODES)
+    given = {name: context.params[name] for name in options if context.params[name] is not None}
     if scenes is not None:
-        given["scenes"] = scene_files(scenes, on_error)
+        given["scenes"] = console.scene_files(scenes, on_error)
     elif on_error != "stop":
         raise ValueError(
             f"`on-error` (={on_error!r}) is about the files of --scenes: give that, too"
         )
-    device = torch_device(device)
-    plan = _plan(preset, env, list(policy or ()), given)
-    if append is not None and plan.hash is None:
-        raise ValueError(
-            f"`append` (={str(append)!r}) takes the results of a benchmark only: give "
-            "--preset ae_bench_v2_still, _video or _bracket"
-        )
-    if append is None and author:
-        raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
+    device = console.torch_device(device)
+    plan = make_plan(preset, env, policy or [], given)
     if append is not None:
+        if plan.hash is None:
+            raise ValueError(
+                f"`append` (={str(append)!r}) takes the results of a benchmark only: give "
+                "--preset ae_bench_v2_still, _video or _bracket"
+            )
         if not append.parent.is_dir():
             raise ValueError(f"`append` (={str(append)!r}): there is no folder {append.parent}")
-        make_folder(append.parent, name="append", file=append)
+        console.make_folder(append.parent, name="append", file=append)
+    elif author:
+        raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
     _run(plan, out, append, author, workers, device)
 
 
@@ -168,57 +144,80 @@ def _run(
             check_append(append, plan, ranked, author=author)
             for name in (p for p in plan.policies if p not in ranked):
                 logger.warning("%s gets no row in %s: it is told the best states", name, append)
-        make_folder(out)
+        console.make_folder(out)
         if (out / "results.json").is_file():
             logger.warning("%s has the results of another run, which this one replaces", out)
-        with progress_bars() as progress, progress("evaluation") as task:
+        with console.progress_bars() as progress, progress("evaluation") as task:
             results = run.run(workers=workers, progress=task)
-    files = write_report(results, out, command=command_line())
+    files = write_report(results, out, command=console.command_line())
     ranking = overall_ranking(results)
     if append is not None:
         files |= append_rows(append, plan, bench_rows(results, ranking), author=author)
     print_scores(results, ranking)
-    print_files(files)
+    console.print_files(files)
 
 
-def _plan(
-    preset: str | None, env: str | None, policies: list[str], given: Mapping[str, Any]
+def make_plan(
+    preset: str | None, env: str | None, policies: Sequence[str], given: Mapping[str, Any]
 ) -> EvaluationPlan:
-    """The plan that the options describe."""
-    from agents.evaluation.plan import EvaluationPlan, load_plan
+    """The plan that the options describe; `given` are those about episodes, by name."""
+    from pydantic import ValidationError
 
-    base = None if preset is None else load_plan(preset)
-    if base is not None:
+    from agents.evaluation.plan import EvaluationPlan, light_name, load_plan
+    from simulator.utils.config_file import one_line
+
+    if preset is not None:
+        base = load_plan(preset)
         _check_changes(base, [*given, *(["env"] if env is not None else [])])
-    environment: dict[str, Any] = {} if base is None else dict(base.environment)
-    condition: dict[str, Any] = {}
-    if env is not None:
-        from ae_env.options import EnvOptions
-        from ae_env.utils.user_files import load_preset
-
-        arguments = load_preset(env)
-        arguments.pop("max_episode_steps", None)
-        with _errors_of(env):
-            EnvOptions.from_kwargs(arguments)
-        condition = {k: arguments.pop(k) for k in _CONDITION if k in arguments}
-        environment |= arguments
+    elif policies:
+        plain: dict[str, Any] = {"scenes": "bundled", "resolution": 64}
+        base = EvaluationPlan(environment=plain, starts=("random",), frames=8, seeds=(0, 1))
+    else:
+        raise typer.BadParameter("give it once or more, or a --preset", param_hint="--policy")
+    environment, condition = _arguments(env)
+    environment = {**base.environment, **environment}
     environment |= {k: given[k] for k in _ENVIRONMENT if k in given}
     condition |= {k: given[k] for k in _CONDITION if k in given}
     entries: dict[str, Any] = {"environment": environment}
+    if preset is None:
+        scenes = environment["scenes"]
+        name = scenes.get("path", scenes) if isinstance(scenes, Mapping) else scenes
+        entries["name"] = f"{name}, {environment.get('split', 'test')} split"
+    elif env is not None or "scenes" in given or "split" in given:
+        entries["scene_ids"] = []  # those are of the preset's own scenes
     if policies:
         entries["policies"] = list(dict.fromkeys(policies))
     if "frames" in given:
         entries["frames"] = given["frames"]
-    if base is None:
-        if not policies:
-            raise typer.BadParameter("give it once or more, or a --preset", param_hint="--policy")
-        return _changed(EvaluationPlan(), entries | _plain(environment, condition, given))
-    if condition:  # in place of the preset's
-        entries |= {"conditions": _one_condition(condition), "delays": [0]}
-    entries["seeds"] = _seeds(base.seeds, given)
-    if env is not None or "scenes" in given or "split" in given:
-        entries["scene_ids"] = []  # those are of the preset's own scenes
-    return _changed(base, entries)
+    if condition:  # in place of the base's
+        light = light_name(condition.get("lighting", "static"))
+        entries |= {"conditions": {light: condition}, "delays": [0]}
+    if "seed" in given or "episodes" in given:
+        first = given.get("seed", base.seeds[0])
+        entries["seeds"] = [first + i for i in range(given.get("episodes", len(base.seeds)))]
+    try:
+        plan = base.changed(**entries)
+    except ValidationError as error:
+        raise ValueError(one_line(error)) from None
+    plan.protocol()  # raises where an entry is no JSON value
+    return plan
+
+
+def _arguments(env: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arguments of a preset of the environment, and those of them that are of a condition."""
+    if env is None:
+        return {}, {}
+    from ae_env.options import EnvOptions
+    from ae_env.utils.user_files import load_preset
+
+    arguments = load_preset(env)
+    arguments.pop("max_episode_steps", None)
+    try:
+        EnvOptions.from_kwargs(arguments)
+    except ValueError as error:
+        raise ValueError(f"`env` (={env!r}): {error}") from error
+    condition = {k: arguments.pop(k) for k in _CONDITION if k in arguments}
+    return arguments, condition
 
 
 def _check_changes(base: EvaluationPlan, changed: list[str]) -> None:
@@ -234,84 +233,23 @@ def _check_changes(base: EvaluationPlan, changed: list[str]) -> None:
         raise ValueError(f"`preset` (={base.name!r}) {what}: it does not take {', '.join(refused)}")
 
 
-@contextmanager
-def _errors_of(env: str) -> Iterator[None]:
-    """Errors about an argument name the file that it is in."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"`env` (={env!r}): {error}") from error
-
-
-def _seeds(known: Sequence[int], given: Mapping[str, Any]) -> list[int]:
-    """Seeds of the episodes, with those of the options in place of the preset's."""
-    if "seed" not in given and "episodes" not in given:
-        return list(known)
-    first = given.get("seed", known[0])
-    return [first + i for i in range(given.get("episodes", len(known)))]
-
-
-def _plain(
-    environment: dict[str, Any], condition: dict[str, Any], given: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Entries of a plan without a preset: one condition, starts drawn at random."""
-    environment.setdefault("scenes", "bundled")
-    environment.setdefault("resolution", 64)
-    first = given.get("seed", 0)
-    scenes = environment["scenes"]
-    name = scenes.get("path", scenes) if isinstance(scenes, Mapping) else scenes
-    return {
-        "name": f"{name}, {environment.get('split', 'test')} split",
-        "conditions": _one_condition(condition),
-        "starts": ["random"],
-        "frames": given.get("frames", 8),
-        "seeds": [first + i for i in range(given.get("episodes", 2))],
-    }
-
-
-def _one_condition(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """A condition by the kind of its light."""
-    from agents.evaluation.plan import light_name
-
-    return {light_name(entries.get("lighting", "static")): entries}
-
-
-def _changed(plan: EvaluationPlan, entries: Mapping[str, Any]) -> EvaluationPlan:
-    """`plan` with other entries; an error about them has one line."""
-    from pydantic import ValidationError
-
-    from simulator.utils.config_file import one_line
-
-    try:
-        changed = plan.changed(**entries)
-    except ValidationError as error:
-        raise ValueError(one_line(error)) from None
-    changed.protocol()  # raises where an entry is no JSON value
-    return changed
-
-
 # -- results on the terminal ----------------------------------------------------------------------
 
 
 def print_scores(
-    results: EvaluationResult | Mapping[str, EvaluationResult], ranking: list[Rank] | None = None
+    results: EvaluationResult | Mapping[str, EvaluationResult], ranking: pd.DataFrame | None = None
 ) -> None:
     """Prints the scores of an evaluation, and every source group's where there are few."""
-    from agents.report.evaluation import summary
-
-    for title, frame in summary(results, ranking):
-        _print_table(title, list(frame.columns), frame.to_numpy().tolist())
-
-
-def _print_table(title: str, head: list[str], body: list[list[str]]) -> None:
-    """Prints a table; names in it are no markup, and those of policies are not cut off."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title)
-    for name in head:
-        left = name == "policy"
-        table.add_column(Text(name), justify="left" if left else "right", overflow="fold")
-    for line in body:
-        table.add_row(*(Text(text) for text in line))
-    console.print(table)
+    from agents.report.evaluation import summary
+
+    for title, frame in summary(results, ranking):
+        table = Table(title=title)
+        for name in frame.columns:  # names in it are no markup, and those of policies not cut off
+            side: Any = "left" if name == "policy" else "right"
+            table.add_column(Text(name), justify=side, overflow="fold")
+        for line in frame.to_numpy().tolist():
+            table.add_row(*map(Text, line))
+        console.terminal.print(table)

@@ -1,14 +1,12 @@
 """The command line: the commands together, and what becomes of their errors.
 
-Help and usage errors come at once: the modules of the commands import nothing heavy (torch, numba,
-gymnasium, NumPy), and each command imports what it needs when it runs. `ae_env` itself loads
-gymnasium, so it is imported in functions, too.
+Help and usage errors come at once: modules of commands import nothing heavy (torch, numba, NumPy,
+gymnasium and so `ae_env`); each command imports what it needs when it runs.
 """
 
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import logging
 import signal
 import sys
@@ -21,13 +19,14 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 
-from agents.cli.console import Seed, make_folder, print_line
+from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
 from agents.cli.show import film, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
+from simulator import __version__
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
@@ -56,7 +55,7 @@ def bench(
             "of your own ./results."
         ),
     ] = None,
-    seed: Seed = 0,
+    seed: console.Seed = 0,
     quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
     against: Annotated[
         Path | None,
@@ -91,7 +90,7 @@ def bench(
         )
     if out is None:  # results of a folder of one's own are not those of the docs
         out = CHECKOUT / "docs" / "results" if folder is None else Path("results")
-    make_folder(out, make=False)  # a benchmark makes it for its results
+    console.make_folder(out, make=False)  # a benchmark makes it for its results
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name)
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)
@@ -136,15 +135,8 @@ app.command(no_args_is_help=True)(bench)
 app.add_typer(scenes, name="scenes")
 
 #: Commands that go on where they were stopped.
-_RESUMING = (
-    "quickstart",
-    "train",
-    "train-simulator",
-    "evaluate",
-    "bench",
-    "scenes",
-    "score-tables",
-)
+_RESUMING = {"quickstart", "evaluate", "bench", "scenes", "score-tables"}
+_RESUMING |= {"train", "train-simulator"}
 #: Errors about the user's options and files.
 _USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 #: Exit status after Ctrl-C, and after SIGTERM.
@@ -173,7 +165,7 @@ def main() -> None:
         raise SystemExit(2 if usage else 1) from None
     except SystemExit as stop:
         if stop.code in (_INTERRUPTED, _TERMINATED):  # the first is what Typer makes of Ctrl-C
-            resumes = any(name in sys.argv[1:] for name in _RESUMING)
+            resumes = not _RESUMING.isdisjoint(sys.argv[1:])
             more = "; run the same command again to continue" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
         raise
@@ -204,7 +196,7 @@ def _one_line(error: Exception) -> str:
 
 def _version(asked: bool) -> None:
     if asked:
-        print_line(f"ae-env {importlib.metadata.version('ae-env')}")
+        console.print_line(f"ae-env {__version__}")
         raise typer.Exit
 
 

@@ -4,27 +4,13 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from agents.cli.console import (
-    TOLERANCE,
-    Cache,
-    Depth,
-    Device,
-    Policies,
-    Seed,
-    Tolerance,
-    Weights,
-    check_outputs,
-    console,
-    print_files,
-    print_line,
-    progress_bars,
-    torch_device,
-)
-from agents.cli.simulate import check_depth, make_simulator
+from agents.cli import console
+from agents.cli.console import print_files, print_line, progress_bars
+from agents.cli.simulate import make_simulator
 
 #: What is shown where nothing is named; `ae-env warm-up` draws it.
 DEFAULT_SCENES = "bundled:small"
@@ -46,11 +32,11 @@ def view(
         bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")
     ] = True,
     scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
-    weights: Weights = "compact",
-    depth: Depth = "far",
-    tolerance: Tolerance = TOLERANCE,
-    device: Device = "auto",
-    cache: Cache = True,
+    weights: console.Weights = "compact",
+    depth: console.Depth = "far",
+    tolerance: console.Tolerance = console.TOLERANCE,
+    device: console.Device = "auto",
+    cache: console.Cache = True,
 ) -> None:
     """Look at a scene in the browser: any settings, all scores, episodes of two policies.
 
@@ -69,35 +55,33 @@ def view(
     from ae_env.scorers import make_scorer
     from agents.viewer.page import Options
     from agents.viewer.viewed_scene import find_scenes
-    from simulator.capture.plan import check_tolerance
+    from simulator.capture.exposure import check_tolerance
 
-    check_depth(depth, weights)
     check_tolerance(tolerance)
     make_scorer(scorer)
     port = free_port(port)
-    simulator = make_simulator(weights, torch_device(device), cache)
+    simulator = make_simulator(weights, device, cache, depth)
     with progress_bars() as progress, progress("scenes") as task:
         library = find_scenes(what)
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
-    serve(options, port, open_browser, _announce)
 
+    def announce(address: str) -> None:
+        print_line(f"open {address}\nCtrl-C stops")
+        console.terminal.file.flush()
 
-def _announce(address: str) -> None:
-    print_line(f"open {address}")
-    print_line("Ctrl-C stops")
-    console.file.flush()
+    serve(options, port, open_browser, announce)
 
 
 def film(
-    policy: Policies = None,
+    policy: console.Policies = None,
     light: Annotated[
         str, typer.Option(help="Kind of moving light: tunnels, sines, shadows, clouds, pans...")
     ] = "tunnels",
     scenes: Annotated[str, typer.Option(help="Scenes to draw from.")] = "bundled",
     scene: Annotated[str | None, typer.Option(help="Id of the scene; drawn by default.")] = None,
     frames: Annotated[int, typer.Option(help="Actions of the episode.", min=1)] = 64,
-    seed: Seed = 0,
+    seed: console.Seed = 0,
     out: Annotated[Path, typer.Option(help="The animated GIF.")] = Path("film.gif"),
 ) -> None:
     """Film one episode of AutoExposureVideo-v0: policies side by side, in the same moving light.
@@ -112,15 +96,16 @@ def film(
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
     from agents.report.plots import record, write_film
+    from agents.rollouts import scenes_of
     from simulator.utils.checks import check_word
 
-    check_outputs(out=(out, ".gif"))
+    console.check_outputs(out=(out, ".gif"))
     check_word("light", light, (*MOVES, *KIND_SETS))
-    options: dict[str, Any] = {"scenes": scenes, "split": "test"}
     envs = gym.make_vec(
         "ae_env/AutoExposureVideo-v0",
         num_envs=1,
-        **options,
+        scenes=scenes,
+        split="test",
         lighting={"kind": "moving", "kinds": light},
         max_episode_steps=frames + 1,
         render_mode="rgb_array",
@@ -128,7 +113,7 @@ def film(
     )
     with closing(envs), progress_bars() as progress:
         if scene is not None:
-            _check_scene(scene, envs)
+            check_word("scene", scene, tuple(one.scene_id for one in scenes_of(envs)))
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in policy or POLICIES}
         with progress("fitting") as task:
@@ -137,18 +122,6 @@ def film(
             episodes = [record(n, p, envs, frames, seed, scene) for n, p in policies.items()]
             write_film(out, episodes, task)
     print_files({"film": out})
-
-
-def _check_scene(scene: str, envs: Any) -> None:
-    """Raises a `ValueError` unless `envs` have `scene`."""
-    from simulator.utils.checks import did_you_mean
-
-    known = [one.scene_id for one in envs.unwrapped.scenes]
-    if scene not in known:
-        raise ValueError(
-            f"`scene` (={scene!r}) must be the id of a test scene, such as {known[0]!r}"
-            f"{did_you_mean(scene, known)}"
-        )
 
 
 def scorers() -> None:
@@ -173,5 +146,5 @@ def scorers() -> None:
         if row.package != "ae-env":
             what.append(f" From {row.package}.", "dim")
         table.add_row(Text(row.name), row.domain, row.depends_on, what)
-    console.print(table)
+    console.terminal.print(table)
     print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")

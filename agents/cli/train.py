@@ -9,18 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from agents.cli.console import (
-    Device,
-    OwnSeed,
-    check_outputs,
-    command_line,
-    console,
-    make_folder,
-    print_files,
-    print_line,
-    progress_bars,
-    torch_device,
-)
+from agents.cli import console
+from agents.cli.console import print_files, print_line, progress_bars
 
 if TYPE_CHECKING:
     from agents.learning.training import AgentConfig
@@ -31,8 +21,8 @@ def train(
     out: Annotated[Path, typer.Option(help="File name of the agent, without suffix.")] = Path(
         "runs/agent"
     ),
-    seed: OwnSeed = None,
-    device: Device = "cpu",
+    seed: console.OwnSeed = None,
+    device: console.Device = "cpu",
     tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
 ) -> None:
     """Train an agent; a second run resumes the first.
@@ -44,18 +34,14 @@ def train(
     from agents.report.plots import plot_learning
     from simulator.utils.files import sibling
 
-    device = torch_device(device)
+    device = console.torch_device(device)
     agent = load_config(find_config(config))
     file = sibling(out, ".json")
-    make_folder(file.parent, file=file)
+    console.make_folder(file.parent, file=file)
     if seed is not None:
         agent = agent.with_seed(seed)
     with progress_bars() as progress, progress(f"training {agent.agent}") as task:
-
-        def report(done: int, total: int, values: dict[str, float]) -> None:
-            task(done, total, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
-
-        train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
+        train_agent(agent, out, progress=task, device=device, tensorboard=tensorboard)
     files = {"weights": sibling(out, ".safetensors"), "description": file}
     curve = sibling(out, ".csv")
     if curve.is_file():
@@ -85,8 +71,8 @@ def train_simulator(
     out: Annotated[
         Path | None, typer.Option(help="Folder; by default runs/simulator/NAME-OF-THE-CONFIG.")
     ] = None,
-    seed: OwnSeed = None,
-    device: Device = "auto",
+    seed: console.OwnSeed = None,
+    device: console.Device = "auto",
     tensorboard: Annotated[bool, typer.Option(help="Log to OUT/tensorboard.")] = True,
 ) -> None:
     """Train the simulator's modules stage by stage; a second run resumes the first.
@@ -96,34 +82,32 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from ae_env.utils.user_files import find_config
-    from simulator.networks.weights import build_modules
-    from simulator.training.train import load_config, load_start, train_and_save
+    from simulator.training.train import first_modules, load_config, train_and_save
 
     training = load_config(find_config(config))
     if seed is not None:
         training = training.model_copy(update={"seed": seed})
     if training.start is not None:
-        load_start(training, build_modules(training.preset))
+        first_modules(training)
     folder = Path("runs/simulator") / config.stem if out is None else out
-    make_folder(folder)
-    device = torch_device(device)
-    with progress_bars() as progress:
-        tasks: dict[str, Any] = {}
-        with contextlib.ExitStack() as stack:
+    console.make_folder(folder)
+    device = console.torch_device(device)
+    tasks: dict[str, Any] = {}
+    with progress_bars() as progress, contextlib.ExitStack() as stack:
 
-            def report(name: str, share: float, values: dict[str, float]) -> None:
-                if name not in tasks:
-                    tasks[name] = stack.enter_context(progress(name))
-                tasks[name](share, 1.0, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
+        def report(name: str, share: float, values: dict[str, float]) -> None:
+            if name not in tasks:
+                tasks[name] = stack.enter_context(progress(name))
+            tasks[name](share, 1.0, values)
 
-            weights = train_and_save(
-                training,
-                folder / training.preset,
-                command=command_line(),
-                device=device,
-                tensorboard=tensorboard,
-                progress=report,
-            )
+        weights = train_and_save(
+            training,
+            folder / training.preset,
+            command=console.command_line(),
+            device=device,
+            tensorboard=tensorboard,
+            progress=report,
+        )
     print_files({"weights": weights, "model card": weights.with_suffix(".json")})
     if training.preset in ("compact", "paper"):
         command = shlex.join(["ae-env", "simulate", "RAW", "--weights", str(weights)])
@@ -155,25 +139,20 @@ def export(
         raise ValueError(
             f"`policy` (={policy!r}) must be regression or ppo, alone or with :video or :PATH"
         )
-    check_outputs(out=(out, ".onnx"))
+    console.check_outputs(out=(out, ".onnx"))
     name = training_seeds(policy)[0]
     _, card = load_agent(name.partition(":")[2], kind)
     seen, grid = card["context"], trained_grid(card)
     states = {n: list(getattr(grid, n)) for n in ("isos", "exposure_times", "f_numbers")}
-    with contextlib.closing(
-        gym.make_vec(
-            "ae_env:ae_env/AutoExposure-v0",
-            num_envs=1,
-            scenes="bundled:small",
-            resolution=seen["resolution"][-1],
-            sensors=seen["sensors"],
-            grid=states,
-        )
-    ) as envs:
+    options = {"resolution": seen["resolution"][-1], "sensors": seen["sensors"], "grid": states}
+    envs = gym.make_vec(
+        "ae_env:ae_env/AutoExposure-v0", num_envs=1, scenes="bundled:small", **options
+    )
+    with contextlib.closing(envs):
         agent = make_policy(name, PolicyContext.from_envs(envs))
     file = export_agent(agent, out)
     controller = Controller(file)
-    console.print(
+    console.terminal.print(
         f"{len(controller.states)} states, frames of {controller.frame_shape}, "
         f"{file.stat().st_size / 1e6:.2f} MB"
     )

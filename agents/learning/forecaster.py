@@ -115,12 +115,8 @@ def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np
         before: Metered EV100 of the frame before it.
         exposed_at: EV100 that the frame was taken at.
     """
-    parts = [
-        (reading.ev100 - before) / 2.0,
-        (reading.ev100 - exposed_at) / 4.0,
-        reading.saturated,
-        np.asarray(reading.black, np.float64),
-    ]
+    change, exposure = (reading.ev100 - before) / 2.0, (reading.ev100 - exposed_at) / 4.0
+    parts = [change, exposure, reading.saturated, reading.black]
     return np.stack(parts, axis=-1).astype(np.float32)
 
 
@@ -160,12 +156,7 @@ class LearntTracker:
 
 
 def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
-    """The forecaster that a training wrote.
-
-    Raises:
-        FileNotFoundError: If a file is missing.
-        ValueError: If a file is damaged, or holds another kind of agent.
-    """
+    """The forecaster that a training wrote; raises as `load_agent`."""
     tensors, card = load_agent(path, "forecaster")
     network = LightForecaster(card["width"])
     load_into(network, tensors, path)
@@ -175,16 +166,8 @@ def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
 # -- training -------------------------------------------------------------------------------------
 
 
-def train_forecaster(
-    training: ForecasterTraining,
-    session: Session = UNWATCHED,
-) -> LightForecaster:
-    """Trains a forecaster on light of the training kinds.
-
-    Args:
-        training: Hyperparameters.
-        session: Where it runs, and what it reports to.
-    """
+def train_forecaster(training: ForecasterTraining, session: Session = UNWATCHED) -> LightForecaster:
+    """Trains a forecaster on light of the training kinds."""
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(training.seed)
         network = LightForecaster(training.width).to(session.device)
@@ -254,14 +237,10 @@ def _bent(light: Floats, share: float, rng: np.random.Generator) -> Floats:
 
 
 def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
-    """What an average meter reads on frames exposed for the light three frames before.
+    """What an average meter reads on frames exposed for the light three frames before, (B, T).
 
     A frame is 64 luminances, normal in stops with a mean of 1; each exposure is off by about half a
-    stop, and of a grid of whole stops.
-
-    Args:
-        light: (B, T) EV100.
-        rng: Draws the scenes and the errors.
+    stop, and of a grid of whole stops. `light` (B, T) is in EV100; `rng` draws scenes and errors.
 
     Returns:
         The readings, matched where frames clip, and the EV100 of the exposures, (B, T) each.
@@ -277,17 +256,10 @@ def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
     saturated = (signal >= WHITE_SIGNAL).mean(axis=2)
     mean = np.minimum(signal, 1.0).mean(axis=2) + rng.normal(0.0, BLACK_SIGNAL, light.shape)
     shown = np.where(signal >= WHITE_SIGNAL, np.nan, signal)
-    matcher = ZoneMatcher()
-    read = [
-        matcher.match(
-            mean_reading(mean[:, t], saturated[:, t], exposed_at[:, t]),
-            shown[:, t],
-            exposed_at[:, t],
-        )
-        for t in range(frames)
-    ]
-    columns = (
-        np.stack([getattr(one, name) for one in read], axis=1)
-        for name in ("ev100", "saturated", "black")
-    )
-    return Reading(*columns), exposed_at
+    matcher, read = ZoneMatcher(), []
+    for t in range(frames):
+        taken_at = exposed_at[:, t]
+        reading = mean_reading(mean[:, t], saturated[:, t], taken_at)
+        read.append(matcher.match(reading, shown[:, t], taken_at))
+    columns = zip(*((one.ev100, one.saturated, one.black) for one in read), strict=True)
+    return Reading(*(np.stack(column, axis=1) for column in columns)), exposed_at

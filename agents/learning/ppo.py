@@ -129,6 +129,10 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
 
+#: Hyperparameters that are not arguments of Stable-Baselines3's PPO.
+_OF_OURS = {"total_timesteps", "learning_rate", "width", "history", "seed"}
+
+
 class PPOTraining(Configuration):
     """Hyperparameters of PPO, named as in Stable-Baselines3.
 
@@ -207,38 +211,23 @@ class PPOPolicy(NetworkPolicy):
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """Most probable allowed state (N,)."""
-        if self._history is None:
-            return self._chosen(observations, action_masks)
-        self.check_reset(observations)
-        shown = {**observations, "history": self._history.observe(observations)}
-        states = self._chosen(shown, action_masks)
-        self._history.record_action(states)
-        return states
-
-    def _chosen(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None
-    ) -> NDArray[np.int64]:
+        shown = dict(observations)
+        if self._history is not None:
+            self.check_reset(observations)
+            shown["history"] = self._history.observe(observations)
         with torch.inference_mode():
-            tensors, _ = self.network.obs_to_tensor(dict(observations))
+            tensors, _ = self.network.obs_to_tensor(shown)
             distribution: Any = self.network.get_distribution(tensors).distribution
-        return masked_argmax(distribution.logits.cpu().numpy(), action_masks)
+        states = masked_argmax(distribution.logits.cpu().numpy(), action_masks)
+        if self._history is not None:
+            self._history.record_action(states)
+        return states
 
 
 def train_ppo(
-    envs: gym.vector.VectorEnv,
-    training: PPOTraining,
-    session: Session = UNWATCHED,
+    envs: gym.vector.VectorEnv, training: PPOTraining, session: Session = UNWATCHED
 ) -> ExposureActorCritic:
-    """Trains PPO on the scenes of `envs` (autoreset mode SAME_STEP).
-
-    Args:
-        envs: Vector environments.
-        training: Hyperparameters.
-        session: Where it runs, and what it reports to.
-
-    Returns:
-        The trained policy network.
-    """
+    """A policy network, trained by PPO on the scenes of `envs` (autoreset mode SAME_STEP)."""
     training.check_batch(envs.num_envs)
     context = PolicyContext.from_envs(envs)
     callback = _TrainingCallback(training, session)
@@ -248,22 +237,17 @@ def train_ppo(
     seen: VecEnv = SB3VectorAdapter(envs)
     if training.history:
         seen = WithHistory(seen, context, training.history)
+    seed = training.seed
+    if done:  # a training that resumes must not repeat its first draws
+        seed = int(np.random.SeedSequence([seed, done]).generate_state(1)[0])
     model = PPO(
         ExposureActorCritic,
         ShiftedFrames(seen, np.random.default_rng([training.seed, done])),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
-        n_steps=training.n_steps,
-        batch_size=training.batch_size,
-        n_epochs=training.n_epochs,
-        gamma=training.gamma,
-        gae_lambda=training.gae_lambda,
-        clip_range=training.clip_range,
-        ent_coef=training.ent_coef,
-        vf_coef=training.vf_coef,
-        max_grad_norm=training.max_grad_norm,
         policy_kwargs={"grid": context.grid, "width": training.width},
-        seed=_seed(training.seed, done),
+        seed=seed,
         device=session.device,
+        **training.model_dump(exclude=_OF_OURS),
     )
     if past is not None:
         model.policy.load_state_dict(past["policy"])
@@ -316,8 +300,3 @@ class _TrainingCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.learnt = self.num_timesteps
-
-
-def _seed(seed: int, done: int) -> int:
-    """Seed of a training that resumes after `done` frames: it must not repeat its first draws."""
-    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) if done else seed

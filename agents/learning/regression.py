@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,7 +33,7 @@ from agents.learning.networks import (
 )
 from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.meters import make_meter
-from agents.metering.reading import Floats, Meter, Reading
+from agents.metering.reading import Floats, Reading
 from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.policy_names import FORECASTERS, LEARNT, weight_files
 from simulator.utils.config_file import Configuration
@@ -119,10 +118,7 @@ class RegressionPolicy(NetworkPolicy):
     """Takes the state with the highest predicted score, accumulated over the frames so far.
 
     Args:
-        context: The camera, the grid and the observation.
-        weights: As of `NetworkPolicy`.
-        network: As of `NetworkPolicy`.
-        device: As of `NetworkPolicy`.
+        context, weights, network, device: As of `NetworkPolicy`.
         foresight: ``"none"``: frames of the same light count together; else the latest frames are
             shown to the network as if taken in the light that is expected, and the state is taken
             that promises most in the frames that its controls are in effect in. ``"trend"``: an
@@ -156,12 +152,9 @@ class RegressionPolicy(NetworkPolicy):
                     f"{max(context.delays)} asks for {1 + max(context.delays)}: use 'trend'"
                 )
             self._forecasters = [load_forecaster(file, device) for file in files]
+        #: Shows that the light has changed.
+        self._meter = make_meter("average", context.camera)
         super().__init__(context, weights, network, device)
-
-    @cached_property
-    def _meter(self) -> Meter:
-        """Meter whose reading shows that the light has changed."""
-        return make_meter("average", self.context.camera)
 
     @staticmethod
     def make_network(context: PolicyContext, card: dict[str, Any]) -> ScoreRegressor:
@@ -179,16 +172,14 @@ class RegressionPolicy(NetworkPolicy):
         self._light, self._frames = np.zeros(num_envs), np.zeros(num_envs)
         self._foresight: Foresight | None = None
         if self.foresight != "none":
-            self._foresight = Foresight(self.context, self._tracker(num_envs))
+            ev100 = self.context.grid.ev100
+            tracker: LightTracker = TrendTracker(num_envs, (ev100.min(), ev100.max()))
+            if self._forecasters:
+                tracker = LearntTracker(num_envs, self._forecasters)
+            self._foresight = Foresight(self.context, tracker)
         # The network's inputs of the latest frames, but for the settings, which are beside them,
         # and the meter's reading.
         self._recent: list[tuple[torch.Tensor, Any, torch.Tensor | None, Reading]] = []
-
-    def _tracker(self, num_envs: int) -> LightTracker:
-        if self._forecasters:
-            return LearntTracker(num_envs, self._forecasters)
-        ev100 = self.context.grid.ev100
-        return TrendTracker(num_envs, (float(ev100.min()), float(ev100.max())))
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
@@ -197,14 +188,26 @@ class RegressionPolicy(NetworkPolicy):
         self.check_reset(observations)
         if self._foresight is not None:
             return self._act_ahead(self._foresight, observations, action_masks)
-        self._forget_other_light(observations)
-        device = next(self.network.parameters()).device
-        with torch.inference_mode():
-            scores, log_variance = self.network(*observation_tensors(observations, device))
-        precision = torch.exp(-log_variance).double().cpu().numpy()
-        self._weighted += precision * scores.double().cpu().numpy()
+        # The earlier frames of environments whose metered light has changed count no longer.
+        ev100 = self._meter(observations).ev100
+        self.forget((self._frames > 0) & (np.abs(ev100 - self._light) > SAME_LIGHT_EV))
+        self._frames += 1.0
+        self._light += (ev100 - self._light) / self._frames
+        scores, precision = self._predict(*observation_tensors(observations, self._device))
+        self._weighted += precision * scores
         self._precision += precision
         return masked_argmax(self._weighted / self._precision, action_masks)
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def _predict(self, *inputs: torch.Tensor | None) -> tuple[Floats, Floats]:
+        """Scores of all states and their precision, (N, S) each."""
+        with torch.inference_mode():
+            scores, log_variance = self.network(*inputs)
+        precision = torch.exp(-log_variance)
+        return scores.double().cpu().numpy(), precision.double().cpu().numpy()
 
     def _act_ahead(
         self,
@@ -213,8 +216,7 @@ class RegressionPolicy(NetworkPolicy):
         action_masks: NDArray[np.bool_] | None,
     ) -> NDArray[np.int64]:
         reading = foresight.observe(self._meter(observations), observations)
-        device = next(self.network.parameters()).device
-        codes, _, sensors = observation_tensors(observations, device)
+        codes, _, sensors = observation_tensors(observations, self._device)
         frame = codes, np.array(observations["settings"]), sensors, reading
         self._recent = [*self._recent, frame][-RECENT:]
         utility = foresight.utility(self._scores_in)
@@ -225,36 +227,22 @@ class RegressionPolicy(NetworkPolicy):
 
     def _scores_in(self, ev100: Floats) -> Floats:
         """Scores (N, S) in light that is metered at `ev100` (N,), from all recent frames."""
-        device = next(self.network.parameters()).device
         weighted, precisions = np.zeros((2, len(ev100), len(self.context.grid)))
         # What a white frame reads is only a bound: in hand, it counts alone and as it is.
         newest = self._recent[-1][3]
         white = newest.saturated >= WHITE_SHARE
         ev100 = np.where(white, newest.ev100, ev100)
         for codes, settings, sensors, reading in self._recent:
-            shifted = torch.from_numpy(shift_ev(settings, ev100 - reading.ev100)).to(device)
-            with torch.inference_mode():
-                scores, log_variance = self.network(codes, shifted, sensors)
-            precision = torch.exp(-log_variance).double().cpu().numpy()
+            shifted = torch.from_numpy(shift_ev(settings, ev100 - reading.ev100))
+            scores, precision = self._predict(codes, shifted.to(self._device), sensors)
             if reading is not newest:
                 precision[white | (reading.saturated >= WHITE_SHARE)] = 0.0
-            weighted += precision * scores.double().cpu().numpy()
+            weighted += precision * scores
             precisions += precision
         return weighted / precisions
 
-    def _forget_other_light(self, observations: Observations) -> None:
-        """Forgets the earlier frames of those environments whose metered light has changed."""
-        ev100 = self._meter(observations).ev100
-        self.forget((self._frames > 0) & (np.abs(ev100 - self._light) > SAME_LIGHT_EV))
-        self._frames += 1.0
-        self._light += (ev100 - self._light) / self._frames
-
     def forget(self, done: NDArray[np.bool_]) -> None:
-        """Forgets the frames of the environments that `done` marks, such as ended episodes.
-
-        Raises:
-            ValueError: With foresight, which forgets all of them only, in `reset`.
-        """
+        """Forgets the frames of the environments that `done` marks; not with foresight."""
         if self._foresight is not None and done.any():
             raise ValueError(
                 "`forget` works without `foresight`; call reset() for all environments"
@@ -297,20 +285,9 @@ class RegressionTraining(Configuration):
 
 
 def train_regression(
-    envs: gym.vector.VectorEnv,
-    training: RegressionTraining,
-    session: Session = UNWATCHED,
+    envs: gym.vector.VectorEnv, training: RegressionTraining, session: Session = UNWATCHED
 ) -> ScoreRegressor:
-    """Trains a regression agent on the training scenes of `envs` (autoreset mode SAME_STEP).
-
-    Args:
-        envs: Vector environments.
-        training: Hyperparameters.
-        session: Where it runs, and what it reports to.
-
-    Returns:
-        The trained network.
-    """
+    """A regression agent, trained on the scenes of `envs` (autoreset mode SAME_STEP)."""
     context = PolicyContext.from_envs(envs)
     with _seeded("cpu", training.seed):
         network = ScoreRegressor(
@@ -373,12 +350,7 @@ class Rollout:
 
 
 class Replay:
-    """The last frames and their scores, to be seen again, shifted.
-
-    Args:
-        training: Hyperparameters.
-        rng: Chooses the frames to see again.
-    """
+    """The last frames and their scores, to be seen again, shifted; `rng` chooses which."""
 
     def __init__(self, training: RegressionTraining, rng: np.random.Generator) -> None:
         self.training, self.rng = training, rng

@@ -57,19 +57,14 @@ class SB3VectorAdapter(VecEnv):
         """Takes the step and returns observations, float32 rewards, dones and infos."""
         observations, rewards, terminated, truncated, infos = self.envs.step(self._actions)
         dones = terminated | truncated
-        final, columns = infos.get("final_obs"), _columns(infos)
-        last = _columns(infos.get("final_info", {}))
-        info_of = self._info_of
+        columns, last = _columns(infos), _columns(infos.get("final_info", {}))
         rows: list[dict[str, Any]] = []
         for i in range(self.num_envs):
             row: dict[str, Any] = {"TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
-            if dones[i] and final is not None:
-                self.reset_infos[i] = info_of(columns, i)
-                row |= info_of(last, i)
-                row["terminal_observation"] = final[i]
-            else:
-                row |= info_of(columns, i)
-            rows.append(row)
+            rows.append(row | self._info_of(last if dones[i] else columns, i))
+            if dones[i]:
+                self.reset_infos[i] = self._info_of(columns, i)
+                rows[i]["terminal_observation"] = infos["final_obs"][i]
         return observations, rewards.astype(np.float32), dones, rows
 
     def close(self) -> None:
@@ -87,11 +82,7 @@ class SB3VectorAdapter(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Not possible, as the environments share one object.
-
-        Raises:
-            AttributeError: Always.
-        """
+        """Raises an `AttributeError`, as the environments share one object."""
         raise AttributeError(f"`{attr_name}` cannot be set on the environments of a batch")
 
     def env_method(
@@ -114,9 +105,8 @@ class SB3VectorAdapter(VecEnv):
 
     def _get_indices(self, indices: Any) -> list[int]:
         """Any of SB3's ways to name environments, or a NumPy integer, as a list."""
-        if indices is None:
-            return list(range(self.num_envs))
-        return [int(i) for i in np.atleast_1d(indices)]
+        named = range(self.num_envs) if indices is None else np.atleast_1d(indices)
+        return [int(i) for i in named]
 
 
 class ShiftedFrames(VecEnvWrapper):
@@ -173,18 +163,18 @@ class WithHistory(VecEnvWrapper):
         """Takes the step."""
         observations, rewards, dones, infos = self.venv.step_wait()
         assert isinstance(observations, dict)
-        if not dones.any():
-            history = self._history.observe(observations)
-            return {**observations, "history": history}, rewards, dones, infos
-        last = {name: values.copy() for name, values in observations.items()}
-        for i in np.flatnonzero(dones):
-            for name, value in infos[i]["terminal_observation"].items():
-                last[name][i] = value
+        last, ended = observations, np.flatnonzero(dones)
+        if len(ended):
+            last = {name: values.copy() for name, values in observations.items()}
+            for i in ended:
+                for name, value in infos[i]["terminal_observation"].items():
+                    last[name][i] = value
         history = self._history.observe(last)
-        for i in np.flatnonzero(dones):
-            infos[i]["terminal_observation"]["history"] = history[i]
-        self._history.forget(dones)
-        history = np.where(dones[:, None], self._history.observe(observations, dones), history)
+        if len(ended):
+            for i in ended:
+                infos[i]["terminal_observation"]["history"] = history[i]
+            self._history.forget(dones)
+            history = np.where(dones[:, None], self._history.observe(observations, dones), history)
         return {**observations, "history": history}, rewards, dones, infos
 
 

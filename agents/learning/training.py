@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -17,9 +16,10 @@ from pydantic import Field, ValidationError, model_validator
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.networks import Progress, Session
 from agents.learning.regression import RegressionTraining, train_regression
-from agents.learning.weights import describe_agent, load_agent, save_agent
+from agents.learning.weights import load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
+from simulator.utils.checks import check_word
 from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
@@ -59,7 +59,7 @@ class AgentConfig(Configuration):
     def _check(self) -> AgentConfig:
         from ae_env.options import EnvOptions
 
-        hyperparameters = self.hyperparameters()
+        hyperparameters: Any = self.hyperparameters()
         if self.agent == "forecaster":
             for name in sorted(self.model_fields_set - {"agent", "training"}):
                 unused = type(self).model_fields[name].get_default(call_default_factory=True)
@@ -69,17 +69,12 @@ class AgentConfig(Configuration):
             options = EnvOptions.from_kwargs(self.environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
             options.make_lighting()
+            taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
+            check_word("observation", options.observation, taken)  # that its network takes
         except ValueError as error:
             raise ValueError(f"environment: {error}") from error
-        taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
-        if options.observation not in taken:
-            raise ValueError(
-                f"environment: `observation` (={options.observation!r}) must be one of "
-                f"{list(taken)}, which is what the agent's network takes"
-            )
-        check_batch = getattr(hyperparameters, "check_batch", None)
-        if check_batch is not None:
-            check_batch(self.num_envs)
+        if self.agent == "ppo":
+            hyperparameters.check_batch(self.num_envs)
         try:
             json.dumps(self.card())
         except TypeError as error:  # raises before the training, not when the agent is saved
@@ -99,11 +94,7 @@ class AgentConfig(Configuration):
             raise ValueError(one_line(error, "training.", kind)) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
-        """The same training with another seed.
-
-        Raises:
-            ValueError: If the seed is out of range.
-        """
+        """The same training with another seed, which is checked."""
         changed = self.model_copy(update={"training": {**self.training, "seed": seed}})
         changed.hyperparameters()
         return changed
@@ -117,8 +108,7 @@ def load_config(path: str | Path) -> AgentConfig:
     """The configuration in a YAML file.
 
     Raises:
-        ValueError: If the file is missing or not YAML, or an entry is unknown or out of range; the
-            message names the file and the entry.
+        ValueError: If it is no such file; the message names the file and the entry.
     """
     return load_yaml(path, AgentConfig)
 
@@ -147,10 +137,8 @@ def train_agent(
 ) -> Path:
     """Trains an agent and writes it to ``out.safetensors`` and ``out.json``.
 
-    Beside them, ``out.csv`` is its learning curve (`LearningCurve`).
-
-    A training that was interrupted goes on from its checkpoint, ``out.checkpoint``; one that is
-    complete is not repeated.
+    Beside them, ``out.csv`` is its learning curve (`LearningCurve`). A training that was
+    interrupted goes on from ``out.checkpoint``; one that is complete is not repeated.
 
     Args:
         config: The training.
@@ -165,8 +153,16 @@ def train_agent(
     if is_trained(config, out):
         return out
     training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
-    curve = LearningCurve(sibling(out, ".csv"))
-    with _logged(curve, progress, tensorboard) as report, ExitStack() as stack:
+    takers: list[Progress] = [LearningCurve(sibling(out, ".csv"))]
+    takers += [] if progress is None else [progress]
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        for take in takers:
+            take(done, total, values)
+
+    with ExitStack() as stack:
+        if tensorboard is not None:
+            takers.insert(0, stack.enter_context(_tensorboard(tensorboard)))
         session, context = Session(checkpoint, report, device, config.card()), None
         if isinstance(training, ForecasterTraining):
             network: Any = train_forecaster(training, session)
@@ -179,7 +175,7 @@ def train_agent(
                 from agents.learning.ppo import train_ppo
 
                 network = train_ppo(envs, training, session)
-    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
+    save_agent(out, config.agent, network, network.width, context, config.card())
     checkpoint.unlink(missing_ok=True)
     return out
 
@@ -189,28 +185,15 @@ def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
 
     import ae_env  # noqa: F401  (registers the environment)
 
-    options = dict(config.environment)
+    options = {**config.environment, "autoreset_mode": "SAME_STEP"}
     if config.max_episode_steps is not None:
         options["max_episode_steps"] = config.max_episode_steps
-    return gym.make_vec(
-        config.task, num_envs=config.num_envs, autoreset_mode="SAME_STEP", **options
-    )
+    return gym.make_vec(config.task, num_envs=config.num_envs, **options)
 
 
 @contextmanager
-def _logged(
-    curve: LearningCurve, progress: Progress | None, folder: Path | None
-) -> Iterator[Progress]:
-    """What takes each report: the curve, TensorBoard's log in `folder`, and `progress`."""
-    takers: list[Progress] = [curve] if progress is None else [curve, progress]
-
-    def report(done: int, total: int, values: dict[str, float]) -> None:
-        for take in takers:
-            take(done, total, values)
-
-    if folder is None:
-        yield report
-        return
+def _tensorboard(folder: Path) -> Iterator[Progress]:
+    """Takes each report for TensorBoard's log in `folder`."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -221,8 +204,7 @@ def _logged(
             writer.add_scalar(f"train/{name}", value, done)
 
     with SummaryWriter(str(folder)) as writer:
-        takers.insert(0, log)
-        yield report
+        yield log
 
 
 class LearningCurve:
@@ -248,7 +230,8 @@ class LearningCurve:
     def __call__(self, done: int, total: int, values: dict[str, float]) -> None:
         """Take in what the training reports after `done` of `total` frames."""
         # What another training left here, or this one after its checkpoint.
-        while self._rows and not self._goes_on(done, values):
+        names = {"frames", *values}
+        while self._rows and (self._rows[-1]["frames"] >= done or self._rows[-1].keys() != names):
             self._rows.pop()
         self._recent.append(values)
         last = self._rows[-1]["frames"] if self._rows else 0
@@ -257,18 +240,10 @@ class LearningCurve:
         means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
         self._rows.append({"frames": done, **means})
         self._recent = []
-        text = io.StringIO()
-        writer = csv.DictWriter(text, self._rows[-1], lineterminator="\n")
-        writer.writeheader()
+        lines = [["frames", *values]]
         for row in self._rows:
-            shown = {name: f"{value:.6g}" for name, value in row.items()}
-            writer.writerow({**shown, "frames": int(row["frames"])})
-        write_atomically(self.path, text.getvalue())
-
-    def _goes_on(self, done: int, values: dict[str, float]) -> bool:
-        """Whether the last row is of this training, from before `done` frames."""
-        last = self._rows[-1]
-        return last["frames"] < done and last.keys() == {"frames", *values}
+            lines.append([str(int(row["frames"])), *(f"{row[name]:.6g}" for name in values)])
+        write_atomically(self.path, "".join(",".join(line) + "\n" for line in lines))
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:
@@ -309,13 +284,12 @@ def train_in_parallel(
 ) -> None:
     """Trains every job that is not trained yet, each in a process of its own.
 
+    After Ctrl-C the same call resumes from the checkpoints.
+
     Args:
         jobs: Agents to train.
-        workers: Processes at a time, each with its share of the cores; by default one per core.
+        workers: See `run_in_parallel`.
         progress: Called with the job's name, frames done, frames in all, and losses.
-
-    Raises:
-        KeyboardInterrupt: After Ctrl-C; the same call resumes from the checkpoints.
     """
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
     run_in_parallel(_train, waiting, workers=workers, progress=progress)

@@ -36,14 +36,23 @@ class _Card(BaseModel):
     aliases: dict[str, str]
 
 
-def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, Any]) -> None:
+def save_agent(
+    path: Path,
+    kind: str,
+    module: nn.Module,
+    width: int,
+    context: PolicyContext | None,
+    training: dict[str, Any],
+) -> None:
     """Writes ``path.safetensors`` and ``path.json``.
 
     Args:
         path: File name, with or without one of the two endings.
-        kind: ``"regression"`` or ``"ppo"``.
+        kind: ``"regression"``, ``"ppo"`` or ``"forecaster"``.
         module: Its state is stored.
-        description: JSON values, see `describe_agent`.
+        width: Hidden features of its network.
+        context: That it was trained for; None if for any.
+        training: JSON values that identify the training.
 
     Raises:
         ValueError: If the weights are not finite; nothing is written then.
@@ -59,8 +68,10 @@ def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, 
             aliases[name] = source
     check_finite(tensors, path)
     content = save(tensors)
-    head = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
-    write_pair(path, content, {**head, **description, "aliases": aliases})
+    card = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
+    described = {} if context is None else describe_context(context)
+    card |= {"width": width, "context": described, "training": training, "aliases": aliases}
+    write_pair(path, content, card)
 
 
 def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -95,30 +106,12 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
 
 
 def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -> None:
-    """Gives `module` the tensors of `load_agent`.
-
-    Raises:
-        ValueError: If they are not those of this network.
-    """
+    """Gives `module` the tensors of `load_agent`; a `ValueError` if they are of another network."""
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"`weights` (={str(path)!r}) do not fit the network: {text}") from error
-
-
-def describe_agent(
-    width: int, context: PolicyContext | None, training: dict[str, Any]
-) -> dict[str, Any]:
-    """Description of an agent for `save_agent`.
-
-    Args:
-        width: Hidden features of its network.
-        context: The camera, grid and observation that it was trained for; None if for any.
-        training: JSON values that identify the training.
-    """
-    described = {} if context is None else describe_context(context)
-    return {"width": width, "context": described, "training": training}
 
 
 def describe_context(context: PolicyContext) -> dict[str, Any]:
@@ -135,38 +128,27 @@ def describe_context(context: PolicyContext) -> dict[str, Any]:
 
 
 def trained_grid(card: dict[str, Any]) -> ExposureGrid:
-    """The grid that an agent was trained on, from its `card`.
-
-    Raises:
-        ValueError: If the card does not describe one.
-    """
+    """The grid that an agent was trained on, from its `card`."""
     return ExposureGrid.from_spec({name: card["context"].get(name, ()) for name in _GRID})
 
 
 def check_context(card: dict[str, Any], context: PolicyContext) -> None:
-    """Checks that the agent of `card` can act in `context`.
+    """Raises a `ValueError` that says what differs unless the agent of `card` fits `context`.
 
     Any grid whose values lie within the trained ranges works: a state enters the networks by its
     numbers.
-
-    Raises:
-        ValueError: If it cannot; the message says what differs.
     """
     for name, here in describe_context(context).items():
         trained = card["context"].get(name)
-        if trained == here:
-            continue
-        if name not in _GRID:
-            raise ValueError(
-                f"`weights`: the agent was trained with {name} = {trained}, "
-                f"the environment has {here}"
-            )
-        known = getattr(trained_grid(card), name)
-        if here[0] < known[0] * (1.0 - _ROUNDED) or here[-1] > known[-1] * (1.0 + _ROUNDED):
-            raise ValueError(
-                f"`weights`: the agent was trained with {name} from {known[0]:g} to {known[-1]:g}, "
-                f"the environment has {here[0]:g} to {here[-1]:g}"
-            )
+        differs, values = trained != here, f"= {trained}, the environment has {here}"
+        if differs and name in _GRID:
+            known = getattr(trained_grid(card), name)
+            below, above = known[0] * (1.0 - _ROUNDED), known[-1] * (1.0 + _ROUNDED)
+            differs = here[0] < below or here[-1] > above
+            ends = f"{here[0]:g} to {here[-1]:g}"
+            values = f"from {known[0]:g} to {known[-1]:g}, the environment has {ends}"
+        if differs:
+            raise ValueError(f"`weights`: the agent was trained with {name} {values}")
 
 
 class NetworkPolicy(Policy, ABC):
@@ -209,9 +191,4 @@ class NetworkPolicy(Policy, ABC):
     @staticmethod
     @abstractmethod
     def make_network(context: PolicyContext, card: dict[str, Any]) -> nn.Module:
-        """The untrained network that the weights of an agent of this kind fit.
-
-        Args:
-            context: The camera, the grid and the observation.
-            card: Description of the agent, see `load_agent`.
-        """
+        """The untrained network that the weights of an agent of this kind, of `card`, fit."""

@@ -25,8 +25,7 @@ def run_in_parallel(
 ) -> None:
     """Calls ``work(job)`` for every job, in processes of their own.
 
-    After an error or Ctrl-C the jobs that still run are terminated: one that writes checkpoints
-    loses what came after its last one.
+    After an error or Ctrl-C the jobs that still run are terminated.
 
     Args:
         work: A function of a module, which reports with `send_progress`.

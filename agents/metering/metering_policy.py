@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from ae_env.observation import SENSOR_RANGES, decode_sensors
 from agents.foresight import Foresight, TrendTracker
 from agents.metering.meters import make_meter
-from agents.metering.programs import (
-    ProgramOptions,
-    StateChooser,
-    check_used,
-    program_cost,
-)
+from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
 from agents.metering.reading import EVTracker, Floats, ReferenceFrames
 from agents.metering.tuned import ScoreRegression
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
@@ -99,7 +94,7 @@ class MeteringPolicy(Policy):
             raise ValueError(f"`damping` (={damping!r}) must be 0 with `foresight`")
         self.foresight = foresight
         by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
-        check_used(program, **by_hand, weights=weights)
+        check_used(program, weights=weights, **by_hand)
         given = {name: value for name, value in by_hand.items() if value is not None}
         self.options = ProgramOptions(compensation, damping, shutter_cap, **given)
         self.meter = make_meter(meter, context.camera)
@@ -170,11 +165,8 @@ class MeteringPolicy(Policy):
         """Minus the cost of each state, by the program's priorities."""
         chooser = self._chooser
         target = readings[:, 0] - self.options.compensation
-        cost = np.broadcast_to(
-            program_cost(self.program, chooser, readings), (len(readings), len(chooser.ev100))
-        )
+        cost = program_cost(self.program, chooser, readings) + np.zeros((len(readings), 1))
         if self._previous is not None and self.program == "P":
-            cost = cost.copy()
             cost[np.arange(len(cost)), self._previous] -= HYSTERESIS_COST
         return chooser.utility(chooser.with_hysteresis(target, self._previous), cost)
 

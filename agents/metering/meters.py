@@ -92,11 +92,7 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
 
 
 def weighted_reading(
-    observations: Observations,
-    estimate: Floats | None = None,
-    *,
-    camera: CameraProfile,
-    name: str,
+    observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile, name: str
 ) -> Reading:
     """EV of the weighted mean signal, with the weights of `weight_map`."""
     signal = linear_signal(observations["raw"], camera, GREEN)
@@ -108,10 +104,7 @@ def weighted_reading(
 
 
 def matrix_reading(
-    observations: Observations,
-    estimate: Floats | None = None,
-    *,
-    camera: CameraProfile,
+    observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile
 ) -> Reading:
     """Multi-zone metering: contrast-aware zones, then highlight and shadow constraints.
 
@@ -124,7 +117,10 @@ def matrix_reading(
     signal = linear_signal(observations["raw"], camera, GREEN).mean(axis=1)  # (N, h, w)
     ev = frame_ev100(observations)
     level = np.log2(np.maximum(_zone_means(signal), BLACK_SIGNAL))
-    weights = _zone_weights()
+    offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
+    profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
+    weights = np.outer(profile, profile).ravel()
+    weights /= weights.sum()
     saturated = _zone_means(signal >= WHITE_SIGNAL) @ weights
     reading = mean_reading(np.exp2(level @ weights), saturated, ev)
     # Signal of the top pixels if the frame were taken at the metered EV.
@@ -148,12 +144,3 @@ def _zone_means(images: NDArray[Any]) -> Floats:
         sums = np.add.reduceat(images, starts, axis=axis, dtype=np.float64)
         images = sums / counts.reshape(shape)
     return images.reshape(len(images), -1)
-
-
-def _zone_weights() -> Floats:
-    """Centre weighting of the zones, summing to 1."""
-    offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
-    profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
-    weights: Floats = np.outer(profile, profile).ravel()
-    weights /= weights.sum()
-    return weights

@@ -106,24 +106,28 @@ class StateChooser:
         self.ceiling = ceiling
         self.step = ev_step(grid)
         self.hysteresis = HYSTERESIS_STEPS * self.step
-        self._fixed = self._off(program, options)
         #: Stops by which each state is slower than the cap, ``(S,)``.
         self.over_cap = np.zeros(len(grid))
         if options.shutter_cap is not None:
             times = np.array([s.exposure_time for s in grid.states])
             self.over_cap = np.maximum(np.log2(times / options.shutter_cap) - 1e-6, 0.0)
-        first = _CAPPED * self.over_cap + _BY_HAND * self._fixed
-        self._allowed = first == first.min()
+        self._first = _CAPPED * self.over_cap + _BY_HAND * self._off(program, options)
+        self._allowed = self._first == self._first.min()
 
     def _off(self, program: str, options: ProgramOptions) -> Floats:
         """Stops by which each state is further from what is set by hand than the nearest one is."""
-        off: Floats = np.zeros_like(self.aperture)
+        wanted = []
         if program in ("A", "M"):
-            off += _above_least(np.abs(self.aperture - 2.0 * np.log2(options.f_number)))
+            wanted.append((self.aperture, 2.0 * np.log2(options.f_number)))
         if program in ("S", "M"):
-            off += _above_least(np.abs(self.time + np.log2(options.exposure_time)))
+            wanted.append((self.time, -np.log2(options.exposure_time)))
         if program == "M" and options.iso is not None:
-            off += _above_least(np.abs(self.speed - np.log2(options.iso / 100.0) - 5.0))
+            wanted.append((self.speed, np.log2(options.iso / 100.0) + 5.0))
+        off = np.zeros_like(self.aperture)
+        for values, value in wanted:
+            distance = np.abs(values - value)
+            above_least = distance - distance.min()
+            off += np.where(above_least < 1e-9, 0.0, above_least)
         return off
 
     def with_hysteresis(self, target: Floats, previous: NDArray[np.int64] | None) -> Floats:
@@ -137,21 +141,18 @@ class StateChooser:
         return np.where(farther < self.hysteresis, old, target)
 
     def _distance(self, target: Floats) -> Floats:
-        darker: Floats = self.ev100[None] - target[:, None]  # (N, S)
-        distance: Floats = np.abs(darker)
-        return distance + _ABOVE_CEILING_EV * (darker < -1e-9) if self.ceiling else distance
+        darker = self.ev100[None] - target[:, None]  # (N, S)
+        return np.asarray(np.abs(darker) + _ABOVE_CEILING_EV * (self.ceiling & (darker < -1e-9)))
 
     def _least_distance(self, distance: Floats) -> Floats:
         """Of the states that the cap and what is set by hand leave, ``(N, 1)``."""
-        least: Floats = distance[:, self._allowed].min(axis=1, keepdims=True)
-        return least
+        return np.asarray(distance[:, self._allowed].min(axis=1, keepdims=True))
 
     def nearby(self, target: Floats, limit: float) -> NDArray[np.bool_]:
         """States that may be used within `limit` [EV] of `target` or as near as any, ``(N, S)``."""
         distance = self._distance(target)
         near = np.maximum(self._least_distance(distance) + SAME_EV, limit)
-        found: NDArray[np.bool_] = (distance <= near) & self._allowed
-        return found
+        return np.asarray((distance <= near) & self._allowed)
 
     def utility(self, target: Floats, preference: Floats) -> Floats:
         """How well each state fits, ``(N, S)``; the highest is to be taken.
@@ -166,8 +167,7 @@ class StateChooser:
         distance = self._distance(target)
         # Nominal values are rounded (1/15 s for 1/16 s): states this near are the same exposure.
         distance = np.maximum(distance - self._least_distance(distance) - SAME_EV, 0.0)
-        first = _CAPPED * self.over_cap + _BY_HAND * self._fixed
-        return -(first + _DISTANCE * distance + preference)
+        return -(self._first + _DISTANCE * distance + preference)
 
 
 def check_used(program: str, **options: object) -> None:
@@ -196,12 +196,6 @@ def ev_step(grid: ExposureGrid) -> float:
     return float(np.median(steps)) if len(steps) else 1.0
 
 
-def _above_least(values: Floats) -> Floats:
-    """How far each value is above the least one."""
-    above: Floats = values - values.min()
-    return np.where(above < 1e-9, 0.0, above)
-
-
 def program_cost(program: str, chooser: StateChooser, readings: Floats) -> Floats:
     """Which of the states of one EV a program prefers: the cost of each, ``(N or 1, S)``.
 
@@ -214,20 +208,15 @@ def program_cost(program: str, chooser: StateChooser, readings: Floats) -> Float
         readings: Metered EV100, and log2 of the image speed and of the defocus spread where the
             camera has sensors, ``(N, 1 or 3)``.
     """
-    gain: Floats = (chooser.speed - chooser.speed.min())[None]
+    gain = (chooser.speed - chooser.speed.min())[None]
     if program in ("S", "M"):
-        cost: Floats = 0.1 * gain
-        return cost
+        return np.asarray(0.1 * gain)
     slow = np.maximum(shutter_limit(readings) - chooser.time[None], 0.0)  # stops too slow
     if program == "A":
-        cost = 10.0 * slow
-        cost += 0.1 * gain
-        return cost
+        return np.asarray(10.0 * slow + 0.1 * gain)
     wide = np.maximum(aperture_limit(readings) - chooser.aperture[None], 0.0)  # stops too wide
     line = np.abs(chooser.aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))[None]
-    cost = slow**2 + 0.5 * wide**2
-    cost += 0.25 * gain**2 + 0.05 * line**2
-    return cost
+    return np.asarray(slow**2 + 0.5 * wide**2 + (0.25 * gain**2 + 0.05 * line**2))
 
 
 def shutter_limit(readings: Floats) -> Floats:
@@ -237,8 +226,7 @@ def shutter_limit(readings: Floats) -> Floats:
     """
     if readings.shape[1] == 1:
         return np.full((len(readings), 1), -np.log2(HANDHELD_LIMIT))
-    limit: Floats = readings[:, 1:2] - np.log2(BLUR_LIMIT)
-    return limit
+    return np.asarray(readings[:, 1:2] - np.log2(BLUR_LIMIT))
 
 
 def aperture_limit(readings: Floats) -> Floats:
@@ -249,5 +237,4 @@ def aperture_limit(readings: Floats) -> Floats:
     if readings.shape[1] == 1:
         return np.full((len(readings), 1), 2.0 * np.log2(PROGRAM_F_NUMBER))
     # Blur diameter at f-number N is 4 D / N pixels of a 64-pixel frame.
-    limit: Floats = 2.0 * (2.0 + readings[:, 2:3] - np.log2(64 * BLUR_LIMIT))
-    return limit
+    return np.asarray(2.0 * (2.0 + readings[:, 2:3] - np.log2(64 * BLUR_LIMIT)))

@@ -111,20 +111,12 @@ def linear_signal(
 def signal_codes(
     raw: NDArray[Any], camera: CameraProfile, planes: slice = slice(None)
 ) -> NDArray[np.uint8]:
-    """The 8-bit codes of observed frames, from any kind of observation.
-
-    Args:
-        raw: As for `linear_signal`.
-        camera: As for `linear_signal`.
-        planes: Planes to take, of R, G1, G2, B.
-    """
+    """The 8-bit codes of observed frames, from any kind of observation; see `linear_signal`."""
     if raw.dtype == np.uint8:
         return raw[:, planes]
     signal = linear_signal(raw, camera, planes).clip(-PEDESTAL, 1.0)
-    codes: NDArray[np.uint8] = np.rint(
-        (CODES - 1.0) * np.sqrt((signal + PEDESTAL) / (1.0 + PEDESTAL))
-    ).astype(np.uint8)
-    return codes
+    codes = (CODES - 1.0) * np.sqrt((signal + PEDESTAL) / (1.0 + PEDESTAL))
+    return np.asarray(np.rint(codes).astype(np.uint8))
 
 
 def mean_reading(mean: Floats, saturated: Floats, ev: Floats) -> Reading:
@@ -146,17 +138,15 @@ class EVTracker:
     the bound stays. A frame that is all white or all black moves any other estimate half of the
     way to the end of the range.
 
-    With damping the EV that is handed out follows that estimate, keeping `damping` of its distance
-    to it at every frame. It is a number of its own and never read back from the settings: a grid of
-    whole stops does not hold it up. Its past never counts as lying beyond the range: light that
-    comes back after a long night is followed at once.
+    With damping, the EV that is handed out follows the estimate. It is never read back from the
+    settings, so a grid of whole stops does not hold it up, and its past never counts as lying
+    beyond the range: light that comes back after a long night is followed at once.
 
     Args:
         num_envs: Cameras.
         ev_range: Lowest and highest EV100 of the camera's exposure states.
         damping: Share of the distance to the estimate [EV] that remains after a frame, in [0, 1).
-        compensation: Exposure compensation [EV] that is taken off what is handed out: the range of
-            that is so much higher.
+        compensation: Exposure compensation [EV], by which the range of the past is higher.
     """
 
     def __init__(
@@ -192,11 +182,10 @@ class EVTracker:
 class ReferenceFrames:
     """Keeps, for each camera, the best frame of the present light.
 
-    What a search finds on a saturated frame and on a dark one of the same scene differs, because
-    neither shows what the other does: a controller that follows the frame in hand may go to and fro
-    between the two for ever. So it continues to search on the better one for as long as new frames
-    look as that one predicts. Of two frames the less saturated is better; of two that are not
-    saturated, the brighter.
+    Neither a saturated frame nor a dark one shows what the other does: a search on the frame in
+    hand may go to and fro between the two for ever. So it continues on the better one for as long
+    as new frames look as that one predicts. Of two frames the less saturated is better; of two that
+    are not saturated, the brighter.
 
     Args:
         camera: The camera, for its black and white level.
@@ -204,11 +193,8 @@ class ReferenceFrames:
 
     def __init__(self, camera: CameraProfile) -> None:
         self.camera = camera
-        self._raw: NDArray[np.uint8] | None = None  # (N, 4, h, w) codes
-        self._settings: NDArray[np.floating] | None = None
-        self._quantiles = np.empty((0, 0))
-        self._saturated = np.empty(0)
-        self._ev = np.empty(0)
+        #: Codes (N, 4, h, w), settings, quantiles of the signal, saturated share and EV100.
+        self._best: tuple[NDArray[Any], ...] | None = None
 
     def update(self, observations: Observations) -> Observations:
         """Take in the frames in hand; returns the best ones, raw and settings."""
@@ -221,23 +207,24 @@ class ReferenceFrames:
         quantiles = CODE_SIGNALS[ordered[:, ranks]]
         white = np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)
         saturated = (green >= white).mean(axis=1)
-        if self._raw is None or self._settings is None:
-            self._raw, self._settings = raw.copy(), settings.copy()
-            self._quantiles, self._saturated, self._ev = quantiles, saturated, ev
-            return {"raw": self._raw, "settings": self._settings}
-        hides, hid = saturated >= _SATURATED, self._saturated >= _SATURATED
-        better = np.where(
-            hides | hid, saturated < self._saturated, ev <= self._ev
-        )  # the same state again is a newer look at the same light
-        replaced = better | self._changed(quantiles, ev)
-        self._raw[replaced], self._settings[replaced] = raw[replaced], settings[replaced]
-        self._quantiles[replaced], self._ev[replaced] = quantiles[replaced], ev[replaced]
-        self._saturated[replaced] = saturated[replaced]
-        return {"raw": self._raw, "settings": self._settings}
+        if self._best is None:
+            self._best = (raw.copy(), settings.copy(), quantiles, saturated, ev)
+        else:
+            _, _, _, known_saturated, known_ev = self._best
+            hides, hid = saturated >= _SATURATED, known_saturated >= _SATURATED
+            # The same state again is a newer look at the same light.
+            better = np.where(hides | hid, saturated < known_saturated, ev <= known_ev)
+            replaced = better | self._changed(quantiles, ev)
+            for known, new in zip(
+                self._best, (raw, settings, quantiles, saturated, ev), strict=True
+            ):
+                known[replaced] = new[replaced]
+        return {"raw": self._best[0], "settings": self._best[1]}
 
     def _changed(self, quantiles: Floats, ev: Floats) -> NDArray[np.bool_]:
         """Whether the frames in hand look other than predicted, ``(N,)``."""
-        predicted = self._quantiles * np.exp2(self._ev - ev)[:, None]
+        assert self._best is not None
+        predicted = self._best[2] * np.exp2(self._best[4] - ev)[:, None]
         both = np.stack([predicted, quantiles]).clip(0.0, 1.0)
         apart = np.abs(np.diff(np.sqrt(both), axis=0)[0]).mean(axis=1) > _TOLERANCE
         shown = (both.min(axis=0) > _SHOWN[0]) & (both.max(axis=0) < _SHOWN[1])
@@ -267,7 +254,7 @@ class ZoneMatcher:
 
         Args:
             reading: What a meter reads in the frames, ``(N,)``.
-            zones: Mean signals of their zones, ``(N, zones)``, NaN where a pixel clips.
+            zones: See `zone_signals`.
             exposed_at: EV100 that they were taken at, ``(N,)``.
         """
         light, saturated = reading.ev100, reading.saturated
@@ -281,29 +268,10 @@ class ZoneMatcher:
         return Reading(light, saturated, reading.black)
 
 
-class MatchedReadings(ZoneMatcher):
-    """`ZoneMatcher` on the zones of observed frames.
-
-    Args:
-        camera: The camera, for its black and white level.
-    """
-
-    def __init__(self, camera: CameraProfile) -> None:
-        super().__init__()
-        self.camera = camera
-
-    def update(self, reading: Reading, observations: Observations) -> Reading:
-        """Take in one frame of each camera; what it reads, unsaturated where it was matched."""
-        signal = linear_signal(observations["raw"], self.camera, GREEN)
-        return self.match(reading, _zones(signal), frame_ev100(observations))
-
-
 def light_change(before: Floats, now: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """How many stops more signal `now` has than `before`, over what both show.
+    """How many stops more signal `now` has than `before` in the zones that both show.
 
-    Args:
-        before: Mean signals of zones, (..., zones), NaN where one clips.
-        now: Likewise, of the same zones.
+    Both are signals of zones, (..., zones), NaN where one clips.
 
     Returns:
         Stops (...), and whether there was enough to compare; 0 where not.
@@ -316,8 +284,9 @@ def light_change(before: Floats, now: Floats) -> tuple[Floats, NDArray[np.bool_]
     return np.where(enough, stops, 0.0), enough
 
 
-def _zones(signal: NDArray[np.float32]) -> Floats:
-    """Means over zones (N, zones) of the greens (N, 2, h, w); NaN where a pixel clips."""
+def zone_signals(raw: NDArray[Any], camera: CameraProfile) -> Floats:
+    """Mean green signals of the zones of observed frames, (N, zones); NaN where a pixel clips."""
+    signal = linear_signal(raw, camera, GREEN)
     pixels = np.where(signal >= WHITE_SIGNAL, np.nan, signal).mean(axis=1)  # NaN if either does
     high, wide = (max(1, size // ZONES) for size in pixels.shape[1:])
     rows, columns = pixels.shape[1] // high, pixels.shape[2] // wide

@@ -78,12 +78,11 @@ def highlight_weighted_reading(
     Of each pixel the brightest of its four planes counts. A frame in which more than 1 % of the
     pixels are saturated says only that the light is brighter than that: it reads 1.5 to 3 EV more.
     """
-    codes = signal_codes(observations["raw"], camera).max(axis=1)
-    shares = _shares(codes)
-    top = _quantile_signal(np.cumsum(shares, axis=1), HIGHLIGHT_QUANTILE)
-    white = top >= WHITE_SIGNAL
+    shares = _shares(signal_codes(observations["raw"], camera).max(axis=1))
+    top = CODE_SIGNALS[np.argmax(np.cumsum(shares, axis=1) >= HIGHLIGHT_QUANTILE - 1e-12, axis=1)]
     blown = shares[:, CODE_SIGNALS >= WHITE_SIGNAL].sum(axis=1)
-    saturated = np.where(white, HIGHLIGHT_SATURATED + (1.0 - HIGHLIGHT_SATURATED) * blown, 0.0)
+    share = HIGHLIGHT_SATURATED + (1.0 - HIGHLIGHT_SATURATED) * blown
+    saturated = np.where(top >= WHITE_SIGNAL, share, 0.0)
     level = np.log2(np.maximum(top, BLACK_SIGNAL) / HIGHLIGHT_SIGNAL)
     ev = frame_ev100(observations) + level + SATURATED_STEP_EV * saturated
     return Reading(ev, saturated, top <= BLACK_SIGNAL)
@@ -99,7 +98,10 @@ def skewness_reading(
     is 0 is looked for. (About the *mean*, as textbooks have it, the skewness of a power-law code
     does not depend on the exposure until something clips.)
     """
-    shares, ev = _green_shares(observations, camera), frame_ev100(observations)
+    shares, ev = (
+        _shares(signal_codes(observations["raw"], camera, GREEN)),
+        frame_ev100(observations),
+    )
     exposed = _exposed(shares, SEARCH_EV, _DEVELOPED_GAIN)  # (N, K, BINS)
     centres = (np.arange(BINS) + 0.5) / BINS - encoded(np.array(0.18))
     moment = np.cbrt(exposed @ centres**3)  # (N, K), rising with the exposure
@@ -114,35 +116,34 @@ def entropy_reading(
 
     Noise counts as detail: entropy likes gain.
     """
-    shares, ev = _green_shares(observations, camera), frame_ev100(observations)
+    shares, ev = (
+        _shares(signal_codes(observations["raw"], camera, GREEN)),
+        frame_ev100(observations),
+    )
     exposed = _exposed(shares, SEARCH_EV)  # (N, K, BINS)
     entropy = -(exposed * np.log2(np.maximum(exposed, 1e-30))).sum(axis=2)
     return _search_reading(shares, ev, peak(entropy, SEARCH_EV))
 
 
-def peak(values: Floats, positions: Floats) -> Floats:
-    """Where each row of `values` is highest: the top of the parabola through its best three.
+def peak(values: Floats, positions: Floats, best: NDArray[np.intp] | None = None) -> Floats:
+    """Where each row of `values` (N, K) is highest: the top of the parabola through its best three.
 
     Args:
-        values: ``(N, K)`` at evenly spaced `positions`; of equal ones that nearest to 0 counts.
-        positions: ``(K,)``.
-
-    Returns:
-        ``(N,)``, within `positions`.
+        values: ``(N, K)``.
+        positions: ``(K,)``, ascending.
+        best: Index of the highest value of each row, ``(N,)``; by default of equal ones that at the
+            position nearest to 0.
     """
-    best = np.argmax(values.round(9) - 1e-9 * np.abs(positions), axis=1)
-    inner = np.clip(best, 1, len(positions) - 2)[:, None]
-    left, middle, right = (np.take_along_axis(values, inner + i, axis=1)[:, 0] for i in (-1, 0, 1))
-    curvature = left - 2.0 * middle + right
-    found: Floats = positions[best].astype(np.float64)
-    fits = (curvature < -1e-12) & (best == inner[:, 0])
-    offset = 0.5 * (left - right) / np.where(fits, curvature, -1.0)
-    found += np.where(fits, offset, 0.0) * (positions[1] - positions[0])
-    return found
-
-
-def _green_shares(observations: Observations, camera: CameraProfile) -> Floats:
-    return _shares(signal_codes(observations["raw"], camera, GREEN))
+    if best is None:
+        best = np.argmax(values.round(9) - 1e-9 * np.abs(positions), axis=1)
+    inner = np.clip(best, 1, len(positions) - 2)
+    left, middle, right = (positions[inner + i] for i in (-1, 0, 1))
+    low, top, high = (values[np.arange(len(values)), inner + i] for i in (-1, 0, 1))
+    rise, fall = (top - low) / (middle - left), (high - top) / (right - middle)
+    curved = (fall - rise) / (right - left)
+    fits = (best == inner) & (curved < -1e-12)
+    found = 0.5 * (left + middle - rise / np.where(fits, curved, -1.0))
+    return np.where(fits, np.clip(found, left, right), positions[best])
 
 
 def _shares(codes: NDArray[np.uint8]) -> Floats:
@@ -153,21 +154,8 @@ def _shares(codes: NDArray[np.uint8]) -> Floats:
     return shares
 
 
-def _quantile_signal(cumulated: Floats, quantile: float) -> Floats:
-    """Signal below which `quantile` of the pixels lie, ``(N,)``."""
-    index = np.argmax(cumulated >= quantile - 1e-12, axis=1)
-    signal: Floats = CODE_SIGNALS[index]
-    return signal
-
-
 def _exposed(shares: Floats, evs: Floats, gain: float = 1.0) -> Floats:
-    """Histograms of sRGB codes of the frames at other exposures, ``(N, K, BINS)``.
-
-    Args:
-        shares: Share of each code of the observation, ``(N, 256)``.
-        evs: Exposures relative to the frame's [EV], ``(K,)``.
-        gain: Factor that is also applied to the signal.
-    """
+    """Histograms ``(N, K, BINS)`` of sRGB codes at other exposures, ``(K,)`` [EV], of `_shares`."""
     below, rest = _edges(tuple(evs), gain)
     cumulated = np.concatenate([np.zeros((len(shares), 1)), np.cumsum(shares, axis=1)], axis=1)
     lower = cumulated[:, below]
@@ -178,11 +166,7 @@ def _exposed(shares: Floats, evs: Floats, gain: float = 1.0) -> Floats:
 
 @functools.lru_cache(maxsize=8)
 def _edges(evs: tuple[float, ...], gain: float) -> tuple[NDArray[np.intp], Floats]:
-    """Where the inner edges of the simulated bins lie among those of the observation's codes.
-
-    Returns:
-        ``(K, BINS - 1)``: the code below, and the part of it.
-    """
+    """The code below each inner edge of the simulated bins (K, BINS - 1), and its part."""
     import torch
 
     from ae_env.scorers.measures import srgb_decode
@@ -240,7 +224,8 @@ def shim_reading(
     metric = np.stack(
         [shim_gradient(torch.from_numpy(frame.luma(base**g))).numpy() for g in GAMMAS], axis=1
     )
-    gamma = _best_gamma(metric)
+    found = peak(metric, np.array(GAMMAS), metric.argmax(axis=1))
+    gamma = np.where(metric.max(axis=1) > _NO_GRADIENT, found, 1.0)
     ratio = SHIM_SHAPE * np.tan((1.0 - gamma) * math.atan(1.0 / SHIM_SHAPE))  # R - 1
     factor = 1.0 + np.where(gamma >= 1.0, 0.5, 1.0) * SHIM_SPEED * ratio
     here = metric[:, GAMMAS.index(1.0)]
@@ -295,12 +280,8 @@ class _Frame:
 
     def luma(self, tables: Floats) -> NDArray[np.float32]:
         """Luma of the frames ``(N, h, w)`` through a table of their own each, ``(N, CODES)``."""
-        table = tables.astype(np.float32)
-        count, _, height, width = self.codes.shape
-        out = np.empty((count, height, width), np.float32)
-        for i in range(count):
-            np.mean(table[i][self.codes[i]], axis=0, out=out[i])
-        return out
+        shown = zip(tables.astype(np.float32), self.codes, strict=True)
+        return np.stack([table[codes].mean(axis=0) for table, codes in shown])
 
     def metric(self, function: Callable[[Any], Any]) -> Callable[[Floats], Floats]:
         """`function` of the luma, as one of how much brighter than the estimate it is [EV]."""
@@ -348,23 +329,4 @@ class _Frame:
 
 def _table(shift: Floats) -> Floats:
     """sRGB of each code of the observation at `shift` EV more exposure, ``(N, CODES)``."""
-    linear = np.clip(CODE_SIGNALS[None] * np.exp2(shift)[:, None], 0.0, 1.0)
-    assert linear.shape[1] == CODES
-    return encoded(linear)
-
-
-def _best_gamma(metric: Floats) -> Floats:
-    """The gamma of the highest metric, ``(N, len(GAMMAS))``; 1 where there is no gradient."""
-    gammas = np.array(GAMMAS)
-    best = metric.argmax(axis=1)
-    rows = np.arange(len(metric))
-    inner = np.clip(best, 1, len(gammas) - 2)
-    left, middle, right = (gammas[inner + i] for i in (-1, 0, 1))
-    low, top, high = (metric[rows, inner + i] for i in (-1, 0, 1))
-    # The top of the parabola through three unevenly spaced points.
-    rise, fall = (top - low) / (middle - left), (high - top) / (right - middle)
-    curved = (fall - rise) / (right - left)
-    fits = (best == inner) & (curved < -1e-12)
-    peak = 0.5 * (left + middle - rise / np.where(fits, curved, -1.0))
-    found = np.where(fits, np.clip(peak, left, right), gammas[best])
-    return np.where(metric.max(axis=1) > _NO_GRADIENT, found, 1.0)
+    return encoded(np.clip(CODE_SIGNALS * np.exp2(shift)[:, None], 0.0, 1.0))

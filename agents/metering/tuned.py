@@ -46,17 +46,12 @@ class ScoreRegression:
 
     @classmethod
     def fit(cls, features: Floats, scores: Floats, groups: NDArray[Any]) -> ScoreRegression:
-        """Choose the bandwidths by cross-validation over source groups.
+        """Choose the bandwidths by cross-validation over source `groups` (n,): one is never split.
 
         The criterion is the mean score of the state that the regression picks for the groups left
-        out (8 folds); the bandwidth of the EV is chosen first, then that of the sensors. Of those
-        within 0.001 of the best the widest is taken: the criterion is flat, narrow kernels are not
-        safe where few scenes are near.
-
-        Args:
-            features: ``(n, d)``, the metered EV first.
-            scores: ``(n, S)``.
-            groups: Source group of each sample, ``(n,)``: a group is never split.
+        out (8 folds); the bandwidth of the EV, the first feature, is chosen first, then that of the
+        sensors. Of those within 0.001 of the best the widest is taken: the criterion is flat,
+        narrow kernels are not safe where few scenes are near.
         """
         dimensions = features.shape[1]
         folds = np.unique(groups, return_inverse=True)[1] % FOLDS
@@ -65,7 +60,16 @@ class ScoreRegression:
             return np.array([ev, *[sensors] * (dimensions - 1)])
 
         def criterion(candidate: Floats) -> float:
-            return _left_out_score(features, scores, folds, candidate)
+            """Mean score of the states picked for each fold by the regression on the others."""
+            total = 0.0
+            for fold in np.unique(folds):
+                held = folds == fold
+                if held.all():  # a single group: nothing to choose by
+                    return float(scores.mean())
+                model = cls(features[~held], scores[~held], candidate)
+                picked = model.predict(features[held]).argmax(axis=1)
+                total += float(np.take_along_axis(scores[held], picked[:, None], axis=1).sum())
+            return total / len(scores)
 
         sensors = SENSOR_BANDWIDTHS[1]
         ev = _widest_good(EV_BANDWIDTHS, [criterion(bandwidths(b, sensors)) for b in EV_BANDWIDTHS])
@@ -87,12 +91,7 @@ class ScoreRegression:
             prior = self._local_fit(features, self.bandwidths * widen, prior)
         return prior
 
-    def _local_fit(
-        self,
-        features: Floats,
-        bandwidths: Floats,
-        prior: Floats,
-    ) -> Floats:
+    def _local_fit(self, features: Floats, bandwidths: Floats, prior: Floats) -> Floats:
         """Ridge-regularised local linear fit around each query, shrunk to `prior`."""
         known, query = self.features / bandwidths, features / bandwidths
         # Squared distances through the inner product: no (N, n, d) array.
@@ -120,24 +119,13 @@ class ScoreRegression:
         """Write the regression as a safetensors file."""
         from safetensors.numpy import save
 
-        arrays = {
-            "features": self.features,
-            "scores": self.scores,
-            "bandwidths": self.bandwidths,
-        }
-        return write_atomically(path, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
+        return write_atomically(
+            path, save({k: np.ascontiguousarray(v) for k, v in vars(self).items()})
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:
-        """Read what `save` wrote.
-
-        Args:
-            path: The file.
-            name: What errors call it.
-
-        Raises:
-            ValueError: If the file is missing or is not one of these.
-        """
+        """Read what `save` wrote; a `ValueError`, where `name` names the file, if it is none."""
         from safetensors import SafetensorError
         from safetensors.numpy import load_file
 
@@ -150,21 +138,3 @@ class ScoreRegression:
 def _widest_good(bandwidths: Sequence[float], criteria: Sequence[float]) -> float:
     best = max(criteria)
     return max(b for b, c in zip(bandwidths, criteria, strict=True) if c >= best - INDIFFERENCE)
-
-
-def _left_out_score(
-    features: Floats,
-    scores: Floats,
-    folds: NDArray[np.intp],
-    bandwidths: Floats,
-) -> float:
-    """Mean score of the states picked for each fold by the regression on the others."""
-    total = 0.0
-    for fold in np.unique(folds):
-        held = folds == fold
-        if held.all():  # a single group: nothing to choose by
-            return float(scores.mean())
-        model = ScoreRegression(features[~held], scores[~held], bandwidths)
-        picked = model.predict(features[held]).argmax(axis=1)
-        total += float(np.take_along_axis(scores[held], picked[:, None], axis=1).sum())
-    return total / len(scores)

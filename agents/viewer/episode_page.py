@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from nicegui import run, ui
+from nicegui import ui
 
 import ae_env  # noqa: F401  (registers the environments)
 from ae_env.grid import ExposureGrid
@@ -88,19 +88,14 @@ class EpisodePage(Tab):
         super().__init__(address, folder)
         self._recordings: list[Recording] = []
         self._grid = ExposureGrid.video()
-
-    def build(self) -> None:
-        """Puts the tab together."""
         with ui.element("div").classes("column w-full"):
             with ui.element("div").classes("bar"):
                 choices = "".join(f'<option value="{name}">' for name in NAMES)
                 ui.html(choices, sanitize=False, tag="datalist").props("id=policies")
-                self._policies = [
-                    ui.input(f"policy {letter}", value=name)
-                    .props("dense list=policies")
-                    .classes("w-72")
-                    for letter, name in zip("AB", (NAMES[0], NAMES[2]), strict=True)
-                ]
+                self._policies = [ui.input("policy A", value=NAMES[0])]
+                self._policies += [ui.input("policy B", value=NAMES[2])]
+                for policy in self._policies:
+                    policy.props("dense list=policies").classes("w-72")
                 self._light = ui.select(list(LIGHTS), label="light", value="shadows").props("dense")
                 self._frames = ui.number("frames", value=_FRAMES, min=2, max=512, precision=0)
                 self._seed = ui.number("seed", value=0, min=0, max=2**31, precision=0)
@@ -110,7 +105,6 @@ class EpisodePage(Tab):
             with ui.element("div").classes("column w-full") as self._shown:
                 self._build_player()
         self._shown.set_visibility(False)
-        self._timer = ui.timer(1.0 / FRAME_RATE, self._advance, active=False)
 
     def _build_player(self) -> None:
         with ui.element("div").classes("players"):
@@ -120,8 +114,12 @@ class EpisodePage(Tab):
                     self._images.append(ui.element("img").props('alt="frame"'))
                     self._facts.append(ui.label().classes("note").style(f"color:{colour}"))
         with ui.element("div").classes("bar"):
-            self._play = ui.button(icon="play_arrow", on_click=self._toggle)
-            self._play.props('dense aria-label="play or pause"')
+            self._timer = ui.timer(1.0 / FRAME_RATE, self._advance, active=False)
+            play = ui.button(icon="play_arrow", on_click=self._toggle)
+            play.props('dense aria-label="play or pause"')
+            play.bind_icon_from(
+                self._timer, "active", lambda plays: "pause" if plays else "play_arrow"
+            )
             self._frame = ui.slider(min=0, max=1, step=1, value=0, on_change=self._show_frame)
             self._frame.props('aria-label="frame"').classes("flex-1")
             self._number = ui.label().classes("note")
@@ -142,23 +140,16 @@ class EpisodePage(Tab):
     async def _record(self) -> None:
         if self.viewed is None:
             return
-        viewed, names = self.viewed, [str(field.value) for field in self._policies]
+        names = [str(field.value) for field in self._policies]
         names = list(dict.fromkeys(names))  # a policy beside itself is shown once
-        light = str(self._light.value)
+        light, frames = str(self._light.value), int(self._frames.value or _FRAMES)
+        options = {"light": light, "frames": frames, "seed": int(self._seed.value or 0)}
         found: list[Recording] | None = None
         with loading(self._run, Exception):  # whatever a policy of the user's raises
-            found = await run.io_bound(
-                play,
-                names,
-                viewed.scored,
-                light=light,
-                frames=int(self._frames.value or _FRAMES),
-                seed=int(self._seed.value or 0),
-            )
-        if found is None or viewed is not self.viewed:
-            return
-        self._grid = ExposureGrid.default() if light == STILL else ExposureGrid.video()
-        self._show_recordings(found)
+            found = await self.work(play, names, self.viewed.scored, **options)
+        if found is not None:
+            self._grid = ExposureGrid.default() if light == STILL else ExposureGrid.video()
+            self._show_recordings(found)
 
     def _show_recordings(self, recordings: list[Recording]) -> None:
         self._recordings = recordings
@@ -169,12 +160,11 @@ class EpisodePage(Tab):
         self._draw("Score", [(c, r.scores) for c, r in lines], 0.0, 1.0)
         regrets = [(c, r.regrets) for c, r in lines]
         self._draw("Regret", regrets, 0.0, max(0.1, *(max(v) for _, v in regrets)))
-        self._frame.props(f"max={len(recordings[0].states) - 1}")
+        self._frame.props(f"max={self._last}")
         self._frame.value = 0
         self._show_frame()
         self._shown.set_visibility(True)
         self._timer.active = True
-        self._play.props("icon=pause")
 
     def _draw(
         self, name: str, lines: Sequence[tuple[str, Sequence[float]]], low: float, high: float
@@ -182,13 +172,18 @@ class EpisodePage(Tab):
         ends = f'<span class="high">{high:.3g}</span><span class="low">{low:.3g}</span>'
         self._charts[name][1].content = curves(lines, low, high, 110) + ends
 
+    @property
+    def _last(self) -> int:
+        """The last frame."""
+        return len(self._recordings[0].states) - 1
+
     def _show_frame(self) -> None:
         if not self._recordings:
             return
-        frame, last = int(self._frame.value), len(self._recordings[0].states) - 1
-        self._number.text = f"frame {frame} of {last}"
+        frame = int(self._frame.value)
+        self._number.text = f"frame {frame} of {self._last}"
         for holder, _ in self._charts.values():
-            holder.style(f"--now: {100.0 * frame / max(last, 1):.2f}%")
+            holder.style(f"--now: {100.0 * frame / max(self._last, 1):.2f}%")
         for i, (image, facts) in enumerate(zip(self._images, self._facts, strict=True)):
             if i >= len(self._recordings):
                 facts.text = ""
@@ -205,14 +200,11 @@ class EpisodePage(Tab):
 
     def _toggle(self) -> None:
         self._timer.active = not self._timer.active
-        if self._timer.active and self._frame.value >= len(self._recordings[0].states) - 1:
+        if self._timer.active and self._frame.value >= self._last:
             self._frame.value = 0
-        self._play.props("icon=pause" if self._timer.active else "icon=play_arrow")
 
     def _advance(self) -> None:
-        last = len(self._recordings[0].states) - 1 if self._recordings else 0
-        if self._frame.value >= last:
+        if self._recordings and self._frame.value < self._last:
+            self._frame.value = int(self._frame.value) + 1
+        else:
             self._timer.active = False
-            self._play.props("icon=play_arrow")
-            return
-        self._frame.value = int(self._frame.value) + 1

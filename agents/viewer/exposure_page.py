@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from nicegui import run, ui
 from ae_env.grid import ExposureGrid
 from agents.policy_names import METERS, PROGRAMS
 from agents.viewer.episode_page import SETTLED, settled
-from agents.viewer.tab import Stage, Tab, complain, curves
+from agents.viewer.tab import Stage, Tab, curves, loading
 from agents.viewer.viewed_scene import Picture, Readout, View, ViewedScene
 from simulator import CameraSettings
 from simulator.settings import format_exposure_time
@@ -51,22 +52,13 @@ class ExposurePage(Tab):
         self._rows: dict[str, ui.element] = {}
         self._states: dict[int, tuple[ui.element, ui.label]] = {}
         self._facts: dict[str, ui.label] = {}
-
-    # -- the page ---------------------------------------------------------------------------------
-
-    def build(self) -> None:
-        """Puts the tab together."""
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("column looked-at"):
                 self._build_picture()
             with ui.element("div").classes("column controls"):
-                self._iso = self._slider("ISO", len(ISOS) - 1, 1, lambda i: f"{ISOS[int(i)]:g}")
-                self._time = self._slider(
-                    "Shutter", len(TIMES) - 1, 1, lambda i: format_exposure_time(TIMES[int(i)])
-                )
-                self._f_number = self._slider(
-                    "Aperture", len(F_NUMBERS) - 1, 1, lambda i: f"f/{F_NUMBERS[int(i)]:g}"
-                )
+                self._iso = self._stops("ISO", ISOS, "{:g}".format)
+                self._time = self._stops("Shutter", TIMES, format_exposure_time)
+                self._f_number = self._stops("Aperture", F_NUMBERS, "f/{:g}".format)
                 self._build_map()
                 self._speed = self._slider("Motion", 2.0, 0.05, "{:.2f} H/s".format)
                 self._defocus = self._slider("Defocus", 8.0, 0.25, "{:.2f} px".format)
@@ -99,9 +91,8 @@ class ExposurePage(Tab):
         self._show_window()
 
     def _build_readouts(self) -> None:
-        self._histogram = ui.html(sanitize=False).props(
-            'role=img aria-label="histogram of the raw planes"'
-        )
+        self._histogram = ui.html(sanitize=False)
+        self._histogram.props('role=img aria-label="histogram of the raw planes"')
         ui.label(
             "Raw histogram of R, G1, G2 and B, black to white level (height: square root of the "
             "pixel share)."
@@ -111,6 +102,9 @@ class ExposurePage(Tab):
                 ui.label(name).classes("name")
                 self._facts[name] = ui.label()
         self._plan = ui.label().classes("plan")
+
+    def _stops(self, name: str, values: Sequence[float], text: Callable[[float], str]) -> ui.slider:
+        return self._slider(name, len(values) - 1, 1, lambda i: text(values[int(i)]))
 
     def _slider(
         self,
@@ -122,9 +116,8 @@ class ExposurePage(Tab):
     ) -> ui.slider:
         with ui.element("div").classes("setting") as self._rows[name]:
             ui.label(name)
-            slider = ui.slider(
-                min=0, max=most, step=step, value=0, on_change=on_change or self._refresh
-            )
+            change = on_change or self._refresh
+            slider = ui.slider(min=0, max=most, step=step, value=0, on_change=change)
             slider.props(f'aria-label="{name}" dense')
             ui.label().classes("value").bind_text_from(slider, "value", text)
         return slider
@@ -134,9 +127,12 @@ class ExposurePage(Tab):
             for n, f_number in enumerate(_GRID.f_numbers):
                 with ui.element("div").classes("map"):
                     ui.label(f"f/{f_number:g}: ISO down, shutter across").classes("head")
-                    for i in range(len(_GRID.isos)):
-                        for t in range(len(_GRID.exposure_times)):
-                            self._build_state(_GRID.index(i, t, n))
+                    for i, t in np.ndindex(len(_GRID.isos), len(_GRID.exposure_times)):
+                        state = _GRID.index(i, t, n)
+                        button = ui.element("button").classes("state")
+                        button.on("click", partial(self._set, _GRID[state]))
+                        with button:
+                            self._states[state] = (button, ui.label())
         with ui.element("div").classes("bar"):
             self._names = ui.select(
                 list(POLICIES),
@@ -149,23 +145,14 @@ class ExposurePage(Tab):
             self._names.props("dense use-chips").classes("w-full")
         self._legend = ui.label().classes("note legend")
 
-    def _build_state(self, state: int) -> None:
-        button = ui.element("button").classes("state")
-        button.on("click", lambda: self._set(_GRID[state]))
-        with button:
-            self._states[state] = (button, ui.label())
-
     # -- what is shown ----------------------------------------------------------------------------
 
     @property
     def view(self) -> View:
         """What the page shows now."""
+        iso, time = ISOS[int(self._iso.value)], TIMES[int(self._time.value)]
         return View(
-            CameraSettings(
-                ISOS[int(self._iso.value)],
-                TIMES[int(self._time.value)],
-                F_NUMBERS[int(self._f_number.value)],
-            ),
+            CameraSettings(iso, time, F_NUMBERS[int(self._f_number.value)]),
             speed=float(self._speed.value),
             defocus=float(self._defocus.value),
             clipping=bool(self._clipping.value),
@@ -186,13 +173,9 @@ class ExposurePage(Tab):
         self._legend.text = ""
         self._show_compared(None)
         self._show_window()
-        best = await run.io_bound(viewed.best)
-        if best is None or viewed is not self.viewed:
-            return
-        if self.view.settings == before:
-            await self._set(best)
-        else:
-            await self._refresh()
+        best = await self.work(viewed.best)
+        if best is not None:
+            await (self._set(best) if self.view.settings == before else self._refresh())
 
     async def _set(self, settings: CameraSettings) -> None:
         self._iso.value = ISOS.index(round(settings.iso))
@@ -205,14 +188,9 @@ class ExposurePage(Tab):
         if self._refreshing.locked():
             return
         async with self._refreshing:
-            self._spinner.visible = True
-            try:
+            with loading(self._spinner):
                 while self.viewed is not None and (self.viewed, self.view) != self._shown:
                     await self._show_view(self.viewed, self.view)
-            except (ValueError, OSError, RuntimeError) as error:
-                complain(error)
-            finally:
-                self._spinner.visible = False
 
     async def _show_view(self, viewed: ViewedScene, view: View) -> None:
         picture = await run.io_bound(viewed.picture, view)
@@ -252,9 +230,8 @@ class ExposurePage(Tab):
             letters = [_LETTERS[i] for i, s in enumerate(self._marks.values()) if s == state]
             score = float(table.mean[state])
             background, ink = score_colour(score)
-            label.text = f"{'★' * (state == best)}{''.join(letters)} {score:.2f}".replace(
-                " 0.", " ."
-            ).strip()
+            text = f"{'★' * (state == best)}{''.join(letters)} {score:.2f}"
+            label.text = text.replace(" 0.", " .").strip()
             size = 12 if len(label.text) <= 6 else 9
             button.style(f"background:{background};color:{ink};font-size:{size}px")
             button.props["aria-label"] = f"{_GRID[state]}: score {score:.2f}"
@@ -302,7 +279,7 @@ class ExposurePage(Tab):
             self._show_compared(None)
             return
         view = replace(self.view, clipping=False)
-        picture = await run.io_bound(self.viewed.picture, view)
+        picture = await self.work(self.viewed.picture, view)
         if picture is not None:
             self._show_compared(picture, f"right of the divider: {view.settings}")
 
@@ -313,29 +290,26 @@ class ExposurePage(Tab):
     async def _mark(self) -> None:
         if self.viewed is None:
             return
-        names = [str(name) for name in self._names.value or []][: len(_LETTERS)]
+        viewed, names = self.viewed, self._marked[: len(_LETTERS)]
         missing = [name for name in names if name not in self._marks]
-        viewed = self.viewed
-        self._spinner.visible = True
-        try:
-            if missing:
-                found = await run.io_bound(settled, missing, viewed.scored)
-                self._marks |= found or {}
-        except Exception as error:  # whatever a policy of the user's raises
-            complain(error)
-            self._names.value = [name for name in names if name not in missing]
-            return
-        finally:
-            self._spinner.visible = False
+        if missing:
+            with loading(self._spinner, Exception):  # whatever a policy of the user's raises
+                self._marks |= await self.work(settled, missing, viewed.scored) or {}
         if viewed is not self.viewed:
             return
-        chosen = [str(name) for name in self._names.value or []]  # more may have come meanwhile
-        self._marks = {name: self._marks[name] for name in chosen if name in self._marks}
+        if not self._marks.keys() >= set(names):
+            self._names.value = [name for name in names if name not in missing]
+            return
+        self._marks = {name: self._marks[name] for name in self._marked if name in self._marks}
         self._legend.text = "\n".join(
             f"{letter} {name}: {_GRID[state]}"
             for letter, (name, state) in zip(_LETTERS, self._marks.items(), strict=False)
         )
         await self._show_scores(viewed, self.view)
+
+    @property
+    def _marked(self) -> list[str]:
+        return [str(name) for name in self._names.value or []]
 
 
 def score_colour(score: float) -> tuple[str, str]:

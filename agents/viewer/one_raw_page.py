@@ -5,17 +5,17 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from nicegui import run, ui
+from nicegui import ui
 from PIL import Image
 
 from agents.applications.hdr import hdr_picture, linear_rgb, write_exr
-from agents.applications.refocus import refocus
+from agents.applications.refocus import NOTHING_FOUND, refocus
 from agents.report.plots import upright_picture
 from agents.viewer.tab import Stage, Tab, complain
 from agents.viewer.viewed_scene import ViewedScene, encoded
@@ -74,10 +74,7 @@ def opened(raw: RawImage, f_number: float, simulator: CameraSimulator) -> Render
     largest = result.metadata["largest_disc_px"]
     text = f"f/{f_number:g}, blur estimated: the widest disc has {largest:.1f} packed pixels"
     if largest == 0.0:
-        text = (
-            "nothing was found out of focus, so nothing changed: blur below 1.5 pixels cannot be "
-            "told from sharpness"
-        )
+        text = NOTHING_FOUND
     image = upright_picture(result, render_srgb(result))
     return RenderedImage.of(image, text, dng=lambda path: write_dng(path, result))
 
@@ -100,13 +97,7 @@ def fused(raw: RawImage, simulator: CameraSimulator) -> RenderedImage:
 
 
 class OneRawPage(Tab):
-    """The tab.
-
-    Args:
-        address: See `Tab`.
-        folder: See `Tab`.
-        simulator: Reduces noise, and estimates the blur.
-    """
+    """The tab, see `Tab`; `simulator` reduces noise, and estimates the blur."""
 
     def __init__(
         self, address: Callable[[bytes], str], folder: Path, simulator: CameraSimulator
@@ -114,15 +105,9 @@ class OneRawPage(Tab):
         super().__init__(address, folder)
         self._simulator = simulator
         self._f_numbers: tuple[float, ...] = ()
-        self._busy = False
-        self._begun, self._doing = 0.0, ""
+        self._begun, self._doing = 0.0, ""  # what is under way, if anything is
         self._results: dict[str, RenderedImage] = {}
         self._saves: dict[str, ui.button] = {}
-
-    # -- the page ---------------------------------------------------------------------------------
-
-    def build(self) -> None:
-        """Puts the tab together."""
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("column looked-at"):
                 self._stage = Stage(self, "the raw", "divider between the raw and the result")
@@ -169,13 +154,14 @@ class OneRawPage(Tab):
 
     def _update(self) -> None:
         """Enables what can be done now."""
-        ready = self.viewed is not None and self.viewed.photograph is not None and not self._busy
+        busy = bool(self._doing)
+        ready = self.viewed is not None and self.viewed.photograph is not None and not busy
         self._open.set_enabled(ready and bool(self._f_numbers))
         self._slider.set_enabled(ready and bool(self._f_numbers))
         self._fuse.set_enabled(ready)
         for ending, button in self._saves.items():
-            button.set_enabled(ending in self._results and not self._busy)
-        self._spinner.visible = self._clock.active = self._busy
+            button.set_enabled(ending in self._results and not busy)
+        self._spinner.visible = self._clock.active = busy
 
     def take_scene(self, viewed: ViewedScene) -> None:
         """Takes another scene; `show_raw` shows it."""
@@ -185,7 +171,7 @@ class OneRawPage(Tab):
         self._slider.value = max(len(self._f_numbers) - 1, 0)  # the widest
         self._stage.clear()
         self._raw_text.text = ""
-        if not self._busy:
+        if not self._doing:
             open_already = "" if self._f_numbers else "The aperture of this raw is open already."
             self._status.text = _NO_RAW if viewed.photograph is None else open_already
         self._update()
@@ -196,8 +182,8 @@ class OneRawPage(Tab):
         if viewed is None or viewed.photograph is None or self._raw_text.text:
             return
         self._raw_text.text = "left of the divider: the raw ..."
-        image = await run.io_bound(recorded, viewed.photograph)
-        if image is not None and viewed is self.viewed:
+        image = await self.work(recorded, viewed.photograph)
+        if image is not None:
             self._stage.show(image.jpeg, image.aspect)
             self._raw_text.text = f"left of the divider: the raw, {image.text}"
 
@@ -214,10 +200,9 @@ class OneRawPage(Tab):
     ) -> None:
         """Shows the result of `function` for the raw; it may take minutes, and the page lives."""
         viewed = self.viewed
-        if viewed is None or viewed.photograph is None or self._busy:
+        if viewed is None or viewed.photograph is None or self._doing:
             return
-        raw = viewed.photograph
-        self._busy, self._begun = True, perf_counter()
+        raw, self._begun = viewed.photograph, perf_counter()
         self._doing = f"{doing}, {4e-6 * raw.data[0].numel():.1f} megapixels"
         self._tick()
         self._update()
@@ -232,8 +217,7 @@ class OneRawPage(Tab):
             status = f"{doing} failed: {' '.join(str(error).split())}"
             complain(status)
         finally:
-            self._busy = False
-            self._status.text = status
+            self._doing, self._status.text = "", status
             self._update()
 
     def _tick(self) -> None:
@@ -249,20 +233,14 @@ class OneRawPage(Tab):
 
 async def _in_background(function: Callable[..., RenderedImage], *arguments: Any) -> RenderedImage:
     """The result of `function`, in a thread that the end of the program does not wait for."""
-    loop = asyncio.get_running_loop()
-    result: asyncio.Future[RenderedImage] = loop.create_future()
-
-    def settle(how: Callable[[Any], None], value: Any) -> None:
-        with suppress(RuntimeError):  # the program has ended
-            loop.call_soon_threadsafe(lambda: None if result.done() else how(value))
+    result: Future[RenderedImage] = Future()
+    result.set_running_or_notify_cancel()  # from now on it cannot be cancelled
 
     def work() -> None:
         try:
-            image = function(*arguments)
+            result.set_result(function(*arguments))
         except Exception as error:  # raised where it is awaited
-            settle(result.set_exception, error)
-        else:
-            settle(result.set_result, image)
+            result.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
-    return await result
+    return await asyncio.wrap_future(result)

@@ -6,9 +6,9 @@ import asyncio
 import shutil
 import tempfile
 import uuid
-from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ from simulator.camera_simulator import Depth
 _LARGEST_UPLOAD = 300_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
-#: Name of the tab of refocusing and HDR.
-_ONE_RAW = "Refocus, HDR"
+#: Names of the tabs.
+_TABS = ("Exposure", "Episode", "Refocus, HDR")
 _STYLE = Path(__file__).with_name("page.css")
 
 
@@ -36,24 +36,23 @@ class PictureStore:
     """Pictures under addresses of their own, the latest `_WAITING` of them."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[str, bytes] = OrderedDict()
+        self._kept: dict[str, bytes] = {}
         app.get("/frame/{key}")(self.fetch)
 
     def address(self, jpeg: bytes) -> str:
         """Address that `jpeg` can be fetched from."""
         key = uuid.uuid4().hex
         self._kept[key] = jpeg
-        while len(self._kept) > _WAITING:
-            self._kept.popitem(last=False)
+        if len(self._kept) > _WAITING:
+            del self._kept[next(iter(self._kept))]  # the oldest
         return f"/frame/{key}"
 
     def fetch(self, key: str) -> Response:
         """What the browser gets."""
         if key not in self._kept:
             return Response(status_code=404)
-        return Response(
-            self._kept[key], media_type="image/jpeg", headers={"Cache-Control": "no-store"}
-        )
+        headers = {"Cache-Control": "no-store"}
+        return Response(self._kept[key], media_type="image/jpeg", headers=headers)
 
 
 @dataclass
@@ -82,19 +81,16 @@ class Options:
 
     def viewed(self, library: Library, name: str) -> ViewedScene:
         """The scene called `name`, to be shown."""
-        return ViewedScene(
-            library.open(name),
-            self.simulator,
-            depth=self.depth,
-            tolerance=self.tolerance,
-            scorer=self.scorer,
-        )
+        how = {"depth": self.depth, "tolerance": self.tolerance, "scorer": self.scorer}
+        return ViewedScene(library.open(name), self.simulator, **how)  # type: ignore[arg-type]
 
 
 async def show_page(options: Options) -> None:
-    """Puts the page together, for one tab of the browser."""
+    """Puts the page together, for one tab of the browser, and opens the first scene."""
     ui.add_css(_STYLE.read_text())
-    await Page(options).build()
+    page = Page(options)
+    await ui.context.client.connected()
+    await page.open(options.library.first)
 
 
 class Page:
@@ -107,45 +103,35 @@ class Page:
     def __init__(self, options: Options) -> None:
         self._options = options
         # Uploads belong to their tab of the browser.
-        self._library = Library(options.library.readers, options.library.first)
-        self._folder = Path(tempfile.mkdtemp(dir=options.folder))
-        shared = options.pictures.address, self._folder
-        self._exposure, self._episode = ExposurePage(*shared), EpisodePage(*shared)
-        self._one_raw = OneRawPage(*shared, options.simulator)
-
-    async def build(self) -> None:
-        """Builds the page, and opens the first scene."""
-        client = ui.context.client
-        client.on_delete(lambda: shutil.rmtree(self._folder, ignore_errors=True))
+        self._library = Library(options.library.readers)
+        self._folder = folder = Path(tempfile.mkdtemp(dir=options.folder))
+        ui.context.client.on_delete(lambda: shutil.rmtree(folder, ignore_errors=True))
         with ui.element("header").classes("bar"):
             self._title = ui.label("ae-env view").classes("title")
             self._picker = self._scene_picker()
             ui.button("Scenes", icon="photo_library", on_click=self._open_picker).props("dense")
+            most = f"a raw may have {_LARGEST_UPLOAD // 10**6} MB at most"
             upload = ui.upload(
                 auto_upload=True,
                 max_file_size=_LARGEST_UPLOAD,
                 on_upload=self._take_upload,
-                on_rejected=lambda: ui.notify(
-                    f"a raw may have {_LARGEST_UPLOAD // 10**6} MB at most", type="negative"
-                ),
+                on_rejected=lambda: ui.notify(most, type="negative"),
             ).classes("hidden")
-            ui.button(
-                "Open raw", icon="upload", on_click=lambda: upload.run_method("pickFiles")
-            ).props("dense")
+            pick = partial(upload.run_method, "pickFiles")
+            ui.button("Open raw", icon="upload", on_click=pick).props("dense")
             self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")
-        pages = {"Exposure": self._exposure, "Episode": self._episode, _ONE_RAW: self._one_raw}
         with ui.tabs().props("dense align=left") as tabs:
-            for name in pages:
+            for name in _TABS:
                 ui.tab(name)
-        self._panels = ui.tab_panels(
-            tabs, value="Exposure", animated=False, on_change=self._show_raw
-        ).classes("w-full bg-transparent")
-        with self._panels:
-            for name, page in pages.items():
-                with ui.tab_panel(name).classes("p-0"):
-                    page.build()
-        await client.connected()
-        await self._open(self._library.first)
+        self._panels = ui.tab_panels(tabs, value=_TABS[0], animated=False, on_change=self._show_raw)
+        shared = options.pictures.address, folder
+        with self._panels.classes("w-full bg-transparent"):
+            with ui.tab_panel(_TABS[0]).classes("p-0"):
+                self._exposure = ExposurePage(*shared)
+            with ui.tab_panel(_TABS[1]).classes("p-0"):
+                self._episode = EpisodePage(*shared)
+            with ui.tab_panel(_TABS[2]).classes("p-0"):
+                self._one_raw = OneRawPage(*shared, options.simulator)
 
     def _scene_picker(self) -> ui.dialog:
         with ui.dialog() as dialog, ui.card().classes("w-full"):
@@ -172,22 +158,20 @@ class Page:
         """Puts the thumbnail of the scene called `name` into `image`."""
         shared = name in self._options.library.readers
         known = self._options.thumbnails if shared else {}
-        jpeg = known.get(name)
+        jpeg, viewed = known.get(name), self._options.viewed
         if jpeg is None:
             with suppress(ValueError, OSError):  # such a file says so when it is opened
-                jpeg = await run.io_bound(self._thumbnail, name)
+                jpeg = await run.io_bound(lambda: viewed(self._library, name).thumbnail())
         if jpeg is not None:  # else the program ends
             known[name] = jpeg
             self._exposure.show(image, jpeg)
 
-    def _thumbnail(self, name: str) -> bytes:
-        return self._options.viewed(self._library, name).thumbnail()
-
     async def _pick(self, name: str) -> None:
         self._picker.close()
-        await self._open(name)
+        await self.open(name)
 
-    async def _open(self, name: str) -> None:
+    async def open(self, name: str) -> None:
+        """Shows the scene called `name` on all tabs."""
         title, self._title.text = self._title.text, f"{name} ..."
         before = self._exposure.view.settings
         try:
@@ -206,7 +190,7 @@ class Page:
         await self._show_raw()
 
     async def _show_raw(self) -> None:
-        if self._panels.value == _ONE_RAW:
+        if self._panels.value == _TABS[2]:
             await self._one_raw.show_raw()
 
     async def _take_upload(self, event: Any) -> None:
@@ -221,12 +205,11 @@ class Page:
             complain(error)
             return
         if own is not None:
-            await self._open(own)
+            await self.open(own)
 
     async def _download(self) -> None:
         viewed, view = self._exposure.viewed, self._exposure.view
         if viewed is not None:
             name = f"{Path(viewed.scene.scene_id).stem}-simulated.dng"
-            await self._exposure.download(
-                self._save, name, lambda path: viewed.write_dng(path, view)
-            )
+            write = partial(viewed.write_dng, view=view)
+            await self._exposure.download(self._save, name, write)

@@ -8,11 +8,14 @@ import secrets
 import socket
 import tempfile
 from collections.abc import Callable
-from http.cookies import SimpleCookie
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
+from fastapi.responses import PlainTextResponse
 from nicegui import app, background_tasks, ui
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
+from starlette.websockets import WebSocketClose
 
 from agents.viewer.page import Options, show_page
 
@@ -43,41 +46,32 @@ class TokenGuard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        headers = {key.decode().lower(): value.decode("latin-1") for key, value in scope["headers"]}
-        in_query = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        cookie = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        origin = headers.get("origin")
-        own = headers.get("host") in self._hosts
+        asked = HTTPConnection(scope)
+        origin = asked.headers.get("origin")
+        own = asked.headers.get("host") in self._hosts
         own = own and (origin is None or urlsplit(origin).netloc in self._hosts)
-        by_query = own and self._is_token(in_query)
-        if not (by_query or (own and cookie is not None and self._is_token(cookie.value))):
-            await _refuse(scope, receive, send)
+        by_query = own and self._is_token(asked.query_params.get("token", ""))
+        if not by_query and not (own and self._is_token(asked.cookies.get(self._cookie, ""))):
+            text = "Open the address that `ae-env view` printed: it contains the token."
+            refusal: Any = PlainTextResponse(text, 403)
+            if scope["type"] == "websocket":
+                refusal = WebSocketClose(1008)
+            await refusal(scope, receive, send)
             return
 
         async def with_cookie(message: Any) -> None:
             if message["type"] == "http.response.start":
-                extra = [(b"referrer-policy", b"no-referrer")]
+                headers = MutableHeaders(scope=message)
+                headers["referrer-policy"] = "no-referrer"
                 if by_query:
                     value = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
-                    extra.append((b"set-cookie", value.encode()))
-                message = {**message, "headers": [*message["headers"], *extra]}
+                    headers.append("set-cookie", value)
             await send(message)
 
         await self._app(scope, receive, with_cookie)
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode(), self._token.encode())
-
-
-async def _refuse(scope: Any, receive: Any, send: Any) -> None:
-    if scope["type"] == "websocket":
-        await receive()
-        await send({"type": "websocket.close", "code": 1008})
-        return
-    text = b"Open the address that `ae-env view` printed: it contains the token."
-    headers = [(b"content-type", b"text/plain; charset=utf-8")]
-    await send({"type": "http.response.start", "status": 403, "headers": headers})
-    await send({"type": "http.response.body", "body": text})
 
 
 def free_port(port: int) -> int:

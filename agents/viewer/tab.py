@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,8 +20,8 @@ _DIVIDE = (
 )
 
 
-class Tab(ABC):
-    """One tab of the page.
+class Tab:
+    """One tab of the page, put together where it is made.
 
     Args:
         address: Gives a picture an address that the browser can fetch it from.
@@ -33,17 +32,21 @@ class Tab(ABC):
         self.address, self.folder = address, folder
         self.viewed: ViewedScene | None = None
 
-    @abstractmethod
-    def build(self) -> None:
-        """Puts the tab together, where it is called."""
-
     def show(self, image: ui.element, jpeg: bytes | None) -> None:
         """Shows a picture in an ``img``, or none."""
-        if jpeg is None:
-            image.props.pop("src", None)
-        else:
+        image.props.pop("src", None)
+        if jpeg is not None:
             image.props["src"] = self.address(jpeg)
         image.update()
+
+    async def work(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """What `function` returns, in another thread.
+
+        None if another scene was opened meanwhile, or the program ends.
+        """
+        viewed = self.viewed
+        found = await run.io_bound(function, *arguments, **options)
+        return found if viewed is self.viewed else None
 
     async def download(self, button: ui.button, name: str, write: Callable[[Path], object]) -> None:
         """Sends the browser the file called `name` that `write` writes to a path."""
@@ -54,15 +57,24 @@ class Tab(ABC):
 
 
 @contextmanager
-def loading(button: ui.button, errors: Any = (ValueError, OSError, ImportError)) -> Iterator[None]:
-    """Shows that work of `button` is under way; `errors` become notices."""
-    button.props("loading")
+def loading(
+    element: ui.button | ui.spinner, errors: Any = (ValueError, OSError, ImportError, RuntimeError)
+) -> Iterator[None]:
+    """Shows by a button or spinner that work is under way; `errors` become notices."""
+
+    def show(busy: bool) -> None:
+        if isinstance(element, ui.spinner):
+            element.visible = busy
+        else:
+            element.props["loading"] = busy
+
+    show(True)
     try:
         yield
     except errors as error:
         complain(error)
     finally:
-        button.props(remove="loading")
+        show(False)
 
 
 def complain(error: Exception | str) -> None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import io
 import math
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +17,10 @@ from PIL import Image
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.bundled import bundled_scenes
 from ae_env.scenes.folder import find_files
 from ae_env.scenes.recorded import PREFIX
+from ae_env.scenes.scene import SceneRequest, SceneSet
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator import (
@@ -41,7 +41,7 @@ from simulator.utils.files import RAW_SUFFIXES
 
 #: Camera in whose colours named scenes and radiance maps are made, as the environment's default.
 CAMERA = "nikon_z6"
-#: Scenes kept in memory: a raw of 24 megapixels takes 0.1 GB, with its noise reduced twice that.
+#: Raws kept in memory: one of 24 megapixels takes 0.1 GB, with its noise reduced twice that.
 _KEPT = 4
 #: Most files that an error names.
 _MOST_NAMED = 8
@@ -68,12 +68,10 @@ class OpenedScene:
 
     Args:
         scene: At its finest resolution.
-        turns: Quarter turns to the left that turn its picture upright.
         raw: The photograph that it is; None for a scene that is none.
     """
 
     scene: Scene
-    turns: int = 0
     raw: RawImage | None = None
 
 
@@ -89,9 +87,7 @@ class Library:
         self, readers: Mapping[str, Callable[[], OpenedScene]], first: str | None = None
     ) -> None:
         self.readers = dict(readers)
-        self.first = next(iter(self.readers)) if first is None else first
-        self._lock = threading.Lock()
-        self._read: OrderedDict[str, OpenedScene] = OrderedDict()
+        self.first = first or next(iter(self.readers))
 
     def add(self, path: Path, name: str) -> str:
         """Adds the raw at `path`; returns the name it got, `name` with a number where taken.
@@ -99,35 +95,23 @@ class Library:
         Raises:
             ValueError: If the file is no raw that can be read.
         """
-        scene = _read_raw(path, name)
+        _read_raw(path, name)
         own, number = name, 1
         while own in self.readers:
             number += 1
             own = f"{name} ({number})"
         self.readers[own] = partial(_read_raw, path, name)
-        self._keep(own, scene)
         return own
 
     def open(self, name: str) -> OpenedScene:
         """The scene called `name`."""
-        with self._lock:
-            scene = self._read.get(name)
-        if scene is None:
-            scene = self.readers[name]()
-        self._keep(name, scene)
-        return scene
-
-    def _keep(self, name: str, scene: OpenedScene) -> None:
-        with self._lock:
-            self._read[name] = scene
-            self._read.move_to_end(name)
-            while len(self._read) > _KEPT:
-                self._read.popitem(last=False)
+        return self.readers[name]()
 
 
+@lru_cache(maxsize=_KEPT)
 def _read_raw(path: Path, name: str) -> OpenedScene:
     raw = read_raw(path)
-    return OpenedScene(Scene.from_raw(raw, scene_id=name), quarter_turns(raw), raw)
+    return OpenedScene(Scene.from_raw(raw, scene_id=name), raw)
 
 
 def find_scenes(what: str) -> Library:
@@ -150,8 +134,8 @@ def find_scenes(what: str) -> Library:
             if path.suffix.lower() in RADIANCE_SUFFIXES:
                 readers |= _loaded(str(path))
             else:
-                name = str(path.relative_to(base)) if path.is_relative_to(base) else path.name
-                name = path.name if name == "." else name
+                own = path != base and path.is_relative_to(base)
+                name = str(path.relative_to(base)) if own else path.name
                 readers[name] = partial(_read_raw, path, name)
         return Library(readers, _first_readable(what, readers))
     try:
@@ -159,7 +143,7 @@ def find_scenes(what: str) -> Library:
     except ValueError:
         if what.startswith(PREFIX):
             raise
-    bundled = _loaded("bundled")
+    bundled = _bundled()
     if what not in bundled:
         raise ValueError(
             f"`what` (={what!r}) must be a raw, a radiance map, a folder, scenes such as bundled, "
@@ -170,29 +154,42 @@ def find_scenes(what: str) -> Library:
 
 
 def _first_readable(what: str, readers: Mapping[str, Callable[[], OpenedScene]]) -> str:
-    """Name of the first scene that can be read: files are refused here, not on an empty page.
-
-    Raises:
-        ValueError: If none can; names them.
-    """
+    """Name of the first scene that can be read: files are refused here, not on an empty page."""
     broken: list[str] = []
     for name, read in readers.items():
         try:
             read()
         except (ValueError, OSError) as error:
             broken.append(f"{name}: {error}")
-            continue
-        return name
+        else:
+            return name
     named = "; ".join(broken[:_MOST_NAMED])
     if len(broken) > _MOST_NAMED:
         named += f"; and {len(broken) - _MOST_NAMED} more"
     raise ValueError(f"`what` (={what!r}) must hold a raw that can be read, but none can: {named}")
 
 
-def _loaded(spec: Any) -> dict[str, Callable[[], OpenedScene]]:
+def _loaded(spec: str) -> dict[str, Callable[[], OpenedScene]]:
     """The scenes that `load_scenes` makes of `spec`, by id."""
     scenes = load_scenes(spec, "all", camera=get_camera(CAMERA), resolution=None)
     return {scene.scene_id: partial(OpenedScene, scene) for scene in scenes}
+
+
+def _bundled() -> dict[str, Callable[[], OpenedScene]]:
+    """The bundled scenes by id, each drawn when it is opened."""
+
+    def draw(scenes: SceneSet, index: int) -> OpenedScene:
+        return OpenedScene(scenes[index])
+
+    sets = [
+        bundled_scenes(SceneRequest(split, get_camera(CAMERA), resolution=None))
+        for split in ("train", "test")
+    ]
+    return {
+        name: partial(draw, scenes, index)
+        for scenes in sets
+        for index, name in enumerate(scenes.scene_ids)
+    }
 
 
 @dataclass(frozen=True)
@@ -277,10 +274,11 @@ class ViewedScene:
         tolerance: float = 0.1,
         scorer: str = "balanced",
     ) -> None:
-        self.scene, self.turns, self.photograph = opened.scene, opened.turns, opened.raw
+        self.scene, self.photograph = opened.scene, opened.raw
+        self.turns = 0 if opened.raw is None else quarter_turns(opened.raw)
         self._simulator, self._depth, self._tolerance = simulator, depth, tolerance
         self._scorer = make_scorer(scorer)
-        self._prepared: dict[object, PreparedScene] = {}
+        self._prepared: dict[tuple[int, int] | None, PreparedScene] = {}
         self._tables: dict[object, ScoreTable] = {}
         self._lock = threading.RLock()  # one capture at a time: more would share the cores
 
@@ -346,20 +344,15 @@ class ViewedScene:
                 )
             return self._tables[key]
 
-    def raw(self, view: View) -> RawImage:
-        """The full frame at the settings of `view`, at the sensor's resolution."""
-        with self._lock:
-            height = self.scene.light.shape[1]
-            return self._simulator.simulate(
-                self._prepare(self.scene),
-                view.settings,
-                image_speed=view.speed,
-                defocus=view.defocus * height / SCORED_PIXELS,
-            )
-
     def write_dng(self, path: Path, view: View) -> Path:
-        """Writes the full frame as a DNG."""
-        write_dng(path, self.raw(view))
+        """Writes the full frame at the settings of `view`, at the sensor's resolution."""
+        with self._lock:
+            defocus = view.defocus * self.scene.light.shape[1] / SCORED_PIXELS
+            prepared = self._prepare(self.scene)
+            raw = self._simulator.simulate(
+                prepared, view.settings, image_speed=view.speed, defocus=defocus
+            )
+        write_dng(path, raw)
         return path
 
     def thumbnail(self) -> bytes:
@@ -377,20 +370,16 @@ class ViewedScene:
 
     def _part(self, view: View) -> PreparedScene:
         """The part that `view` shows, prepared: networks run once a frame and once a window."""
-        if view.centre is None:
-            key: object = None
-            scene = self.small
-        else:
+        key, scene = None, self.small
+        if view.centre is not None:
             rows, columns = self._window(view.centre)
-            key = (rows.start, columns.start)
-            scene = self.scene.cut(rows, columns)
+            key, scene = (rows.start, columns.start), self.scene
         if key not in self._prepared:
             if len(self._prepared) > 8:
                 self._prepared = {k: p for k, p in self._prepared.items() if k is None}
-            self._prepared[key] = self._prepare(scene)
-        prepared = self._prepared[key]
-        whole = self.small if key is None else self.scene
-        height = whole.light.shape[1]
+            part = scene if key is None else scene.cut(rows, columns)
+            self._prepared[key] = self._prepare(part)
+        prepared, height = self._prepared[key], scene.light.shape[1]
         return replace(
             prepared,
             image_speed=view.speed * height / prepared.light.shape[1],  # heights of what is shown
@@ -398,7 +387,9 @@ class ViewedScene:
         )
 
     def _window(self, centre: tuple[float, float]) -> tuple[slice, slice]:
-        down, right = _unturned(centre, self.turns)
+        down, right = centre
+        for _ in range(self.turns % 4):  # from the upright picture to the frame
+            down, right = right, 1.0 - down
         found = []
         for share, side, size in zip(
             (down, right), self.scene.light.shape[1:], WINDOW_SIZE, strict=True
@@ -418,8 +409,7 @@ class ViewedScene:
                 ((capture <= _AT_BLACK).all(dim=0), _BLACK_MARK),
                 ((capture >= _AT_WHITE).any(dim=0), _WHITE_MARK),
             ):
-                mask = clipped.numpy().repeat(scale, 0).repeat(scale, 1)
-                image[mask] = colour
+                image[clipped.numpy().repeat(scale, 0).repeat(scale, 1)] = colour
         return self._upright(image)
 
     def _upright(self, image: np.ndarray) -> np.ndarray:
@@ -428,14 +418,6 @@ class ViewedScene:
 
 def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:
     return RawImage(capture, settings, scene.camera, white_balance=scene.white_balance)
-
-
-def _unturned(point: tuple[float, float], turns: int) -> tuple[float, float]:
-    """Where `point` of the upright picture lies in the frame, both as shares down and right."""
-    down, right = point
-    for _ in range(turns % 4):
-        down, right = right, 1.0 - down
-    return down, right
 
 
 def encoded(picture: Image.Image | np.ndarray, kind: str = "JPEG", quality: int = 90) -> bytes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -387,7 +388,8 @@ def _difference(
 
 def picture(means: list[Row], meta: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(10.0, 7.0), dpi=100, layout="constrained")
-    upper, lower = figure.subfigures(2, 1)
+    halves: Any = figure.subfigures(2, 1)
+    upper, lower = halves
     drawn = ("repeatability", "accuracy", "auc_5")
     for axis, measure in zip(upper.subplots(1, 3), drawn, strict=True):
         for arm in dict.fromkeys(row["arm"] for row in means):
@@ -409,10 +411,10 @@ def picture(means: list[Row], meta: dict[str, Any]) -> Figure:
         arm: training.train(arm, meta["seed"], steps, limit)[0] for arm in ("scaling", "full")
     }
     pairs = list(held_out_pairs("test", [condition], meta["seed"], limit))
-    matches = {
-        arm: [matched(*model.detect(p.pictures, KEYPOINTS), p.homography) for p in pairs]
-        for arm, model in models.items()
-    }
+    matches: dict[str, Any] = {arm: [] for arm in models}
+    for pair, (arm, model) in product(pairs, models.items()):
+        one, other = model.detect(pair.pictures, KEYPOINTS)
+        matches[arm].append(matched(one, other, pair.homography))
     # The pair with the median number of right matches under plain scaling.
     right = [(errors <= 3.0).sum() for *_, errors in matches["scaling"]]
     middle = int(np.argsort(right, kind="stable")[len(right) // 2])
@@ -448,7 +450,7 @@ def measure(seed: int, body: int, quick: bool) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     limit, steps = (QUICK_SOURCES, training.QUICK_STEPS) if quick else (None, training.STEPS)
     trained = {arm: training.train(arm, seed, steps, limit) for arm in training.AUGMENTATIONS}
-    detects = {arm: model.detect for arm, (model, _) in trained.items()}
+    detects: dict[str, Detect] = {arm: model.detect for arm, (model, _) in trained.items()}
     rows = {split: _judged(detects, split, body, quick) for split in ("validation", "test")}
     return [
         {"arm": arm, "seed": seed, "steps": steps, "seconds": seconds}

@@ -129,7 +129,8 @@ def mapped(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
 
 def inside(points: np.ndarray, size: int, border: float = 0.0) -> np.ndarray:
     """(N,) whether points lie in a crop."""
-    return ((points >= border) & (points <= size - 1 - border)).all(axis=1)
+    within: np.ndarray = ((points >= border) & (points <= size - 1 - border)).all(axis=1)
+    return within
 
 
 def two_crops(
@@ -352,7 +353,8 @@ def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[De
 
 
 def _stored(path: Path) -> tuple[Detector, float]:
-    model, stored = Detector().to(memory_format=torch.channels_last), load_file(path)
+    model, stored = Detector(), load_file(path)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     seconds = float(stored.pop("seconds"))
     model.load_state_dict(stored)
     return model, seconds
@@ -362,7 +364,7 @@ def _fit(
     model: Detector, arm: str, seed: int, steps: range, rate: float, limit: int | None, path: Path
 ) -> None:
     views, begun = _views(limit), time.perf_counter()
-    model.to(memory_format=torch.channels_last).train()
+    model.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(len(steps), 2))
     chosen = islice(enumerate(batches(len(views), BATCH, seed)), steps.start, steps.stop)
@@ -377,7 +379,7 @@ def _fit(
             pictures[some] = AUGMENTATIONS[arm](pictures[some], seeds)
         loss = _loss(model, (pictures * 255.0).round() / 255.0, batch)
         optimiser.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
         schedule.step()
@@ -398,7 +400,8 @@ Pair = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]
 
 def _pair(view: View, rng: np.random.Generator) -> Pair:
     """Two crops, the corners of each, and points (POINTS, 2) of each that are the same places."""
-    homographies = two_crops(rng, *view.picture.shape[:2], SIZE)
+    height, width, _ = view.picture.shape
+    homographies = two_crops(rng, height, width, SIZE)
     crops = [warped(view.picture, h, SIZE) for h in homographies]
     if rng.random() < 0.5:  # both, mirrored
         mirror = np.array([[-1.0, 0.0, SIZE - 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -427,14 +430,15 @@ def _loss(model: Detector, pictures: Tensor, batch: list[Pair]) -> Tensor:
         x, y = np.round(points).astype(np.int64).T
         labels[index, y // CELL, x // CELL] = torch.from_numpy((y % CELL) * CELL + x % CELL)
     scored = F.cross_entropy(logits, labels)
-    points = [np.stack([pair[2][side] for pair in batch]) for side in (0, 1)]
-    first, second = (torch.from_numpy(p.astype(np.float32)) for p in points)
+    places = [np.stack([pair[2][side] for pair in batch]) for side in (0, 1)]
+    first, second = (torch.from_numpy(p.astype(np.float32)) for p in places)
     a, b = sample(dense[0::2], first).flatten(0, 1), sample(dense[1::2], second).flatten(0, 1)
     similar = a @ b.T / _TEMPERATURE
     # Neighbours of a point are no negatives.
     near = torch.cdist(first, first) < _SAME
     near &= ~torch.eye(POINTS, dtype=torch.bool)
-    similar = similar.masked_fill(torch.block_diag(*near), -torch.inf)
+    blocks: Tensor = torch.block_diag(*near)  # type: ignore[no-untyped-call]
+    similar = similar.masked_fill(blocks, -torch.inf)
     target = torch.arange(len(similar))
     described = F.cross_entropy(similar, target) + F.cross_entropy(similar.T, target)
     return scored + _DESCRIBED * 0.5 * described

@@ -21,7 +21,7 @@ from benchmarks.harness import Row, clipped, data_root, pivot, sections
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
-from simulator.optics.disc_bank import DiscBank, added_blur
+from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
 
@@ -62,7 +62,7 @@ def measure(seed: int, quick: bool) -> list[Row]:
         for pixels, total in totals[totals["count"] > 0].iterrows():
             asked, exp = CLASSES[str(pixels)][2], total["exp"]
             relative = ((total[own.columns[4:]] / exp) ** 0.5).to_dict()
-            row: Row = {"part": "defocus", "set": name, "iso": int(iso), "pixels": pixels}
+            row: Row = {"part": "defocus", "set": name, "iso": int(str(iso)), "pixels": pixels}
             row |= {"count": int(total["count"]), "area": total["count"] / clear}
             row |= {"rmse_exp": (exp / (4 * total["count"])) ** 0.5, "relative_to_exp": relative}
             by_scene = own[(own["pixels"] == pixels) & (own["count"] >= FEWEST_PIXELS)]

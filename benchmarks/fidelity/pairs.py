@@ -232,7 +232,7 @@ def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str, mix: str) -
             row: Row = {"part": "pairs", "camera": camera, "mix": mix, "group": group}
             row |= {"method": name, "preset": preset, "body_correction": corrected}
             row |= {"pairs": len(chosen), "source_groups": len(set(subjects))}
-            row |= own.drop(columns="ms").mean().to_dict()
+            row |= {str(k): mean for k, mean in own.drop(columns="ms").mean().items()}
             # Gains are over the exposure alone, and over the stage before.
             others = {"over_exp": ("EXP", preset or "compact", corrected or not preset)}
             if before := {"NS": "EXP", "Full": "NS"}.get(name):

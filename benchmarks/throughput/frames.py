@@ -35,7 +35,7 @@ from simulator import (
     write_dng,
 )
 from simulator.camera import get_camera
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 from simulator.radiance.procedural import dead_leaves
 from simulator.raw.dng import SOFTWARE_NAME
 

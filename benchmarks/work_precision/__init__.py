@@ -291,10 +291,10 @@ def _by_tolerance(rows: list[Row]) -> list[Row]:
     for (kind, tolerance), own in frame.groupby(["kind", "tolerance"]):
         shares = own["network"].fillna("none").value_counts(normalize=True)
         kept = own["measured"][own["said"]] <= tolerance
-        row = {"kind": kind, "tolerance": tolerance, "cases": len(own)}
+        row: Row = {"kind": kind, "tolerance": tolerance, "cases": len(own)}
         row["networks"] = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
-        row |= own[["predicted", "measured"]].median().to_dict()
-        row |= own[["covered", "said"]].mean().to_dict()
+        row |= {key: own[key].median() for key in ("predicted", "measured")}
+        row |= {key: own[key].mean() for key in ("covered", "said")}
         found.append(row | {"ci95": _interval(own), "kept": kept.mean() if len(kept) else None})
     return found
 

@@ -18,12 +18,19 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import Pool
-from simulator.capture.exposure import LIGHT_LIMIT, Exposure, exposure_table
+from simulator.capture.exposure import LIGHT_LIMIT, Exposure, decide
+from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, noise_balance, record
+from simulator.capture.sensor import (
+    Noise,
+    Transitions,
+    exposure_table,
+    noise_keys,
+    record,
+    single_normals,
+)
 from simulator.capture.statistics import LightStatistics
-from simulator.noise.generator import Noise, noise_keys, single_normals
-from simulator.optics.blur import Blur, blur_many
+from simulator.optics.discs import Blur, blur_many
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 
@@ -238,6 +245,9 @@ class CaptureBatch:
             # Scenes that are shown several times share their light, but not what is blurred of it.
             light = scene.blurred_light.copy(pool=self._pool)
             scene = self._scenes[index] = scene.changed(blurred_light=light)
+            if len(scene.targets) < len(self.states):  # else another episode asked for them
+                for settings in self.states:
+                    scene.targets[settings]
         return scene
 
     # -- planning -----------------------------------------------------------------------------
@@ -247,19 +257,19 @@ class CaptureBatch:
         columns, noisy, exposures = self._table, self.noise is not None, []
         for index, row, gain in zip(indices.tolist(), rows.tolist(), gains.tolist(), strict=True):
             scene, settings = self.prepared_scene(index), self.states[row % len(self.states)]
-            exposure = scene.exposure(settings, gain=gain)
+            exposure = decide(scene, settings, gain=gain)
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
             columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
             columns.remaining_variance[row] = None  # `_begin_blur` knows it
             columns.any_blurs |= bool(blurs)
             if not blurs:
                 columns.light[row] = scene.blurred_light.source(exposure).contiguous()
-            excess = _excess_variance(scene.statistics, exposure) if noisy else 0.0
+            excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
             columns.excess_variance[row] = excess
             error = exposure.left_out
             if not scene.nlf.is_zero:
-                shown = exposure if noisy else scene.exposure(settings, noise=False, gain=gain)
-                error = math.hypot(*scene.predicted_errors(settings, shown).values())
+                shown = exposure if noisy else decide(scene, settings, noise=False, gain=gain)
+                error = math.hypot(*predict_errors(scene, settings, shown).values())
             columns.predicted_error[row] = error
             columns.modules[row] = _modules(exposure, noisy)
             exposures.append(exposure)

@@ -13,21 +13,22 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
-from simulator.capture.layout import Layout
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics import disc_bank
-from simulator.optics.blur import Blur, disc_blur, kernel_energy, motion_blur
-from simulator.optics.disc_bank import HALO, DiscBank
-from simulator.optics.motion_path import Path, Taps, path_blur, path_blur_apart, path_taps
+from simulator.optics import discs
+from simulator.optics.discs import HALO, Blur, DiscBank, disc_blur, kernel_energy
+from simulator.optics.motion import Path, Taps, motion_blur, path_blur, path_blur_apart, path_taps
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
+
+if TYPE_CHECKING:
+    from simulator.capture.prepared_scene import Layout
 
 #: Memory that the cached blurred light of one scene may take, and that its cached opened light may
 #: [byte].
@@ -131,7 +132,7 @@ class MapApertureBlur(ApertureBlur):
 
     def remaining_variance(self, f_number: float) -> Tensor:
         """See `ApertureBlur`."""
-        return disc_bank.remaining_variance(self._added(self.diameter, f_number))
+        return discs.remaining_variance(self._added(self.diameter, f_number))
 
     @functools.cached_property
     def mean_square_diameter(self) -> float:
@@ -142,7 +143,7 @@ class MapApertureBlur(ApertureBlur):
         return float(self._added(self.diameter.max(), f_number))
 
     def _added(self, diameter: Tensor, f_number: float) -> Tensor:
-        return disc_bank.added_blur(diameter, self.f_number, f_number)
+        return discs.added_blur(diameter, self.f_number, f_number)
 
     @functools.cached_property
     def _tiles(self) -> list[Tile]:
@@ -321,7 +322,7 @@ class BlurredLight:
         The latest light is cached, because an agent that has settled repeats its state.
 
         Returns:
-            The light, and the blur (`simulator.optics.blur.blur_many`) or the function that fills
+            The light, and the blur (`simulator.optics.discs.blur_many`) or the function that fills
             it; None where that was done before.
         """
         if self._latest is not None and self._latest[0] == exposure.blur:
@@ -452,15 +453,15 @@ def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: 
     height, width = layout.defocus.shape
     diameter = layout.defocus * defocus_px
     if path is None:
-        return disc_bank.remaining_variance(diameter)
+        return discs.remaining_variance(diameter)
     taps = path_taps(path, height, width)
-    left = disc_bank.remaining_variance(diameter, taps)
+    left = discs.remaining_variance(diameter, taps)
     if own is None:
         return path_blur(left[None], taps)[0]
     # Taps of pixels that differ leave the mean of what each of these would leave alone.
     taps_own = path_taps(own, height, width)
     left = path_blur(left.flatten()[layout.behind][None], taps)
-    subject = path_blur(layout.mask * disc_bank.remaining_variance(diameter, taps_own), taps_own)
+    subject = path_blur(layout.mask * discs.remaining_variance(diameter, taps_own), taps_own)
     seen = 1.0 - path_blur(layout.mask, taps_own)
     return (seen.square() * left + subject)[0].clamp(max=1.0)
 
@@ -468,4 +469,4 @@ def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: 
 @functools.lru_cache(maxsize=4096)
 def _uniform_energy(path: Path | None, defocus_px: float, height: int, width: int) -> float:
     taps: Taps | None = None if path is None else path_taps(path, height, width)
-    return float(disc_bank.remaining_variance(torch.full((1, 1), defocus_px), taps))
+    return float(discs.remaining_variance(torch.full((1, 1), defocus_px), taps))

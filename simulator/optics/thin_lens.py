@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from simulator.optics.blur import disc_blur, disc_kernel
+from simulator.optics.discs import disc_blur, disc_kernel
 
 _Length = TypeVar("_Length", float, np.ndarray, torch.Tensor)
 

@@ -20,13 +20,14 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import temperature_tint
 from simulator.radiance.procedural import (
     Drawing,
     LeafStyle,
     dead_leaves,
     fractal_noise,
+    log_uniform,
     paint_leaves,
 )
 from simulator.utils.checks import check_integer, check_word
@@ -86,18 +87,16 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     blur = _background(rng, size, levels[0], levels[0] - levels[-1])
     surface = np.zeros((size, size), np.int32)
     for number, level in enumerate(levels[1:], start=1):
-        thing = _put_thing(rng, blur, surface, number, level)
-        leaves = np.clip(_leaves(rng, len(thing.tone)) * thing.tone, 0.003, 0.97)
-        picture[:, thing.rows, thing.columns][:, thing.seen] = leaves[:, *thing.inside][
-            :, thing.seen
-        ]
+        place, inside, seen, tone = _put_thing(rng, blur, surface, number, level)
+        leaves = np.clip(_leaves(rng, len(tone)) * tone, 0.003, 0.97)
+        picture[:, *place][:, seen] = leaves[:, *inside][:, seen]
     blur = np.clip(blur, -LARGEST_BLUR, LARGEST_BLUR)
     if focus == "everything":
         blur *= LARGEST_BLUR_IN_FOCUS * rng.uniform(0.0, 1.0) / max(float(np.abs(blur).max()), 1e-6)
     if rng.random() < 1.0 / 3.0:
         _add_highlights(rng, picture, surface)
     light = _soften(picture, rng.uniform(0.05, 0.09))
-    illuminance = float(f"{math.exp(rng.uniform(0.0, math.log(20_000.0))):.4g}")
+    illuminance = float(f"{log_uniform(rng, 1.0, 20_000.0):.4g}")
     drawing = Drawing(light, illuminance, temperature_tint(rng.uniform(-0.1, 1.0)))
     far = math.exp(rng.uniform(math.log(0.02), math.log(1.0)))
     return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
@@ -111,21 +110,12 @@ def draw_layout(name: str, height: int, width: int) -> Layout:
 
     Args:
         name: Decides the layout.
-        height: Of the picture [packed pixels].
-        width: Of the picture [packed pixels].
+        height, width: Of the picture [packed pixels].
     """
     rng = np.random.default_rng([zlib.crc32(f"layout {name}".encode()), 0])
-    blur, subject = _blur_and_subject(rng)
-    side = max(height, width)
-    maps = torch.from_numpy(np.stack([blur, subject.astype(np.float32)]))[None]
-    sized = F.interpolate(maps, (side, side), mode="area")[0, :, :height, :width]
-    return Layout(sized[0].clamp(max=1.0), sized[1] > 0.5)
-
-
-def _blur_and_subject(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Relative circle of confusion (S, S) float32, and where the nearest thing is, bool."""
     focus = str(rng.choice(_LAYOUT_FOCUSES, p=_LAYOUT_SHARES))
-    while True:
+    share = 0.0
+    while share < _LEAST_SUBJECT:  # else the nearest thing is hidden, or outside the frame
         levels = _levels(rng, int(rng.integers(1, 4)), focus)
         levels *= LARGEST_BLUR / np.abs(levels).max()  # only what is relative to it matters
         blur = _background(rng, _LAYOUT_SIDE, levels[0], levels[0] - levels[-1])
@@ -133,13 +123,15 @@ def _blur_and_subject(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]
         for number, level in enumerate(levels[1:], start=1):
             _put_thing(rng, blur, surface, number, level, _LAYOUT_SIDES)
         subject = surface == len(levels) - 1
-        if subject.mean() >= _LEAST_SUBJECT:  # else it is hidden, or outside the frame
-            size = np.abs(blur)
-            return size / size.max(), subject
+        share = subject.mean()
+    diameter, side = np.abs(blur), max(height, width)
+    maps = torch.from_numpy(np.stack([diameter / diameter.max(), subject.astype(np.float32)]))[None]
+    sized = F.interpolate(maps, (side, side), mode="area")[0, :, :height, :width]
+    return Layout(sized[0].clamp(max=1.0), sized[1] > 0.5)
 
 
 def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[float, np.ndarray]:
-    """Focus distance and depth at which a scene has `blur`.
+    """Focus distance [m] and depth (H, W) float32 [m] at which a scene has `blur`.
 
     Solves the thin-lens relation ``c = f**2 / (N (s - f)) * (z - s) / z`` (c signed, on the sensor)
     for the focus distance s and the depths z, at `FOCAL_LENGTH` and `F_NUMBER`.
@@ -148,9 +140,6 @@ def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[fl
         blur: (H, W) signed circle of confusion [packed pixels].
         far: Inverse distance [1/m] where `blur` is largest.
         pixel_pitch: Distance between packed pixels [m].
-
-    Returns:
-        Focus distance [m] and (H, W) float32 depth [m].
     """
     # With inverse distances D = 1/z, F = 1/s: c = f^2 / N * (F - D) / (1 - f F).
     scale = FOCAL_LENGTH**2 / (F_NUMBER * pixel_pitch)
@@ -193,17 +182,6 @@ def _background(rng: np.random.Generator, size: int, level: float, span: float) 
     return np.repeat((level - nearer)[:, None], size, axis=1)
 
 
-@dataclass(frozen=True)
-class _Thing:
-    """Where a thing is in the frame: rows and columns there and `inside` it, and what is seen."""
-
-    rows: slice
-    columns: slice
-    inside: tuple[slice, slice]
-    seen: np.ndarray
-    tone: np.ndarray
-
-
 def _put_thing(
     rng: np.random.Generator,
     blur: np.ndarray,
@@ -211,8 +189,8 @@ def _put_thing(
     number: int,
     level: float,
     sides: tuple[float, float] = _SIDES,
-) -> _Thing:
-    """Adds one thing to `blur` and `surface`, wherever it is the nearest."""
+) -> tuple[tuple[slice, slice], tuple[slice, slice], np.ndarray, np.ndarray]:
+    """Adds one thing: its place in the frame and in itself, where it is seen, its tone."""
     size = blur.shape[0]
     side = int(rng.uniform(*sides) * size)
     top, left = (int(rng.integers(-side // 3, size - 2 * side // 3)) for _ in range(2))
@@ -225,23 +203,23 @@ def _put_thing(
         tone = np.ones((side, side), np.float32)
     rows = slice(max(top, 0), min(top + side, size))
     columns = slice(max(left, 0), min(left + side, size))
+    place = (rows, columns)
     inside = (
         slice(rows.start - top, rows.stop - top),
         slice(columns.start - left, columns.stop - left),
     )
-    seen = mask[inside] & (depth[inside] < blur[rows, columns])
-    blur[rows, columns][seen] = depth[inside][seen]
-    surface[rows, columns][seen] = number
-    return _Thing(rows, columns, inside, seen, tone)
+    seen = mask[inside] & (depth[inside] < blur[place])
+    blur[place][seen] = depth[inside][seen]
+    surface[place][seen] = number
+    return place, inside, seen, tone
 
 
 def _board(rng: np.random.Generator, side: int) -> np.ndarray:
     """(side, side) bool: an ellipse or a rectangle at an angle."""
-    shape = np.array(
-        [[rng.uniform(0, np.pi)], [2.0 ** rng.uniform(-0.6, 0.6)], [rng.random() < 0.5]]
-    )
-    middle = np.array([0.5 * side])
-    return paint_leaves(side, np.array([rng.uniform(0.28, 0.4) * side]), middle, middle, shape) > 0
+    angle, elongation = rng.uniform(0, np.pi), 2.0 ** rng.uniform(-0.6, 0.6)
+    shape = np.array([[angle], [elongation], [rng.random() < 0.5]])
+    radius, middle = np.array([rng.uniform(0.28, 0.4) * side]), np.array([0.5 * side])
+    return paint_leaves(side, radius, middle, middle, shape) > 0
 
 
 def _bush(rng: np.random.Generator, side: int) -> np.ndarray:
@@ -258,13 +236,8 @@ def _foliage(
     """Mask, blur and tone of leaves that float at depths of their own, the nearer in front."""
     number = int(rng.integers(8, 50))
     radius = side * np.exp(rng.uniform(np.log(0.03), np.log(0.16), number))
-    shape = np.stack(
-        [
-            rng.uniform(0.0, np.pi, number),
-            np.exp2(rng.uniform(-1.2, 1.2, number)),
-            (rng.random(number) < 0.2).astype(np.float64),
-        ]
-    )
+    angle, elongation = rng.uniform(0.0, np.pi, number), np.exp2(rng.uniform(-1.2, 1.2, number))
+    shape = np.stack([angle, elongation, rng.random(number) < 0.2])
     centre_y, centre_x = rng.uniform(0.2, 0.8, (2, number)) * side
     label = paint_leaves(side, radius, centre_y, centre_x, shape)
     spread = rng.uniform(0.0, 1.5)
@@ -281,7 +254,7 @@ def _leaves(rng: np.random.Generator, size: int) -> np.ndarray:
     that smoothness alone does not tell that something is out of focus.
     """
     style = LeafStyle(
-        smallest=float(np.exp(rng.uniform(np.log(1.5), np.log(12.0)))),
+        smallest=float(log_uniform(rng, 1.5, 12.0)),
         largest=rng.uniform(0.2, 0.5),
         contrast=rng.uniform(0.3, 0.9),
         chroma=rng.uniform(0.1, 0.5),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -103,29 +102,15 @@ def temperature_tint(log2_red_over_green: float) -> tuple[float, float, float]:
     return (2.0**log2_red_over_green, 1.0, 2.0 ** (-1.5 * log2_red_over_green))
 
 
-class CameraLight(NamedTuple):
-    """Light in a camera's colours, as the raw that it would record at `reference`, not clipped.
-
-    Args:
-        light: (4, H, W) float32 packed planes R, G1, G2, B; 1.0 at sensor white.
-        reference: Settings at which `light` is.
-        white_balance: Gains of R, G, B that make a grey card grey.
-    """
-
-    light: torch.Tensor
-    reference: CameraSettings
-    white_balance: tuple[float, float, float]
-
-
 def camera_light(
     rgb: torch.Tensor | np.ndarray,
     camera: CameraProfile,
-    *,
     illuminance: float | None = None,
     ev100: float = DEFAULT_EV100,
     illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    *,
     sampled: bool = False,
-) -> CameraLight:
+) -> tuple[torch.Tensor, CameraSettings, tuple[float, float, float]]:
     """Takes linear light into a camera's colours, and to the level of its reference settings.
 
     Args:
@@ -142,10 +127,21 @@ def camera_light(
             that is sharp to about a pixel and the camera's colour filter array. Otherwise each
             becomes a packed pixel, all four planes of it at one place.
 
+    Returns:
+        (4, H, W) float32 packed planes R, G1, G2, B, 1.0 at sensor white and not clipped; the
+        settings at which they are; and the gains of R, G, B that make a grey card grey.
+
     Raises:
         ValueError: If `rgb` is not linear light, or black nearly everywhere and of unknown scale.
     """
-    image = _check_rgb(rgb)
+    image = torch.as_tensor(rgb)
+    if image.ndim != 3 or image.shape[0] != 3 or not image.dtype.is_floating_point:
+        raise ValueError(
+            f"`rgb` ({image.dtype}, shape {tuple(image.shape)}) must be float, (3, H, W)"
+        )
+    if not bool((torch.isfinite(image) & (image >= 0)).all()) or not image.numel():
+        raise ValueError("`rgb` must be light, finite and at least 0 everywhere")
+    image = image.float()
     matrix, white = camera_from_srgb(camera, illuminant)
     planes = torch.from_numpy(matrix).float() @ image.reshape(3, -1)
     planes = planes.clamp_(min=0.0).reshape(image.shape)
@@ -157,20 +153,4 @@ def camera_light(
         reference = reference_settings(ev100)
         light *= mean_anchor(light[1:3] if sampled else light[1])
     red, green, blue = white.tolist()
-    return CameraLight(light, reference, (green / red, 1.0, green / blue))
-
-
-def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
-    """`rgb` as float32 (3, H, W).
-
-    Raises:
-        ValueError: Unless it is linear light, finite and at least 0.
-    """
-    image = torch.as_tensor(rgb)
-    if image.ndim != 3 or image.shape[0] != 3 or min(image.shape) < 1:
-        raise ValueError(f"`rgb` (shape {tuple(image.shape)}) must be (3, H, W)")
-    if not image.dtype.is_floating_point:
-        raise ValueError(f"`rgb` (dtype {image.dtype}) must be floating point and linear")
-    if not bool(torch.isfinite(image).all()) or bool((image < 0).any()):
-        raise ValueError("`rgb` must be finite and at least 0 everywhere")
-    return image.float()
+    return light, reference, (green / red, 1.0, green / blue)

@@ -5,6 +5,7 @@ A radiance map is linear but relative: nothing in it says how many lux it shows.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import math
@@ -32,7 +33,7 @@ _USUAL_EXPONENT = 20
 
 
 def read_radiance(path: str | Path) -> np.ndarray:
-    """Linear light of an .hdr or .exr file.
+    """Linear light of an .hdr or .exr file, (3, H, W) float32 of arbitrary scale.
 
     Values that are not light are repaired, and the repair is logged: NaN and negative values
     (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
@@ -41,14 +42,11 @@ def read_radiance(path: str | Path) -> np.ndarray:
         path: The file. Its primaries are taken to be sRGB's, as those files usually have; alpha and
             further channels are ignored; a file with luminance only is grey.
 
-    Returns:
-        (3, H, W) float32 of arbitrary scale, finite and at least 0.
-
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, holds no light or is neither kind, or claims more
-            pixels than `simulator.utils.files` allows for a file of its length.
+        ValueError: If the file cannot be read, holds no light, or claims more pixels than
+            `simulator.utils.files` allows for a file of its length.
     """
     path = as_path(path)
     if not path.is_file():
@@ -95,19 +93,15 @@ def map_views(
     """
     height, width = image.shape[1:]
     is_panorama = abs(width / height - 2.0) <= 0.01
+    available = min(height, width)
+    size = native_size(resolution) if is_panorama else native_size(resolution, available)
     if is_panorama:
         available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
-        size = native_size(resolution)
-    else:
-        available = min(height, width)
-        size = native_size(resolution, available)
-    sampled = True
-    if available >= 2 * size:
+    sampled = available >= 2 * size
+    if sampled:
         size = 2 * size
     elif native and resolution and available >= 2 * resolution:
-        size = available // 2 * 2
-    else:
-        sampled = False
+        sampled, size = True, available // 2 * 2
     if is_panorama:
         return {f"-{round(a):03d}": perspective(image, a, size) for a in AZIMUTHS}, sampled
     return {"": _central_square(image, size)}, sampled
@@ -128,15 +122,15 @@ def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
     return resolution * max(1, size // max(resolution, 1))
 
 
-def assumed_ev100(group: str) -> float:
-    """EV100 of a map of unknown light, in [3, 14], by a hash of its source group.
+def hash_fraction(name: str) -> float:
+    """A number in [0, 1) that `name` alone decides."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
 
-    >>> assumed_ev100("forest") == assumed_ev100("forest")
-    True
-    """
-    fraction = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+
+def assumed_ev100(group: str) -> float:
+    """EV100 of a map of unknown light, in [3, 14], by a hash of its source group."""
     low, high = EV100_RANGE
-    return round(low + fraction * (high - low), 2)
+    return round(low + hash_fraction(group) * (high - low), 2)
 
 
 def perspective(
@@ -146,22 +140,18 @@ def perspective(
     field_of_view: float = FIELD_OF_VIEW,
     pitch: float = 0.0,
 ) -> np.ndarray:
-    """A pin-hole view into an equirectangular panorama (gnomonic projection).
+    """A pin-hole view (3, size, size) into an equirectangular panorama (gnomonic).
+
+    Sampled bilinearly at least as densely as the panorama has pixels, then box-averaged, so that
+    small lamps keep their energy.
 
     Args:
         panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
             latitudes from +90 degrees.
-        azimuth: Longitude of the view's middle [degrees].
+        azimuth, pitch: Longitude and latitude of the view's middle [degrees].
         size: Height and width of the view [pixels].
         field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
-        pitch: Angle of the view's middle above the horizon [degrees].
-
-    Returns:
-        (3, size, size) float32. Sampled bilinearly at least as densely as the panorama has
-        pixels, then box-averaged, so that small lamps keep their energy.
     """
-    if not 0.0 < field_of_view <= 150.0:
-        raise ValueError(f"`field_of_view` (={field_of_view!r}) must be in (0, 150] degrees")
     half = math.tan(math.radians(field_of_view) / 2.0)
     per_radian = panorama.shape[2] / (2.0 * math.pi)
     dense = max(1, math.ceil(per_radian / (size / (2.0 * half))))
@@ -210,24 +200,20 @@ def _read_hdr(path: Path) -> np.ndarray:
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
     content = path.read_bytes()
-    _refuse_lies(path, *_hdr_size(content), len(content))
-    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
+    claim = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
+    if claim:
+        _refuse_lies(path, int(claim[1]), int(claim[2]), len(content))
+    level = cv2.utils.logging.setLogLevel(0)  # the error below says it all
+    image = None
     try:
         flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    except cv2.error as error:
-        raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+        with contextlib.suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     finally:
         cv2.utils.logging.setLogLevel(level)
     if image is None or image.dtype != np.float32:
         raise ValueError(f"radiance map {str(path)!r} must be a complete Radiance RGBE file")
     return image[:, :, ::-1].transpose(2, 0, 1)
-
-
-def _hdr_size(content: bytes) -> tuple[int, int]:
-    """Rows and columns that a Radiance file claims; 0 where it does not say."""
-    found = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
-    return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
 def _refuse_lies(path: Path, height: int, width: int, size: int) -> None:
@@ -264,14 +250,12 @@ def _read_exr(path: Path) -> np.ndarray:
             f"radiance map {str(path)!r} must be a complete OpenEXR file, but OpenEXR says: {error}"
         ) from error
     names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
-    missing = sorted({n for n in names if n not in channels})
-    if missing:
+    planes = [np.asarray(channels[n], np.float32) for n in names if n in channels]
+    if len(planes) != 3 or len({p.shape for p in planes}) != 1:
         raise ValueError(
-            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G, B or Y"
+            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G and B of the "
+            "same size, or Y"
         )
-    planes = [np.asarray(channels[n], np.float32) for n in names]
-    if len({p.shape for p in planes}) != 1:
-        raise ValueError(f"radiance map {str(path)!r} must have R, G and B of the same size")
     return np.stack(planes)
 
 

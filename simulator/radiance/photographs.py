@@ -5,7 +5,6 @@ Only files inside scikit-image's wheel are used: nothing is downloaded, nothing 
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from simulator.radiance.light import temperature_tint
-from simulator.radiance.procedural import NATIVE_SIZE, Drawing
+from simulator.radiance.procedural import NATIVE_SIZE, Drawing, log_uniform
 
 #: Scenes made of each photograph: crops, mirrored or not, under lights of their own.
 SCENES_PER_PHOTOGRAPH = 3
@@ -84,8 +83,7 @@ def photograph_drawings(photograph: Photograph) -> Iterator[Drawing]:
         crop = light[:, top : top + NATIVE_SIZE, left : left + NATIVE_SIZE]
         if index and rng.random() < 0.5:
             crop = crop[:, :, ::-1]
-        low, high = (math.log(v) for v in photograph.illuminance)
-        illuminance = float(f"{math.exp(rng.uniform(low, high)):.4g}")
+        illuminance = float(f"{log_uniform(rng, *photograph.illuminance):.4g}")
         tint = temperature_tint(rng.uniform(*photograph.tint))
         yield Drawing(np.ascontiguousarray(crop), illuminance, tint)
 
@@ -107,10 +105,6 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     Returns:
         (3, H, W) float32, at least 0; 1.0 at the photograph's white, above in the highlights.
     """
-    if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        raise ValueError(
-            f"`image` ({image.dtype}, shape {image.shape}) must be uint8, (H, W) or (H, W, 3)"
-        )
     colour = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
     codes = colour[:, :, :3].transpose(2, 0, 1).astype(np.float64)
     shown = np.clip((codes + rng.uniform(-0.5, 0.5, codes.shape)) / 255.0, 0.0, 1.0)

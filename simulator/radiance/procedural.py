@@ -15,11 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from simulator.radiance.light import temperature_tint
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import check_word
 from simulator.utils.compute import kernel
 
 #: Part of every cache key: raise it with any change of the drawings.
@@ -74,28 +75,30 @@ def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np
 
 
 def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = None) -> np.ndarray:
-    """Reflectance of a dead-leaves picture.
+    """Reflectance of a dead-leaves picture, (3, size, size) float32 linear sRGB in [0.005, 0.97].
 
     Args:
         rng: Source of all randomness.
         size: Height and width [pixels].
         style: Appearance of the leaves.
-
-    Returns:
-        (3, size, size) float32 reflectance in linear sRGB, in [0.005, 0.97].
     """
     style = LeafStyle() if style is None else style
-    radius, centre_y, centre_x, shape = _draw_leaves(rng, size, style)
-    label = paint_leaves(size, radius, centre_y, centre_x, shape)
-    number = len(radius) + 1  # label 0 is the ground
+    leaves = _draw_leaves(rng, size, style)
+    label = paint_leaves(size, *leaves)
+    number = len(leaves[0]) + 1  # label 0 is the ground
 
     tone = rng.normal(0.0, style.contrast, number).astype(np.float32)
     palette = rng.normal(0.0, style.chroma, (style.palette, 2))
     chroma = palette[rng.integers(0, style.palette, number)] + rng.normal(0, 0.12, (number, 2))
     gain = np.exp2(np.stack([chroma[:, 0], np.zeros(number), chroma[:, 1]])).astype(np.float32)
 
-    texture = _texture(rng, size, label, number, style)
-    shading = _shading(rng, size, label, radius, centre_y, centre_x)
+    # A stretch of a fractal field for each leaf, at a strength of its own.
+    field = fractal_noise(rng, size, 0.8)
+    strength = (style.texture * rng.random(number) ** 2).astype(np.float32)
+    shift = rng.integers(0, size * size, number)
+    position = np.arange(size * size).reshape(size, size)
+    texture = strength[label] * field.ravel()[(position + shift[label]) % (size * size)]
+    shading = _shading(rng, size, label, *leaves[:3])
     luminance = np.exp(tone[label] + texture + shading)
     reflectance = luminance * gain[:, label]
     return scale_to_mean(reflectance, style.mean)
@@ -137,11 +140,7 @@ def _draw_leaves(
 
 
 def paint_leaves(
-    size: int,
-    radius: np.ndarray,
-    centre_y: np.ndarray,
-    centre_x: np.ndarray,
-    shape: np.ndarray,
+    size: int, radius: np.ndarray, centre_y: np.ndarray, centre_x: np.ndarray, shape: np.ndarray
 ) -> np.ndarray:
     """(size, size) label of the topmost leaf at each pixel, 0 for the ground."""
     angle, elongation, is_box = shape
@@ -192,17 +191,6 @@ def _paint(label, bounds, centre, turned, boxes):  # type: ignore[no-untyped-def
                     inside = u * u + v * v < 1.0
                 if inside:
                     label[y, x] = leaf + 1
-
-
-def _texture(
-    rng: np.random.Generator, size: int, label: np.ndarray, number: int, style: LeafStyle
-) -> np.ndarray:
-    """Natural-log texture: a stretch of a fractal field for each leaf, at a strength of its own."""
-    field = fractal_noise(rng, size, 0.8)
-    strength = (style.texture * rng.random(number) ** 2).astype(np.float32)
-    shift = rng.integers(0, size * size, number)
-    position = np.arange(size * size).reshape(size, size)
-    return np.asarray(strength[label] * field.ravel()[(position + shift[label]) % (size * size)])
 
 
 def _shading(
@@ -258,9 +246,7 @@ def draw(
     Raises:
         ValueError: If there is no such kind; the message proposes the nearest name.
     """
-    if kind not in _KINDS:
-        hint = did_you_mean(kind, _KINDS)
-        raise ValueError(f"`kind` (={kind!r}) must be one of {list_kinds()}{hint}")
+    check_word("kind", kind, tuple(_KINDS))
     drawing = _KINDS[kind](rng, size)
     return replace(drawing, light=_lens(drawing.light)) if lens else drawing
 
@@ -329,7 +315,10 @@ def back_light(rng: np.random.Generator, size: int) -> Drawing:
     room = rng.random() < 0.4
     subject = dead_leaves(rng, size, _varied_style(rng, rng.uniform(0.13, 0.24)))
     background = _windows(rng, size) if room else _sky_above_skyline(rng, size)
-    background &= ~_figure(rng, size)
+    axis = np.linspace(0.0, 1.0, size, dtype=np.float32)
+    scale = rng.uniform(0.18, 0.45)
+    middle, top = rng.uniform(0.3, 0.7), rng.uniform(0.25, 0.5)
+    background &= ~_person(axis[:, None], axis[None, :], top, middle, scale)
     contrast = np.exp2(rng.uniform(3.0, 6.0)) * 0.18
     clouds = np.exp((0.1 if room else 0.2) * fractal_noise(rng, size, 1.4))
     sky = np.exp2(rng.uniform(0.0, 0.35)) if not room else 1.0  # blue over red
@@ -349,7 +338,7 @@ def night(rng: np.random.Generator, size: int) -> Drawing:
     """
     light = dead_leaves(rng, size, _varied_style(rng, rng.uniform(0.1, 0.18)))
     axis = np.linspace(0.0, 1.0, size, dtype=np.float32)
-    ambient, number = np.exp(rng.uniform(np.log(0.01), np.log(0.08))), int(rng.integers(2, 6))
+    ambient, number = log_uniform(rng, 0.01, 0.08), int(rng.integers(2, 6))
     lamp_y, lamp_x = rng.uniform(0.08, 0.6, number), rng.uniform(0.05, 0.95, number)
     pools = np.zeros((size, size), np.float32)
     for y, x in zip(lamp_y, lamp_x, strict=True):
@@ -362,7 +351,7 @@ def night(rng: np.random.Generator, size: int) -> Drawing:
     if rng.random() < 0.5:
         _add_neon(rng, light)
     for y, x in zip(lamp_y, lamp_x, strict=True):
-        value = np.exp(rng.uniform(np.log(20.0), np.log(1000.0)))
+        value = log_uniform(rng, 20.0, 1000.0)
         _add_lamp(light, y, x, rng.uniform(0.004, 0.013), value, _warm(rng))
     return Drawing(light, _lux(rng, 1.0, 50.0), temperature_tint(rng.uniform(0.2, 1.0)))
 
@@ -373,18 +362,18 @@ def spot_light(rng: np.random.Generator, size: int) -> Drawing:
     The beam covers 4 to 15 % of the frame, often off centre; the rest has 1.5 to 6 % of its light.
     """
     axis = np.linspace(0.0, 1.0, size, dtype=np.float32)
-    dark = np.exp(rng.uniform(np.log(0.015), np.log(0.06)))
+    dark = log_uniform(rng, 0.015, 0.06)
     radius = rng.uniform(0.1, 0.2)
     y, x = rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.8)
     distance = np.hypot((axis[:, None] - y) / 1.25, axis[None, :] - x) / radius
-    beam = 1.0 / (1.0 + np.exp(np.clip((distance - 1.0) / 0.06, -60, 60)))
+    beam = _soft_step(1.0 - distance)
     stage = dead_leaves(rng, size, _varied_style(rng, 0.1))
     performer = dead_leaves(rng, size, LeafStyle(mean=rng.uniform(0.25, 0.42), largest=0.1))
     body = _person(axis[:, None], axis[None, :], y - 0.8 * radius, x, 0.55 * radius)
     light = np.where(body, performer, stage) * (dark + (1.0 - dark) * beam).astype(np.float32)
     if rng.random() < 0.5:
         for _ in range(int(rng.integers(1, 5))):
-            value = np.exp(rng.uniform(np.log(5.0), np.log(200.0)))
+            value = log_uniform(rng, 5.0, 200.0)
             position = rng.uniform(0.03, 0.2), rng.uniform(0.05, 0.95)
             _add_lamp(light, *position, rng.uniform(0.004, 0.012), value, _neon_colour(rng))
     return Drawing(light, _lux(rng, 20.0, 2000.0), temperature_tint(rng.uniform(-0.1, 0.8)))
@@ -401,9 +390,19 @@ _KINDS: dict[str, Callable[[np.random.Generator, int], Drawing]] = {
 }
 
 
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> Any:
+    """A number between `low` and `high` whose logarithm is uniform."""
+    return np.exp(rng.uniform(np.log(low), np.log(high)))
+
+
 def _lux(rng: np.random.Generator, low: float, high: float) -> float:
     """Log-uniform illuminance, to 4 digits."""
-    return float(f"{np.exp(rng.uniform(np.log(low), np.log(high))):.4g}")
+    return float(f"{log_uniform(rng, low, high):.4g}")
+
+
+def _soft_step(values: np.ndarray) -> np.ndarray:
+    """A soft step: 0 well below 0, 1 well above."""
+    return 1.0 / (1.0 + np.exp(np.clip(-values / 0.06, -60, 60)))
 
 
 def _varied_style(rng: np.random.Generator, mean: float | None = None) -> LeafStyle:
@@ -411,7 +410,7 @@ def _varied_style(rng: np.random.Generator, mean: float | None = None) -> LeafSt
     if mean is None:
         mean = float(np.clip(0.17 * np.exp(rng.normal(0.0, 0.2)), 0.1, 0.3))
     return LeafStyle(
-        smallest=np.exp(rng.uniform(np.log(1.2), np.log(7.0))),
+        smallest=log_uniform(rng, 1.2, 7.0),
         largest=rng.uniform(0.3, 0.7),
         contrast=rng.uniform(0.5, 0.9),
         chroma=rng.uniform(0.2, 0.6),
@@ -430,8 +429,7 @@ def _lens(light: np.ndarray) -> np.ndarray:
 def _shadows(rng: np.random.Generator, size: int, share: float, depth: float) -> np.ndarray:
     """Illumination: 1 in the light, `depth` in soft-edged shadows that cover `share`."""
     field = fractal_noise(rng, size, 1.6)
-    edge = np.quantile(field, share)
-    lit = 1.0 / (1.0 + np.exp(-np.clip((field - edge) / 0.06, -60, 60)))
+    lit = _soft_step(field - np.quantile(field, share))
     return np.asarray((depth + (1.0 - depth) * lit).astype(np.float32))
 
 
@@ -463,13 +461,6 @@ def _person(y: np.ndarray, x: np.ndarray, top: float, middle: float, scale: floa
     across = np.abs(x - middle) / (0.75 * scale)
     down = (y - top - 0.4 * scale) / (0.35 * scale)
     return head | ((across < 1.0) & (down > across**3))
-
-
-def _figure(rng: np.random.Generator, size: int) -> np.ndarray:
-    axis = np.linspace(0.0, 1.0, size, dtype=np.float32)
-    scale = rng.uniform(0.18, 0.45)
-    middle, top = rng.uniform(0.3, 0.7), rng.uniform(0.25, 0.5)
-    return _person(axis[:, None], axis[None, :], top, middle, scale)
 
 
 def _sky_above_skyline(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -524,7 +515,7 @@ def _add_lamps(
     """Add `number` near-white lamps or glints at random places above `top`, in place."""
     for _ in range(number):
         y, x = rng.uniform(0.02, 0.98) * top, rng.uniform(0.02, 0.98)
-        strength = np.exp(rng.uniform(np.log(value[0]), np.log(value[1])))
+        strength = log_uniform(rng, value[0], value[1])
         _add_lamp(light, y, x, rng.uniform(*radius), strength, np.ones(3, np.float32))
 
 
@@ -546,13 +537,9 @@ def _add_lit_windows(rng: np.random.Generator, light: np.ndarray) -> None:
     for row in range(int(rng.integers(0, size // 3)), size // 2, pitch):
         for column in range(int(left), int(right), pitch):
             if rng.random() < 0.15:
-                value = np.exp(rng.uniform(0.0, np.log(8.0))) * _warm(rng)
-                box = (
-                    slice(None),
-                    slice(row, row + pitch // 3),
-                    slice(column, column + pitch // 3),
-                )
-                light[box] = value[:, None, None]
+                value = log_uniform(rng, 1.0, 8.0) * _warm(rng)
+                side = pitch // 3
+                light[:, row : row + side, column : column + side] = value[:, None, None]
 
 
 def _add_neon(rng: np.random.Generator, light: np.ndarray) -> None:
@@ -563,5 +550,5 @@ def _add_neon(rng: np.random.Generator, light: np.ndarray) -> None:
         radius, stretch = rng.uniform(0.02, 0.06), rng.uniform(0.6, 2.0)
         ring = np.hypot((axis[:, None] - y) * stretch, axis[None, :] - x)
         tube = np.exp(-(((ring - radius) / 0.0025) ** 2))
-        value = np.exp(rng.uniform(np.log(20.0), np.log(80.0)))
+        value = log_uniform(rng, 20.0, 80.0)
         light += (_neon_colour(rng)[:, None, None] * np.float32(value) * tube).astype(np.float32)

@@ -26,8 +26,8 @@ from simulator.capture.exposure import SIGNAL_LIMIT
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import nlf_tensors
-from simulator.optics.blur import motion_blur
 from simulator.optics.flicker_integral import Lamp
+from simulator.optics.motion import motion_blur
 from simulator.optics.thin_lens import Lens, defocus
 from simulator.raw.image import check_packed
 from simulator.settings import CameraSettings, exposure_ratio

@@ -7,8 +7,7 @@ import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
-from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.protocol import Captures
+from ae_env.scorers.captures import Captures, describe_captures
 from simulator import CameraSettings, get_camera, incident_ev100
 
 CAMERA = get_camera("nikon_z6")

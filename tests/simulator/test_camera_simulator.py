@@ -31,7 +31,8 @@ from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.statistics import Residual
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.weights import save_modules
-from simulator.optics.blur import disc_blur, motion_blur
+from simulator.optics.discs import disc_blur
+from simulator.optics.motion import motion_blur
 from simulator.utils.tiles import in_tiles
 from tests.strategies import SEEDS, Mosaic, cameras, log_uniform, mosaics, prepared, settings_within
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.optics.disc_bank import added_blur
+from simulator.optics.discs import added_blur
 from simulator.reference.camera import (
     ReferenceCamera,
     ReferenceScene,

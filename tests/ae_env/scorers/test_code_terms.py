@@ -10,11 +10,13 @@ import torch
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, make_scorer
-from ae_env.scorers.score_table import ScoreTables, prepare_scene, source_noises
-from ae_env.scorers.terms import Highlights, Noise, Shadows, TermScores
-from simulator.capture.layout import Layout
+from ae_env.scorers.captures import prepare_scene, source_noises
+from ae_env.scorers.score_table import ScoreTables
+from ae_env.scorers.term_scores import TermScores
+from ae_env.scorers.terms import Highlights, Noise, Shadows
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import clip_and_quantise
-from simulator.optics.motion_path import Movement
+from simulator.optics.motion import Movement
 from tests.ae_env.environments import make_env
 from tests.ae_env.scorer_images import CAMERA, GRID, Own, make_captures, make_scene
 
@@ -172,7 +174,7 @@ def test_frames_of_static_and_changing_light_need_no_torch(monkeypatch: pytest.M
 def test_compiled_and_loaded_kernels_agree_to_the_last_bit(compiled_and_loaded: Any) -> None:
     """The first process of a fresh installation compiles; all others load what it cached."""
     code = (
-        "import sys, numpy as np; from ae_env.scorers.terms import measure_codes\n"
+        "import sys, numpy as np; from ae_env.scorers.term_scores import measure_codes\n"
         "rng = np.random.default_rng(0); n = np.float32\n"
         "codes, means = rng.integers(0, 256, (3, 4, 900)).astype(np.uint8), np.empty((3, 3))\n"
         "shares, dark = rng.random((2, 4, 256)).astype(n), rng.random(256).astype(n)\n"

@@ -11,7 +11,7 @@ import torch
 
 from ae_env import AutoExposureEnv, AutoExposureVectorEnv
 from ae_env.scorers import Balanced, CompositeScorer, make_scorer
-from ae_env.scorers.protocol import Captures
+from ae_env.scorers.captures import Captures
 from ae_env.utils.user_files import UserCodeError
 from tests.ae_env.environments import SMALL
 from tests.ae_env.scorer_images import GRID, Own, make_captures, mean_signal, random_scene

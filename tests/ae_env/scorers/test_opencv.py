@@ -9,7 +9,7 @@ import torch
 
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
-from ae_env.scorers.opencv import reference_pictures
+from ae_env.scorers.fidelity import reference_pictures
 from simulator import incident_ev100
 from tests.ae_env.scorer_images import GRID, make_captures, make_scene
 

@@ -11,11 +11,11 @@ from scipy.integrate import quad
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
-from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import ScoreTables, prepare_scene
+from ae_env.scorers.captures import describe_captures, prepare_scene
+from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.terms import Sharpness
-from simulator.capture.layout import Layout
-from simulator.optics.motion_path import Movement
+from simulator.capture.prepared_scene import Layout
+from simulator.optics.motion import Movement
 from tests.ae_env.scorer_images import CAMERA, make_scene
 
 SIZE = 40
@@ -85,7 +85,8 @@ def test_the_extent_is_the_root_mean_square() -> None:
     scene = _scene()
     assert scene.layout is not None
     tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
-    captures = tables._captures.describe(scene, GRID.states, defocus=5.0)
+    prepared = prepare_scene(scene, CAMERA, defocus=5.0)
+    captures = tables.term_scores.captures.describe(scene, prepared)
     wanted = 5.0 * SIZE / 64.0 * float(scene.layout.defocus.double().square().mean().sqrt())
     assert captures.blur_px[0] == pytest.approx(wanted, rel=2e-3)
 
@@ -108,7 +109,8 @@ def test_sharpness_of_all_states_at_once_is_that_of_each_capture(
     scene = _scene() if layout else replace(_scene(), layout=None)
     tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
     moves: Any = {"speed": 0.2, "defocus": 6.0, "movement": movement}
-    found = tables.closed_form_terms(scene, prepare_scene(scene, CAMERA, **moves), kinds=("blur",))
+    prepared = prepare_scene(scene, CAMERA, **moves)
+    found = tables.term_scores.closed_form_terms(scene, prepared, "blur")
     for index, state in enumerate(GRID):
         numbers = {"speed": np.array([0.2]), "defocus": np.array([6.0]), "gain": np.ones(1)}
         capture = describe_captures([scene], [state], CAMERA, movements=[movement], **numbers)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, list_scorers, make_scorer, register_scorer, registry
+from ae_env.scorers.captures import Captures
 from ae_env.scorers.defects import DEFECTS
-from ae_env.scorers.protocol import Captures
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
 from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.episodes.core import EpisodeCore
 from ae_env.grid import ExposureGrid
-from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from simulator.capture.prepared_scene import PreparedScene
-from tests.ae_env.environments import SMALL as ENV
+from tests.ae_env.environments import make_env
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
@@ -125,7 +123,7 @@ def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
         return expose(prepared, *args, **kwargs)
 
     monkeypatch.setattr(PreparedScene, "expose", exposed)
-    EpisodeCore(EnvOptions(**ENV, scorer=Own(), tolerance=0.375), 1).task.tables.table(_scene())
+    make_env(scorer=Own(), tolerance=0.375).unwrapped.core.task.tables.table(_scene())  # type: ignore[attr-defined]
     assert seen == {0.375}
     with pytest.raises(ValueError, match="`tolerance`"):
         _tables(tolerance=-1.0)

@@ -1,10 +1,17 @@
+"""Policies compared, from options or a preset; and the main job, on few frames."""
+
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from PIL import Image
 
-from agents.cli.evaluate import _plan
+from agents.cli import quickstart
+from agents.cli.evaluate import make_plan
+from agents.learning.weights import load_agent
+from simulator import RawImage, write_dng
 
 BASE = """\
 name: mine
@@ -29,7 +36,9 @@ def preset(tmp_path: Path) -> str:
 
 
 def test_plain_options_mean_one_condition():
-    plan = _plan(None, None, ["random"], {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5})
+    plan = make_plan(
+        None, None, ["random"], {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5}
+    )
     ((name, condition),) = plan.all_conditions.items()
     assert (name, condition.lighting, condition.delay) == ("sine", "sine", 2)
     assert (plan.starts, plan.frames, plan.seeds) == (("random",), 8, (5, 6, 7))
@@ -37,10 +46,12 @@ def test_plain_options_mean_one_condition():
 
 
 def test_options_replace_what_a_preset_says(preset):
-    plan = _plan(preset, None, [], {})
+    plan = make_plan(preset, None, [], {})
     assert list(plan.all_conditions) == ["static", "step+4", "static/delay1", "step+4/delay1"]
     assert plan.policies == ("matrix:P", "random", "oracle")
-    changed = _plan(preset, None, ["random"], {"scorer": "noise", "frames": 3, "lighting": "ramp"})
+    changed = make_plan(
+        preset, None, ["random"], {"scorer": "noise", "frames": 3, "lighting": "ramp"}
+    )
     assert changed.environment["scorer"] == "noise"
     assert changed.environment["scenes"] == "bundled:small"
     assert (changed.policies, changed.frames) == (("random",), 3)
@@ -52,7 +63,7 @@ def test_an_environment_is_the_base(tmp_path):
         "scenes: 'bundled:small'\nresolution: 40\nlighting: {kind: tunnel}\ndelay: 1\n"
         "max_episode_steps: 30\n"
     )
-    plan = _plan(None, str(tmp_path / "env.yaml"), ["random"], {"delay": 0})
+    plan = make_plan(None, str(tmp_path / "env.yaml"), ["random"], {"delay": 0})
     assert plan.environment == {"scenes": "bundled:small", "resolution": 40}
     assert {n: c.delay for n, c in plan.all_conditions.items()} == {"tunnel": 0}
 
@@ -121,3 +132,65 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     assert ae_env("evaluate", "--preset", preset, "--out", "first")[0] == 0
     # Even times are the same: nothing was run again.
     assert json.loads((folder / "results.json").read_text())["rows"] == rows
+
+
+# -- quickstart -----------------------------------------------------------------------------------
+
+
+def check_files(out: Path) -> dict[str, Any]:
+    names = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png"}
+    names |= {"ev_error.png", "cost.png", "contact_sheet.webp", "contact_sheet_2.webp"}
+    assert {path.name for path in out.iterdir() if path.stat().st_size > 200} >= names
+    with Image.open(out / "contact_sheet.webp") as picture:
+        assert min(picture.size) > 300
+    content = json.loads((out / "results.json").read_text())
+    rows = [row for row in content["rows"] if row["condition"] == "all"]
+    scores = {row["policy"]: row["normalised_score"] for row in rows}
+    assert set(scores) == {*quickstart.BASELINES, "regression", "ppo"}
+    assert scores["oracle"] == max(scores.values()) == pytest.approx(1.0)
+    return content
+
+
+@pytest.mark.usefixtures("quick_spawn")
+def test_quickstart_on_bundled_scenes_then_on_ones_own(
+    ae_env, raw: RawImage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("REGRESSION_FRAMES", 128), ("PPO_FRAMES", 1024), ("EPISODES", 1)):
+        monkeypatch.setattr(quickstart, name, value)
+    monkeypatch.setattr("agents.metering.metering_policy.FIT_PER_SCENE", 1)
+    out = tmp_path / "my out"
+    code, text, error = ae_env("quickstart", "--scenes", "bundled:small", "--out", out, "--seed", 1)
+    assert (code, error) == (0, "")
+    content = check_files(out)
+    assert content["meta"]["zero_shot"] is False
+    assert content["meta"]["command"].startswith("ae-env quickstart --scenes bundled:small ")
+    assert {row["split"] for row in content["rows"]} == {"test"}
+    assert load_agent(out / "agents" / "ppo", "ppo")[1]["training"]["training"]["seed"] == 1
+    following = (
+        f"ae-env evaluate --policy 'ppo:{out}/agents/ppo' --policy matrix:tuned "
+        f"--scenes bundled:small --out '{out}/meters'"
+    )
+    assert following in text
+    assert following in (out / "report.md").read_text()
+
+    # Few raws have no training split; the agents are there already.
+    monkeypatch.setattr("agents.learning.workers.ProcessPoolExecutor", None)
+    monkeypatch.setattr(
+        "agents.rollouts.training_arguments", lambda _: ({"scenes": "bundled:small"}, True)
+    )
+    mine = tmp_path / "my raws"
+    mine.mkdir()
+    for i in range(3):
+        other = raw.data.roll(9 * i, dims=2) ** (1 + i / 2)
+        write_dng(mine / f"IMG_{i}.dng", RawImage(other, raw.settings, raw.camera))
+    options = ("--on-error", "skip", "--seed", 1)
+    code, text, _ = ae_env("quickstart", "--scenes", mine, "--out", out, *options)
+    assert code == 0
+    assert f"--scenes '{mine}' --on-error skip --out" in text
+    assert f"fewer than 15 source groups in {mine}: agents trained on bundled scenes" in text
+    content = check_files(out)
+    assert content["meta"]["zero_shot"] is True
+    assert content["meta"]["trained_on"] == "bundled:small"
+    rows = [row for row in content["rows"] if row["condition"] == "all"]
+    assert {(row["num_groups"], row["ci95"]) for row in rows} == {(1, None)}  # they look alike
+    assert "Every source group" in (out / "report.md").read_text()

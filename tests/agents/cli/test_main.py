@@ -1,6 +1,5 @@
 """The program as a whole: help, errors, exit statuses, and the two commands about itself."""
 
-import importlib.metadata
 import re
 import subprocess
 import sys
@@ -11,10 +10,11 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+import simulator
+from ae_env.scorers import list_scorers
 from agents.cli import console
-from agents.cli import main as bench
 from agents.cli import main as cli
-from simulator.capture.plan import DEFAULT_TOLERANCE
+from simulator.capture.exposure import DEFAULT_TOLERANCE
 from tests.simulator.training.captures import write_dataset
 
 COMMANDS = (
@@ -65,7 +65,8 @@ def test_help_and_usage_errors_load_nothing_heavy(tmp_path: Path) -> None:
     wrong = [["nonsense"], ["simulate", "a.dng"], ["sweep", "a.dng", "--nonsense"]]
     wrong += [["evaluate", "--frames", "0"], ["bench", "throughput", "--seed", str(2**63)]]
     code = f"""
-import sys
+import importlib.metadata, sys
+importlib.metadata.version = None  # a source tree need not be installed
 from agents.cli.main import main
 for arguments in {asked + wrong}:
     sys.argv = ["ae-env", *arguments]
@@ -81,7 +82,7 @@ print("loaded", *sys.modules)
     assert run.stderr.count("Usage: ae-env") == len(wrong)
     listed = run.stdout.partition("status")[0]
     assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", listed, re.MULTILINE)) == list(COMMANDS)
-    assert f"ae-env {importlib.metadata.version('ae-env')}\n" in run.stdout
+    assert f"ae-env {simulator.__version__}\n" in run.stdout
     loaded = run.stdout.rpartition("\nloaded ")[2].split()
     heavy = {"torch", "numba", "gymnasium", "numpy", "pandas", "matplotlib", "scipy", "nicegui"}
     assert not heavy & set(loaded)
@@ -89,8 +90,7 @@ print("loaded", *sys.modules)
 
 def test_the_package_runs_as_the_program() -> None:
     command = [sys.executable, "-m", "agents.cli", "--version"]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert run.stdout.startswith("ae-env ")
+    assert subprocess.check_output(command, text=True) == f"ae-env {simulator.__version__}\n"
 
 
 def test_the_default_tolerance_is_the_simulator_s() -> None:
@@ -111,7 +111,7 @@ def test_the_default_tolerance_is_the_simulator_s() -> None:
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none.safetensors"), "no none.json"),
-        ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs an aperture"),
+        ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
         ((*PLAIN, "--depth", "near"), "`depth` (='near') must be one of"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", "--policy", "randm"), "did you mean 'random'?"),
@@ -129,6 +129,11 @@ def test_the_default_tolerance_is_the_simulator_s() -> None:
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
+        (("bench", "throughput", "--part", "agents"), "`part` (='agents') is for transfer only"),
+        (("bench", "transfer", "--part", "table"), "`part` (='table')"),
+        (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
+        (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "`scene` (='nowhere')"),
+        (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else "",
 )
@@ -198,7 +203,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         (tmp_path / folder / "benchmarks" / "convergence.py").write_text(code)
     loaded = {name: sys.modules.pop(name) for name in list(sys.modules) if "benchmarks" in name}
     monkeypatch.syspath_prepend(tmp_path / "mine")  # takes back what is added to the path, too
-    monkeypatch.setattr(bench, "CHECKOUT", tmp_path / "checkout")
+    monkeypatch.setattr(cli, "CHECKOUT", tmp_path / "checkout")
     yield
     for name in [name for name in sys.modules if "benchmarks" in name]:
         del sys.modules[name]
@@ -212,21 +217,11 @@ def test_the_working_folder_does_not_matter(ae_env, folders, tmp_path):
 
 
 def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "CHECKOUT", tmp_path / "site-packages")
+    monkeypatch.setattr(cli, "CHECKOUT", tmp_path / "site-packages")
     code, _, error = ae_env("bench", "throughput")
     assert code == 2
     assert "the benchmarks are not part of the installed package" in error
     assert "pip install -e ." in error
-
-
-@pytest.mark.parametrize(
-    ("name", "part", "words"),
-    [("throughput", "agents", "`part`"), ("transfer", "table", "tables")],
-)
-def test_parts_are_those_of_transfer(ae_env, name, part, words):
-    code, _, error = ae_env("bench", name, "--part", part)
-    assert code == 2
-    assert words in error
 
 
 @pytest.mark.parametrize(
@@ -241,6 +236,14 @@ def test_what_is_refused_leaves_no_folder(ae_env, arguments, tmp_path):
         assert code == 2, error
         assert "nope" in error
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_all_scorers_are_listed(ae_env) -> None:
+    code, out, _ = ae_env("scorers")
+    assert code == 0
+    assert {*list_scorers()} <= {line.split()[0] for line in out.splitlines() if line.strip()}
+    assert "Needs extra cv" in out
+    assert "AE_ENV_NIMA_AESTHETIC" in out
 
 
 def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:

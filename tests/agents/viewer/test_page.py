@@ -19,14 +19,14 @@ import torch
 from PIL import Image
 
 from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 
 playwright = pytest.importorskip("playwright.sync_api")
 expect = playwright.expect
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
-#: Time within which a page does what it is asked, on a busy machine [ms].
-PATIENCE = 60_000
+#: Time within which the program or page does what it is asked, on a busy machine [s].
+PATIENCE = 300
 
 
 @contextmanager
@@ -38,17 +38,16 @@ def served(log, *arguments):
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=env)
     try:
-        for _ in range(600):
-            found = re.search(r"open (http\S+)", log.read_text())
-            if found or process.poll() is not None:
-                break
+        deadline = time.monotonic() + PATIENCE
+        while not (found := re.search(r"open (http\S+)", log.read_text())):
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < deadline, log.read_text()
             time.sleep(0.1)
-        assert found, log.read_text()
         yield found.group(1)
     finally:
         process.send_signal(signal.SIGINT)
         try:
-            process.wait(20)
+            process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
             raise
@@ -79,7 +78,7 @@ def address_of_soft_raw(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    expect.set_options(timeout=PATIENCE)
+    expect.set_options(timeout=1e3 * PATIENCE)
     with playwright.sync_playwright() as driver:
         options = ["--no-sandbox"] if os.geteuid() == 0 else []
         found = driver.chromium.launch(executable_path=CHROMIUM, args=options)
@@ -91,7 +90,7 @@ def browser():
 def opened(address, browser):
     """The page, loaded; nothing may go wrong in its console, nothing may be asked of others."""
     context = browser.new_context(viewport={"width": 1280, "height": 900})
-    context.set_default_timeout(PATIENCE)
+    context.set_default_timeout(1e3 * PATIENCE)
     opened = context.new_page()
     wrong: list[str] = []
     opened.on("console", lambda m: wrong.append(m.text) if m.type in ("error", "warning") else None)
@@ -348,13 +347,14 @@ def test_two_tabs_show_different_scenes(page, address):
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-@pytest.mark.parametrize("tab", ["Exposure", "Refocus, HDR"])
-def test_fits_the_width(page, width, tab):
+@pytest.mark.parametrize(
+    ("tab", "there"), [("Exposure", ".state.shown"), ("Refocus, HDR", "text=Fuse a bracket")]
+)
+def test_fits_the_width(page, width, tab, there):
     page.set_viewport_size({"width": width, "height": 844})
     page.get_by_role("tab", name=tab).click()
-    page.wait_for_timeout(200)
+    page.locator(there).wait_for()
     page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 @pytest.mark.parametrize(
@@ -367,4 +367,4 @@ def test_refuses_whoever_lacks_the_token_or_has_another_name(address, token, hos
     if host is not None:
         request.add_header("Host", host)
     with pytest.raises(urllib.error.HTTPError, match="403"):
-        urllib.request.urlopen(request, timeout=30)
+        urllib.request.urlopen(request, timeout=PATIENCE)

@@ -14,7 +14,6 @@ from ae_env.scenes import Scene
 from agents.viewer.one_raw_page import wider_f_numbers
 from agents.viewer.viewed_scene import (
     WINDOW_SIZE,
-    Library,
     OpenedScene,
     View,
     ViewedScene,
@@ -23,31 +22,31 @@ from agents.viewer.viewed_scene import (
 from simulator import (
     CameraSettings,
     CameraSimulator,
-    NoiseLevelFunction,
     RawImage,
     get_camera,
     write_dng,
 )
-from simulator.optics.blur import disc_blur
+from simulator.optics.discs import disc_blur
 
 CAMERA = get_camera("nikon_z6")
 SETTINGS = CameraSettings(100, 1 / 64, 4)
 
 
-def viewed(light, turns=0, camera=CAMERA):
-    scene = Scene.from_array(light, SETTINGS, camera, scene_id="made")
-    return ViewedScene(OpenedScene(scene, turns), CameraSimulator(device="cpu"))
+def viewed(light, flip=0):
+    scene = Scene.from_array(light, SETTINGS, CAMERA, scene_id="made")
+    raw = RawImage(light, SETTINGS, CAMERA, metadata={"flip": flip})
+    return ViewedScene(OpenedScene(scene, raw), CameraSimulator(device="cpu"))
 
 
 def image(picture):
     return np.asarray(Image.open(io.BytesIO(picture.jpeg))).astype(float)
 
 
-@pytest.mark.parametrize("turns", [0, 1, 2, -1])
-def test_the_window_lies_where_the_upright_picture_was_clicked(turns):
+@pytest.mark.parametrize("flip", [0, 3, 5, 6])  # LibRaw's codes
+def test_the_window_lies_where_the_upright_picture_was_clicked(flip):
     light = torch.full((4, 700, 900), 0.02)
     light[:, 120:124, 700:704] = 0.9  # a spot
-    seen = viewed(light, turns)
+    seen = viewed(light, flip)
     whole = image(seen.picture(View(SETTINGS))).mean(axis=2)
     down, right = np.unravel_index(whole.argmax(), whole.shape)
     centre = ((down + 0.5) / whole.shape[0], (right + 0.5) / whole.shape[1])
@@ -108,26 +107,18 @@ def test_the_best_state_has_the_highest_score():
     assert seen.table(View(best), best).mean[0] == pytest.approx(scores.max(), abs=1e-6)
 
 
-def test_a_library_reads_a_scene_when_it_is_opened_and_keeps_few():
-    reads: list[str] = []
-
-    def read(name):
-        def make():
-            reads.append(name)
-            scene = Scene.from_array(
-                torch.zeros(4, 2, 2), SETTINGS, CAMERA, scene_id=name, nlf=NoiseLevelFunction.zero()
-            )
-            return OpenedScene(scene)
-
-        return make
-
-    library = Library({name: read(name) for name in "abcdef"})
-    assert reads == []
-    for name in "abcdefef":
-        assert library.open(name).scene.scene_id == name
-    assert reads == list("abcdef")
-    library.open("a")
-    assert reads == list("abcdefa")
+def test_a_raw_is_read_when_it_is_opened_and_few_are_kept(tmp_path):
+    for i in range(6):
+        write_dng(tmp_path / f"{i}.dng", RawImage(torch.full((4, 8, 8), 0.1), SETTINGS, CAMERA))
+    library = find_scenes(str(tmp_path))
+    opened = [library.open(f"{i}.dng").scene.scene_id for i in range(6)]
+    assert opened == list(library.readers)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    for i in (5, 4, 3, 2):
+        assert library.open(f"{i}.dng").scene.scene_id == f"{i}.dng"
+    with pytest.raises((ValueError, OSError), match=r"1\.dng"):
+        library.open("1.dng")
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_cam
 from simulator.capture import batch as batch_module
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import MapApertureBlur
-from simulator.capture.sensor import Transitions, noise_balance, record
-from simulator.noise.generator import Noise, noise_keys, single_normals
+from simulator.capture.plan import noise_balance
+from simulator.capture.sensor import Noise, Transitions, noise_keys, record, single_normals
 
 Z6 = get_camera("nikon_z6")
 REFERENCE = CameraSettings(800, 1 / 64, 4)

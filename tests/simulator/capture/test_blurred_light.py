@@ -18,12 +18,11 @@ from simulator.capture import blurred_light as module
 from simulator.capture.batch import CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.exposure import Exposure
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
-from simulator.optics.blur import disc_blur, motion_blur
-from simulator.optics.disc_bank import DIAMETERS, HALO, DiscBank, added_blur
-from simulator.optics.motion_path import Movement, path_blur, path_taps
+from simulator.optics.discs import DIAMETERS, HALO, DiscBank, added_blur, disc_blur
+from simulator.optics.motion import Movement, motion_blur, path_blur, path_taps
 from simulator.utils.tiles import make_tiles
 
 Z6 = get_camera("nikon_z6")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.optics.thin_lens import Lens
 
 

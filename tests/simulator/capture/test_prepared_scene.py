@@ -19,9 +19,9 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_cam
 from simulator.camera import CameraProfile
 from simulator.capture import prepared_scene
 from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
+from simulator.capture.sensor import Noise
 from simulator.capture.statistics import DenoisedLight
-from simulator.noise.generator import Noise
 from simulator.raw.image import unpack_mosaic
 from tests.strategies import SEEDS, USUAL_SETTINGS, cameras, lights, settings_within
 from tests.strategies import prepared as any_prepared

@@ -17,18 +17,20 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.exposure import Exposure, exposure_table
+from simulator.capture.exposure import Exposure
+from simulator.capture.plan import NoiseBalance, noise_balance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (
-    NoiseBalance,
+    Noise,
     Transitions,
     clip_and_quantise,
     exposed_light,
-    noise_balance,
+    exposure_table,
+    frame_normals,
+    noise_keys,
     record,
     record_stepwise,
 )
-from simulator.noise.generator import Noise, frame_normals, noise_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise

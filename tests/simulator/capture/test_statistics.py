@@ -19,7 +19,8 @@ from simulator.capture.statistics import (
     ResidualStatistics,
     wiener_error,
 )
-from simulator.optics.blur import disc_blur, motion_blur
+from simulator.optics.discs import disc_blur
+from simulator.optics.motion import motion_blur
 
 Z6 = get_camera("nikon_z6")
 ZERO = NoiseLevelFunction.zero()

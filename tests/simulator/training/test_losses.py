@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from simulator.networks.aperture_module import DEAD_ZONE, ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, Preset
-from simulator.optics.disc_bank import DiscBank
+from simulator.optics.discs import DiscBank
 from simulator.training.data import Batch, NoiseBatch
 from simulator.training.losses import (
     ApertureLoss,

@@ -47,7 +47,7 @@ def test_keys_depend_on_the_kind_the_parts_and_the_version(monkeypatch):
     assert cache_key("k", {"a": 1, "b": [2]}) == cache_key("k", {"b": [2], "a": 1})
     keys = {cache_key("k", parts) for parts in ({"a": 1}, {"a": 2}, {"b": 1}, {"a": [1]})}
     keys.add(cache_key("l", {"a": 1}))
-    monkeypatch.setattr(cache_module, "package_version", lambda: "99.0")
+    monkeypatch.setattr(cache_module, "__version__", "99.0")
     assert len(keys | {cache_key("k", {"a": 1})}) == 6
 
 
@@ -319,6 +319,6 @@ def test_another_training_or_version(tmp_path, monkeypatch, caplog):
     made(path, {"seed": 0}).save()
     assert made(path, {"seed": 0}).load() == {"step": 7}
     assert made(path, {"seed": 1}).load() is None
-    monkeypatch.setattr(checkpoint, "package_version", lambda: "77")
+    monkeypatch.setattr(checkpoint, "__version__", "77")
     assert made(path, {"seed": 0}).load() is None
     assert caplog.text.count("training restarts") == 2

@@ -1,4 +1,4 @@
-"""Blur kernels against closed forms, and their application against SciPy's convolution."""
+"""Discs, streaks and banks of discs: closed forms, SciPy's convolution, sums in torch."""
 
 import math
 
@@ -7,19 +7,22 @@ import pytest
 import torch
 from scipy import ndimage
 
-from simulator.optics import blur as blur_module
-from simulator.optics.blur import (
+from simulator.optics import discs
+from simulator.optics.discs import (
+    DIAMETERS,
     Blur,
+    DiscBank,
     blur_many,
     box_mean,
-    coverage,
     disc_blur,
     disc_kernel,
     kernel_energy,
-    motion_blur,
-    motion_kernel,
+    remaining_variance,
 )
+from simulator.optics.motion import motion_blur, motion_kernel
 
+BETWEEN = [0.35, 0.85, 1.2, 1.7, 2.4, 3.3, 5.0, 6.5, 9.7, 14.0, 19.0, 27.0]
+KNOTS = np.array(DIAMETERS) ** 2
 EXTENTS = [0.1, 0.3, 0.5, 0.9, 1.0, 1.5, 2.0, 2.5, 3.0, 4.7, 8.0, 11.3, 12.5, 16.0, 21.4, 30.0]
 BOTH = pytest.mark.parametrize("blur", [motion_blur, disc_blur])
 
@@ -147,21 +150,9 @@ def test_light_beyond_the_limit_is_clipped_first(extent):
     np.testing.assert_allclose(out, wanted, rtol=2e-6, atol=300)
 
 
-@pytest.mark.parametrize("radius", [0.3, 0.5, 0.6, 1.0, 2.49, 2.5, 7.3])
-def test_coverage_is_that_of_many_rows_and_columns(radius):
-    reach, rows = max(math.ceil(radius - 0.5), 0), 32
-    edges = np.arange(-reach, reach + 2) - 0.5
-    y = (np.arange((2 * reach + 1) * rows) + 0.5) / rows - reach - 0.5
-    chord = np.sqrt(np.maximum(radius**2 - y**2, 0.0))[:, None]
-    area = np.diff(np.clip(edges, -chord, chord), axis=1).reshape(2 * reach + 1, rows, -1).sum(1)
-    area += area.T
-    wanted = (area / area.sum())[reach:, reach:]
-    np.testing.assert_allclose(coverage(radius), wanted, atol=1e-14)
-
-
 @pytest.mark.parametrize("threads", [1, 3])
 def test_many_images_are_scipys_correlation(threads, monkeypatch):
-    for module in ("utils.compute", "optics.blur"):
+    for module in ("utils.compute", "optics.discs"):
         monkeypatch.setattr(f"simulator.{module}.thread_count", lambda: threads)
     extents = [(0.0, 5.0), (3.3, 0.0), (8.0, 17.0), (1e-4, 1e-7), (2.0, 90.0), (0.7, 0.4)]
     blurs = []
@@ -184,8 +175,8 @@ def test_many_images_are_scipys_correlation(threads, monkeypatch):
 def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(monkeypatch, extent):
     light, narrow = torch.rand(4, 64, 48), torch.empty(4, 64, 48)
     light[:, 20, 20], results = 1e6, []
-    for widest in (blur_module._WIDE_PX, 1e9):
-        monkeypatch.setattr(blur_module, "_WIDE_PX", widest)
+    for widest in (discs._WIDE_PX, 1e9):
+        monkeypatch.setattr(discs, "_WIDE_PX", widest)
         defocused, moved = torch.empty_like(light), torch.empty_like(light)
         wide = Blur(light, 48.0, defocused, extent, moved if extent else None)
         blur_many([wide, Blur(light, 3.0, narrow)], limit=1e3)
@@ -197,10 +188,11 @@ def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(monkeypatch, exte
 def test_a_streak_is_the_same_compiled_and_loaded(compiled_and_loaded):
     """A sum of two products may be fused either way, and was: each process chose its own."""
     code = (
-        "import torch; from simulator.optics.blur import _moved, motion_blur\n"
+        "import torch; from simulator.optics.motion import motion_blur, move_rows\n"
         "light = torch.rand(1, 9, 100, generator=torch.Generator().manual_seed(0))\n"
         "blurred = [motion_blur(light, extent) for extent in (1.3, 5.5, 11.2)]\n"
-        "print(*_moved.stats.cache_hits.values(), torch.stack(blurred).numpy().tobytes().hex())\n"
+        "blurred = torch.stack(blurred).numpy().tobytes().hex()\n"
+        "print(*move_rows.stats.cache_hits.values(), blurred)\n"
     )
     (compiled,), (hits, loaded) = compiled_and_loaded(code)
     assert (hits, loaded) == ("1", compiled)
@@ -224,3 +216,94 @@ def test_box_mean_is_scipys_uniform_filter(window, size):
     sides = (1, 1, window, window)
     expected = ndimage.uniform_filter(image.double().numpy(), sides, mode="nearest")
     np.testing.assert_allclose(box_mean(image, window).numpy(), expected, rtol=2e-6, atol=1e-6)
+
+
+def blurred(image: torch.Tensor, diameter: float) -> torch.Tensor:
+    return DiscBank(image).blurred(torch.full(image.shape[-2:], diameter))
+
+
+def uniform(*size: int, high: float = 1.0, seed: int = 0) -> torch.Tensor:
+    values = np.random.default_rng(seed).uniform(0.0, high, size)
+    return torch.from_numpy(values).float()
+
+
+def through_torch(image: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
+    """What training uses: gradients flow through it."""
+    return DiscBank(image).blurred(diameter.clone().requires_grad_()).detach()
+
+
+@pytest.mark.parametrize("diameter", [*DIAMETERS, 100.0])
+def test_at_its_diameters_and_beyond_them_it_is_the_disc_blur(diameter):
+    image = uniform(2, 24, 31)
+    expected = disc_blur(image, min(diameter, DIAMETERS[-1]))
+    torch.testing.assert_close(blurred(image, diameter), expected, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("diameter", [*BETWEEN, 0.0, 11.3, 100.0])
+def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter):
+    """d^2 / 16 per axis: the moment of a uniform disc of diameter d."""
+    point = torch.zeros(81, 81)
+    point[40, 40] = 1.0
+    spread = blurred(point, diameter).double().numpy()
+    offsets, moment = np.arange(81) - 40, min(diameter, DIAMETERS[-1]) ** 2 / 16
+    assert spread.sum() == pytest.approx(1.0, abs=1e-5)
+    assert spread.min() > -1e-7
+    for marginal in (spread.sum(0), spread.sum(1)):
+        assert marginal @ offsets**2 == pytest.approx(moment, rel=2e-3, abs=2e-4)
+        assert marginal @ offsets == pytest.approx(0.0, abs=1e-5)
+    # Of white noise the sum of squared weights is left.
+    left = float(remaining_variance(torch.tensor(diameter)))
+    assert left == pytest.approx((spread**2).sum(), rel=1e-4)
+
+
+def test_gradient_is_finite_everywhere_and_right():
+    image = uniform(1, 16, 16).requires_grad_()
+    values = torch.tensor([0.0, 1e-9, 0.7, 1.3, 4.0, 32.0, 50.0])
+    diameter = values.repeat(16, 3)[:, :16].clone().requires_grad_()
+    DiscBank(image).blurred(diameter).square().sum().backward()
+    assert diameter.grad is not None
+    assert image.grad is None
+    assert bool(diameter.grad.isfinite().all())
+    assert bool((diameter.grad[:, 0] == 0).all())  # d(diameter^2) is 0 there
+    with torch.no_grad():
+        assert not DiscBank(image).blurred(diameter).requires_grad
+
+    exact = torch.full((6, 6), 1.27, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(DiscBank(uniform(6, 6).double()).blurred, exact, eps=1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 300), (40, 1), (130, 131), (9, 257)])
+@pytest.mark.parametrize("high", [0.3, 3.0, 40.0])
+def test_it_is_the_blend_of_whole_frames(size, high):
+    image, diameter = uniform(4, *size, high=2.0), uniform(*size, high=high, seed=1)
+    diameter.view(-1)[::7] = 0.0
+    found = DiscBank(image).blurred(diameter)
+    torch.testing.assert_close(found, through_torch(image, diameter), rtol=1e-6, atol=1e-6)
+
+
+def test_interpolation_is_linear_in_the_squared_diameter():
+    """Levels that are constants, by NumPy's own interpolation; only those in use are computed."""
+    diameter = uniform(3, 200, high=35.0)
+    bank = DiscBank(torch.zeros(2, 3, 200))
+    for index in range(1, len(DIAMETERS)):
+        bank._levels[index] = torch.full((2, 3, 200), float(index**2))  # stands for a blur
+    wanted = np.interp(diameter.double() ** 2, KNOTS, [float(i * i) for i in range(len(KNOTS))])
+    np.testing.assert_allclose(bank.blurred(diameter), np.stack([wanted] * 2), rtol=1e-5, atol=1e-5)
+    few = DiscBank(torch.zeros(1, 40, 600))
+    few.blurred(torch.tensor([0.3, 9.0]).repeat_interleave(20)[:, None].expand(40, 600))
+    assert sorted(few._levels) == [0, 1, *(DIAMETERS.index(d) for d in (8.0, 11.3))]
+
+
+def test_remaining_variance_is_that_of_each_pixels_kernel():
+    """Of the blend of two discs by NumPy, in frames of any shape."""
+    diameter = uniform(70, 30, high=35.0)
+    found = remaining_variance(diameter)
+    assert torch.equal(remaining_variance(diameter.double()[None])[0].float(), found)
+    for y, x in np.ndindex(7, 3):
+        squared = min(float(diameter[10 * y, 10 * x]) ** 2, KNOTS[-1])
+        index = min(int(np.searchsorted(KNOTS, squared, side="right")), len(KNOTS) - 1)
+        share = (squared - KNOTS[index - 1]) / (KNOTS[index] - KNOTS[index - 1])
+        small, large = (disc_kernel(d) for d in DIAMETERS[index - 1 : index + 1])
+        small = np.pad(small, (len(large) - len(small)) // 2)
+        wanted = (((1 - share) * small + share * large) ** 2).sum()
+        assert float(found[10 * y, 10 * x]) == pytest.approx(wanted, rel=2e-5)

@@ -1,33 +1,53 @@
-"""Motion along a path: how an image moves while the shutter is open, and the blur that this makes.
+"""Motion: how an image moves while the shutter is open, and the blur that this makes.
 
-The shake of a camera has a direction that turns; a subject may move on its own besides. The part of
-the path that is traversed during an exposure is rasterised into a few weighted shifts (taps), whose
-sum is the blurred image. Taps are widened as the streaks of `simulator.optics.blur` are: along
-both axes their second moment is that of the path. Borders are replicated.
+Along the rows it is a streak, in other directions a path: the shake of a camera has a direction
+that turns, and a subject may move on its own besides. A path is rasterised into a few weighted
+shifts (taps), whose sum is the blurred image.
+
+A kernel that merely averages the pixels it covers does nothing below one pixel of extent. Streaks
+and taps are widened so that their second moment is that of the path (of a streak its extent squared
+/ 12): small blurs are then right, too. Both work on *unclipped* light, so that a lamp ten times
+above white smears into a streak that is still white: clipping comes later, once (see
+`simulator.capture.sensor`). Borders are replicated.
+
+On the CPU, streaks run row by row in compiled kernels; a row and what is summed of it stay in the
+first-level cache. A streak is a box of equal weights with a share of one more pixel at each end.
+The box is put together from sums over 1, 2, 4, 8, ... pixels, each the sum of two of the former: a
+streak of n pixels takes about 2 log2(n) additions, and no running sum that would lose the shadows
+beside a lamp.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
-from simulator.optics.blur import streak_share
+from simulator.utils.checks import check_number
 from simulator.utils.compute import kernel, parallel_ranges
 
+#: Samples from which another thread is worth waking, of uniform blurs and of paths.
+_WORTH_A_THREAD, _PATH_WORTH_A_THREAD = 2**16, 2**18
+#: Samples that are summed together: they stay in the first-level cache.
+GROUP = 2048
 #: Points of a path, per pixel of its length and at most: longer ones are sampled more coarsely.
 _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 #: Points that the length of a path is summed over.
 _LENGTH_POINTS = 32
 #: Shares below this are left out.
 _LEAST_WEIGHT = 1e-9
-#: Samples from which another thread is worth waking.
-_WORTH_A_THREAD = 2**18
 _jit = functools.partial(kernel, fastmath={"contract"})
+
+
+# -- movements and paths ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -74,9 +94,8 @@ class Movement:
 
     def subject_extent(self, speed: float, times: np.ndarray) -> np.ndarray:
         """Lengths of the subject's path [frame heights] in exposures of `times` (S,) [s]."""
-        own, angle = self.subject_speed * times, self.subject_direction
-        drift = own * math.cos(angle), own * math.sin(angle)
-        return _lengths(speed * times, self.direction, self.turn * times, *drift)
+        paths = [self.subject_path(speed, time, 1) for time in times.tolist()]
+        return np.array([_length(*path) for path in paths])
 
 
 #: That of an image which moves along the rows, wherever it has a speed.
@@ -118,16 +137,193 @@ def _length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyp
     return total / _LENGTH_POINTS
 
 
-@_jit()
-def _lengths(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyped-def]
-    """Lengths of S paths of one direction; the others are (S,)."""
-    out = np.empty(len(extent))
-    for i in range(len(out)):
-        out[i] = _length(extent[i], direction, turn[i], drift_x[i], drift_y[i])
+# -- streaks along the rows -------------------------------------------------------------------
+
+
+def streak_share(extent_px: float) -> tuple[int, float]:
+    """Pixels n that a streak covers whole on either side, and its share e of one more.
+
+    Both 0 where the extent is too small to blur anything.
+    """
+    target = extent_px * extent_px / 12.0
+    if target < 1e-12:
+        return 0, 0.0
+    n = int((math.sqrt(1.0 + extent_px * extent_px) - 1.0) / 2.0)  # n (n + 1) / 3 is it at e = 0
+    end = (target - n * (n + 1) / 3.0) * (2 * n + 1) / (2.0 * ((n + 1) ** 2 - target))
+    return n, max(end, 0.0)
+
+
+@functools.lru_cache(maxsize=64)
+def motion_kernel(extent_px: float) -> np.ndarray:
+    """Weights (K,), K odd, of a uniform streak of `extent_px` pixels.
+
+    The streak covers ``2 n + 1`` pixels whole and a share e of one more at each end. Its second
+    moment, ``(n (n + 1) (2 n + 1) / 3 + 2 e (n + 1)^2) / (2 n + 1 + 2 e)``, is solved for n and e.
+
+    >>> motion_kernel(2.0).round(3).tolist()
+    [0.167, 0.667, 0.167]
+    """
+    n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
+    if not n and not end:
+        return np.ones(1)
+    weights = np.ones(2 * n + 3)
+    weights[0] = weights[-1] = end
+    return weights / (2 * n + 1 + 2.0 * end)
+
+
+def motion_blur(
+    light: Tensor, extent_px: float, out: Tensor | None = None, *, limit: float = math.inf
+) -> Tensor:
+    """Uniform motion along the rows during the exposure.
+
+    Args:
+        light: (..., H, W) linear light.
+        extent_px: Distance that the image moves, in pixels, >= 0.
+        out: Contiguous float32 tensor on the CPU to write to, instead of a new one.
+        limit: Light beyond it, on either side of 0, is clipped before it is blurred; float32 on the
+            CPU only.
+
+    Returns:
+        (..., H, W), the same dtype. The cost of long streaks hardly depends on the extent.
+    """
+    n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
+    if not n and not end:
+        return light if out is None else out.copy_(light)
+    if has_kernels(light):
+        most = np.float32(limit)
+        return by_rows(light, out, lambda a, b, rows, to: move_rows(a, b, rows, n, end, most, to))
+    width, radius = light.shape[-1], n + 1
+    covered = 2 * n + 1 + 2.0 * end
+    full, edge = 1.0 / covered, end / covered
+    if radius >= width:  # the whole row and both borders: counted, as padding might not fit
+        column = torch.arange(width, device=light.device)
+        left, right = radius - 1 - column + edge / full, column + radius - width + edge / full
+        rows = light.double()
+        total = rows.sum(-1, keepdim=True) + rows[..., :1] * left + rows[..., -1:] * right
+        return (total * full).to(light.dtype)
+    padded = F.pad(light.reshape(-1, 1, width), (radius, radius), mode="replicate")
+    sums = F.pad(padded.double().cumsum(-1), (1, 0))
+    inner = sums[..., 2 * radius : 2 * radius + width] - sums[..., 1 : 1 + width]
+    ends = padded[..., :width] + padded[..., 2 * radius :]
+    return (inner * full + ends.double() * edge).to(light.dtype).reshape(light.shape)
+
+
+def has_kernels(light: Tensor) -> bool:
+    """Whether the kernels for the CPU take it."""
+    return light.device.type == "cpu" and light.dtype == torch.float32 and not light.requires_grad
+
+
+def by_rows(
+    light: Tensor,
+    out: Tensor | None,
+    task: Callable[[int, int, np.ndarray, np.ndarray], None],
+    cost: int = 1,
+) -> Tensor:
+    """`light` by `task` on shares of its rows, into `out`; `cost` is that of a sample."""
+    out = torch.empty(light.shape) if out is None else out
+    width = light.shape[-1]
+    rows, result = light.contiguous().reshape(-1, width).numpy(), out.reshape(-1, width).numpy()
+    parallel_ranges(
+        lambda first, last: task(first, last, rows, result),
+        len(rows),
+        least=1 + _WORTH_A_THREAD // (cost * width),
+    )
     return out
 
 
-# -- taps -------------------------------------------------------------------------------------
+@_jit()
+def copy_row(a, out):  # type: ignore[no-untyped-def]
+    """`out` becomes `a`."""
+    for x in range(len(out)):
+        out[x] = a[x]
+
+
+@_jit()
+def add_rows(a, b, out):  # type: ignore[no-untyped-def]
+    """`out` becomes the sum of two rows."""
+    for x in range(len(out)):
+        out[x] = a[x] + b[x]
+
+
+@_jit()
+def pad_rows(rows, y, top, bottom, radius, limit, padded):  # type: ignore[no-untyped-def]
+    """Rows from `y` on, but of [top, bottom), each with `radius` more pixels at both ends."""
+    width = rows.shape[1]
+    for i in range(len(padded)):
+        source = np.uint64(min(max(y + i, top), bottom - 1))
+        for x in range(width):
+            value = rows[source, x]
+            value = value if value < limit else limit
+            padded[i, np.uint64(radius + x)] = value if value > -limit else -limit
+        for x in range(radius):
+            padded[i, x] = padded[i, radius]
+            padded[i, np.uint64(radius + width + x)] = padded[i, radius + width - 1]
+
+
+@_jit()
+def _whole_rows(first, last, rows, radius, edge, full, limit, out):  # type: ignore[no-untyped-def]
+    """A streak that covers a whole row and both borders: their pixels are counted."""
+    width, share = rows.shape[1], edge / full
+    for y in range(first, last):
+        total = 0.0
+        for x in range(width):
+            total += min(max(rows[y, x], -limit), limit)
+        begin = min(max(rows[y, 0], -limit), limit)
+        end = min(max(rows[y, width - 1], -limit), limit)
+        for x in range(width):
+            left, right = radius - 1 - x + share, x + radius - width + share
+            out[y, x] = np.float32((total + begin * left + end * right) * full)
+
+
+@_jit()
+def _box(current, following, length, out):  # type: ignore[no-untyped-def]
+    """Sums over samples 1 to `length` from each one on; overwrites `current`."""
+    size, offset, power = len(current), 1, 1
+    while power <= length:
+        if length & power:
+            if length & (power - 1):
+                add_rows(out[: size - offset], current[offset:], out[: size - offset])
+            else:
+                copy_row(current[offset:], out[: size - offset])
+            offset += power
+        power *= 2
+        if power <= length:
+            valid = size - power + 1
+            add_rows(current[:valid], current[power // 2 :], following[:valid])
+            current, following = following, current
+
+
+@_jit()
+def _streak(first, last, rows, radius, share, full, limit, out):  # type: ignore[no-untyped-def]
+    width = rows.shape[1]
+    pitch = width + 2 * radius
+    many = max(1, GROUP // pitch)
+    padded = np.empty((many, pitch), np.float32)
+    box = np.zeros((many, pitch), np.float32)  # rows behind one another: one long vector
+    current, following = np.zeros(many * pitch, np.float32), np.zeros(many * pitch, np.float32)
+    for y in range(first, last, many):
+        pad_rows(rows, y, y, last, radius, limit, padded)
+        copy_row(padded.reshape(-1), current)
+        _box(current, following, 2 * radius - 1, box.reshape(-1))
+        for i in range(min(many, last - y)):
+            row = np.uint64(y + i)  # unsigned: no check whether it counts from the end
+            for x in range(width):
+                ends = padded[i, x] + padded[i, np.uint64(x + 2 * radius)]
+                # One product to a sum: of two, the compiler would choose which one it fuses.
+                out[row, x] = (box[i, x] + ends * share) * full
+
+
+@_jit()
+def move_rows(first, last, rows, n, end, limit, out):  # type: ignore[no-untyped-def]
+    """Rows `first` to `last` behind a streak of 2 n + 1 pixels and a share of two more."""
+    full = 1.0 / (2 * n + 1 + 2.0 * end)
+    if n + 1 >= rows.shape[1]:
+        _whole_rows(first, last, rows, n + 1, end * full, full, limit, out)
+    else:
+        _streak(first, last, rows, n + 1, np.float32(end), np.float32(full), limit, out)
+
+
+# -- paths: taps and their sums ---------------------------------------------------------------
 
 
 class Taps(NamedTuple):
@@ -158,7 +354,7 @@ def path_taps(path: Path, height: int, width: int) -> Taps:
 
 
 def _streak_taps(extent_px: float, width: int) -> Taps:
-    """The taps of a streak along the rows, as `simulator.optics.blur.motion_kernel` has them."""
+    """The taps of a streak along the rows, as `motion_kernel` has them."""
     n, end = streak_share(abs(extent_px))
     weights = np.ones(2 * n + 3)
     weights[0] = weights[-1] = end
@@ -241,9 +437,6 @@ def _rasterised(  # type: ignore[no-untyped-def]
     return rows, columns, (weights / weights.sum()).astype(np.float32)
 
 
-# -- blur -------------------------------------------------------------------------------------
-
-
 @_jit()
 def _blur_rows(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
     """Sums of shifted rows, four taps at a time."""
@@ -300,12 +493,8 @@ def _blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no
 
 
 def path_blur(
-    light: torch.Tensor,
-    taps: Taps,
-    out: torch.Tensor | None = None,
-    *,
-    limit: float = math.inf,
-) -> torch.Tensor:
+    light: Tensor, taps: Taps, out: Tensor | None = None, *, limit: float = math.inf
+) -> Tensor:
     """Motion along a path; the borders are replicated.
 
     Args:
@@ -321,21 +510,21 @@ def path_blur(
             planes[first:last], *taps, np.float32(limit), result[first:last]
         ),
         len(planes),
-        least=1 + _WORTH_A_THREAD // planes[0].size,
+        least=1 + _PATH_WORTH_A_THREAD // planes[0].size,
     )
     return out.to(light.device)
 
 
 def path_blur_apart(
-    light: torch.Tensor,
-    mask: torch.Tensor,
-    behind: torch.Tensor,
+    light: Tensor,
+    mask: Tensor,
+    behind: Tensor,
     taps: Taps,
     own: Taps,
-    out: torch.Tensor | None = None,
+    out: Tensor | None = None,
     *,
     limit: float = math.inf,
-) -> torch.Tensor:
+) -> Tensor:
     """A subject that moves along its own path, in front of a background that moves along another.
 
     ``(1 - A) (K_b * B) + K_s * (M L)`` with the mask M of the subject, A = K_s * M, and the
@@ -356,6 +545,6 @@ def path_blur_apart(
     parallel_ranges(
         lambda first, last: _blur_apart(planes[first:last], *fixed, result[first:last]),
         len(planes),
-        least=1 + _WORTH_A_THREAD // planes[0].size,
+        least=1 + _PATH_WORTH_A_THREAD // planes[0].size,
     )
     return out.to(light.device)

@@ -1,0 +1,492 @@
+"""`TermScores`: the scores of frames, and of what is known of captures without a frame.
+
+`Highlights`, `Shadows` and `Noise` are means over the samples of functions of the recorded value.
+They are evaluated from the histogram of a frame's codes. Their expectation over the noise of a
+light is a mean over the light of smooth functions, which are tabulated once for each noise: exact
+for the means, and for scores to the first order in their noise, which a frame of thousands of
+samples averages. All other parts of a scorer are torch's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from scipy.special import ndtr
+
+from ae_env.observation import PEDESTAL, encode_array
+from ae_env.scenes.scene import Scene
+from ae_env.scorers.captures import Captures, DependsOn, SceneCaptures, reads_pixels
+from ae_env.scorers.composite import CompositeScorer, is_own
+from ae_env.scorers.terms import (
+    Banding,
+    Brightness,
+    Highlights,
+    Noise,
+    Shadows,
+    Sharpness,
+    code_signals,
+)
+from simulator.camera import CameraProfile
+from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.sensor import Transitions, record
+from simulator.settings import CameraSettings
+from simulator.utils.cache import LruCache
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
+
+#: Memory for tabulated expectations [byte].
+_BYTES = 2**25
+#: States whose pixels are looked at at once: more only spends time in memory paging.
+CHUNK = 16
+#: Samples times frames from which another thread is worth waking.
+_WORTH_A_THREAD = 2**15
+#: Expectations are tabulated at this many values between two codes.
+_FINE = 8
+#: Distance at which noise no longer matters, in its standard deviations.
+_FAR = 4.5
+#: The normal distribution up to there, and its values in a standard deviation.
+_PER_DEVIATION = 128
+_NORMAL = ndtr(np.arange(-_FAR * _PER_DEVIATION, _FAR * _PER_DEVIATION + 1) / _PER_DEVIATION)
+_ZERO, _ONE = np.float32(0), np.float32(1)
+_PEDESTAL = np.float32(PEDESTAL)
+_SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
+_BLOCK = 256
+#: Column of the means for each term; and the terms that need none.
+_COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
+_WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
+_SIGNALS = code_signals()
+_jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
+
+
+class TermScores:
+    """Scores of one scorer at the states of a grid, part by part.
+
+    Args:
+        scorer: The scorer.
+        camera: The body that takes the captures.
+        states: The settings of the S states.
+        noise: Whether captures are noisy.
+
+    Attributes:
+        parts: Parts that are made of the terms of `ae_env.scorers.terms` alone, composites
+            included, and measured on frames; by name. Their expectation has a closed form.
+        torch_terms: All other parts, which torch evaluates; None if there are none.
+        reads_captures: Whether `parts` need `Captures` besides the means.
+        closed_form: Whether every part's expectation has a closed form, so that no noise is drawn
+            for it.
+        captures: Describes captures of a scene at the states.
+    """
+
+    def __init__(
+        self,
+        scorer: CompositeScorer,
+        camera: CameraProfile,
+        states: Sequence[CameraSettings],
+        *,
+        noise: bool,
+    ) -> None:
+        self.camera, self.states, self.noise = camera, states, noise
+        self.parts = {n: p for n, p in scorer.parts.items() if _is_known(p) and _has_pixels(p)}
+        self.torch_terms = scorer.subset(set(scorer.parts) - set(self.parts))
+        self.reads_captures = any(type(part) not in _COLUMNS for part in self.parts.values())
+        self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
+        # Scorers of one's own get a copy of the light, lest they write to the scene.
+        self.captures = SceneCaptures(camera, states, noisy=noise, copies=is_own(scorer))
+        isos = sorted({state.iso for state in states})
+        noises = [camera.nlf(iso) for iso in isos]
+        self._which = np.array([isos.index(state.iso) for state in states])
+        self._shot_read = np.array([[n.shot, n.read] for n in noises])[self._which]  # (S, 2, 4)
+        self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
+        self._dark = Shadows.shares(_SIGNALS).numpy()
+        self._edges = _code_edges(camera)
+        # Up to light beyond white that even the most noise does not bring back.
+        shot, read = (max(max(getattr(n, name)) for n in noises) for name in ("shot", "read"))
+        light = 1.0
+        for _ in range(100):
+            light = 1.0 + _FAR * math.sqrt(shot * light + read)
+        self._size = int(_FINE * (2.0 + 255.0 * math.sqrt(light + PEDESTAL)))
+        self._tables: LruCache[np.ndarray] = LruCache(_BYTES)
+
+    # -- parts that torch evaluates -----------------------------------------------------------
+
+    def torch_scores(
+        self, images: torch.Tensor | None, captures: Captures, *kinds: DependsOn
+    ) -> dict[str, np.ndarray]:
+        """Scores (B,) of those of `torch_terms` that depend on `kinds`.
+
+        Args:
+            images: (B, 4, H, W) in [0, 1]; None where the kinds look at none.
+            captures: The captures.
+            kinds: Any of `DependsOn`.
+        """
+        if self.torch_terms is None:
+            return {}
+        scores = self.torch_terms.score_parts(images, captures, kinds)
+        return {name: values.numpy() for name, values in scores.items()}
+
+    def closed_form_terms(
+        self,
+        scene: Scene,
+        prepared: PreparedScene,
+        *kinds: DependsOn,
+        gain: float | np.ndarray = 1.0,
+        row_gain: np.ndarray | None = None,
+    ) -> dict[str, np.ndarray]:
+        """Scores (S,) of those of `torch_terms` that look at no frame but depend on `kinds`.
+
+        Args:
+            scene: The scene.
+            prepared: As it is in the episode.
+            kinds: ``"light"``, ``"blur"`` or both.
+            gain: See `ScoreTables.table`.
+            row_gain: See `ScoreTables.table`.
+        """
+        names = [] if self.torch_terms is None else self.torch_terms.names(*kinds)
+        if self.torch_terms is None or not names:
+            return {}
+        parts = [self.torch_terms.parts[name] for name in names]
+        if all(type(part) is Sharpness for part in parts):  # few states differ in blur
+            blur, alike = self.captures.blur(scene, prepared)
+            score = Sharpness.of(blur, scene.light.shape[-2])[alike].numpy()
+            return dict.fromkeys(names, score)
+        chunks = []
+        for part in slices(len(self.states), CHUNK if any(map(reads_pixels, parts)) else None):
+            captures = self.captures.describe(scene, prepared, part, gain, row_gain)
+            chunks.append(self.torch_scores(None, captures, *kinds))
+        return {name: np.concatenate([c[name] for c in chunks]) for name in names}
+
+    # -- parts that are made of terms ---------------------------------------------------------
+
+    def _noise_shares(
+        self, shot_read: np.ndarray, source_noise: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(K, 4, 256) float32 `Noise.shares` of each code.
+
+        Args:
+            shot_read: (K, 2, 4) noise of a native pixel.
+            source_noise: (K, 2, 4) noise of the source, where it may be greater.
+        """
+        light = _SIGNALS.double().numpy()
+        variance = np.zeros((len(shot_read), 4, 256))
+        if self.noise:
+            variance = shot_read[:, 0, :, None] * light + shot_read[:, 1, :, None]
+            if source_noise is not None:
+                other = source_noise[:, 0, :, None] * light + source_noise[:, 1, :, None]
+                variance = np.maximum(variance, other)
+        shares: np.ndarray = Noise.shares(_SIGNALS, torch.from_numpy(variance).float()).numpy()
+        return shares
+
+    def score(self, means: np.ndarray, captures: Captures | None) -> dict[str, np.ndarray]:
+        """Scores (B,) float64 by part.
+
+        Args:
+            means: (B, 3) result of `measured` or `expected` for the captures.
+            captures: The captures; None unless `reads_captures`.
+        """
+        return {name: _score(part, means, captures) for name, part in self.parts.items()}
+
+    def _shares_of_frames(
+        self, states: np.ndarray, source_noise: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Noise shares (K, 4, 256) and which of them each frame has; see `measured`."""
+        noisy = source_noise.any(axis=(1, 2))
+        if not noisy.any():
+            return self._shares, self._which[states]
+        own = self._noise_shares(self._shot_read[states[noisy]], source_noise[noisy])
+        which = self._which[states]
+        which[noisy] = len(self._shares) + np.arange(len(own))
+        return np.concatenate([self._shares, own]), which
+
+    def measured(
+        self, codes: np.ndarray, states: np.ndarray, source_noise: np.ndarray
+    ) -> np.ndarray:
+        """Means (B, 3) of recorded frames: shares of blown and of blocked samples, and `noise`.
+
+        Args:
+            codes: (B, 4, H, W) uint8 of the frames.
+            states: (B,) at which they were taken.
+            source_noise: (B, 2, 4) shot and read noise of the sources, of a native pixel.
+        """
+        shares, which = self._shares_of_frames(states, source_noise)
+        flat = codes.reshape(len(codes), 4, -1)
+        means = np.empty((len(codes), 3))
+        least = max(1, _WORTH_A_THREAD // flat[0].size)
+        fixed = (flat, shares, which, self._dark, means)
+        parallel_ranges(lambda a, b: measure_codes(a, b, *fixed), len(codes), least=least)
+        return means
+
+    def expected(
+        self,
+        transitions: Transitions,
+        states: np.ndarray,
+        box_factors: np.ndarray,
+        row_gain: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Expectation (B, 3) of `measured` over the noise that the transitions add.
+
+        Args:
+            transitions: Light and exposures.
+            states: (B,) of the frames.
+            box_factors: (B,) sensor pixels averaged per side into one of the frame.
+            row_gain: (B, H) light of each row relative to the frame's, or None.
+        """
+        table = transitions.before_rounding(self.camera).averaged_table()
+        source_noise = table[:, 3:] * np.square(box_factors)[:, None, None]
+        if not self.noise:
+            codes = np.empty((len(table), *transitions.light[0].shape), np.uint8)
+            record(transitions, self.camera, row_gain=row_gain, codes=codes)
+            return self.measured(codes, states, source_noise)
+        shares, which = self._shares_of_frames(states, source_noise)
+        # What the noise shares depend on, too.
+        kinds = np.stack([self._which[states], box_factors], axis=1)
+        keys = [table[i, 1:].tobytes() + kinds[i].tobytes() for i in range(len(table))]
+        numbers: dict[bytes, int] = {}
+        tables: list[np.ndarray] = []
+        for i, key in enumerate(keys):
+            if key not in numbers:
+                numbers[key] = len(tables)
+                tables.append(self._tabulated(key, table[i, 1:3], shares[which[i]]))
+        height, width = transitions.light[0].shape[-2:]
+        rows = np.ones((len(table), 1)) if row_gain is None else row_gain
+        fixed = (
+            addresses(transitions.light),
+            1 if row_gain is None else height,
+            height * width if row_gain is None else width,
+            table[:, 0].astype(np.float32),
+            rows.astype(np.float32),
+            self._size,
+            np.array([tables[numbers[key]].ctypes.data for key in keys], np.uintp),
+        )
+        means = np.empty((len(table), 3))
+        least = max(1, _WORTH_A_THREAD // (4 * height * width))
+        parallel_ranges(lambda a, b: expect_means(a, b, *fixed, means), len(table), least=least)
+        return means
+
+    def _tabulated(self, key: bytes, missing: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """(4, 3, G) float32 expectations by light: above the last code, blocked, and `noise`."""
+        found = self._tables.get(key)
+        if found is None:
+            found = np.empty((4, 3, self._size), np.float32)
+            for plane in range(4):
+                noise = self._edges[plane], *missing[:, plane]
+                expect_codes(self._dark, shares[plane], *noise, found[plane])
+            self._tables.put(key, found, found.nbytes)
+        return found
+
+
+def slices(count: int, size: int | None) -> list[slice]:
+    """[0, `count`) in parts of `size`; None for one."""
+    size = size or count
+    return [slice(i, min(i + size, count)) for i in range(0, count, size)]
+
+
+def _code_edges(camera: CameraProfile) -> np.ndarray:
+    """(4, 256) signals from which a plane is recorded as each code or one above.
+
+    A signal is rounded to digital numbers first: halfway below the first number of a code.
+    """
+    numbers = np.arange(camera.white_level + 1.0)
+    edges = np.empty((4, 256))
+    for plane, (black, span) in enumerate(zip(camera.black_level, camera.span, strict=True)):
+        first = np.searchsorted(encode_array((numbers - black) / span), np.arange(256))
+        edges[plane] = (first - 0.5 - black) / span
+    return edges
+
+
+def _is_known(part: Any) -> bool:
+    """Whether `part` is exactly what is computed here; a subclass may do something else."""
+    if isinstance(part, CompositeScorer):
+        known = type(part).__module__.startswith("ae_env.")
+        return known and all(map(_is_known, part.parts.values()))
+    # An instance with constants of its own is not known either.
+    return type(part) in (*_COLUMNS, *_WITHOUT_PIXELS) and not vars(part)
+
+
+def _has_pixels(part: Any) -> bool:
+    if isinstance(part, CompositeScorer):
+        return any(map(_has_pixels, part.parts.values()))
+    return type(part) in _COLUMNS
+
+
+def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarray:
+    if isinstance(part, CompositeScorer):
+        scores = {name: _score(inner, means, captures) for name, inner in part.parts.items()}
+        return part.totals(scores)
+    column = _COLUMNS.get(type(part))
+    if column is None:
+        return np.asarray(part(None, captures).numpy())
+    values = means[:, column]
+    return np.asarray(np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0))
+
+
+# -- kernels --------------------------------------------------------------------------------------
+
+
+@_jit
+def measure_codes(  # type: ignore[no-untyped-def]
+    first, last, codes, shares, which, dark, means
+):
+    """Means of the frames `first` to `last`.
+
+    Args:
+        first: First frame.
+        last: One past the last.
+        codes: (B, 4, N) uint8.
+        shares: (K, 4, 256) float32, what a sample of each code adds to `noise`.
+        which: (B,) which of them each frame has.
+        dark: (256,) float32, what a sample of each code adds to the share of blocked ones.
+        means: (B, 3) float64 to write to.
+    """
+    size = codes.shape[2]
+    # Four histograms: a sample need not wait for that of the sample before.
+    counts = np.empty((4, 256), np.int32)
+    whole = size // 4 * 4
+    for frame in range(first, last):
+        blown, planes, blocked, clean = 0, 0, 0.0, 0.0
+        for plane in range(4):
+            samples = codes[frame, plane]
+            counts[:] = 0
+            for i in range(0, whole, 4):
+                counts[0, samples[i]] += 1
+                counts[1, samples[i + 1]] += 1
+                counts[2, samples[i + 2]] += 1
+                counts[3, samples[i + 3]] += 1
+            for i in range(whole, size):
+                counts[0, samples[i]] += 1
+            for code in range(256):
+                count = counts[0, code] + counts[1, code] + counts[2, code] + counts[3, code]
+                blocked += count * np.float64(dark[code])
+                clean += count * np.float64(shares[which[frame], plane, code])
+            white = counts[0, 255] + counts[1, 255] + counts[2, 255] + counts[3, 255]
+            blown, planes = blown + white, planes + (white > 0)
+        if planes > 1:  # else no pixel was counted twice
+            blown = 0
+            red, green, other, blue = codes[frame]
+            for i in range(size):
+                brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
+                blown += brightest == 255
+        means[frame, 0] = blown / size
+        means[frame, 1] = blocked / (4 * size)
+        means[frame, 2] = clean / (4 * size)
+
+
+@_jit
+def _normal_above(z):  # type: ignore[no-untyped-def]
+    """Share of standard normals above -z, |z| <= `_FAR`, within 1e-5."""
+    place = (z + _FAR) * _PER_DEVIATION
+    index = min(int(place), len(_NORMAL) - 2)
+    return _NORMAL[index] + (place - index) * (_NORMAL[index + 1] - _NORMAL[index])
+
+
+@_jit
+def expect_codes(dark, clean, edges, shot, read, out):  # type: ignore[no-untyped-def]
+    """Expectations of functions of the code that noisy light is recorded as.
+
+    Args:
+        dark: (256,) float32 by code, the first function.
+        clean: (256,) float32, the second.
+        edges: (256,) signals from which each code is recorded, or one above.
+        shot: Shot noise that is added.
+        read: Read noise that is added.
+        out: (3, G) float32 to write to, at `_FINE` values of light between two codes: the
+            probability of the last code, and both expectations.
+    """
+    unit, start, last, count = (1.0 + PEDESTAL) / 255.0**2, 0, 0, out.shape[1]
+    i = 0
+    while True:
+        light = unit * (i / _FINE) ** 2 - PEDESTAL
+        spread = math.sqrt(max(max(light, 0.0) * shot + read, 1e-30))
+        lowest, highest = light - _FAR * spread, light + _FAR * spread
+        while start > 0 and edges[start] > lowest:
+            start -= 1
+        while start < 255 and edges[start + 1] <= lowest:
+            start += 1
+        code, by_spread = start, 1.0 / spread
+        blocked, noise, above = dark[code], clean[code], np.float64(code == 255)
+        while code < 255 and edges[code + 1] <= highest:
+            code += 1
+            above = _normal_above((light - edges[code]) * by_spread)
+            blocked += above * (dark[code] - dark[code - 1])
+            noise += above * (clean[code] - clean[code - 1])
+        out[0, i] = above if code == 255 else 0.0
+        out[1, i], out[2, i] = blocked, noise
+        for f in range(3):  # a straight line from the last one
+            for j in range(last + 1, i):
+                share = (j - last) / (i - last)
+                out[f, j] = out[f, last] + share * (out[f, i] - out[f, last])
+        if i == count - 1:
+            return
+        # Steps of a quarter of a standard deviation: wide noise leaves nothing fine.
+        step = math.sqrt((light + 0.25 * spread + PEDESTAL) / unit) * _FINE
+        last, i = i, min(max(i + 1, int(step)), count - 1)
+
+
+@_jit
+def _interpolated(table, places, shares):  # type: ignore[no-untyped-def]
+    """Sum of a function between `places` and the next ones."""
+    total = _ZERO
+    for i in range(len(places)):
+        low, high = table[places[i]], table[places[i] + 1]
+        total += low + shares[i] * (high - low)
+    return total
+
+
+@_jit
+def expect_means(  # type: ignore[no-untyped-def]
+    first, last, light, rows, columns, ratio, row_gain, grid, tables, means
+):
+    """Expected means of the frames `first` to `last`.
+
+    Args:
+        first: First frame.
+        last: One past the last.
+        light: (B,) addresses of (4, R, C) float32.
+        rows: R; 1 where all rows have the same gain.
+        columns: C.
+        ratio: (B, 4) float32, what the light is multiplied by.
+        row_gain: (B, R) float32.
+        grid: G.
+        tables: (B,) addresses of (4, 3, G) float32 of `expect_codes`.
+        means: (B, 3) float64 to write to.
+    """
+    kept, shares = np.empty((2, _BLOCK), np.float32)
+    places = np.empty(_BLOCK, np.int32)
+    size, end_of_grid = rows * columns, np.float32(grid - 1.001)
+    for frame in range(first, last):
+        pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
+        signal = numba.carray(pointer, (4, size))
+        own = numba.carray(as_pointer(tables[frame]), (4, 3, grid))
+        blown = blocked = clean = 0.0
+        for row in range(rows):
+            gain = row_gain[frame, row]
+            for start in range(row * columns, (row + 1) * columns, _BLOCK):
+                end = min(start + _BLOCK, (row + 1) * columns)
+                number = end - start
+                kept[:number] = _ONE
+                for plane in range(4):
+                    factor, part = ratio[frame, plane] * gain, signal[plane, start:end]
+                    brightest = np.int32(0)
+                    for i in range(number):
+                        x = part[i] * factor + _PEDESTAL
+                        place = min(np.sqrt(x if x > _ZERO else _ZERO) * _SCALE, end_of_grid)
+                        places[i] = np.int32(place)
+                        shares[i] = place - np.float32(places[i])
+                        brightest = max(brightest, places[i])
+                    table = own[plane]
+                    blocked += _interpolated(table[1], places[:number], shares)
+                    clean += _interpolated(table[2], places[:number], shares)
+                    if table[0, brightest + 1] > _ZERO:
+                        for i in range(number):
+                            low, high = table[0, places[i]], table[0, places[i] + 1]
+                            kept[i] *= _ONE - (low + shares[i] * (high - low))
+                left = _ZERO
+                for i in range(number):
+                    left += kept[i]
+                blown += number - left
+        means[frame, 0] = blown / size
+        means[frame, 1] = blocked / (4 * size)
+        means[frame, 2] = clean / (4 * size)

@@ -1,0 +1,660 @@
+"""Defocus: uniform discs, and a bank of them that blends a blur for each pixel.
+
+Discs are energy-preserving and, as streaks are (`simulator.optics.motion`), matched in second
+moment: that of a continuous disc is its diameter squared / 16 per axis. On the CPU a disc is a sum
+over shifts; its symmetry saves three of four products.
+
+A bank blurs once with every disc of a few diameters and interpolates between neighbours, per pixel
+and in the *squared* diameter (second moments add, so that is where blur is linear): any map of blur
+diameters and any f-number for the cost of a gather.
+"""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import math
+import operator
+import sys
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.signal import fftconvolve
+from torch import Tensor
+
+from simulator.optics.motion import (
+    GROUP,
+    Taps,
+    add_rows,
+    by_rows,
+    copy_row,
+    has_kernels,
+    motion_kernel,
+    move_rows,
+    pad_rows,
+    streak_share,
+)
+from simulator.raw.image import new_frame
+from simulator.utils.checks import check_number
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges, thread_count
+
+#: Rows per pixel in the numerical integration of a disc's coverage.
+_SUBROWS = 32
+#: Streaks longer than this [pixel] are not written out: they leave next to no noise in any case.
+_LONGEST_KERNEL = 4096.0
+#: Kernels wider than this are applied in the Fourier domain; and where the kernel for the CPU does
+#: the sum of a single image.
+_FFT_TAPS, _DIRECT_TAPS = 11, 25
+#: Discs wider than this are cheaper in the Fourier domain than as a sum, in a batch [pixel].
+_WIDE_PX = 40.0
+#: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
+#: discs is within 2 % of the disc between them.
+DIAMETERS = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6, 32.0)
+_KNOTS = np.array(DIAMETERS) ** 2
+#: How far the largest disc reaches, as a multiple of 4 [pixel].
+HALO = 20
+#: Pixels from which another thread is worth waking for a blend, and pixels blended together.
+_WORTH_A_THREAD, _BLENDED = 2**12, 128
+_ONE = np.float32(1)
+_jit = functools.partial(kernel, fastmath={"contract"})
+_blend_jit = functools.partial(kernel, fastmath={"contract", "nnan", "nsz"})
+
+
+# -- shapes -----------------------------------------------------------------------------------
+
+
+@_jit()  # every new diameter asks for it
+def coverage(radius):  # type: ignore[no-untyped-def]
+    """Area of a disc of `radius` in the pixels of a quadrant, (r + 1, r + 1) float64.
+
+    Over all four quadrants it sums to 1.
+    """
+    reach = max(math.ceil(radius - 0.5), 0)
+    area = np.zeros((reach + 1, reach + 1))
+    for i in range(reach + 1):
+        for k in range(_SUBROWS):
+            y = (k + 0.5) / _SUBROWS + i - 0.5
+            chord = math.sqrt(max(radius**2 - y**2, 0.0))
+            area[i, 0] += 2.0 * min(chord, 0.5)
+            for j in range(1, reach + 1):
+                area[i, j] += min(chord, j + 0.5) - min(chord, j - 0.5)
+    # Loops: numpy's operations on whole arrays compile three times as long.
+    out = np.empty_like(area)
+    first = lower = inner = 0.0
+    for i in range(reach + 1):
+        for j in range(reach + 1):
+            out[i, j] = area[i, j] + area[j, i]  # the quadrature treats rows and columns alike
+            if i:
+                lower += out[i, j]
+                if j:
+                    inner += out[i, j]
+            elif j:
+                first += out[i, j]
+    total = out[0, 0] + 2.0 * (first + lower + inner)
+    for i in range(reach + 1):
+        for j in range(reach + 1):
+            out[i, j] /= total
+    return out
+
+
+def _disc_coverage(radius: float) -> np.ndarray:
+    """Area of a disc of `radius` in each pixel, (K, K), K odd, sums to 1."""
+    rows = coverage(radius)
+    rows = np.concatenate([rows[:0:-1], rows])
+    return np.concatenate([rows[:, :0:-1], rows], axis=1)
+
+
+@functools.cache
+def _radius_table() -> tuple[list[float], list[float]]:
+    """Second moments per axis of covered discs, and their radii: the inverse is interpolated."""
+    radii = np.concatenate([[0.5], 0.5 + np.geomspace(1e-4, 7.5, 700)])
+    profiles = [_disc_coverage(radius).sum(0) for radius in radii]
+    moments = np.array([(p * (np.arange(len(p)) - len(p) // 2) ** 2).sum() for p in profiles])
+    return np.maximum.accumulate(moments).tolist(), radii.tolist()
+
+
+def disc_radius(diameter_px: float) -> float:
+    """Radius of the disc whose coverage has the second moment of one of `diameter_px`.
+
+    At most 0.5 where the diameter is too small to blur anything.
+    """
+    target = diameter_px * diameter_px / 16.0
+    if target < 1e-6:
+        return 0.5
+    moments, radii = _radius_table()
+    if target >= moments[-1]:
+        return 2.0 * math.sqrt(target - 1.0 / 12.0)
+    i = bisect.bisect_right(moments, target)
+    share = (target - moments[i - 1]) / (moments[i] - moments[i - 1])
+    return radii[i - 1] + share * (radii[i] - radii[i - 1])
+
+
+@functools.lru_cache(maxsize=64)
+def disc_kernel(diameter_px: float) -> np.ndarray:
+    """Weights (K, K), K odd, of a uniform disc of `diameter_px` pixels.
+
+    >>> kernel = disc_kernel(3.0)
+    >>> round(float((kernel.sum(0) * [1, 0, 1]).sum()), 2)  # 3**2 / 16
+    0.56
+    """
+    diameter = check_number("diameter_px", diameter_px, 0.0, sys.float_info.max)
+    return _disc_coverage(disc_radius(diameter))
+
+
+@functools.lru_cache(maxsize=4096)
+def kernel_energy(motion_px: float, defocus_px: float) -> float:
+    """Sum of squared weights of both blurs together: the share of white noise's variance left."""
+    disc = disc_kernel(defocus_px)
+    if motion_px > _LONGEST_KERNEL:  # as if it were much longer than the disc is wide
+        n, end = streak_share(motion_px)
+        total = 2 * n + 1 + 2.0 * end
+        return float((disc.sum(axis=1) ** 2).sum()) * (2 * n + 1 + 2.0 * end**2) / total**2
+    streak = motion_kernel(motion_px)
+    if disc.shape[0] == 1:
+        return float((streak**2).sum())
+    both = np.apply_along_axis(np.convolve, 1, disc, streak)
+    return float((both**2).sum())
+
+
+# -- uniform discs ----------------------------------------------------------------------------
+
+
+def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
+    """Defocus by a uniform disc.
+
+    Args:
+        light: (..., H, W) linear light.
+        diameter_px: Diameter of the circle of confusion, in pixels, >= 0.
+
+    Returns:
+        (..., H, W), the same dtype.
+    """
+    weights = disc_kernel(diameter_px)
+    taps = weights.shape[0]
+    if taps == 1:
+        return light
+    height, width = light.shape[-2:]
+    if taps <= _DIRECT_TAPS and has_kernels(light):
+        quadrant, reach = _quadrant(disc_radius(diameter_px))
+        most = np.float32(math.inf)
+        return by_rows(
+            light,
+            None,
+            lambda a, b, rows, out: _disc(a, b, height, rows, quadrant, reach, most, out),
+            cost=len(quadrant) ** 2,
+        )
+    radius = taps // 2
+    padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
+    disc = torch.from_numpy(weights).to(light.device)
+    if taps <= _FFT_TAPS:
+        return F.conv2d(padded, disc[None, None].to(light.dtype)).reshape(light.shape)
+    # float64: a lamp a thousand times above white must not leave ringing in the shadows.
+    size = [height + 2 * radius, width + 2 * radius]
+    spectrum = torch.fft.rfft2(padded.double()) * torch.fft.rfft2(disc, s=size)
+    blurred = torch.fft.irfft2(spectrum, s=size)[..., 2 * radius :, 2 * radius :]
+    return blurred.to(light.dtype).reshape(light.shape)
+
+
+class Blur(NamedTuple):
+    """One image for `blur_many`: a disc, a streak, or one after the other.
+
+    Args:
+        light: (..., H, W) contiguous float32 on the CPU.
+        diameter_px: Of the disc, in pixels, >= 0.
+        defocused: Like `light`; the image behind the disc is written here. None for no disc.
+        extent_px: Of the streak, in pixels, >= 0.
+        moved: Like `light`; the image behind both is written here. None for no streak.
+    """
+
+    light: Tensor
+    diameter_px: float = 0.0
+    defocused: Tensor | None = None
+    extent_px: float = 0.0
+    moved: Tensor | None = None
+
+
+def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
+    """Blurs images of one shape: as `disc_blur` and `motion_blur`, but each image on one thread.
+
+    Args:
+        blurs: The images and their blurs; (P, H, W) each where a disc is wide.
+        limit: See `simulator.optics.motion.motion_blur`.
+    """
+    wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
+    if wide:
+        parallel_ranges(lambda a, b: [_wide_disc(blur, limit) for blur in wide[a:b]], len(wide))
+        blurs = [b for b in blurs if b.defocused is None or b.diameter_px <= _WIDE_PX]
+        moved_on = [b for b in wide if b.moved is not None]
+        blurs += [Blur(b.defocused, extent_px=b.extent_px, moved=b.moved) for b in moved_on]  # type: ignore[arg-type]
+    if not blurs:
+        return
+    # The costliest first, and dealt out in turn: every thread gets about as much to do.
+    shares = min(thread_count(), len(blurs))
+    ranked = sorted(blurs, key=lambda blur: -blur.diameter_px)
+    blurs = [blur for share in range(shares) for blur in ranked[share::shares]]
+    light = blurs[0].light
+    height, width = light.shape[-2:]
+    planes = light.numel() // (height * width)
+    lights = addresses([blur.light for blur in blurs])
+    defocused = addresses([blur.defocused for blur in blurs])
+    moved = addresses([blur.moved for blur in blurs])
+    images, most = (planes, height, width, lights, defocused), np.float32(limit)
+    if defocused.any():
+        radius = np.array([disc_radius(blur.diameter_px) for blur in blurs])
+    if moved.any():
+        whole, end = np.array([streak_share(blur.extent_px) for blur in blurs]).T.copy()
+        streaks = (moved, whole.astype(np.int64), end)
+
+    def run(first: int, last: int) -> None:
+        if defocused.any():
+            _defocus_some(first, last, *images, radius, most)
+        if moved.any():
+            _move_some(first, last, *images, *streaks, most)
+
+    parallel_ranges(run, len(blurs))
+
+
+def _wide_disc(blur: Blur, limit: float) -> None:
+    """`disc_blur` by numpy, whose transforms are safe in a forked process."""
+    assert blur.defocused is not None
+    weights = disc_kernel(blur.diameter_px)
+    radius = len(weights) // 2
+    light = np.clip(blur.light.numpy(), -limit, limit).astype(np.float64)
+    padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
+    size = padded.shape[-2:]
+    spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
+    blurred = np.fft.irfft2(spectrum, s=size)
+    blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
+
+
+@_jit()
+def _add_scaled(a, weight, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] += weight * a[x]
+
+
+@_jit()
+def _add_product(a, b, weight, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] += weight * (a[x] + b[x])
+
+
+@_jit()
+def _disc(first, last, height, rows, weights, reach, limit, out):  # type: ignore[no-untyped-def]
+    width, radius = rows.shape[1], len(weights) - 1
+    pitch = width + 2 * radius
+    many = max(1, min(height, GROUP // pitch))
+    padded = np.empty((many + 2 * radius, pitch), np.float32)
+    flat = padded.reshape(-1)
+    size = many * pitch
+    total, both = np.zeros((many, pitch), np.float32), np.zeros(size, np.float32)
+    inner = total.reshape(-1)[radius : size - radius]
+    y = first
+    while y < last:
+        top = y // height * height
+        count = min(many, last - y, top + height - y)
+        pad_rows(rows, y - radius, top, top + height, radius, limit, padded)
+        for i in range(radius + 1):
+            above, below = (radius - i) * pitch, (radius + i) * pitch
+            if i:
+                add_rows(flat[above : above + size], flat[below:], both)
+            else:
+                copy_row(flat[above:], both)
+                inner[:] = np.float32(0)
+            _add_scaled(both[radius:], weights[i, 0], inner)
+            for j in range(1, reach[i] + 1):
+                _add_product(both[radius - j :], both[radius + j :], weights[i, j], inner)
+        for i in range(count):
+            row = np.uint64(y + i)
+            for x in range(width):
+                out[row, x] = total[i, np.uint64(radius + x)]
+        y += count
+
+
+@_jit()
+def _quadrant(radius):  # type: ignore[no-untyped-def]
+    """Weights (r + 1, r + 1) of a disc's quadrant, and the last non-zero one of each row."""
+    weights = coverage(radius).astype(np.float32)
+    reach = np.zeros(len(weights), np.int64)
+    for i in range(len(weights)):
+        for j in range(len(weights)):
+            if weights[i, j] > 0:
+                reach[i] = j
+    return weights, reach
+
+
+# Two kernels for the two blurs: what compiles slowly and is not needed is not compiled.
+@_jit()
+def _defocus_some(  # type: ignore[no-untyped-def]
+    first, last, planes, height, width, light, defocused, radius, limit
+):
+    """Images `first` to `last` behind discs; an address of 0 to write to leaves one out."""
+    shape = (planes * height, width)
+    for i in range(first, last):
+        if defocused[i]:
+            rows = numba.carray(as_pointer(light[i]), shape)  # type: ignore[attr-defined, call-arg]
+            out = numba.carray(as_pointer(defocused[i]), shape)
+            weights, reach = _quadrant(radius[i])
+            _disc(0, len(rows), height, rows, weights, reach, limit, out)
+
+
+@_jit()
+def _move_some(  # type: ignore[no-untyped-def]
+    first, last, planes, height, width, light, defocused, moved, whole, end, limit
+):
+    """Images `first` to `last` behind streaks, of what is `defocused` where there is that."""
+    shape = (planes * height, width)
+    for i in range(first, last):
+        if moved[i]:
+            source = defocused[i] if defocused[i] else light[i]
+            rows = numba.carray(as_pointer(source), shape)  # type: ignore[attr-defined, call-arg]
+            out = numba.carray(as_pointer(moved[i]), shape)
+            move_rows(0, len(rows), rows, whole[i], end[i], limit, out)
+
+
+# -- a bank of discs --------------------------------------------------------------------------
+
+
+def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | float) -> Tensor:
+    """Diameter of the disc that turns the blur at `f_source` into that at `f_target` [pixel].
+
+    The circle of confusion grows with 1 / N and squared diameters add: the difference of squares,
+    ``c^2 ((N_1 / N_2)^2 - 1)``, 0 where the aperture closes.
+    """
+    ratio = torch.as_tensor(f_source) / torch.as_tensor(f_target)
+    return diameter * (ratio.square() - 1.0).clamp(min=0.0).sqrt().to(diameter)
+
+
+class DiscBank:
+    """An image behind every disc of the bank; each blur is computed when it is first needed.
+
+    Args:
+        image: (..., H, W) linear light. No gradient flows into it.
+    """
+
+    def __init__(self, image: Tensor) -> None:
+        self._levels = {0: image.detach()}
+
+    def level(self, index: int) -> Tensor:
+        """The image behind disc `index` of `DIAMETERS`."""
+        if index not in self._levels:
+            self._levels[index] = disc_blur(self._levels[0], DIAMETERS[index])
+        return self._levels[index]
+
+    def blurred(self, diameter: Tensor, out: Tensor | None = None) -> Tensor:
+        """The image blurred by `diameter`, differentiable in it.
+
+        Args:
+            diameter: (..., H, W) blur diameter of each pixel [pixel], >= 0, broadcast against the
+                image; beyond the largest disc of the bank it stays there.
+            out: Contiguous float32 tensor like the image to write to, instead of a new one, where
+                image and diameters are on the CPU.
+        """
+        image, frame = self._levels[0], _frame_of(diameter)
+        if frame is not None and frame.shape == image.shape[-2:] and has_kernels(image):
+            return self._blended(frame, out)
+        weights = _weights(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
+        return functools.reduce(operator.add, (self.level(i) * weight for i, weight in weights))
+
+    def _blended(self, diameter: Tensor, out: Tensor | None) -> Tensor:
+        """`blurred` by kernels, by `diameter` (H, W)."""
+        diameters, knots = diameter.contiguous().numpy(), _KNOTS.astype(np.float32)
+        used = np.zeros(len(knots), np.bool_)
+        _mark(diameters, knots, used)
+        light, indices = self._levels[0].contiguous(), np.flatnonzero(used).tolist()
+        made = {i: torch.empty_like(light) for i in indices if i not in self._levels}
+        # Several levels side by side wake the other threads once.
+        blur_many([Blur(light, DIAMETERS[index], level) for index, level in made.items()])
+        self._levels |= made
+        # Levels without a share are read too, times 0: any image does.
+        levels = [self._levels[i].contiguous() if used[i] else light for i in range(len(knots))]
+        out = new_frame(light) if out is None else out
+        fixed = (diameters, knots, addresses(levels), out.numel())
+        result, (height, width) = out.numpy().reshape(-1, *out.shape[-2:]), out.shape[-2:]
+        parallel_ranges(
+            lambda first, last: _blend(first, last, *fixed, result),
+            height,
+            least=1 + _WORTH_A_THREAD // width,
+        )
+        return out
+
+
+def _frame_of(diameter: Tensor) -> Tensor | None:
+    """The diameters as one frame (H, W) that the kernels take; None if they are not.
+
+    Nothing is learnt through the kernels: a gradient takes the other way.
+    """
+    learns = diameter.requires_grad and torch.is_grad_enabled()
+    frame = diameter.detach()
+    if learns or not has_kernels(frame) or frame.ndim < 2 or frame.numel() == 0:
+        return None
+    size = frame.shape[-2:]
+    return frame.reshape(size) if frame.numel() == size.numel() else None
+
+
+def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
+    """(index, weight) of every disc that some pixel needs: hat functions of squared diameter."""
+    knots = _KNOTS.tolist()
+    low, high = (float(v) for v in torch.aminmax(squared.detach()))
+    for index, knot in enumerate(knots):
+        before = knots[index - 1] if index else -1.0
+        after = knots[index + 1] if index + 1 < len(knots) else knot + 1.0
+        if before < high and low < after and not (high <= before or low >= after):
+            rising = (squared - before) / (knot - before)
+            falling = (after - squared) / (after - knot)
+            yield index, torch.minimum(rising, falling).clamp(min=0.0)
+
+
+def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
+    """Share of white noise's variance that `DiscBank.blurred` leaves, per pixel of `diameter`.
+
+    The sum of squared weights of the blended kernel,
+    ``(1 - t)^2 E_aa + 2 t (1 - t) E_ab + t^2 E_bb`` between discs a and b.
+
+    Args:
+        diameter: (..., H, W) blur diameter of each pixel [pixel].
+        taps: Of a motion behind the discs; None for none.
+    """
+    products = _kernel_products() if taps is None else _moved_products(taps, diameter)
+    ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
+    frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
+    out = torch.empty(frame.shape)
+    fixed = (frame.contiguous().numpy(), _KNOTS.astype(np.float32), ends.astype(np.float32))
+    parallel_ranges(
+        lambda first, last: _evaluate(first, last, *fixed, out.numpy()),
+        len(frame),
+        least=1 + _WORTH_A_THREAD // frame.shape[1],
+    )
+    return out.reshape(diameter.shape).to(diameter)
+
+
+@functools.cache
+def _kernel_products() -> np.ndarray:
+    """(K, K) sums of products of the weights of each disc and itself or its successor."""
+    kernels = [disc_kernel(d) for d in DIAMETERS]
+    products = np.zeros((len(kernels), len(kernels)))
+    for i, disc in enumerate(kernels):
+        products[i, i] = (disc**2).sum()
+        if i + 1 < len(kernels):
+            larger = kernels[i + 1]
+            margin = (larger.shape[0] - disc.shape[0]) // 2
+            inner = larger[margin : margin + disc.shape[0], margin : margin + disc.shape[0]]
+            products[i, i + 1] = (disc * inner).sum()
+    return products
+
+
+@functools.cache
+def _correlations() -> np.ndarray:
+    """(K, 2, R, R) correlations of a disc with itself and its successor; the middle is no shift."""
+    kernels = [disc_kernel(d) for d in DIAMETERS]
+    size = 2 * kernels[-1].shape[0] - 1
+    found = np.zeros((len(kernels), 2, size, size))
+    for i, disc in enumerate(kernels):
+        for j, other in enumerate(kernels[i : i + 2]):
+            # Discs are symmetric: their convolution is their correlation.
+            both = fftconvolve(disc, other)
+            margin = (size - len(both)) // 2
+            inner = slice(margin, margin + len(both))
+            found[i, j, inner, inner] = both
+    return found
+
+
+def _moved_products(taps: Taps, diameter: Tensor) -> np.ndarray:
+    """`_kernel_products` of discs behind which there is a motion, up to the largest `diameter`."""
+    largest = float(diameter.max())
+    count = min(int(np.searchsorted(DIAMETERS, largest)) + 1, len(DIAMETERS))
+    products = np.zeros((len(DIAMETERS), len(DIAMETERS)))
+    weights = taps.weights.astype(np.float64)
+    _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
+    return products
+
+
+# Each pixel looks up the two images around its squared diameter and interpolates between them: no
+# weight is ever stored for a whole frame, and no image is read where it has none.
+@_blend_jit()
+def _square(diameter, largest, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        squared = diameter[x] * diameter[x]
+        out[x] = squared if squared < largest else largest
+
+
+@_blend_jit()
+def _extremes(values):  # type: ignore[no-untyped-def]
+    low = high = values[0]
+    for x in range(len(values)):
+        low = values[x] if values[x] < low else low
+        high = values[x] if values[x] > high else high
+    return low, high
+
+
+@_blend_jit()
+def _below(knots, value):  # type: ignore[no-untyped-def]
+    """The last interval between `knots` that begins at `value` or before."""
+    index = 0
+    while index < len(knots) - 2 and knots[index + 1] <= value:
+        index += 1
+    return index
+
+
+@_blend_jit()
+def _place(squared, knots, index, share):  # type: ignore[no-untyped-def]
+    """In which interval between `knots` each value is, and how far in it from 0 to 1."""
+    index[:] = 0
+    for knot in knots[1:-1]:
+        for x in range(len(index)):
+            index[x] += np.int32(squared[x] >= knot)
+    for x in range(len(index)):
+        low, high = knots[index[x]], knots[index[x] + 1]
+        share[x] = (squared[x] - low) / (high - low)
+
+
+@_blend_jit()
+def _blend(first, last, diameter, knots, images, samples, out):  # type: ignore[no-untyped-def]
+    """Rows from `first` to `last`; `images` are the addresses of (P, H, W)."""
+    planes, height, width = out.shape
+    squares, shares = np.empty(_BLENDED, np.float32), np.empty(_BLENDED, np.float32)
+    indexes = np.empty(_BLENDED, np.int32)
+    for y in range(first, last):
+        for start in range(0, width, _BLENDED):
+            end = min(start + _BLENDED, width)
+            size = end - start
+            squared, index, share = squares[:size], indexes[:size], shares[:size]
+            _square(diameter[y, start:end], knots[-1], squared)
+            _place(squared, knots, index, share)
+            for plane in range(planes):
+                target = out[plane, y, start:end]
+                offset = (plane * height + y) * width + start
+                for x in range(size):
+                    pointer = as_pointer(images[index[x]])  # type: ignore[call-arg, var-annotated]
+                    one = numba.carray(pointer, (samples,))
+                    other = numba.carray(as_pointer(images[index[x] + 1]), (samples,))
+                    least = (_ONE - share[x]) * one[np.uint64(offset + x)]
+                    target[x] = least + share[x] * other[np.uint64(offset + x)]
+
+
+@_blend_jit()
+def _mark(diameter, knots, used):  # type: ignore[no-untyped-def]
+    """Marks the images around the diameters of each group of pixels."""
+    width = diameter.shape[1]
+    squares = np.empty(_BLENDED, np.float32)
+    for y in range(len(diameter)):
+        for start in range(0, width, _BLENDED):
+            end = min(start + _BLENDED, width)
+            squared = squares[: end - start]
+            _square(diameter[y, start:end], knots[-1], squared)
+            low, high = _extremes(squared)
+            stop = _below(knots, high)
+            used[_below(knots, low) + (low == knots[-1]) : stop + 1] = True
+            used[stop + 1] |= high > knots[stop]
+
+
+@_blend_jit()
+def _evaluate(first, last, diameter, knots, ends, out):  # type: ignore[no-untyped-def]
+    """Quadratic pieces between `knots`: `ends` (K - 1, 3) are their products."""
+    for y in range(first, last):
+        for x in range(diameter.shape[1]):
+            squared = min(diameter[y, x] * diameter[y, x], knots[-1])
+            index = _below(knots, squared)
+            share = (squared - knots[index]) / (knots[index + 1] - knots[index])
+            rest = _ONE - share
+            both = rest * ends[index, 1] + rest * ends[index, 1] + share * ends[index, 2]
+            out[y, x] = rest * rest * ends[index, 0] + share * both
+
+
+@_blend_jit()
+def _sum_products(correlations, rows, columns, weights, products):  # type: ignore[no-untyped-def]
+    """Sums of correlations over all pairs of taps, by their products of weights."""
+    count, _, size, _ = correlations.shape
+    middle = size // 2
+    for k in range(len(weights)):
+        for n in range(len(weights)):
+            y, x = rows[k] - rows[n] + middle, columns[k] - columns[n] + middle
+            if 0 <= y < size and 0 <= x < size:
+                for i in range(count):
+                    both = weights[k] * weights[n]
+                    products[i, i] += both * correlations[i, 0, y, x]
+                    if i + 1 < len(products):
+                        products[i, i + 1] += both * correlations[i, 1, y, x]
+
+
+# -- boxes ------------------------------------------------------------------------------------
+
+
+def box_mean(x: Tensor, window: int) -> Tensor:
+    """Mean over `window` x `window` pixels, borders repeated.
+
+    Sums over 1, 2, 4, 8 ... pixels are doubled from one another: a few additions of whole images
+    where pooling would read every pixel `window` times.
+
+    Args:
+        x: (B, C, H, W).
+        window: Odd side of the window [pixel].
+
+    Returns:
+        (B, C, H, W).
+    """
+    height, width = x.shape[-2:]
+    padded = F.pad(x, (window // 2,) * 4, mode="replicate")
+    rows = _running_sum(padded, window, -2, height)
+    return _running_sum(rows, window, -1, width) / (window * window)
+
+
+def _running_sum(x: Tensor, window: int, axis: int, size: int) -> Tensor:
+    """Sums of `window` neighbours along `axis`, the first `size` of them."""
+    total: Tensor | None = None
+    done, span = 0, 1
+    while True:
+        if window & span:
+            part = x.narrow(axis, done, size)
+            total = part if total is None else total + part
+            done += span
+        if 2 * span > window:
+            assert total is not None
+            return total
+        length = x.shape[axis] - span
+        x = x.narrow(axis, 0, length) + x.narrow(axis, span, length)
+        span *= 2
