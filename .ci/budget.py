@@ -13,7 +13,7 @@ PACKAGES = ("simulator", "ae_env", "agents")
 #: A function is counted without its docstring.
 #: The lines are what stands today and only go down: the aims are 38,000, 7,000 and 19,000.
 MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 43_900, 140, 60, 15
-MAX_LINES_OF = {"benchmarks": 10_500, "tests": 25_300}
+MAX_LINES_OF = {"benchmarks": 8_750, "tests": 25_300}
 
 
 def module_name(path: Path) -> str:
