@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from scipy.optimize import nnls
+from scipy.stats import spearmanr
 
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
@@ -133,15 +134,23 @@ def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str,
     rendered = np.broadcast_to(LEVELS[defect], estimated.shape)[chosen]
     values, groups = estimated[chosen], np.array([scene.group for scene in scenes])[chosen]
     errors = pd.Series(np.abs(values - rendered).mean(axis=1)).groupby(groups).mean().to_numpy()
-    frame, truth = pd.DataFrame(values.T), pd.Series(LEVELS[defect])
-    within = frame.corrwith(truth, method="spearman").fillna(0.0)  # 0 where nothing varies
-    over_all = pd.Series(values.ravel()).corr(pd.Series(rendered.ravel()), method="spearman")
+    within = np.mean([_spearman(v, r) for v, r in zip(values, rendered, strict=True)])
     row: Row = {"part": "own", "measure": f"analytic_{defect}", "scenes": which}
     row |= {"resolution": scenes[0].light.shape[-1], "num_scenes": len(values)}
-    row |= {"num_groups": len(errors), "spearman": over_all, "mae": float(errors.mean())}
-    row |= {"spearman_within_scene": within.mean(), "mae_ci95": interval(errors, seed, RESAMPLES)}
+    row |= {
+        "num_groups": len(errors),
+        "spearman": _spearman(values.ravel(), rendered.ravel()),
+        "mae": float(errors.mean()),
+    }
+    row |= {"spearman_within_scene": float(within), "mae_ci95": interval(errors, seed, RESAMPLES)}
     constant = np.abs(rendered - np.median(LEVELS[defect])).mean()
     return row | {"mae_of_a_constant": float(constant)}
+
+
+def _spearman(first: np.ndarray, second: np.ndarray) -> float:
+    """Spearman's coefficient; 0 where one of the two does not vary."""
+    varies = min(np.ptp(first), np.ptp(second)) >= 1e-12
+    return float(spearmanr(first, second).statistic) if varies else 0.0
 
 
 def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:

@@ -379,8 +379,9 @@ def _difference(
     row["text"] = f"{found.value:+.3f}"
     if found.pair is not None:
         row["text"] += " [{:+.3f}, {:+.3f}]".format(*found.pair)
-    mark = "**" if found.significant else ""
-    return row | {"beyond": found.significant, "text": mark + row["text"] + mark}
+    beyond = found.pair is not None and not found.pair[0] <= 0.0 <= found.pair[1]
+    mark = "**" if beyond else ""
+    return row | {"beyond": beyond, "text": mark + row["text"] + mark}
 
 
 # -- picture --------------------------------------------------------------------------------------

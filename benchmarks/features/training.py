@@ -129,8 +129,7 @@ def mapped(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
 
 def inside(points: np.ndarray, size: int, border: float = 0.0) -> np.ndarray:
     """(N,) whether points lie in a crop."""
-    within: np.ndarray = ((points >= border) & (points <= size - 1 - border)).all(axis=1)
-    return within
+    return np.asarray(((points >= border) & (points <= size - 1 - border)).all(axis=1))
 
 
 def two_crops(
