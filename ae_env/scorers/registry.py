@@ -2,8 +2,8 @@
 
 | file | scorers |
 |---|---|
-| `composite.py` | `balanced`, weighted means |
-| `terms.py` | `brightness`, `highlights`, `shadows`, `noise`, `sharpness`, `banding` |
+| `terms.py` | weighted means, `balanced`; `brightness`, `highlights`, `shadows`, `noise`, |
+| | `sharpness`, `banding` |
 | `measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy`; `shim`, |
 | | `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
@@ -22,9 +22,9 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-from ae_env.scorers import composite, defects, fidelity, learnt, measures, terms
+from ae_env.scorers import defects, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
-from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.terms import CompositeScorer
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
@@ -34,7 +34,7 @@ PYIQA = "pyiqa"
 Factory = TypeVar("Factory", bound=Callable[[], Any])
 
 _REGISTRY: dict[str, Callable[[], Any]] = {
-    "balanced": composite.Balanced,
+    "balanced": terms.Balanced,
     "brightness": terms.Brightness,
     "highlights": terms.Highlights,
     "shadows": terms.Shadows,
