@@ -294,7 +294,8 @@ class Defects(CompositeScorer):
     worst_share = 0.75
 
     def __init__(self) -> None:
-        super().__init__({name: measure() for name, measure in ANALYTIC.items()})
+        parts: dict[str, Any] = {name: measure() for name, measure in ANALYTIC.items()}
+        super().__init__(parts)
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total score from the parts' scores: tensors or arrays of any one shape."""

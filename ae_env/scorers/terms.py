@@ -412,7 +412,7 @@ class Balanced(CompositeScorer):
     """
 
     def __init__(self) -> None:
-        parts: dict[str, Scorer] = {
+        parts: dict[str, Any] = {
             "brightness": Brightness(),
             "highlights": Highlights(),
             "shadows": Shadows(),
