@@ -151,7 +151,7 @@ class Scene:
         return LightStatistics(self.light)  # computes each value when it is first asked for
 
     def own_blur(self, f_number: float) -> float:
-        """Root mean square of the scene's own circle of confusion at `f_number` (effective) [pixel].
+        """Root mean square of the scene's own circle of confusion at an effective f-number [px].
 
         It grows as the aperture opens; a smaller aperture than the reference's leaves its blur. 0
         without a `defocus_map`.
