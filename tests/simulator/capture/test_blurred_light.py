@@ -189,9 +189,7 @@ def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
     ]
 
 
-def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(
-    made: list[tuple[str, float]],
-) -> None:
+def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(made: list[tuple[str, float]]) -> None:
     blurred_light = BlurredLight(LIGHT, (), ZERO, None, cache_bytes=2 * LIGHT.nbytes)
     for disc in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0):
         found = blurred_light.blurred(replace(STILL, defocus_px=disc))

@@ -230,7 +230,7 @@ def test_black_offset_moves_the_numbers_but_not_the_noise_of_light():
 
 
 def test_drawn_bodies():
-    assert BodyError.none().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
+    assert BodyError().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
     bodies = [BodyError.draw(Z6, seed) for seed in range(300)]
     assert bodies[5] == BodyError.draw(Z6, 5) != bodies[6]
     assert pickle.loads(pickle.dumps(bodies[5])) == bodies[5]  # for workers of a data loader
