@@ -210,8 +210,7 @@ class Pool:
     """Memory for the light of a batch's scenes: new memory costs more than what is written to it.
 
     Args:
-        keeps: Whether the defocused light of every f-number is kept until its scene is forgotten;
-            else only that of the latest.
+        keeps: See `cache_light` of `simulator.capture.batch.CaptureBatch`.
     """
 
     def __init__(self, keeps: bool) -> None:

@@ -298,10 +298,7 @@ class PreparedScene:
     ) -> SimulationPlan:
         """Steps, reasons, predicted error and cost of a capture at `settings`.
 
-        Args:
-            settings: Settings to simulate.
-            noise: False plans `expected`, the light without noise, instead of a capture.
-            gain: Light relative to this scene's.
+        Without `noise`, of `expected`; the arguments are those of `exposure`.
         """
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
@@ -319,8 +316,7 @@ class PreparedScene:
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
 
-        Shot and read noise are compared apart, so that a mixed case is stated too high rather than
-        too low.
+        Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
         exposure = self.exposure(settings)
         source = exposure.source_noise.scaled(float(self.box_factor**2))
@@ -339,9 +335,7 @@ class PreparedScene:
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
         """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped.
 
-        Args:
-            settings: Settings to simulate.
-            gain: Light relative to this scene's.
+        The light is `gain` times this scene's.
         """
         exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
