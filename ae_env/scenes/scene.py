@@ -226,10 +226,7 @@ class Scene:
 
     @classmethod
     def from_raw(cls, raw: RawImage, *, scene_id: str, kind: str = "raw", **fields: Any) -> Scene:
-        """A scene from a raw photograph: its light, its noise, its saturated pixels.
-
-        Saturated pixels are neutral (`simulator.raw.develop`), so that they stay so when they
-        are darkened.
+        """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
         Args:
             raw: The photograph; its settings become the reference.
@@ -295,10 +292,10 @@ class Scene:
                 ``"native"`` cuts R x R pixels out of the middle, ``k = 1``.
 
         Returns:
-            The scene with ``nlf / k**2`` and ``box_factor * k``; a pixel counts as saturated if
-            any pixel averaged into it was. `defocus_map` is the root of the mean square, as second
-            moments add, divided by k: in pixels of the new light. The defocus of `layout` is the
-            mean, its subject where that has most of a pixel.
+            The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
+            was averaged into it was. `defocus_map` is the root mean square, as second moments add,
+            divided by k. The defocus of `layout` is the mean, its subject where that has most of a
+            pixel.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
@@ -476,9 +473,8 @@ class SceneRequest:
     Args:
         split: ``"train"``, ``"test"`` or ``"all"``.
         camera: Camera in whose colours light is stated, unless a raw brings its own.
-        resolution: Packed pixels a side; None keeps each scene's own size.
-        crop: See `Scene.resized`.
-        resize: Brings each scene to `resolution`, as `Scene.resized` does.
+        resolution, crop: See `Scene.resized`.
+        resize: Brings each scene to that size, as `Scene.resized` does.
     """
 
     split: Split

@@ -237,14 +237,10 @@ def _bent(light: Floats, share: float, rng: np.random.Generator) -> Floats:
 
 
 def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
-    """What an average meter reads on frames exposed for the light three frames before.
+    """What an average meter reads on frames exposed for the light three frames before, (B, T).
 
     A frame is 64 luminances, normal in stops with a mean of 1; each exposure is off by about half a
-    stop, and of a grid of whole stops.
-
-    Args:
-        light: (B, T) EV100.
-        rng: Draws the scenes and the errors.
+    stop, and of a grid of whole stops. `light` (B, T) is in EV100; `rng` draws scenes and errors.
 
     Returns:
         The readings, matched where frames clip, and the EV100 of the exposures, (B, T) each.

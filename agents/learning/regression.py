@@ -242,11 +242,7 @@ class RegressionPolicy(NetworkPolicy):
         return weighted / precisions
 
     def forget(self, done: NDArray[np.bool_]) -> None:
-        """Forgets the frames of the environments that `done` marks, such as ended episodes.
-
-        Raises:
-            ValueError: With foresight, which forgets all of them only, in `reset`.
-        """
+        """Forgets the frames of the environments that `done` marks; not with foresight."""
         if self._foresight is not None and done.any():
             raise ValueError(
                 "`forget` works without `foresight`; call reset() for all environments"

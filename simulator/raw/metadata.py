@@ -42,13 +42,8 @@ _NAMES = (
     *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),
     *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
-    *(
-        "StandardOutputSensitivity",
-        "DateTimeOriginal",
-        "FocalLength",
-        "UserComment",
-        "DefaultScale",
-    ),
+    *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
+    "DefaultScale",
 )
 _NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
@@ -60,14 +55,10 @@ _MAX_DIRECTORIES, _MAX_TAGS, _MAX_VALUES = 64, 4096, 2**18
 
 
 def read_directories(stream: BinaryIO) -> list[Directory]:
-    """The tags of all directories of a TIFF-structured file, SubIFDs and EXIF included.
+    """The tags of all directories of a TIFF-structured file, SubIFDs and EXIF included, in order.
 
-    Args:
-        stream: The file. At most a few megabytes of it are read, whatever it claims.
-
-    Returns:
-        One directory each that holds any of the tags above, in reading order. Damaged directories
-        and tags are left out; the list is empty if the file is not TIFF-structured.
+    At most a few megabytes of the file are read, whatever it claims. Damaged directories and tags
+    are left out; the list is empty if the file is not TIFF-structured.
     """
     head = _read_at(stream, 0, 8)
     form = {b"II": tifffile.TIFF.CLASSIC_LE, b"MM": tifffile.TIFF.CLASSIC_BE}.get(head[:2])
@@ -201,12 +192,7 @@ def is_raw_container(stream: BinaryIO) -> bool:
 
 
 def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple[str, str]:
-    """Make and model as the camera recorded them; ``("", "")`` where the file does not say.
-
-    Args:
-        stream: The file.
-        directories: Its TIFF directories, empty for other containers.
-    """
+    """Make and model as the camera recorded them; ``("", "")`` where the file does not say."""
     for tags in directories:
         if "Model" in tags:
             return str(tags.get("Make", ("",))[0]), str(tags["Model"][0])
@@ -368,11 +354,8 @@ def read_black_level(
 ) -> tuple[float, float, float, float] | None:
     """Black level per plane R, G1, G2, B with its fraction; None for other forms of the tag.
 
-    Args:
-        directories: The file's.
-        cfa: Order of the colour filter array at `origin`.
-        origin: Row and column of the file's array where the mosaic begins. The tag's tile begins
-            at the corner of the ActiveArea (DNG specification 1.4).
+    `cfa` is the order at `origin`, the row and column of the file's array where the mosaic begins.
+    The tag's tile begins at the corner of the ActiveArea (DNG specification 1.4).
     """
     tags = next((tags for tags in directories if "BlackLevel" in tags), None)
     if tags is None or "BlackLevelDeltaH" in tags or "BlackLevelDeltaV" in tags:

@@ -23,7 +23,6 @@ from simulator import (
 from simulator.camera import BayerPattern, CameraProfile
 from simulator.raw.develop import (
     apply_tone,
-    demosaic_half,
     demosaic_malvar,
     develop_inverse,
     neutral_highlights,
@@ -226,12 +225,6 @@ def test_malvar_border_is_that_of_a_mirrored_mosaic(pattern, size):
     mirrored = np.pad(mosaic, 4, mode="reflect")
     theirs = demosaicing_CFA_Bayer_Malvar2004(mirrored, pattern)[4:-4, 4:-4]
     np.testing.assert_allclose(ours, theirs, atol=1e-14)
-
-
-def test_half_is_one_pixel_per_tile():
-    rgb = demosaic_half(torch.arange(2 * 4 * 2 * 3.0).reshape(2, 4, 2, 3))
-    assert rgb.shape == (2, 3, 2, 3)
-    assert rgb[1, :, 0, 2].tolist() == [26.0, 35.0, 44.0]  # of 26, 32, 38, 44
 
 
 @pytest.mark.gpu

@@ -222,8 +222,6 @@ def test_a_recorded_mosaic_serves_only_where_it_is_quiet() -> None:
 
 
 def test_pictures_and_crops_that_are_none() -> None:
-    with pytest.raises(ValueError, match=r"`light`.* of 'a'"):
-        picture(2, 8, 8)
     for pictures, bodies in (([], [Z6]), ([flat()], [])):
         with pytest.raises(ValueError, match="`pictures` and `cameras`"):
             DetailCrops(pictures, bodies)

@@ -23,16 +23,17 @@ from simulator import CameraSettings, get_camera
 from simulator.capture.statistics import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
-from simulator.reference.camera import (
-    DRAPED,
-    MOSAIC,
-    ReferenceCamera,
-    ReferenceScene,
-)
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import train
-from simulator.training.data import DetailCrops, DetailPicture, ReferencePairs, draw_sequences
+from simulator.training.data import (
+    DetailCrops,
+    DetailPicture,
+    ReferencePairs,
+    draw_sequences,
+    no_progress,
+)
 from simulator.training.train import (
     Clock,
     SimulatorConfig,
@@ -75,7 +76,7 @@ def quick_calibration():
 
 
 def save(
-    folder: Path, *given: Any, progress: Any = None, scenes: Any = scenes, **changes: Any
+    folder: Path, *given: Any, progress: Any = no_progress, scenes: Any = scenes, **changes: Any
 ) -> Path:
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
