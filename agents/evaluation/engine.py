@@ -311,7 +311,7 @@ class EvaluationRun:
         return policy
 
     def run_policy(
-        self, name: str, policy: Policy, condition: Condition, light: Arrays | None, report: Report
+        self, name: str, policy: Policy, condition: Condition, light: Arrays, report: Report
     ) -> Track:
         """Runs `policy`, which is fitted, through all episodes of `condition`.
 
@@ -329,8 +329,6 @@ class EvaluationRun:
             return self._run_brackets(name, policy, condition, report)
         oracle: Ints | None = None
         if getattr(policy, "privileged", False):
-            if light is None:
-                raise ValueError(f"policy {name!r} is privileged: it needs the score tables")
             oracle = best_states(light["scores"], light["allowed"])
         frames, episodes = self.plan.frames, self.episodes
         envs = self._make_envs(condition, batch_size(len(episodes), self.batch), frames)

@@ -81,17 +81,8 @@ def difference_interval(
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
         seed: Seed of the resampling.
-
-    Raises:
-        ValueError: If the shapes do not agree.
     """
-    first, second = np.atleast_2d(gains), np.atleast_2d(other)
-    groups = len(span)
-    if first.shape[1] != groups or second.shape[1] != groups:
-        raise ValueError(
-            f"`gains` (={first.shape}) and `other` (={second.shape}) must have one column for each "
-            f"of the {groups} groups of `span`"
-        )
+    first, second, groups = np.atleast_2d(gains), np.atleast_2d(other), len(span)
     value = float((first.mean(0) - second.mean(0)).sum() / span.sum())
     seeds = max(len(first), len(second))
     if groups < MIN_GROUPS:

@@ -191,7 +191,7 @@ class Jobs(EvaluationRun):
             return
         policy = self.fitted(job.trained, conditions[0])
         for condition in conditions:
-            light = self.light(condition) if getattr(policy, "privileged", False) else None
+            light = self.light(condition) if getattr(policy, "privileged", False) else {}
             track = self.run_policy(
                 *(job.trained.name, policy, condition, light),
                 report=lambda frames: report(frames * _FRAME_MS),

@@ -271,14 +271,14 @@ def write_report(
     title = f"{rows.source[0]}, {rows.split[0]} split"
     title = title if result.plan is None else result.plan.name
     ends = pd.DataFrame([pair or (None, None) for pair in rows.ci95])
-    plain = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
-    contract = [name for name in ROW_COLUMNS if name != "ci95"]
-    plain = plain[[*contract, "ci95_low", "ci95_high", *MORE_COLUMNS]]
+    table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
+    columns = [name for name in ROW_COLUMNS if name != "ci95"]
+    table = table[[*columns, "ci95_low", "ci95_high", *MORE_COLUMNS]]
     contents = _records(rows[list(ROW_COLUMNS)])
     files = {
         "results.json": write_results(folder / "results.json", contents, meta),
         "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
-        "metrics.csv": _write_csv(folder / "metrics.csv", plain),
+        "metrics.csv": _write_csv(folder / "metrics.csv", table),
     }
     pictures = _write_pictures(folder, results, rows, ranking, title)
     text = _Report(results, rows, meta, list(pictures)).markdown(title, next_commands)
@@ -298,11 +298,9 @@ def _write_pictures(
     order = ranking.policy.tolist()
     order += [name for name in result.tracks if name not in order]
     if len(results) > 1:
-        columns = ["policy", "normalised_score", "ci95"]
-        together = ranking[columns].assign(
-            condition="all conditions", num_groups=rows.num_groups.iloc[0]
-        )
-        rows = pd.concat([rows, together])
+        together = ranking[["policy", "normalised_score", "ci95"]]
+        named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
+        rows = pd.concat([rows, together.assign(**named)])
     pictures = {
         "scores.png": plot_scores(folder / "scores.png", rows, title),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
@@ -328,15 +326,13 @@ def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
 
 def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
-    plan, best = result.plan, best_meter(result)
-    described = None
-    if plan is not None:
-        described = plan.describe()
+    best, described, differences = best_meter(result), None, []
+    if result.plan is not None:
+        described = result.plan.describe()
         protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
         described["sha256"] = digest(protocol)
-    differences = pd.DataFrame()
     if best is not None:
-        differences = difference_rows(result, best, resamples=resamples)
+        differences = _records(difference_rows(result, best, resamples=resamples))
     return {
         **result_meta(command, result.seed),
         "plan": described,
@@ -347,7 +343,7 @@ def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int)
         "by_kind": scores_by_kind(result),
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
-        "differences_to_best_meter": _records(differences),
+        "differences_to_best_meter": differences,
         "training_seeds": training_seed_rows(result),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
