@@ -31,7 +31,7 @@ Ints = NDArray[np.int64]
 def make_envs(
     env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Environments for `evaluate` and `fit_policies`: no autoreset, episodes of `frames` and more.
+    """Environments without autoreset, whose episodes allow `frames` actions and more.
 
     Args:
         env_options: Arguments of the environment, such as ``{"split": "test"}``.

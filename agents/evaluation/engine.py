@@ -170,13 +170,7 @@ def _plan_of(
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """One policy of a plan, or one training seed of an agent.
-
-    Args:
-        policy: Name in the tables.
-        name: Name for `agents.make_policy`.
-        index: Number of the training seed.
-    """
+    """One training seed of a policy: its name in the tables, and that for `agents.make_policy`."""
 
     policy: str
     name: str
@@ -317,13 +311,13 @@ class EvaluationRun:
         return policy
 
     def run_policy(
-        self, name: str, policy: Policy, condition: Condition, light: Arrays | None, report: Report
+        self, name: str, policy: Policy, condition: Condition, light: Arrays, report: Report
     ) -> Track:
-        """Runs `policy` through all episodes of `condition`.
+        """Runs `policy`, which is fitted, through all episodes of `condition`.
 
         Args:
             name: The policy's name in errors.
-            policy: The policy, fitted.
+            policy: The policy.
             condition: Light and delay, or budget.
             light: What `score_light` returns; only a privileged policy needs it.
             report: Called with the frames done since the last call.
@@ -335,8 +329,6 @@ class EvaluationRun:
             return self._run_brackets(name, policy, condition, report)
         oracle: Ints | None = None
         if getattr(policy, "privileged", False):
-            if light is None:
-                raise ValueError(f"policy {name!r} is privileged: it needs the score tables")
             oracle = best_states(light["scores"], light["allowed"])
         frames, episodes = self.plan.frames, self.episodes
         envs = self._make_envs(condition, batch_size(len(episodes), self.batch), frames)
@@ -455,13 +447,13 @@ def run_batch(
     frames: int,
     *,
     oracle: Ints | None = None,
-) -> dict[str, NDArray[Any]]:
-    """Run one policy over one batch of episodes.
+) -> Arrays:
+    """Run one policy over one batch of episodes, which `envs` are freshly reset to.
 
     Args:
         name: The policy's name in errors.
         policy: The policy.
-        envs: Freshly reset to `batch`.
+        envs: The environments.
         batch: The episodes.
         frames: Actions.
         oracle: (N, frames + 1) best state of every frame, the reset frame first, which a privileged
@@ -470,9 +462,6 @@ def run_batch(
     Returns:
         The arrays of a `Track` without their leading axis, of the valid episodes, and their
         ``start_states`` (n,); ``seconds`` (frames,) that `act` took for the batch.
-
-    Raises:
-        UserCodeError: If the policy raises, or returns something else than allowed states.
     """
     base: Any = envs.unwrapped
     with errors_of(name, "reset"):
@@ -537,11 +526,8 @@ def check_captures(name: str, policy: Policy) -> float:
 def other_scores(result: EvaluationResult) -> dict[str, dict[str, float]]:
     """Mean expected score of the states that each policy chose, by scorer and policy.
 
-    Of some scenes of the first seed, all starts and frames; averaged over frames, then training
-    seeds, episodes of a source group, and source groups.
-
-    Args:
-        result: The results in unchanging light, with their plan, which names the scorers.
+    Of some scenes of the first seed of `result`, in unchanging light, all starts and frames;
+    averaged over frames, then training seeds, episodes of a source group, and source groups.
     """
     plan = result.plan
     assert plan is not None

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -17,6 +19,7 @@ RESAMPLES = 10_000
 LEVEL = 0.95
 #: Below this many source groups an interval would promise too much: values only.
 MIN_GROUPS = 15
+RANK_COLUMNS = ("place", "policy", "tier", "normalised_score", "ci95", "to_best", "to_next")
 #: Standard errors below this are rounding: the two policies do the same.
 _ROUNDING = 1e-12
 
@@ -43,11 +46,6 @@ class Interval:
     def pair(self) -> list[float] | None:
         """``[low, high]``, or None."""
         return None if self.low is None or self.high is None else [self.low, self.high]
-
-    @property
-    def significant(self) -> bool:
-        """Whether the interval leaves out zero."""
-        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
 
 
 def score_interval(
@@ -83,17 +81,8 @@ def difference_interval(
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
         seed: Seed of the resampling.
-
-    Raises:
-        ValueError: If the shapes do not agree.
     """
-    first, second = np.atleast_2d(gains), np.atleast_2d(other)
-    groups = len(span)
-    if first.shape[1] != groups or second.shape[1] != groups:
-        raise ValueError(
-            f"`gains` (={first.shape}) and `other` (={second.shape}) must have one column for each "
-            f"of the {groups} groups of `span`"
-        )
+    first, second, groups = np.atleast_2d(gains), np.atleast_2d(other), len(span)
     value = float((first.mean(0) - second.mean(0)).sum() / span.sum())
     seeds = max(len(first), len(second))
     if groups < MIN_GROUPS:
@@ -131,27 +120,7 @@ def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Flo
 # -- ranking --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Rank:
-    """One line of a ranking.
-
-    Args:
-        policy: Name.
-        score: Normalised score with its own (not simultaneous) interval.
-        tier: 1 for the best; None below 15 source groups.
-        to_best: Paired difference of the scores to the best policy, with its simultaneous interval;
-            None for itself.
-        to_next: The same to the policy below; None for the last.
-    """
-
-    policy: str
-    score: Interval
-    tier: int | None
-    to_best: Interval | None
-    to_next: Interval | None
-
-
-def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLES) -> list[Rank]:
+def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLES) -> pd.DataFrame:
     """Policies from the best to the worst, with the differences that are significant.
 
     Differences of all pairs are bootstrapped together (source groups are drawn once for all
@@ -165,6 +134,12 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
         gains: ``q - q_random`` by policy, ``(K, G)`` per training seed and source group.
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
+
+    Returns:
+        A row for each policy: its ``place``, ``policy``, its ``tier`` (1 for the best; None below
+        15 source groups), ``normalised_score`` with its own (not simultaneous) interval ``ci95``;
+        ``to_best`` and ``to_next`` (None for the best and the last) have the ``other`` policy, the
+        ``difference`` to it, its ``simultaneous_ci95`` and whether that is ``significant``.
     """
     scores = {name: score_interval(own, span, resamples=resamples) for name, own in gains.items()}
     names = sorted(scores, key=lambda name: -scores[name].value)  # ties keep the given order
@@ -172,22 +147,26 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
     if len(span) >= MIN_GROUPS and len(names) > 1:
         widths = _half_widths([gains[name] for name in names], span, resamples)
 
-    def difference(i: int, j: int) -> Interval:
+    def difference(i: int, j: int) -> dict[str, Any]:
         value = scores[names[i]].value - scores[names[j]].value
         half = None if widths is None else float(widths[i, j])
-        low, high = (None, None) if half is None else (value - half, value + half)
-        seeds = max(scores[names[k]].num_seeds for k in (i, j))
-        return Interval(value, low, high, len(span), seeds)
+        return {
+            "other": names[j],
+            "difference": value,
+            "simultaneous_ci95": None if half is None else [value - half, value + half],
+            "significant": half is not None and abs(value) > half,
+        }
 
-    ranks: list[Rank] = []
+    rows = []
     leader, tier = 0, None if widths is None else 1
     for i, name in enumerate(names):
-        if tier is not None and i > leader and difference(i, leader).significant:
+        if tier is not None and i > leader and difference(i, leader)["significant"]:
             leader, tier = i, tier + 1
         to_best = difference(i, 0) if i else None
         to_next = difference(i, i + 1) if i + 1 < len(names) else None
-        ranks.append(Rank(name, scores[name], tier, to_best, to_next))
-    return ranks
+        score = scores[name]
+        rows.append((i + 1, name, tier, score.value, score.pair, to_best, to_next))
+    return pd.DataFrame(rows, columns=list(RANK_COLUMNS))
 
 
 def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:

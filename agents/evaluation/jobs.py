@@ -57,13 +57,9 @@ _MAX_NEIGHBOURS = 200
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work for one process.
+    """A piece of work for one process, and about the time that it takes [ms].
 
-    Args:
-        conditions: Names of the condition whose light is scored, or of those in which a policy is
-            run, which have one delay or budget.
-        trained: The policy; None for the light.
-        cost: About the time that it takes [ms].
+    It scores the light of one condition, or runs a policy in all conditions of one delay or budget.
     """
 
     conditions: tuple[str, ...]
@@ -72,14 +68,7 @@ class Job:
 
 
 class Jobs(EvaluationRun):
-    """A run of a plan in jobs, whose finished parts are stored.
-
-    Args:
-        plan: The plan, of JSON values.
-        folder: Folder of the finished parts.
-        scenes: Those of the plan; loaded by default.
-        device: Torch device of a learnt agent's network.
-    """
+    """A run of a plan, of JSON values, in jobs; finished parts are stored in `folder`."""
 
     def __init__(
         self, plan: EvaluationPlan, folder: Path, scenes: list[Scene] | None = None, *, device: str
@@ -202,7 +191,7 @@ class Jobs(EvaluationRun):
             return
         policy = self.fitted(job.trained, conditions[0])
         for condition in conditions:
-            light = self.light(condition) if getattr(policy, "privileged", False) else None
+            light = self.light(condition) if getattr(policy, "privileged", False) else {}
             track = self.run_policy(
                 *(job.trained.name, policy, condition, light),
                 report=lambda frames: report(frames * _FRAME_MS),

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from agents.evaluation import metrics
 from agents.evaluation.intervals import (
+    RANK_COLUMNS,
     RESAMPLES,
-    Interval,
-    Rank,
     difference_interval,
     rank,
     score_interval,
@@ -259,12 +258,8 @@ class EvaluationResult:
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
     def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
-        """Mean of a metric: over a source group's episodes, then over groups and seeds.
-
-        Args:
-            policy: Name of the policy.
-            key: Name of the metric, see `episode_metrics`.
-            episodes: Which of the episodes, ``(E,)``; all by default.
+        """Mean of a metric of `episode_metrics`: over a source group's episodes, then over groups
+        and seeds; of the `episodes` that are True, ``(E,)``, or of all.
         """
         members = self.condition("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]
@@ -274,8 +269,6 @@ class EvaluationResult:
         self, policy: str, condition: str | NDArray[np.bool_] = "all"
     ) -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
-
-        These are the arguments of `agents.evaluation.intervals`.
 
         Args:
             policy: Name of the policy.
@@ -379,18 +372,13 @@ def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> di
     }
 
 
-def bracket_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     """A row per budget and policy of an evaluation of brackets, the best policy first.
 
-    Args:
-        results: By budget.
-        ranking: Of `overall_ranking`.
-
-    Returns:
-        `quality` with its 95 % interval `ci95`, `to_best` with `to_best_ci95`, its paired
-        difference to the best policy over all budgets, and the means of `BRACKET_METRICS`.
+    `quality` has its 95 % interval `ci95`; `to_best`, with `to_best_ci95`, is the paired difference
+    to the best policy over all budgets; the other metrics are means.
     """
-    names, rows = [one.policy for one in ranking], []
+    names, rows = ranking.policy.tolist(), []
     plan = next(iter(results.values())).plan
     assert plan is not None
     for budget, result in zip(plan.budgets or (), results.values(), strict=True):
@@ -478,13 +466,7 @@ def difference_rows(
 ) -> pd.DataFrame:
     """Paired differences of every other policy's normalised score to that of `minus`.
 
-    Args:
-        result: The results of one condition.
-        minus: The policy that is subtracted.
-        resamples: Bootstrap resamples.
-
-    Returns:
-        A row for each policy and part that has scenes.
+    A row for each policy and part that has scenes.
     """
     rows = []
     for part in result.conditions:
@@ -506,47 +488,19 @@ def difference_rows(
     return pd.DataFrame(rows)
 
 
-def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> list[Rank]:
+def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataFrame:
     """Policies by their score over all conditions, each with the same weight; none that is
-    privileged.
+    privileged. A row for each, as of `agents.evaluation.intervals.rank`.
     """
     first = next(iter(results.values()))
     names = [name for name, track in first.tracks.items() if not track.privileged]
     if not names:
-        return []
+        return pd.DataFrame(columns=list(RANK_COLUMNS))
     gains = {
         name: np.mean([r.group_gains(name)[0] for r in results.values()], axis=0) for name in names
     }
     spans = [result.group_gains(names[0])[1] for result in results.values()]
     return rank(gains, np.mean(spans, axis=0), resamples=resamples)
-
-
-def ranking_rows(ranking: Sequence[Rank]) -> list[dict[str, Any]]:
-    """A ranking as JSON values."""
-    names = [one.policy for one in ranking]
-
-    def change(interval: Interval | None, other: int) -> dict[str, Any] | None:
-        if interval is None:
-            return None
-        return {
-            "other": names[other],
-            "difference": interval.value,
-            "simultaneous_ci95": interval.pair,
-            "significant": interval.significant,
-        }
-
-    return [
-        {
-            "place": i + 1,
-            "policy": one.policy,
-            "tier": one.tier,
-            "normalised_score": one.score.value,
-            "ci95": one.score.pair,
-            "to_best": change(one.to_best, 0),
-            "to_next": change(one.to_next, i + 1),
-        }
-        for i, one in enumerate(ranking)
-    ]
 
 
 def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:

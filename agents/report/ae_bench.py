@@ -14,7 +14,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation.intervals import Rank
 from agents.evaluation.plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
@@ -108,32 +107,7 @@ _TABLES = {
 }
 #: What tells a page that this module wrote.
 _MARK = "<!-- written by `ae-env evaluate --append`"
-_PAGE = """\
-# AE-Bench v2
-
-<!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->
-
-40 scenes that nothing was trained on: 24 of the procedural generators, and a view of each of the \
-16 real places of the test split (`ae-env scenes download` fetches them). Three tasks, each a \
-preset of `configs/evaluation`; what the columns mean: [evaluation.md](evaluation.md). Times are \
-those of each row's own machine (`cpu` in the CSV file). [AE-Bench v1](ae-bench/v1.md) is \
-superseded.
-
-Add your own policy with one command for each task that it is for:
-
-    ae-env evaluate --preset ae_bench_v2_still --policy my.py:Mine \\
-        --append {table} --author "Your name"
-
-`_still`, `_video` or `_bracket`; `--observation statistics` shows the policy the statistics of an \
-image processor in place of pixels. A row replaces the one of the same task, policy, observation \
-and author, where there is one, and no other. Send it as a pull request with the two files that \
-the command changes, `{table}` and `{page}`, and, if it may be public, the policy's file.
-
-The plans of all tasks, their scenes and the rules of the environment have the hash `{hash}`, \
-which every row carries; a run under another one is refused.
-
-{tables}
-"""
+_PAGE = Path(__file__).with_name("ae_bench.md")
 
 
 def scene_signature(scene: Scene) -> list[Any]:
@@ -350,7 +324,7 @@ def page_of(table: Path) -> Path:
     return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
 
 
-def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     """The rows of the policies that are ranked: means over all conditions or budgets.
 
     Args:
@@ -361,7 +335,7 @@ def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
     real = is_real(first.groups)
     parts = {"procedural": ~real, "real": real}
     rows = []
-    for one in ranking:
+    for one in ranking.itertuples():
         means = {
             key: np.mean([result.mean(one.policy, key) for result in results.values()])
             for key in _MEANS[first.measure]
@@ -372,10 +346,10 @@ def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
             if part.any()
         }
         track = first.tracks[one.policy]
-        low, high = one.score.pair or (None, None)
+        low, high = one.ci95 or (None, None)
         row = {
             "policy": one.policy,
-            "score": one.score.value,
+            "score": one.normalised_score,
             "ci95_low": low,
             "ci95_high": high,
             "ms_alone": 1000.0 * means["seconds"] if "seconds" in means else track.ms_alone,
@@ -404,6 +378,6 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
         for task, (title, text, columns) in _TABLES.items()
         if (rows.task == task).any()
     ]
-    return _PAGE.format(
+    return _PAGE.read_text(encoding="utf-8").format(
         table=shown(table), page=shown(page_of(table)), hash=plan.hash, tables="\n\n".join(blocks)
     )

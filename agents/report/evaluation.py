@@ -8,13 +8,14 @@ import os
 import re
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
+from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES
 from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.result import (
     MORE_COLUMNS,
@@ -28,7 +29,6 @@ from agents.evaluation.result import (
     group_rows,
     oracle_histogram,
     overall_ranking,
-    ranking_rows,
     result_rows,
     scene_rows,
     scores_by_kind,
@@ -81,17 +81,7 @@ _BY_CONDITION = (
 )
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
-       max-width: 78rem; margin: 2rem auto; padding: 0 1.2rem; }
-h1 { font-size: 1.7rem; } h2 { margin-top: 2.4rem; border-bottom: 1px solid #ddd; }
-img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-size: .86rem; display: block; overflow-x: auto; }
-th, td { padding: .22rem .6rem; border-bottom: 1px solid #e6e6e6; white-space: nowrap; }
-thead th { border-bottom: 2px solid #999; } tbody tr:hover { background: #f5f7fa; }
-code { background: #f3f3f3; padding: .08rem .25rem; border-radius: 3px; }
-pre { background: #f3f3f3; padding: .8rem; overflow-x: auto; } pre code { padding: 0; }
-"""
+_PAGE = Path(__file__).with_name("report.html")
 #: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
 _SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
 
@@ -227,12 +217,8 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
 
     page = MarkdownIt("commonmark", {"html": False}).enable("table")
     page.add_render_rule("image", image)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
-        f"<body>\n{page.render(markdown)}</body>\n</html>\n"
-    )
+    template = string.Template(_PAGE.read_text(encoding="utf-8"))
+    return template.substitute(title=html.escape(title), body=page.render(markdown))
 
 
 # -- files ----------------------------------------------------------------------------------------
@@ -285,17 +271,17 @@ def write_report(
     title = f"{rows.source[0]}, {rows.split[0]} split"
     title = title if result.plan is None else result.plan.name
     ends = pd.DataFrame([pair or (None, None) for pair in rows.ci95])
-    plain = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
-    contract = [name for name in ROW_COLUMNS if name != "ci95"]
-    plain = plain[[*contract, "ci95_low", "ci95_high", *MORE_COLUMNS]]
+    table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
+    columns = [name for name in ROW_COLUMNS if name != "ci95"]
+    table = table[[*columns, "ci95_low", "ci95_high", *MORE_COLUMNS]]
     contents = _records(rows[list(ROW_COLUMNS)])
     files = {
         "results.json": write_results(folder / "results.json", contents, meta),
         "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
-        "metrics.csv": _write_csv(folder / "metrics.csv", plain),
+        "metrics.csv": _write_csv(folder / "metrics.csv", table),
     }
     pictures = _write_pictures(folder, results, rows, ranking, title)
-    text = _Report(results, rows, meta, ranking, list(pictures)).markdown(title, next_commands)
+    text = _Report(results, rows, meta, list(pictures)).markdown(title, next_commands)
     page = html_report(text, pictures, f"Exposure policies compared: {title}")
     return {
         **files,
@@ -306,22 +292,22 @@ def write_report(
 
 
 def _write_pictures(
-    folder: Path, results: Results, rows: pd.DataFrame, ranking: Sequence[Rank], title: str
+    folder: Path, results: Results, rows: pd.DataFrame, ranking: pd.DataFrame, title: str
 ) -> dict[str, Path]:
     result = results[static_condition(results)]
-    order = [one.policy for one in ranking]
+    order = ranking.policy.tolist()
     order += [name for name in result.tracks if name not in order]
     if len(results) > 1:
-        overall = [(r.policy, r.score.value, r.score.pair, r.score.num_groups) for r in ranking]
-        columns = ["policy", "normalised_score", "ci95", "num_groups"]
-        together = pd.DataFrame(overall, columns=columns).assign(condition="all conditions")
-        rows = pd.concat([rows, together])
+        together = ranking[["policy", "normalised_score", "ci95"]]
+        named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
+        rows = pd.concat([rows, together.assign(**named)])
     pictures = {
         "scores.png": plot_scores(folder / "scores.png", rows, title),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
     }
     alone = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
-    scores = {one.policy: one.score.value for one in ranking if one.policy in alone}
+    ranked = ranking[ranking.policy.isin(list(alone))]
+    scores = dict(zip(ranked.policy, ranked.normalised_score, strict=True))
     if scores:
         pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores)
     return pictures | path_sheets(folder, result, order)
@@ -338,30 +324,26 @@ def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
     return write_atomically(path, text)
 
 
-def _meta(
-    results: Results, ranking: Sequence[Rank], command: str, resamples: int
-) -> dict[str, Any]:
+def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
-    plan, best = result.plan, best_meter(result)
-    described = None
-    if plan is not None:
-        described = plan.describe()
+    best, described, differences = best_meter(result), None, []
+    if result.plan is not None:
+        described = result.plan.describe()
         protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
         described["sha256"] = digest(protocol)
-    differences = pd.DataFrame()
     if best is not None:
-        differences = difference_rows(result, best, resamples=resamples)
+        differences = _records(difference_rows(result, best, resamples=resamples))
     return {
         **result_meta(command, result.seed),
         "plan": described,
         "episodes": len(result.scene_ids),
         "scenes": len(set(result.scene_ids.tolist())),
         "frames": result.scores.shape[1],
-        "ranking": ranking_rows(ranking),
+        "ranking": _records(ranking),
         "by_kind": scores_by_kind(result),
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
-        "differences_to_best_meter": _records(differences),
+        "differences_to_best_meter": differences,
         "training_seeds": training_seed_rows(result),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
@@ -387,24 +369,23 @@ def _bracket_report(plan: EvaluationPlan, rows: pd.DataFrame, command: str) -> s
     return "\n\n".join(parts) + "\n"
 
 
+@dataclass
 class _Report:
     """The parts of ``report.md`` of an evaluation of frames."""
 
-    def __init__(
-        self,
-        results: Results,
-        rows: pd.DataFrame,
-        meta: Mapping[str, Any],
-        ranking: Sequence[Rank],
-        pictures: Sequence[str],
-    ) -> None:
-        self.results, self.rows, self.meta, self.pictures = results, rows, meta, pictures
-        self.static = static_condition(results)
-        self.result = results[self.static]
-        by = rows.replace({"condition": {"all": self.static}})
+    results: Results
+    rows: pd.DataFrame
+    meta: Mapping[str, Any]
+    pictures: Sequence[str]
+
+    def __post_init__(self) -> None:
+        self.static = static_condition(self.results)
+        self.result = self.results[self.static]
+        by = self.rows.replace({"condition": {"all": self.static}})
         #: Of each condition as a whole.
-        self.by = by[by.condition.isin(list(results))]
-        self.scores = {one.policy: one.score.value for one in ranking}
+        self.by = by[by.condition.isin(list(self.results))]
+        ranking = self.meta["ranking"]
+        self.scores = {row["policy"]: row["normalised_score"] for row in ranking}
 
     def markdown(self, title: str, next_commands: Sequence[str]) -> str:
         """The report as Markdown."""
@@ -624,7 +605,7 @@ def _plan_part(plan: EvaluationPlan, described: Mapping[str, Any]) -> list[str]:
 
 
 def summary(
-    results: EvaluationResult | Results, ranking: Sequence[Rank] | None = None
+    results: EvaluationResult | Results, ranking: pd.DataFrame | None = None
 ) -> list[tuple[str, pd.DataFrame]]:
     """Tables of an evaluation for the terminal: titles, and frames of texts.
 
@@ -640,11 +621,11 @@ def summary(
         lines = [
             {
                 "policy": one.policy,
-                "all": f"{one.score.value:.4f}",
-                "95 % interval": _interval(one.score.pair, ".4f"),
+                "all": f"{one.normalised_score:.4f}",
+                "95 % interval": _interval(one.ci95, ".4f"),
                 **{name: f"{r.normalised(one.policy):.4f}" for name, r in results.items()},
             }
-            for one in ranking
+            for one in ranking.itertuples()
         ]
         title = "quality of the merged picture, by time of all frames"
         return [(title, pd.DataFrame(lines))]
@@ -661,11 +642,11 @@ def summary(
             {
                 "tier": "-" if one.tier is None else str(one.tier),
                 "policy": one.policy,
-                "all conditions": f"{one.score.value:.3f}",
-                "95 % interval": _interval(one.score.pair),
+                "all conditions": f"{one.normalised_score:.3f}",
+                "95 % interval": _interval(one.ci95),
                 static: f"{result.normalised(one.policy):.3f}",
             }
-            for one in ranking
+            for one in ranking.itertuples()
         ]
         table = pd.DataFrame(lines)
         title = f"normalised score over {len(results)} conditions, and in {static!r}"

@@ -199,11 +199,10 @@ def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float
 
 
 def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
-    """Write contact sheets of one scene's states with the paths of the policies.
+    """Write contact sheets of one scene's states with the paths of the best policies.
 
     Args:
-        folder: Folder of ``contact_sheet.webp``, and of ``contact_sheet_2.webp`` for further
-            policies; only the best of them are shown.
+        folder: Folder of ``contact_sheet.webp``, and of ``contact_sheet_2.webp`` for more policies.
         result: The results in unchanging light.
         order: Policies, the best first.
 
@@ -296,16 +295,16 @@ _INK, _PAPER, _ORACLE, _CHOSEN = "#202020", "#ffffff", "#b0b0b0", "#c0392b"
 
 @dataclass
 class Recording:
-    """One policy's episode.
+    """One policy's episode: lists with a value for every frame.
 
     Args:
         name: Of the policy.
-        pictures: (H, W, 3) uint8 of every frame.
-        ev100: EV100 of the settings of every frame.
-        best: EV100 of the best state of every frame.
-        scores: Score of every frame.
-        states: Index of the state of every frame.
-        regrets: Best state's expected score less that of the frame's state, of every frame.
+        pictures: (H, W, 3) uint8.
+        ev100: EV100 of the settings.
+        best: EV100 of the best state.
+        scores: Score of the frame.
+        states: Index of the state.
+        regrets: Best state's expected score less that of the frame's state.
     """
 
     name: str
