@@ -187,8 +187,9 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
     elif "sha256" not in card:
         rule = "the .json must hold the hash, `sha256`"
     elif card.get("preset") not in list(BUILDERS):
-        found = card.get("preset")
-        rule = f"unknown preset {found!r} in the .json, the presets are {list(BUILDERS)}"
+        rule = (
+            f"unknown preset {card.get('preset')!r} in the .json, the presets are {list(BUILDERS)}"
+        )
     if rule is not None:
         raise ValueError(f"`weights` (={str(name)!r}): {rule}")
 
