@@ -65,25 +65,3 @@ def test_given_weights_are_measured_and_nothing_is_trained(ae_env, here: Path) -
     rows = json.loads((here / "results" / "paper.json").read_text())["rows"]
     assert {row["preset"] for row in rows} == {"paper", "compact"}
     assert not (here / "runs" / "paper").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("paper",), "ae-env bench paper FOLDER"),
-        (("paper", "none"), "`folder` (='none') must be an existing folder"),
-        (("paper", "runs"), "`folder` (='runs') must hold a camera_params.csv"),
-        (("paper", "data", "--weights", "none.safetensors"), "there is no none.json"),
-        (("convergence", "data"), "`folder` (='data')"),
-        (
-            ("convergence", "--weights", "a"),
-            "`weights` (='a')",
-        ),
-    ],
-)
-def test_errors_before_any_work(ae_env, here: Path, arguments, message: str) -> None:
-    (here / "runs").mkdir()
-    code, _, error = ae_env("bench", *arguments, "--out", "results")
-    assert code == 2
-    assert message in error
-    assert error.strip().count("\n") == 0

@@ -63,22 +63,3 @@ def test_the_noise_of_two_real_captures_is_told(tmp_path: Path) -> None:
         error = -10.0 * np.log10(float((again - other).double().square().mean()))
         ceiling = recorded._ceiling(scene, GRID, state, everywhere)
         assert ceiling == pytest.approx(error, abs=0.3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("none",), "`scenes` (='recorded:"),
-        (("empty",), "must hold captures"),
-        (("empty", "--weights", "a"), "`weights` (='a')"),
-    ],
-)
-def test_errors_are_one_line_and_nothing_is_written(
-    ae_env, benchmarks_here: Path, arguments: tuple[str, ...], message: str
-) -> None:
-    (benchmarks_here / "empty").mkdir()
-    code, _, error = ae_env("bench", "recorded", *arguments, "--out", "results")
-    assert code == 2
-    assert message in error
-    assert error.strip().count("\n") == 0
-    assert not list(benchmarks_here.glob("results/*"))
