@@ -155,16 +155,19 @@ def test_errors_are_one_line(ae_env, dng: Path, arguments, message) -> None:
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
-def test_policies_that_fail(ae_env, tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(OWN)
-    small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
-    for name, status, message in (
+@pytest.mark.parametrize(
+    ("name", "status", "message"),
+    [
         ("Raises", 1, r"own\.py:.*`act` raised KeyError: 'lost'"),
         ("Counts", 2, r"`captures_per_decision` of policy `own\.py:Counts` \(='two'\)"),
-    ):
-        code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *small)
-        assert (code, error.count("\n")) == (status, 1)
-        assert re.search(message, error)
+    ],
+)
+def test_policies_that_fail(ae_env, tmp_path: Path, name, status, message) -> None:
+    (tmp_path / "own.py").write_text(OWN)
+    small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
+    code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *small)
+    assert (code, error.count("\n")) == (status, 1)
+    assert re.search(message, error)
 
 
 @pytest.mark.parametrize(
