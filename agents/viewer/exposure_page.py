@@ -70,8 +70,8 @@ class ExposurePage(Tab):
                 self._histogram = ui.html(sanitize=False)
                 self._histogram.props('role=img aria-label="histogram of the raw planes"')
                 ui.label(
-                    "Raw histogram of R, G1, G2 and B, black to white level (height: square root of "
-                    "the pixel share)."
+                    "Raw histogram of R, G1, G2 and B, black to white level (height: square root "
+                    "of the pixel share)."
                 ).classes("note")
                 with ui.element("div").classes("facts"):
                     for name in ("Score", "Noise", "Blur", "Clipped", "Time"):
