@@ -6,12 +6,26 @@ Importing it registers the tasks, such as ``ae_env/AutoExposure-v0``, and loads 
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ae_env.registration import register_envs
-from ae_env.utils.packages import check_package
 
-check_package("simulator")
+
+def _check_simulator() -> None:
+    """The packages that are installed together have common names: whose it is is checked."""
+    own, spec = Path(__file__).resolve().parents[1] / "simulator", find_spec("simulator")
+    folders = [] if spec is None else [*(spec.submodule_search_locations or [spec.origin])]
+    found = next(iter(folders), None)
+    if found is None or Path(found).resolve() != own:
+        raise ImportError(
+            f"ae-env needs its own package 'simulator' ({own}), but Python finds {found}: "
+            "rename the other one, or take its folder off sys.path (PYTHONPATH, the working folder)"
+        )
+
+
+_check_simulator()
 
 from simulator import __version__ as __version__  # noqa: E402  (checked first)
 

@@ -10,14 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from ae_env.episodes.core import (
-    EpisodeCore,
-    FindTransitions,
-    Frames,
-    MakeTask,
-    Task,
-    check_actions,
-)
+from ae_env.episodes.core import EpisodeCore, FindTransitions, Frames, MakeTask, Task, check_actions
 from ae_env.episodes.lookup import RECORDED
 from ae_env.episodes.state import Episode, Episodes, check_options
 from ae_env.grid import ExposureGrid
@@ -498,7 +491,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
-    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise.generator`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
+    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.capture.sensor`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |

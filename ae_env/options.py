@@ -21,9 +21,9 @@ from ae_env.scenes.scene import SceneSet
 from ae_env.scenes.scene import Split as Split
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
-from simulator.capture.plan import check_tolerance
-from simulator.capture.prepared_scene import MAX_DISC_PX, MAX_IMAGE_SPEED
+from simulator.capture.exposure import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
+from simulator.capture.exposure import MAX_DISC_PX, check_tolerance
+from simulator.capture.prepared_scene import MAX_IMAGE_SPEED
 from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 
 #: Smallest frame that the default networks of the common libraries take.

@@ -26,7 +26,7 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.vector_env import AutoExposureVectorEnv
 from simulator.capture.batch import FrameStatistics
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.optics.motion import Taps, path_blur_apart
 from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
 from simulator.settings import exposure_ratio

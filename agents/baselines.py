@@ -24,10 +24,8 @@ if TYPE_CHECKING:
 
 #: What oracles know, and the entry of ``info`` that holds it.
 ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}
-#: Episodes per scene from which the best constant state is taken.
-FIT_EPISODES = 2
-#: Scenes that they are of, at most.
-FIT_SCENES = 400
+#: The best constant state is taken from so many episodes per scene, of so many scenes at most.
+FIT_EPISODES, FIT_SCENES = 2, 400
 
 
 class Random(Policy):
@@ -62,9 +60,8 @@ class BestFixed(Policy):
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
         """Average the expected scores of all states over the scenes of `envs`."""
-        episodes = RolloutPlan.of_each_scene(
-            scenes_of(envs), count=FIT_EPISODES, seed=seed, most=FIT_SCENES
-        )
+        sizes = {"count": FIT_EPISODES, "most": FIT_SCENES}
+        episodes = RolloutPlan.of_each_scene(scenes_of(envs), seed=seed, **sizes)
         scores = [expected_scores(envs)[batch.valid] for batch in episodes.batches(envs)]
         self.mean_scores = np.concatenate(scores).mean(axis=0)
 
@@ -131,8 +128,7 @@ class Recorded(Policy):
     def __init__(self, context: PolicyContext, path: str | os.PathLike[str]) -> None:
         super().__init__(context)
         self.name = f"recorded:{os.fspath(path)}"
-        self.files = _raw_files(path)
-        self.settings = tuple(read_raw(file).settings for file in self.files)
+        self.settings = tuple(read_raw(file).settings for file in _raw_files(path))
         ours = _coordinates(context.grid.states)
         #: Cost of every state, per raw, ``(T, S)``.
         self._cost = ((_coordinates(self.settings)[:, None] - ours[None]) ** 2).sum(axis=2)
@@ -150,17 +146,15 @@ class Recorded(Policy):
         self.check_reset(observations)
         cost = self._cost[min(self._frame, len(self._cost) - 1)].round(9)
         self._frame += 1
-        return masked_argmax(
-            np.broadcast_to(-cost, (len(observations["raw"]), len(cost))), action_masks
-        )
+        utility = np.broadcast_to(-cost, (len(observations["raw"]), len(cost)))
+        return masked_argmax(utility, action_masks)
 
 
 def _raw_files(path: str | os.PathLike[str]) -> list[Path]:
-    raws = []
-    if os.fspath(path) and Path(path).expanduser().exists():
+    raws, folder = [], Path(path).expanduser()
+    if os.fspath(path) and folder.exists():
         with suppress(ValueError):  # no file of any known kind
-            files = find_files(Path(path).expanduser())[1]
-            raws = [file for file in files if file.suffix.lower() in RAW_SUFFIXES]
+            raws = [file for file in find_files(folder)[1] if file.suffix.lower() in RAW_SUFFIXES]
     if not raws:
         raise ValueError(
             f"`path` (={os.fspath(path)!r}) must be a folder of raws: 'recorded:FOLDER'"

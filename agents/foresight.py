@@ -129,7 +129,10 @@ class Foresight:
         reading = self._matcher.match(reading, zones, exposed_at)
         self._tracker.update(reading, exposed_at)
         if not self._actions:  # what the first frame was taken with stays until a decision is there
-            self._actions = [self._shown(observations)] * max(self.leads)
+            shown = np.stack(decode_settings(observations["settings"]), axis=1)
+            apex = np.array([(s.aperture_value, s.time_value, s.speed_value) for s in self.grid])
+            nearest = np.abs(shown[:, None] - apex[None]).sum(axis=2).argmin(axis=1)
+            self._actions = [nearest] * max(self.leads)
         return reading
 
     @property
@@ -153,7 +156,13 @@ class Foresight:
         """
         total: Floats = np.zeros((len(self._actions[0]), 1, 1, 1))
         for frame in sorted(set(self.leads)):
-            promised = self._expected(scores, frame).reshape(-1, *self.grid.shape)
+            ev100, spread = self._tracker.ahead(frame)
+            if spread.any():  # the mean over what the light may be
+                points = zip(*POINTS, strict=True)
+                found = np.sum([w * scores(ev100 + step * spread) for step, w in points], axis=0)
+            else:
+                found = scores(ev100)
+            promised = found.reshape(-1, *self.grid.shape)
             for axis, lead in enumerate(self.leads):
                 if lead < frame:
                     promised = promised.max(axis=1 + axis, keepdims=True)
@@ -164,23 +173,6 @@ class Foresight:
             total = total + promised
         return total.reshape(len(total), -1)
 
-    def _expected(self, scores: Callable[[Floats], Floats], frame: int) -> Floats:
-        """Mean of the scores over what the light of `frame` may be."""
-        ev100, spread = self._tracker.ahead(frame)
-        if not spread.any():
-            return scores(ev100)
-        found = [
-            weight * scores(ev100 + step * spread) for step, weight in zip(*POINTS, strict=True)
-        ]
-        return np.sum(found, axis=0)
-
     def record_action(self, states: Ints) -> None:
         """Remember the decision after the frame in hand, ``(N,)`` states."""
         self._actions = [*self._actions[1:], states]
-
-    def _shown(self, observations: Observations) -> Ints:
-        """States that the frames in hand were taken with, ``(N,)``."""
-        shown = np.stack(decode_settings(observations["settings"]), axis=1)
-        apex = np.array([(s.aperture_value, s.time_value, s.speed_value) for s in self.grid])
-        found: Ints = np.abs(shown[:, None] - apex[None]).sum(axis=2).argmin(axis=1)
-        return found

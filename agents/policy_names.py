@@ -29,8 +29,6 @@ PRETRAINED_SEEDS = (0, 1, 2)
 #: Forecasters of light that come with the package, and the word that asks for them.
 FORECASTERS, LEARNT = str(PRETRAINED / "forecaster-*"), "learnt"
 
-_METERING = "agents.metering.metering_policy:MeteringPolicy"
-_RPI_AGC = "agents.metering.rpi_agc:RpiAgc"
 #: Classes whose names take a file after the colon, and the argument that it is.
 _WITH_FILE = {
     "ppo": ("agents.learning.ppo:PPOPolicy", "weights"),
@@ -39,8 +37,9 @@ _WITH_FILE = {
 }
 #: Files of the agents that come with the package, without ``-SEED``.
 _SHIPPED = {
-    **{agent: str(PRETRAINED / agent) for agent in ("ppo", "regression")},
-    **{f"{agent}:video": str(PRETRAINED / f"video-{agent}") for agent in ("ppo", "regression")},
+    f"{agent}{task}": f"{PRETRAINED}/{prefix}{agent}"
+    for task, prefix in (("", ""), (":video", "video-"))
+    for agent in ("ppo", "regression")
 }
 #: The built-in policies: class, imported when a policy is made, and arguments that the name gives.
 _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -48,8 +47,12 @@ _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
     "best_fixed": ("agents.baselines:BestFixed", {}),
     "oracle:last_frame": ("agents.baselines:Oracle", {"knows": "last_frame"}),
     "oracle:clairvoyant": ("agents.baselines:Oracle", {"knows": "clairvoyant"}),
-    **{f"{m}:{p}": (_METERING, {"meter": m, "program": p}) for m in METERS for p in PROGRAMS},
     **{f"rpi_agc:{p}": ("agents.metering.rpi_agc:RpiAgc", {"program": p}) for p in MANUAL_PROGRAMS},
+    **{
+        f"{m}:{p}": ("agents.metering.metering_policy:MeteringPolicy", {"meter": m, "program": p})
+        for m in METERS
+        for p in PROGRAMS
+    },
     **{
         name: (_WITH_FILE[name.partition(":")[0]][0], {"weights": f"{file}-{PRETRAINED_SEEDS[0]}"})
         for name, file in _SHIPPED.items()
@@ -140,8 +143,6 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
 
     >>> split_options("centre_weighted:P?compensation=-1&shutter_cap=1/50")
     ('centre_weighted:P', {'compensation': -1, 'shutter_cap': 0.02})
-    >>> split_options("ppo:runs/mine")
-    ('ppo:runs/mine', {})
     """
     if not isinstance(name, str):
         raise _refusal(name, " must be a name, such as 'matrix:P'")
@@ -154,8 +155,7 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
     try:
         pairs = parse_qsl(query or "&", keep_blank_values=True, strict_parsing=True)
     except ValueError as error:
-        text = f": options are written name?key=value&key=value: {error}"
-        raise _refusal(name, text) from None
+        raise _refusal(name, f": options are name?key=value&key=value: {error}") from None
     for key, text in pairs:
         if key.strip() in options:
             raise _refusal(name, f": option {key!r} is given twice")
@@ -206,10 +206,21 @@ def make_policy(
     for key in set(options) & set(named):
         raise _refusal(name, f": option {key!r} is given twice")
     cls, fixed = _find(name, base)
-    options = {**options, **named}
+    options |= named
     if "weights" in fixed:
         fixed = {} if "network" in options else {**fixed, "device": device}
-    policy = _construct(cls, name, context, options, fixed)
+    _check_class(name, cls, context)
+    _check_options(name, cls, options, fixed)
+    try:
+        policy: Policy = cls(context, **fixed, **options)
+    except Exception as error:  # a user's constructor may raise anything
+        if not cls.__module__.startswith("agents."):
+            text = f": {cls.__name__} cannot be made: {type(error).__name__}: {error}"
+            raise _refusal(name, text) from error
+        if not isinstance(error, ValueError | FileNotFoundError):
+            raise
+        kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
+        raise kind(f"`policy` (={name!r}): {error}") from error
     if named:
         policy.name = name
     return policy
@@ -222,96 +233,64 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     if found is None and head in _WITH_FILE:
         path, argument = _WITH_FILE[head]
         if "*" in tail and argument == "weights":
-            raise _refusal(
-                name,
-                " is a pattern, so several agents: it is for evaluations; `training_seeds` lists "
-                "the names of the single ones",
-            )
+            raise _refusal(name, " is a pattern, so several agents: `training_seeds` lists them")
         found = path, {argument: tail}
     if found is not None:
         module, _, cls = found[0].partition(":")
         return getattr(importlib.import_module(module), cls), found[1]
     if head.endswith(".py"):
         return load_from_file(head, tail, f"`policy` (={name!r})", example="MyPolicy"), {}
-    if not tail or head in {known.partition(":")[0] for known in (*_POLICIES, *_BRACKETS)}:
+    built_in = {known.partition(":")[0] for known in (*_POLICIES, *_BRACKETS)}
+    if not tail or head in built_in or not all(part.isidentifier() for part in head.split(".")):
         raise _refusal(name, _known(base))
-    return _class_in_module(head, tail, name), {}
-
-
-def _class_in_module(module: str, name: str, policy: str) -> Any:
-    if not all(part.isidentifier() for part in module.split(".")):
-        raise _refusal(policy, _known(policy))
     try:
-        loaded = importlib.import_module(module)
+        loaded = importlib.import_module(head)
     except Exception as error:  # the user's module runs, and may raise anything
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing is not None and (module == missing or module.startswith(f"{missing}.")):
-            raise _refusal(policy, f"{_known(policy)} (there is no module {missing!r})") from None
-        raise _broken(policy, f"{module} cannot be imported", error) from error
-    return find_attribute(loaded, name, f"`policy` (={policy!r})")
+        if missing is not None and f"{head}.".startswith(f"{missing}."):
+            raise _refusal(name, f"{_known(base)} (there is no module {missing!r})") from None
+        text = f": {head} cannot be imported: {type(error).__name__}: {error}"
+        raise _refusal(name, text) from error
+    return find_attribute(loaded, tail, f"`policy` (={name!r})"), {}
 
 
-def _construct(
-    cls: Any, name: str, context: PolicyContext, options: dict[str, Any], fixed: dict[str, Any]
-) -> Policy:
-    """A `cls` with `options` of the caller's and the arguments that the name has `fixed`."""
+def _check_class(name: str, cls: Any, context: PolicyContext) -> None:
+    """Raises a `ValueError` unless `cls` is the class of a policy for this task."""
     if not inspect.isclass(cls):
         raise _refusal(name, " must name a class")
     missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
-    if not missing and issubclass(cls, Policy) and cls.act is Policy.act:
+    if getattr(cls, "act", None) is Policy.act:
         missing = ["act"]
     if missing:
-        methods = " and ".join(f"`{m}`" for m in missing)
-        text = (
-            f": {cls.__name__} is not a policy, it has no {methods}; derive it from agents.Policy"
-        )
-        raise _refusal(name, text)
-    ours = cls.__module__.startswith("agents.")
-    for_brackets = cls.__module__.startswith("agents.bracketing.") or cls.__name__ == "Random"
-    if context.bracket is not None and ours and not for_brackets:
+        text = f": {cls.__name__} is not a policy, it has no {' and '.join(missing)}"
+        raise _refusal(name, f"{text}; derive it from agents.Policy")
+    of_frames = cls.__module__.startswith("agents.") and cls.__name__ != "Random"
+    if context.bracket is not None and of_frames and "agents.bracketing." not in cls.__module__:
         others = f"random, {', '.join(_BRACKETS)} or one of your own"
         raise _refusal(name, f" is not for ae_env/ExposureBracket-v0: take {others}")
-    _check_options(cls, name, options, fixed)
-    try:
-        policy: Policy = cls(context, **fixed, **options)
-    except Exception as error:  # a user's constructor may raise anything
-        if not ours:
-            raise _broken(name, f"{cls.__name__} cannot be made", error) from error
-        if not isinstance(error, ValueError | FileNotFoundError):
-            raise
-        kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
-        raise kind(f"`policy` (={name!r}): {error}") from error
-    return policy
 
 
-def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str, Any]) -> None:
+def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str, Any]) -> None:
     """Raises a `ValueError` if `cls` does not take one of the `options`."""
     parameters = list(inspect.signature(cls).parameters.values())[1:]  # the first is the context
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
     known = [p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and p.name not in fixed]
     for option in set(options) - set(known):
-        takes = f"it takes {', '.join(known)}" if known else "it takes none"
-        text = f": {cls.__name__} does not take the option {option!r}; {takes}"
-        raise _refusal(name, text + did_you_mean(option, known))
+        takes = f"; it takes {', '.join(known) or 'none'}{did_you_mean(option, known)}"
+        raise _refusal(name, f": {cls.__name__} does not take the option {option!r}{takes}")
 
 
-def _known(name: str) -> str:
-    """What a name may be, for an error about the unknown `name`."""
-    files = [f"{head}:{'FOLDER' if head == 'recorded' else 'PATH'}" for head in _WITH_FILE]
-    known = [*_SHORT, *_POLICIES, *files, *_BRACKETS]
-    single = [n for n in (*_POLICIES, *files, *_BRACKETS) if n.partition(":")[0] not in _SHORT]
+def _known(base: str) -> str:
+    """What a name may be, for an error about the unknown `base`."""
+    files = [f"{head}:{argument.upper()}" for head, (_, argument) in _WITH_FILE.items()]
+    names = [*_POLICIES, *files, *_BRACKETS]
+    single = [name for name in names if name.partition(":")[0] not in METERS]
+    hint = did_you_mean(base, [*_SHORT, *names], cutoff=0.5)
     return (
-        f" must be one of {', '.join(single)}; oracle, alone or with :last_frame or :clairvoyant; "
-        f"a meter ({', '.join(METERS)}), alone or with a program "
-        f"({', '.join(f':{p}' for p in PROGRAMS)}); rpi_agc, alone or with "
-        f"{', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
-        f"package.module:Class or path.py:Class{did_you_mean(name, known, cutoff=0.5)}"
+        f" must be one of {', '.join(single)}; a meter ({', '.join(METERS)}), alone or with a "
+        f"program ({', '.join(PROGRAMS)}); package.module:Class or path.py:Class{hint}"
     )
-
-
-def _broken(policy: str, what: str, error: BaseException) -> ValueError:
-    return _refusal(policy, f": {what}: {type(error).__name__}: {error}")
 
 
 def _refusal(policy: object, text: str) -> ValueError:

@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ def record_dataset(
         UserCodeError: If the policy raises, or chooses what is no allowed state.
     """
     check_dataset_id(dataset_id)
-    minari = _minari()
+    minari, report = _minari(), progress or (lambda *_: None)
     root = Path(minari.storage.get_dataset_path(""))
     root.mkdir(parents=True, exist_ok=True)
     oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
@@ -86,10 +86,18 @@ def record_dataset(
         closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
         tempfile.TemporaryDirectory(dir=root, prefix=".unfinished-") as folder,
     ):
+
+        def recorded() -> Iterator[Any]:
+            for i in range(episodes):
+                report(i, episodes)
+                content = _record_episode(env, policy, name, seed + i)
+                yield minari.data_collector.EpisodeBuffer(id=i, **content)
+            report(episodes, episodes)
+
         with _datasets_in(folder):
             minari.create_dataset_from_buffers(
                 dataset_id,
-                _episodes(env, policy, name, range(seed, seed + episodes), progress),
+                recorded(),
                 env=env,
                 algorithm_name=name,
                 description=f"{episodes} episodes of {name} in {task}, seeds from {seed}",
@@ -97,17 +105,11 @@ def record_dataset(
                 data_format="hdf5",
                 jpeg_encoding=False,
             )
-        _publish(Path(folder, dataset_id), root, dataset_id)
+        namespace = dataset_id.rpartition("/")[0]
+        if namespace and namespace not in minari.namespace.list_local_namespaces():
+            minari.namespace.create_namespace(namespace)
+        Path(folder, dataset_id).rename(root / dataset_id)
     return minari.load_dataset(dataset_id)
-
-
-def _publish(finished: Path, root: Path, dataset_id: str) -> None:
-    """Moves a dataset to its place, in its namespace."""
-    namespaces = _minari().namespace
-    namespace = dataset_id.rpartition("/")[0]
-    if namespace and namespace not in namespaces.list_local_namespaces():
-        namespaces.create_namespace(namespace)
-    finished.rename(root / dataset_id)
 
 
 @contextmanager
@@ -125,27 +127,10 @@ def _datasets_in(folder: str) -> Iterator[None]:
             os.environ[_ROOT] = before
 
 
-def _episodes(
-    env: gym.Env[Any, Any],
-    policy: Policy,
-    name: str,
-    seeds: Sequence[int],
-    progress: Callable[[int, int], None] | None,
-) -> Iterator[Any]:
-    buffer = _minari().data_collector.EpisodeBuffer
-    for i, seed in enumerate(seeds):
-        if progress is not None:
-            progress(i, len(seeds))
-        yield buffer(id=i, **_record_episode(env, policy, name, seed))
-    if progress is not None:
-        progress(len(seeds), len(seeds))
-
-
 def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int) -> dict[str, Any]:
     """What an `EpisodeBuffer` of Minari holds of one episode."""
     observation, info = env.reset(seed=seed)
-    seen = {key: [value] for key, value in observation.items()}
-    scene: str = info["scene_id"]
+    seen, scene = {key: [value] for key, value in observation.items()}, info["scene_id"]
     steps: list[tuple[Any, ...]] = []
     with errors_of(name, "reset"):
         policy.reset(1, seed=seed)
@@ -153,11 +138,11 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
     while not done:
         shown = {key: np.asarray(value)[None] for key, value in observation.items()}
         masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
-        told: dict[str, Any] = {}
+        extra: dict[str, Any] = {}
         if getattr(policy, "privileged", False):
-            told = {"info": {"oracle_state": np.array([info["oracle_state"]])}}
+            extra = {"info": {"oracle_state": np.array([info["oracle_state"]])}}
         with errors_of(name, "act"):
-            actions = policy.act(shown, masks, **told)
+            actions = policy.act(shown, masks, **extra)
         state = checked_states(name, actions, masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)
         done = terminated or truncated

@@ -11,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.options import EnvOptions
+from ae_env.scenes.load import BUNDLED, REAL
 from ae_env.utils.user_files import UserCodeError
 from agents.policy import Observations
 
@@ -29,7 +31,7 @@ Ints = NDArray[np.int64]
 def make_envs(
     env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Environments for `evaluate` and `fit_policies`: no autoreset, episodes of `frames` and more.
+    """Environments without autoreset, whose episodes allow `frames` actions and more.
 
     Args:
         env_options: Arguments of the environment, such as ``{"split": "test"}``.
@@ -37,8 +39,6 @@ def make_envs(
         frames: Actions that an episode must allow.
         with_oracle: Whether `info` holds ``oracle_state``.
     """
-    import ae_env  # noqa: F401  (registers the environment)
-
     options = {**env_options, "with_oracle": with_oracle, "autoreset_mode": "DISABLED"}
     # One frame more than is used: the episode must not end inside the evaluation.
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
@@ -51,9 +51,6 @@ def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[st
         Its ``scenes``, with the ``grid`` of recorded ones; and whether they are others, the bundled
         ones, because `scenes` has too few source groups for a training split.
     """
-    from ae_env.options import EnvOptions
-    from ae_env.scenes.load import BUNDLED, REAL
-
     if isinstance(scenes, str) and scenes in (*BUNDLED, *REAL):
         return {"scenes": scenes}, False
     options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
@@ -69,10 +66,10 @@ def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[st
 
 def fitting_arguments(environment: Mapping[str, Any], resolution: int) -> dict[str, Any]:
     """`environment`, arguments of one that a policy is judged in, with scenes to fit it on."""
-    scenes = environment.get("scenes", "bundled")
+    own = dict(environment)
+    scenes = own.pop("scenes", "bundled")
     if not isinstance(scenes, str | Mapping):
         return dict(environment)
-    own = {name: value for name, value in environment.items() if name != "scenes"}
     return training_arguments(scenes, resolution)[0] | own
 
 
@@ -163,11 +160,9 @@ class RolloutPlan:
             valid = np.arange(envs.num_envs) < len(index)
             index = np.concatenate([index, np.resize(index, envs.num_envs - len(index))])
             scenes = [self.scenes[i] for i in self.scene[index]]
-            options = {
-                "scene": [scene.scene_id for scene in scenes],
-                "state": [self.starts[int(i)] for i in index],
-            }
-            seeds: Any = [self.seeds[int(i)] for i in index]
+            states = [self.starts[i] for i in index]
+            options = {"scene": [scene.scene_id for scene in scenes], "state": states}
+            seeds: Any = [self.seeds[i] for i in index]
             observations, info = envs.unwrapped.reset(seed=seeds, options=options)
             yield EpisodeBatch(
                 index=index,

@@ -26,7 +26,7 @@ from ae_env.scenes.folder import find_files
 from ae_env.scenes.load import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import prepare_scene
-from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from ae_env.scorers.score_table import ScoreTables
 from simulator import get_camera
 from simulator.utils.files import write_atomically
 
@@ -131,17 +131,17 @@ class ShardWriter:
         bad: list[dict[str, str]] = []
         frames: dict[str, torch.Tensor] = {}
         scenes = 0
-        first = shard * plan.per_shard
-        own = slice(first, first + plan.per_shard)
+        own = slice(shard * plan.per_shard, (shard + 1) * plan.per_shard)
         for path, name in zip(plan.files[own], plan.names[own], strict=True):
             try:
-                found = self._scenes(path)
+                found = load_scenes(path, "all", camera=self._camera, resolution=plan.resolution)
+                if self._networks is not None:
+                    found = [self._networks.denoised(scene) for scene in found]
             except (ValueError, OSError) as error:
                 bad.append({"file": name, "error": " ".join(str(error).split())})
                 continue
             for scene in found:
-                tables = self._score_tables(scene)
-                for column, values in self._rows(name, scene, tables.table(scene)).items():
+                for column, values in self._rows(name, scene).items():
                     columns.setdefault(column, []).extend(values)
                 if plan.captures:
                     frames[f"{name}:{scene.scene_id}"] = self._captures(scene)
@@ -151,7 +151,7 @@ class ShardWriter:
             write_atomically(Path(plan.out, f"captures-{stem}.safetensors"), save(frames))
         if bad:
             text = "".join(json.dumps(line) + "\n" for line in bad)
-            write_atomically(Path(plan.out, f"bad-{stem}.jsonl"), text.encode())
+            write_atomically(Path(plan.out, f"bad-{stem}.jsonl"), text)
         sink = pa.BufferOutputStream()
         pq.write_table(pa.table(columns), sink)
         write_atomically(plan.table(shard), sink.getvalue().to_pybytes())
@@ -164,17 +164,12 @@ class ShardWriter:
             "process": os.getpid(),
         }
 
-    def _scenes(self, path: str) -> list[Scene]:
-        scenes = load_scenes(path, "all", camera=self._camera, resolution=self.plan.resolution)
-        return [self._networks.denoised(s) for s in scenes] if self._networks else scenes
-
-    def _score_tables(self, scene: Scene) -> ScoreTables:
+    def _rows(self, name: str, scene: Scene) -> dict[str, list[Any]]:
+        """Columns of a scene's states."""
         key = repr(scene.camera)
         if key not in self._tables:
             self._tables = {key: ScoreTables(self._grid, scene.camera, self._scorer)}
-        return self._tables[key]
-
-    def _rows(self, name: str, scene: Scene, table: ScoreTable) -> dict[str, list[Any]]:
+        table = self._tables[key].table(scene)
         count, states = len(self._grid), self._grid.states
         return {
             "file": [name] * count,
@@ -214,15 +209,17 @@ def run(
     """
     check_engine(on)
     plan.begin()
-    todo = plan.missing()
-    progress(len(plan.shards) - len(todo), len(plan.shards))
+    todo, total = plan.missing(), len(plan.shards)
+    progress(total - len(todo), total)
     if not todo:
         return []
+    shards = (
+        map(ShardWriter(plan).write, todo) if on == _LOCAL else _on_ray(plan, todo, on, workers)
+    )
     made = []
-    local = on == _LOCAL
-    for told in map(ShardWriter(plan).write, todo) if local else _on_ray(plan, todo, on, workers):
+    for told in shards:
         made.append(told)
-        progress(len(plan.shards) - len(todo) + len(made), len(plan.shards))
+        progress(total - len(todo) + len(made), total)
     return made
 
 
@@ -262,17 +259,13 @@ def _on_ray(
     import ray
 
     if not ray.is_initialized():
-        if address == _RAY:
-            ray.init(num_cpus=workers, include_dashboard=False, object_store_memory=2**28)
-        else:
-            ray.init(address=address)
+        own = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": 2**28}
+        ray.init(**(own if address == _RAY else {"address": address}))
     # Few workers for the whole run, each with its networks and its compiled code: one cache of
     # numba's per node, beside the installed package. Ray starts a lost one anew and gives its
     # shard to another.
-    dataset = ray.data.from_items(
-        [{"shard": shard} for shard in todo], override_num_blocks=len(todo)
-    )
-    done = dataset.map_batches(
+    shards = [{"shard": shard} for shard in todo]
+    done = ray.data.from_items(shards, override_num_blocks=len(todo)).map_batches(
         _RayWorker,
         fn_constructor_args=(plan,),
         batch_size=1,
@@ -280,5 +273,4 @@ def _on_ray(
         num_cpus=1,
         scheduling_strategy="SPREAD",
     )
-    for row in done.iter_rows():
-        yield dict(row)
+    yield from map(dict, done.iter_rows())

@@ -77,13 +77,12 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     )
     with tempfile.TemporaryDirectory() as folder:
         results = run_plan(plan, folder)
-    (rank,) = overall_ranking(results)
-    gains = {light: results[light].group_gains(rank.policy) for light in LIGHTS}
+    rank = overall_ranking(results).iloc[0]
     return {
         "variant": variant,
-        "score": rank.score.value,
-        "ci95": rank.score.pair,
-        "by_light": {k: float(g.mean(axis=0).sum() / s.sum()) for k, (g, s) in gains.items()},
+        "score": rank.normalised_score,
+        "ci95": rank.ci95,
+        "by_light": {light: results[light].normalised(rank.policy) for light in LIGHTS},
         "training_s": seconds,
         "curve": load_curve(sibling(out, ".csv")),
     }

@@ -17,6 +17,11 @@ import numpy as np
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.utils.checks import check_integer, check_word
 
+#: A sample at or below this signal counts as clipped low: ten stops below white.
+LOW_CLIP = 2.0**-10
+#: A sample at or above this signal counts as clipped high.
+HIGH_CLIP = 1.0 - 1e-6
+
 
 class BayerPattern(StrEnum):
     """Colour filter array, the 2 x 2 tile read row by row."""
@@ -94,7 +99,7 @@ class CameraProfile:
                 f"(={black}), at most {largest}"
             )
 
-    @property
+    @functools.cached_property
     def span(self) -> tuple[float, float, float, float]:
         """Digital numbers from black to white, per plane R, G1, G2, B."""
         return tuple(self.white_level - b for b in self.black_level)  # type: ignore[return-value]
@@ -103,6 +108,23 @@ class CameraProfile:
     def pedestal(self) -> tuple[float, float, float, float]:
         """How far below zero a packed raw can go, per plane: black / (white - black)."""
         return tuple(b / (self.white_level - b) for b in self.black_level)  # type: ignore[return-value]
+
+    @functools.cached_property
+    def digits(self) -> np.ndarray:
+        """How it digitises a signal: (5, 4) float32, columns are the planes R, G1, G2, B.
+
+        The rows: digital numbers from black to white, digital number of black, largest one that
+        counts as clipped low, smallest one that counts as clipped high, largest one.
+        """
+        span, black = (np.array(v, np.float32)[:, None] for v in (self.span, self.black_level))
+        numbers = np.arange(int(self.white_level) + 1, dtype=np.float32)
+        signals = (numbers - black) / span  # (4, W)
+        low = (signals <= LOW_CLIP).sum(axis=1) - 1
+        high = len(numbers) - (signals >= HIGH_CLIP).sum(axis=1)
+        white = np.full(4, self.white_level)
+        table = np.stack([span[:, 0], black[:, 0], low, high, white]).astype(np.float32)
+        table.flags.writeable = False
+        return table
 
     @property
     def full_well(self) -> float | None:

@@ -18,7 +18,7 @@ import torch
 
 from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.depth import draw_layout
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
 from simulator.radiance.procedural import (
@@ -74,8 +74,6 @@ def bundled_scenes(
 ) -> SceneSet:
     """The bundled scenes of a split, from the cache where they have been made before.
 
-    Else those of one split are drawn when they are needed (`DrawnScenes`).
-
     Args:
         request: Split, camera, resolution and crop; without a resolution they have 256 pixels.
         size: ``"small"``: only `SMALL_GROUPS` groups of each kind and split; ``"large"``:
@@ -111,12 +109,7 @@ def bundled_scenes(
 
 
 class SceneGroup(NamedTuple):
-    """Scenes that are drawn together.
-
-    Args:
-        scene_ids: Their names.
-        draw: Draws them, always the same ones.
-    """
+    """Names of scenes that are drawn together, and what draws them, always the same ones."""
 
     scene_ids: Sequence[str]
     draw: Callable[[], Iterable[Scene]]
@@ -127,11 +120,6 @@ class DrawnScenes(SceneSet):
 
     The first is drawn at once, so that what cannot be drawn is an error here. When the last one is
     there, all are stored under `key` for the next process. A pickled copy has all of them.
-
-    Args:
-        name: What they are, in messages.
-        groups: What draws them, in order.
-        key: Of the cache.
     """
 
     def __init__(self, name: str, groups: Sequence[SceneGroup], key: str) -> None:
@@ -228,11 +216,9 @@ def cached_scenes(
 ) -> list[Scene]:
     """Scenes without noise of `camera`, from the cache where they have been made before.
 
-    All of them have a layout, or none.
-
     Args:
         key: Of all that they depend on (`simulator.utils.cache.cache_key`).
-        make: Makes them, all of one size.
+        make: Makes them, all of one size, all with a layout or none.
         camera: In whose colours they are.
         resolution: Packed pixels a side; None for `NATIVE_SIZE`.
     """

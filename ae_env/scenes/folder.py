@@ -17,7 +17,7 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
@@ -117,17 +117,15 @@ NOTHING_KNOWN = FolderOptions()
 def folder_scenes(
     spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
-    """The scenes of a split among the user's files.
+    """The scenes of a split among the user's files; each is resized before the next file is read.
 
     Args:
         spec: See `find_files`.
-        request: Split, camera and size. Each scene is resized before the next file is read.
+        request: Split, camera and size.
         options: Facts about the files that the caller knows.
 
     Raises:
-        ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
-            if no file can), or the split is ``"train"`` and there are too few groups to hold any
-            out.
+        ValueError: If a file cannot be read, or there are too few groups to train on.
     """
     base, files = find_files(spec)
     named = _named_groups(sorted({base, *(p.parent for p in files)}))
@@ -145,9 +143,9 @@ def sequence_scenes(
     """The frames of every sequence of a split, one sequence after the other.
 
     The raws of one folder, in the natural order of their names, are one sequence and one source
-    group; its name is the folder's below `spec`. Each raw's light is known through its own
-    settings: it may change from frame to frame. Raws in `spec` itself are named after it, or ``.``
-    where a folder below has that name.
+    group, called as the folder below `spec`. Each raw's light is known through its own settings: it
+    may change from frame to frame. Raws in `spec` itself are named after it, or ``.`` where a
+    folder below has that name.
 
     Args:
         spec: A folder, searched with its sub-folders, or a glob.
@@ -155,8 +153,7 @@ def sequence_scenes(
         options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
 
     Raises:
-        ValueError: If there are no raws, one cannot be read, there are no sequences of the split,
-            or unreadable raws were to be skipped: all later frames would come too early.
+        ValueError: If there are no raws, one cannot be read, or there are too few to train on.
     """
     if options.on_error == "skip":
         raise ValueError(
@@ -184,9 +181,7 @@ def sequence_scenes(
 def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
     """First and last frame, (F,) int64 each, of the sequence that each of F frames belongs to.
 
-    Args:
-        scenes: As `sequence_scenes` returns them: those of one sequence follow each other. A scene
-            of none is one of its own.
+    Those of one sequence follow each other. A scene of none is one of its own.
     """
     names = [scene.sequence or scene.scene_id for scene in scenes]
     begins = [i for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
@@ -199,13 +194,10 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
-    """The raws and radiance maps that `spec` names, and the folder they are under.
+    """The raws and radiance maps that `spec` names, in natural order, and their folder.
 
     Args:
         spec: A file, a folder (searched with its sub-folders; hidden ones left out) or a glob.
-
-    Returns:
-        The base folder and the files, sorted in natural order (``IMG_2`` before ``IMG_10``).
 
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
@@ -218,12 +210,7 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
         raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
-    files = [
-        p
-        for p in found
-        if p.suffix.lower() in (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
-        and not any(part.startswith(".") for part in p.relative_to(base).parts)
-    ]
+    files = visible_files(base, found, (*RAW_SUFFIXES, *RADIANCE_SUFFIXES))
     if not files:
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):
@@ -248,6 +235,12 @@ def _listed(spec: str | Path) -> tuple[Path, list[Path]]:
         raise ValueError(f"`scenes` (={str(spec)!r}) must name an existing file, folder or glob")
     first = next((i for i, p in enumerate(path.parts) if glob.has_magic(p)), -1)
     return Path(*path.parts[:first]), [p for p in matches if p.is_file()]
+
+
+def visible_files(folder: Path, paths: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
+    """Those of the `paths` that end in one of `suffixes`, and are not hidden in `folder`."""
+    fitting = [path for path in paths if path.suffix.lower() in suffixes]
+    return [p for p in fitting if not any(n.startswith(".") for n in p.relative_to(folder).parts)]
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
@@ -301,16 +294,12 @@ def _read_files(
     if skipped:
         rest = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
         text = "; ".join(skipped[:_MOST_NAMES] + rest)
+        text = f"{len(skipped)} of {len(groups)} scene files skipped ({text})"
         if not scenes:
-            raise ValueError(
-                f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all "
-                f"{len(skipped)} were skipped ({text})"
-            )
-        total = len(groups)
-        logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)
+            raise ValueError(f"`scenes` (={str(spec)!r}) must hold a file that can be read: {text}")
+        logger.warning("%s: %s", spec, text)
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
     scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
-    log_groups(str(spec), scenes)
     return scenes_of_split(spec, scenes, request.split)
 
 
@@ -370,25 +359,22 @@ def radiance_scenes(
             ev100 = assumed_ev100(group)
             fields.setdefault("source", f"{file}; light of unknown scale, EV100 assumed")
     fields.setdefault("source", file)
-    try:
-        views, sampled = map_views(image, request.resolution, native=request.crop == "native")
-        if not sampled:
-            logger.info(
-                "radiance map %s: fewer pixels than photosites, so planes share their places", file
-            )
-        matrix, _ = camera_from_srgb(request.camera)
-        greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
-        levels = [-math.log2(mean_anchor(green)) for green in greens]
-        for (ending, view), level in zip(views.items(), levels, strict=True):
-            if ev100 is not None:  # one scale for the whole map: a darker view stays darker
-                fields["ev100"] = ev100 + level - float(np.mean(levels))
-            scene_id = name + ending
-            scene = Scene.from_radiance(
-                view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
-            )
-            yield request.sized(scene)
-    except ValueError as error:
-        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
+    views, sampled = map_views(image, request.resolution, native=request.crop == "native")
+    if not sampled:
+        logger.info(
+            "radiance map %s: fewer pixels than photosites, so planes share their places", file
+        )
+    matrix, _ = camera_from_srgb(request.camera)
+    greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
+    levels = [-math.log2(mean_anchor(green)) for green in greens]
+    for (ending, view), level in zip(views.items(), levels, strict=True):
+        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
+            fields["ev100"] = ev100 + level - float(np.mean(levels))
+        scene_id = name + ending
+        scene = Scene.from_radiance(
+            view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
+        )
+        yield request.sized(scene)
 
 
 # -- source groups and the split ----------------------------------------------------------------
@@ -439,13 +425,6 @@ def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
       similarity of their colour and brightness histograms at least 0.5.
 
     Anything else starts a new group, named after its first shot.
-
-    Args:
-        names: Name of each shot.
-        shots: Time and colours of each.
-
-    Returns:
-        The group of each, in the order given.
     """
     timed = all(shot.time is not None for shot in shots)
 
@@ -472,11 +451,7 @@ def _same_subject(first: Shot, second: Shot) -> bool:
 
 
 def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
-    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``.
-
-    Raises:
-        ValueError: If such a file lacks a column, leaves one empty or names a missing file.
-    """
+    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``."""
     groups: dict[Path, str] = {}
     for folder in folders:
         table = folder / "groups.csv"
@@ -499,11 +474,7 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
 
 
 def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
-    """Rows and column names of a CSV file.
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
+    """Rows and column names of a CSV file; a `ValueError` if it cannot be read."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.DictReader(stream)
@@ -518,9 +489,6 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
     Below 15 groups all are ``"test"``: too few to hold out. From 15 on a hash of the group's name
     decides, 70 % to training, so that adding a file moves no other. Should the hash leave one side
     empty, the group nearest to the threshold changes sides.
-
-    >>> set(split_groups(["a", "b"]).values())
-    {'test'}
     """
     names = sorted(set(groups))
     if len(names) < FEWEST_GROUPS_TO_SPLIT:
@@ -534,20 +502,20 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
 
 
 def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
-    """The scenes whose source group is in `split`.
-
-    Args:
-        spec: Name of the scenes, for the error.
-        scenes: Scenes of all splits.
-        split: ``"train"``, ``"test"`` or ``"all"``.
+    """The scenes whose source group is in `split`; the log tells the groups and how many are not.
 
     Raises:
         ValueError: If `split` is ``"train"`` and there are too few groups.
     """
+    members: dict[str, list[str]] = {}
+    for scene in scenes:
+        members.setdefault(scene.group, []).append(scene.scene_id)
+    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
+    logger.info("%s: %d source groups (%s)", spec, len(members), text)
     if split == "all":
         return scenes
-    parts = split_groups([scene.group for scene in scenes])
-    _check_training_groups(spec, split, len(parts))
+    _check_training_groups(spec, split, len(members))
+    parts = split_groups(list(members))
     left_out = sum(part != split for part in parts.values())
     if left_out:
         logger.warning(
@@ -566,12 +534,3 @@ def _check_training_groups(spec: str | Path, split: str, count: int, most: str =
             "use these with split='test' (zero-shot) or split='all'; if files are grouped wrongly, "
             "name the groups in a groups.csv (columns file, group) beside them"
         )
-
-
-def log_groups(where: str, scenes: Sequence[Scene]) -> None:
-    """Logs the scenes of each source group."""
-    members: dict[str, list[str]] = {}
-    for scene in scenes:
-        members.setdefault(scene.group, []).append(scene.scene_id)
-    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
-    logger.info("%s: %d source groups (%s)", where, len(members), text)

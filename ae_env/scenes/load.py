@@ -101,12 +101,10 @@ def load_scenes(
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
             made them has split them.
-        camera: In whose colours bundled scenes and radiance maps are made. A raw brings its own
-            camera.
+        camera: In whose colours scenes are made. A raw brings its own camera.
         resolution: Packed pixels a side; None keeps each scene's own size.
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
-        resize: Called with each scene at its finest resolution, `resolution` and `crop`; see
-            `SceneNetworks.resized` for another than the default.
+        resize: Called with each scene at its finest resolution, `resolution` and `crop`.
         grid: States of recorded grids; by default all that their captures have.
 
     Returns:
@@ -192,11 +190,6 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
         )
     for name in spec:
         check_word("scenes", name, (where, *known))
-    if spec[where] in NAMED:
-        raise ValueError(
-            f"`scenes` (={dict(spec)!r}): {where!r} must be a file, folder or glob; give the name "
-            f"{spec[where]!r} itself for those scenes"
-        )
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 
@@ -230,19 +223,14 @@ def environment_scenes(
     """The scenes of `load_scenes`, with what networks find in them, for an environment.
 
     Those with a name, and recorded ones whose files have not changed, stay in memory for the next
-    environment with the same arguments. Bundled ones that must be drawn are when they are needed.
+    environment with the same arguments. Bundled ones are drawn when they are needed.
 
     Args:
         spec, split, camera, resolution, crop, grid: See `load_scenes`.
-        from_raw: Whether a scene without noise is known through one raw of it only
-            (`simulate_source_raw`).
+        from_raw: Whether a scene without noise is known through one raw of it only.
         finds_defocus: Whether a defocus map is estimated where a scene has none.
         simulator: Weights of the networks; None for none, so that noise stays.
         noise: False denoises the light of scenes.
-
-    Raises:
-        ValueError: As `load_scenes`; if the light of a scene is unknown and cannot be estimated; or
-            if recorded scenes are in a list, where their captures would be simulated.
     """
     needs_networks = finds_defocus or from_raw
     recorded = RecordedOptions.of(spec)
@@ -276,9 +264,8 @@ def environment_scenes(
             found = [simulate_source_raw(s) if s.noise_free else s for s in found]
         scenes = SceneSet(_prepare(scene, networks, finds_defocus, noise) for scene in found)
     if key is not None:
-        first, frames = scenes[0].light, scenes[0].recorded
-        size_of_one = first.nbytes + (0 if frames is None else frames.nbytes)
-        _LOADED.put(key, scenes, len(scenes) * size_of_one)
+        held = [t.nbytes for t in (scenes[0].light, scenes[0].recorded) if t is not None]
+        _LOADED.put(key, scenes, len(scenes) * sum(held))
     return scenes
 
 
@@ -309,20 +296,19 @@ def simulate_source_raw(
     """`scene` as one simulated raw of it tells; its illuminance stays known.
 
     The reference camera takes the raw as an average meter would have it, at an ISO drawn between
-    100 and 6400. It replaces the scene: noise, white highlights and all. What is simulated from it
-    is the neural simulator's estimate, as in the paper.
+    100 and 6400: noise, white highlights and all. Captures are simulated from it by the neural
+    simulator, as in the paper.
 
     Args:
         scene: Without noise.
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
-        iso: ISO of the raw; drawn by default.
+        iso: ISO of the raw; drawn by default from `iso_range`, log-uniformly.
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
             default.
-        iso_range: What the ISO is drawn from, log-uniformly.
+        iso_range: See `iso`.
 
     Raises:
-        ValueError: If the scene carries noise, as a raw does; or if it is black nearly everywhere,
-            so that no meter can expose it.
+        ValueError: If the scene carries noise, or is too dark for a meter.
     """
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")
@@ -360,9 +346,8 @@ def simulate_source_raw(
 
 def check_weights(name: str) -> None:
     """Raises a `ValueError` unless `name` is that of weights or the path of some; reads none."""
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"`simulator` (={name!r}) must be None, or the name or path of weights")
-    if name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file():
+    is_text = isinstance(name, str) and name != ""
+    if is_text and (name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file()):
         return
     from simulator.networks.weights import list_pretrained
 
@@ -419,24 +404,23 @@ class SceneNetworks:
 
         def make() -> torch.Tensor:
             logger.info("estimating the defocus of scene %s", scene.scene_id)
-            return self._small_map(scene, resolution, crop)
+            fine, shorter, used = scene, min(scene.light.shape[1:]), resolution
+            if resolution is not None and crop == "box":
+                used = shorter // resolution * resolution
+            if used is not None and used + 2 * _MARGIN < shorter:
+                fine = scene.resized(used + 2 * _MARGIN, "native")
+            # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
+            prepared = self._simulator.prepare(fine.prepared, tolerance=0.0)
+            fine = replace(fine, defocus_map=self._simulator.estimate_defocus(prepared))
+            found = fine.resized(used, "native").resized(resolution, crop).defocus_map
+            assert found is not None
+            return found
 
         numbers = {"map": [MAP_VERSION, DEAD_ZONE], "resolution": resolution, "crop": crop}
-        found = self._cached("defocus_maps", scene, make, shape=small.light.shape[1:], **numbers)
-        return replace(small, defocus_map=found)
-
-    def _small_map(self, scene: Scene, resolution: int | None, crop: Crop) -> torch.Tensor:
-        shorter = min(scene.light.shape[1:])
-        factor = 1 if resolution is None or crop == "native" else shorter // resolution
-        used = None if resolution is None else factor * resolution
-        if used is not None and used + 2 * _MARGIN < shorter:
-            scene = scene.resized(used + 2 * _MARGIN, "native")
-        # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
-        prepared = self._simulator.prepare(scene.prepared, tolerance=0.0)
-        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(prepared))
-        found = fine.resized(used, "native").resized(resolution, crop).defocus_map
-        assert found is not None
-        return found
+        shape = small.light.shape[1:]
+        return replace(
+            small, defocus_map=self._cached("defocus_maps", scene, make, shape=shape, **numbers)
+        )
 
     def _cached(
         self, kind: str, scene: Scene, make: Callable[[], torch.Tensor], **numbers: Any

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
-from simulator.capture.layout import Layout
-from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import ReferenceScene, lens_blur, sample_mosaic
+from simulator.capture.prepared_scene import Layout
+from simulator.reference.camera import lens_blur, sample_mosaic
 from simulator.training.scenes import depth_photographs
 from simulator.utils.files import data_folder
 
@@ -14,45 +13,34 @@ from simulator.utils.files import data_folder
 IN_FOCUS = 0.1
 
 
-def scene_with_depth(reference: ReferenceScene, camera: CameraProfile) -> Scene:
-    """A reference scene for the environment.
-
-    Its layout follows from its depth and its lens: the subject is what is in focus. How large the
-    circle of confusion is, is drawn with each episode, as for every scene.
-
-    Args:
-        reference: The scene; without depth it has no layout.
-        camera: Whose colour filter array samples light at the pitch of the photosites.
-    """
-    light, k, depth = reference.light, reference.pitch, reference.depth
-    layout = None
-    if depth is not None:
-        distance = reference.lens.focus_distance
-        layout = Layout.from_depth(depth, distance, in_focus=IN_FOCUS).averaged(k)
-    return Scene(
-        scene_id=reference.scene_id,
-        group=reference.group,
-        kind=reference.kind,
-        light=sample_mosaic(lens_blur(light), camera.cfa) if k == 2 else light,
-        reference=reference.reference,
-        camera=camera,
-        nlf=NoiseLevelFunction.zero(),
-        illuminance=reference.illuminance,
-        white_balance=reference.white_balance,
-        source=reference.source,
-        sampled=reference.sampled,
-        layout=layout,
-    )
-
-
 def depth_scenes(camera: CameraProfile) -> list[Scene]:
     """Photographs with measured depth: ``scenes="ae_env.scenes.measured_depth:depth_scenes"``.
 
-    Each is focused on its front and on its median depth. Cones is among them where ``AE_ENV_DATA``
-    has it.
+    Each is focused on its front and on its median depth: the subject is what is in focus. How large
+    the circle of confusion is, is drawn with each episode, as for every scene. Cones is among them
+    where ``AE_ENV_DATA`` has it.
 
     Args:
-        camera: In whose colours light is stated.
+        camera: Whose colour filter array samples the light, in its colours.
     """
-    found = depth_photographs(camera, data=data_folder())
-    return [scene_with_depth(reference, camera) for reference in found]
+    scenes = []
+    for found in depth_photographs(camera, data=data_folder()):
+        light, k, depth, layout = found.light, found.pitch, found.depth, None
+        if depth is not None:
+            distance = found.lens.focus_distance
+            layout = Layout.from_depth(depth, distance, in_focus=IN_FOCUS).averaged(k)
+        scene = Scene.from_array(
+            sample_mosaic(lens_blur(light), camera.cfa) if k == 2 else light,
+            found.reference,
+            camera,
+            scene_id=found.scene_id,
+            group=found.group,
+            kind=found.kind,
+            illuminance=found.illuminance,
+            white_balance=found.white_balance,
+            source=found.source,
+            sampled=found.sampled,
+            layout=layout,
+        )
+        scenes.append(scene)
+    return scenes

@@ -78,13 +78,11 @@ class Asset(Configuration):
     """A panorama.
 
     Args:
-        name: Public name.
+        name, bytes, sha256: Public name of its file, the file's length and hash.
         kind: Kind of light.
         split: ``"train"`` or ``"test"``.
         group: Source group: the place; by default the asset itself.
         file: Where it lies in a folder of real files.
-        bytes: Length of the file.
-        sha256: Of the file.
     """
 
     name: str = Field(pattern=r"[a-z0-9_]+")
@@ -132,11 +130,7 @@ def list_assets() -> tuple[Asset, ...]:
 
 
 def split_assets(name: str, split: str) -> list[Asset]:
-    """The assets of a split, whose maps are there.
-
-    Args:
-        name: What the scenes are called in the error.
-        split: ``"train"``, ``"test"`` or ``"all"``.
+    """The assets of a split, whose maps are there; errors call the scenes `name`.
 
     Raises:
         FileNotFoundError: If maps are missing; the message names the command that fetches them.
@@ -159,9 +153,6 @@ def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0
         request: Split, camera and size.
         views: Views of each map, at least 1.
         seed: Of the views' directions, their fields of view and the level of the light.
-
-    Raises:
-        FileNotFoundError: If maps are missing.
     """
     assets = split_assets("polyhaven", request.split)
     camera, plain = request.camera, request.resize is Scene.resized
@@ -232,10 +223,9 @@ def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
     against the view. A white diffuse surface there has a luminance of it over pi.
 
     Args:
-        panorama: (3, H, W) linear sRGB; columns are longitudes from -180 degrees, rows latitudes
-            from +90 degrees.
-        azimuth: Longitude that the surface faces [degrees].
-        pitch: Latitude that it faces [degrees]; 90 is level ground.
+        panorama: See `simulator.radiance.maps.perspective`.
+        azimuth, pitch: Longitude and latitude that the surface faces [degrees]; a pitch of 90 is
+            level ground.
     """
     height, width = panorama.shape[1:]
     longitude = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * math.pi
@@ -276,7 +266,7 @@ def cut_values(panorama: np.ndarray) -> list[str]:
 def download(
     *, url: str = URL, timeout: float = _TIMEOUT, progress: Callable[[int, int, str], None] | None
 ) -> list[Path]:
-    """Fetches the maps that are missing or damaged into the cache; those that are there stay.
+    """Fetches the maps that are missing or damaged into the cache, and returns their files.
 
     A file is put in place when it is complete and its hash is the list's. The environment's proxy
     (``HTTPS_PROXY``) is used.
@@ -285,9 +275,6 @@ def download(
         url: Folder that serves ``NAME_1k.hdr``.
         timeout: Seconds in which the server must answer, and go on answering.
         progress: Called with the bytes that are there, all bytes, and the name of the next map.
-
-    Returns:
-        The files that were fetched.
 
     Raises:
         ImportError: If the extra ``hdr`` is not installed.

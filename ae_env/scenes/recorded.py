@@ -28,7 +28,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, merge
-from ae_env.scenes.folder import log_groups, read_table, scenes_of_split
+from ae_env.scenes.folder import read_table, scenes_of_split, visible_files
 from ae_env.scenes.scene import Scene, SceneRequest
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -75,14 +75,7 @@ _FRAME = re.compile(r"frame[_-]?(\d+)", re.I)
 
 @dataclass(frozen=True)
 class RecordedOptions:
-    """A folder of recorded grids.
-
-    Args:
-        folder: The folder.
-        iso: ISO of files that do not state it.
-        exposure_time: Exposure time [s] of files that do not state it.
-        f_number: F-number of files that do not state it.
-    """
+    """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs."""
 
     folder: Path
     iso: float | None = None
@@ -101,11 +94,7 @@ class RecordedOptions:
 
     @classmethod
     def of(cls, spec: object) -> RecordedOptions | None:
-        """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing.
-
-        Raises:
-            ValueError: If it has an unknown entry, or names no folder.
-        """
+        """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing."""
         if isinstance(spec, RecordedOptions):
             return spec
         if isinstance(spec, str) and spec.startswith(PREFIX):
@@ -164,15 +153,11 @@ def recorded_scenes(
 ) -> list[Scene]:
     """The recorded scenes of a split, frames of one video after the other.
 
-    Args:
-        options: The folder.
-        request: Split, camera and size. Each capture is resized before the next is read.
-        grid: The states; captures at other settings are left out, states without a capture are
-            forbidden (`Scene.allowed`).
+    Each capture is resized before the next is read. Captures at settings that are not in `grid` are
+    left out, states without a capture are forbidden (`Scene.allowed`).
 
     Raises:
-        ValueError: If a capture cannot be read or has another size than its scene's others, two
-            are of one state, or a scene has fewer than two states.
+        ValueError: If a capture cannot be read, or a scene's captures are no grid of one size.
     """
     camera = options.camera(request.camera)
     scenes: list[Scene] = []
@@ -190,7 +175,6 @@ def recorded_scenes(
             f"forbidden there: {name!r} lacks {missing.sum()} of {len(grid)}, "
             f"the first is {grid[int(missing.argmax())]}"
         )
-    log_groups(str(options.folder), scenes)
     return scenes_of_split(options.folder, scenes, request.split)
 
 
@@ -245,7 +229,7 @@ def merged_scene(
 
     Args:
         name: Its name, and its source group.
-        raws: Captures of one size with their state of `grid`; one at a time is held.
+        raws: Captures with their state of `grid`; one at a time is held.
         grid: The states.
         camera: The body, with the noise of its ISO speeds.
         resize: Brings each capture to its size, before they are merged.
@@ -341,11 +325,9 @@ class RecordedFile:
 
 
 def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
-    """Every capture under `folder`, by scene, frame and settings.
+    """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
-    Args:
-        folder: Searched with its sub-folders; hidden ones left out.
-        known: Settings by name that the files do not state; those that they do come first.
+    `known` are settings by name that the files do not state; those that they do come first.
 
     Raises:
         ValueError: If there is no capture, one does not state its settings, or a table is wrong.
@@ -353,12 +335,8 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
     if not folder.is_dir():
         raise ValueError(f"`scenes` (='recorded:{folder}') must name an existing folder")
     tables = _read_tables(folder)
-    found = [
-        _recorded(folder, path, tables, known)
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in (*RAW_SUFFIXES, *PICTURE_SUFFIXES)
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
+    found = [_recorded(folder, path, tables, known) for path in paths]
     if not found:
         raise ValueError(
             f"`scenes` (='recorded:{folder}') must hold captures: raws "
@@ -522,12 +500,13 @@ def _in_file(path: Path) -> dict[str, float]:
 
 
 def recorded_grid(files: Sequence[RecordedFile]) -> ExposureGrid:
-    """The grid of every ISO, exposure time and f-number that some capture was taken at.
-
-    Raises:
-        ValueError: If it would have more than `MOST_STATES`.
-    """
-    values = [_distinct([getattr(file.settings, name) for file in files]) for name in _SETTINGS]
+    """The grid of every ISO, exposure time and f-number that some capture was taken at."""
+    values: list[list[float]] = []
+    for name in _SETTINGS:
+        values.append([])
+        for value in sorted(getattr(file.settings, name) for file in files):
+            if not values[-1] or value > values[-1][-1] * (1.0 + SAME):
+                values[-1].append(value)  # of those that are the same, the first
     isos, times, f_numbers = map(len, values)
     if isos * times * f_numbers > MOST_STATES:
         raise ValueError(
@@ -535,16 +514,7 @@ def recorded_grid(files: Sequence[RecordedFile]) -> ExposureGrid:
             f"f-numbers, {isos * times * f_numbers} combinations; at most {MOST_STATES}: give the "
             "`grid` that you want"
         )
-    return ExposureGrid(*values)
-
-
-def _distinct(values: Sequence[float]) -> tuple[float, ...]:
-    """Ascending; of those that are the same, the first."""
-    found: list[float] = []
-    for value in sorted(values):
-        if not found or value > found[-1] * (1.0 + SAME):
-            found.append(value)
-    return tuple(found)
+    return ExposureGrid(*map(tuple, values))
 
 
 def state_of(settings: CameraSettings, grid: ExposureGrid) -> int | None:

@@ -13,8 +13,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
-from simulator.capture.layout import Layout
-from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
@@ -152,13 +151,10 @@ class Scene:
         return LightStatistics(self.light)  # computes each value when it is first asked for
 
     def own_blur(self, f_number: float) -> float:
-        """Root mean square of the scene's own circle of confusion at `f_number` [pixel].
+        """Root mean square of the scene's own circle of confusion at an effective f-number [px].
 
         It grows as the aperture opens; a smaller aperture than the reference's leaves its blur. 0
         without a `defocus_map`.
-
-        Args:
-            f_number: Effective f-number.
         """
         return self._blur_at_reference * max(1.0, self.reference.effective_f_number / f_number)
 
@@ -227,10 +223,7 @@ class Scene:
 
     @classmethod
     def from_raw(cls, raw: RawImage, *, scene_id: str, kind: str = "raw", **fields: Any) -> Scene:
-        """A scene from a raw photograph: its light, its noise, its saturated pixels.
-
-        Saturated pixels are neutral (`simulator.raw.develop`), so that they stay so when they
-        are darkened.
+        """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
         Args:
             raw: The photograph; its settings become the reference.
@@ -296,10 +289,10 @@ class Scene:
                 ``"native"`` cuts R x R pixels out of the middle, ``k = 1``.
 
         Returns:
-            The scene with ``nlf / k**2`` and ``box_factor * k``; a pixel counts as saturated if
-            any pixel averaged into it was. `defocus_map` is the root of the mean square, as second
-            moments add, divided by k: in pixels of the new light. The defocus of `layout` is the
-            mean, its subject where that has most of a pixel.
+            The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
+            was averaged into it was. `defocus_map` is the root mean square, as second moments add,
+            divided by k. The defocus of `layout` is the mean, its subject where that has most of a
+            pixel.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
@@ -424,15 +417,9 @@ def _checked(scene: Scene) -> Scene:
 class SceneSet(Sequence[Scene]):
     """Scenes in a fixed order; bundled ones are drawn when they are needed.
 
-    All names are known at once. `load` the scenes that are about to be used, several at a time;
-    indexing and iterating load what they need. All scenes of a set that draws are alike: those that
-    are `loaded` tell whether any has a layout.
-
-    Args:
-        scenes: All of them, in order.
-
-    Attributes:
-        scene_ids: Their names.
+    All `scene_ids` are known at once. `load` the scenes that are about to be used, several at a
+    time; indexing and iterating load what they need. All scenes of a set that draws are alike:
+    those that are `loaded` tell whether any has a layout.
     """
 
     def __init__(self, scenes: Iterable[Scene]) -> None:
@@ -477,9 +464,8 @@ class SceneRequest:
     Args:
         split: ``"train"``, ``"test"`` or ``"all"``.
         camera: Camera in whose colours light is stated, unless a raw brings its own.
-        resolution: Packed pixels a side; None keeps each scene's own size.
-        crop: See `Scene.resized`.
-        resize: Brings each scene to `resolution`, as `Scene.resized` does.
+        resolution, crop: See `Scene.resized`.
+        resize: Brings each scene to that size, as `Scene.resized` does.
     """
 
     split: Split

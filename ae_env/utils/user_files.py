@@ -75,8 +75,7 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
         example: A name that the error proposes where there is none.
 
     Raises:
-        ValueError: If there is no such file, it cannot be loaded (the message says in which line,
-            the cause is chained), or it has nothing of that name.
+        ValueError: If it cannot be loaded (the cause is chained), or has nothing of that name.
     """
     if not name:
         raise ValueError(f"{argument} must name a class of the file: '{path}:{example}'")
@@ -88,11 +87,7 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
 
 
 def find_attribute(module: ModuleType, name: str, argument: str) -> Any:
-    """The object that `module` calls `name`.
-
-    Raises:
-        ValueError: If there is nothing of that name; the message lists the module's own classes.
-    """
+    """The object that `module` calls `name`; the `ValueError` without one lists its classes."""
     try:
         return getattr(module, name)
     except AttributeError:
@@ -174,20 +169,16 @@ def _cause(error: BaseException, file: Path | None = None) -> str:
 
 
 def list_presets(kind: str = "env") -> list[str]:
-    """Names of the presets of one kind.
-
-    Args:
-        kind: Folder of ``configs/``, such as ``"env"``.
-    """
+    """Names of the presets of one `kind`, a folder of ``configs/``."""
     return sorted({file.stem for folder in _FOLDERS for file in (folder / kind).glob("*.yaml")})
 
 
 def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
-    """The YAML file of a preset.
+    """The YAML file of a preset of one `kind`, a folder of ``configs/``.
 
     Args:
         name: Name of a preset, or the path of a ``.yaml`` file.
-        kind: Folder of ``configs/``, such as ``"env"``.
+        kind: Such as ``"env"``.
 
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.
@@ -219,14 +210,10 @@ def find_config(path: Path) -> Path:
 
 
 def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
-    """Arguments of the environment from a preset of ``configs/env``.
+    """Keyword arguments of ``gymnasium.make`` from a preset of ``configs/env``.
 
     Args:
         name: Such as ``"tunnel"``, or the path of a ``.yaml`` file.
-
-    Returns:
-        Keyword arguments of ``gymnasium.make("ae_env/AutoExposure-v0", ...)``,
-        ``max_episode_steps`` among them.
 
     Raises:
         ValueError: If there is no such preset, or it cannot be read, is too large or no mapping.

@@ -51,7 +51,9 @@ def bin_of(place: Floats) -> Ints:
 class Schedules:
     """All schedules of a grid, and what they are worth.
 
-    Luminance is in units of that which makes an exposure at EV100 0 white.
+    Luminance is in units of that which makes an exposure at EV100 0 white. A schedule has `states`
+    (M, K), -1 for none, each `counts` times (M, S), so many `frames` (M,), the `longest` of so long
+    (M,) [s]; the first is no frame at all.
 
     Args:
         grid: The states.
@@ -59,12 +61,6 @@ class Schedules:
         budget: Time of all frames together [s].
         max_frames: Frames of a schedule at most.
         box_factor: Photosites averaged a side into one pixel.
-
-    Attributes:
-        states: (M, K) int64, the states of each, -1 for none; the first is no frame at all.
-        counts: (M, S) how often each has each state.
-        frames: (M,) how many frames each has.
-        longest: (M,) its longest exposure [s].
     """
 
     def __init__(
@@ -93,14 +89,7 @@ class Schedules:
         self.noise_error = lru_cache(maxsize=256)(self._noise_error)
 
     def _precision(self, reference: float) -> tuple[Floats, Floats]:
-        """Inverse variance of the merged luminance, and each frame's share of it.
-
-        Args:
-            reference: EV100 that `BINS` are relative to.
-
-        Returns:
-            (M, L), and (M, K, L).
-        """
+        """Inverse variance (M, L) of merged luminance, and each frame's share of it (M, K, L)."""
         luminance = np.exp2(BINS + reference)
         gain = np.exp2(-self.grid.ev100)[:, None]
         signal = gain * luminance
@@ -115,9 +104,7 @@ class Schedules:
     def _noise_error(self, reference: float, floor: float) -> Floats:
         """(M, L) expected error of merged samples [EV]; `WORST_EV` where all frames are white.
 
-        Args:
-            reference: EV100 that `BINS` are relative to.
-            floor: log2 of the luminance below which errors count less; to the nearest stop.
+        `floor` is log2 of the luminance below which errors count less, to the nearest stop.
         """
         total, _ = self.precision(reference)
         luminance, dark = np.exp2(BINS + reference), 2.0 ** round(floor)
@@ -134,7 +121,7 @@ class Schedules:
 
         Args:
             reference: EV100 that `BINS` are relative to.
-            floor: See `noise_error`.
+            floor: log2 of the luminance below which errors count less.
             light: (L,) share of the samples in each of `BINS`.
             blur: (S,) error that the blur of each state makes [EV].
         """
@@ -148,12 +135,7 @@ class Schedules:
         return np.minimum(both, WORST_EV) @ light.astype(np.float32)
 
     def completions(self, taken: Ints, time_left: float) -> NDArray[np.bool_]:
-        """(M,) bool: schedules that hold the frames `taken` so far and fit into the time left.
-
-        Args:
-            taken: States of the frames so far.
-            time_left: Time left [s].
-        """
+        """(M,) bool: schedules that hold the states `taken` and fit into the `time_left` [s]."""
         counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
         more = self.frames - len(taken)
         needed = (self.counts - counts) @ self._exposures + FRAME_GAP * np.maximum(more - 1, 0)
@@ -161,13 +143,7 @@ class Schedules:
         return np.asarray((self.counts >= counts).all(axis=1) & fits)
 
     def next_state(self, schedule: int, taken: Ints, alone: Floats) -> int:
-        """The state of `schedule` to take next, the best by `alone`; -1 when all are taken.
-
-        Args:
-            schedule: Index of the schedule.
-            taken: States of the frames so far.
-            alone: (S,) error of each state alone.
-        """
+        """The next state of `schedule`, of the least error `alone` (S,); -1 when all are taken."""
         left = self.counts[schedule].copy()
         np.subtract.at(left, taken, 1)
         wanted = np.flatnonzero(left > 0)
@@ -193,14 +169,7 @@ BLUR_ERRORS = np.array(
 
 
 class Bracketing(Policy):
-    """Base of the policies: keeps the frames of each camera, and what they show together.
-
-    Args:
-        context: The camera, with the limits of a bracket.
-
-    Raises:
-        ValueError: If the context is not that of `ExposureBracket-v0`.
-    """
+    """Base of the policies: keeps the frames of each camera, and what they show together."""
 
     def __init__(self, context: PolicyContext) -> None:
         super().__init__(context)
@@ -246,10 +215,9 @@ class Bracketing(Policy):
         return np.array([state for state, _ in self._frames[camera][1:]], np.int64)
 
     def merged(self, camera: int) -> tuple[Floats, Floats, float]:
-        """Luminance of each sample in all frames of a camera, its inverse variance, and the limit.
+        """Luminance of each sample in all frames of a camera, and its inverse variance, both flat.
 
-        Returns:
-            Two flat arrays, and log2 of the luminance that the shortest exposure shows white.
+        The third is log2 of the luminance that the shortest exposure shows white.
         """
         states = [state for state, _ in self._frames[camera]]
         codes = np.stack([raw for _, raw in self._frames[camera]])
@@ -285,13 +253,7 @@ class Bracketing(Policy):
         return actions
 
     def choose(self, camera: int, time_left: float, speed: float) -> int:
-        """The next state of one camera, or `stop`.
-
-        Args:
-            camera: Index of the camera.
-            time_left: Time left [s].
-            speed: Speed of its shake [frame heights per second].
-        """
+        """The next state of a camera, or `stop`; `speed` of its shake [frame heights / s]."""
         raise NotImplementedError(f"{type(self).__name__} must implement `choose`")
 
 
@@ -337,13 +299,12 @@ class Hasinoff(Bracketing):
     Of all schedules that fit into the time, the one whose merged signal-to-noise ratio is largest
     where it is smallest over the range of the scene's light (Hasinoff et al., CVPR 2010). The range
     is that of the viewfinder's frame; where that is clipped it reaches `headroom` above white. The
-    schedule knows no motion, so exposures are at most `longest`. `fit` finds both on training
-    scenes, where they are not given.
+    schedule knows no motion, so exposures are at most `longest`.
 
     Args:
         context: The camera.
-        headroom: Stops; None fits it.
-        longest: Longest exposure time [s]; None fits it.
+        headroom: Stops; None: `fit` finds it on training scenes.
+        longest: Longest exposure time [s]; None likewise.
     """
 
     def __init__(
@@ -419,11 +380,8 @@ def describe(
 ) -> NDArray[np.float32]:
     """(3, L) histograms over `BINS`: of clear samples, of white ones, of those in the noise.
 
-    White samples count where they begin, at `limit`; those in the noise at the noise.
-
-    Args:
-        light, precision, limit: Of `Bracketing.merged`.
-        reference: EV100 that `BINS` are relative to.
+    White samples count where they begin, at `limit`; those in the noise at the noise. See
+    `Bracketing.merged`; `BINS` are relative to `reference` [EV100].
     """
     white = precision <= 0.0
     deviation = 1.0 / np.sqrt(np.maximum(precision, 1e-300))
@@ -496,9 +454,6 @@ def run_brackets(
     Returns:
         ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each
         episode, and the ``seconds`` that each decision took on average.
-
-    Raises:
-        UserCodeError: If the policy raises, or returns something else than actions.
     """
     name = name or policy.name
     names = ("quality", "log_error", "unseen", "frames", "time_left")

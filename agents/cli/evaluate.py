@@ -13,7 +13,8 @@ from typer import Option
 from agents.cli import console
 
 if TYPE_CHECKING:
-    from agents.evaluation.intervals import Rank
+    import pandas as pd
+
     from agents.evaluation.plan import EvaluationPlan
     from agents.evaluation.result import EvaluationResult
 
@@ -237,7 +238,7 @@ def _check_changes(base: EvaluationPlan, changed: list[str]) -> None:
 
 
 def print_scores(
-    results: EvaluationResult | Mapping[str, EvaluationResult], ranking: list[Rank] | None = None
+    results: EvaluationResult | Mapping[str, EvaluationResult], ranking: pd.DataFrame | None = None
 ) -> None:
     """Prints the scores of an evaluation, and every source group's where there are few."""
     from rich.table import Table

@@ -49,8 +49,8 @@ def simulate(
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
     from simulator import CameraSettings
-    from simulator.capture.plan import check_tolerance
-    from simulator.noise.generator import check_noise
+    from simulator.capture.exposure import check_tolerance
+    from simulator.capture.sensor import check_noise
 
     check_noise(noise)
     check_tolerance(tolerance)
@@ -115,7 +115,7 @@ def sweep(
     from ae_env.scenes import Scene
     from ae_env.scenes.load import SceneNetworks
     from simulator import write_dng
-    from simulator.capture.plan import check_tolerance
+    from simulator.capture.exposure import check_tolerance
 
     check_tolerance(tolerance)
     simulator = make_simulator(weights, device, cache, depth)

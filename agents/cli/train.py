@@ -82,14 +82,13 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from ae_env.utils.user_files import find_config
-    from simulator.networks.weights import build_modules
-    from simulator.training.train import load_config, load_start, train_and_save
+    from simulator.training.train import first_modules, load_config, train_and_save
 
     training = load_config(find_config(config))
     if seed is not None:
         training = training.model_copy(update={"seed": seed})
     if training.start is not None:
-        load_start(training, build_modules(training.preset))
+        first_modules(training)
     folder = Path("runs/simulator") / config.stem if out is None else out
     console.make_folder(folder)
     device = console.torch_device(device)

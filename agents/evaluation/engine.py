@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import closing
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from ae_env.options import EnvOptions
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
@@ -49,7 +51,6 @@ from simulator.utils.checks import check_integer, check_number
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
-    from simulator.camera import CameraProfile
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 Ints = NDArray[np.int64]
@@ -105,7 +106,15 @@ def evaluate(
     check_integer("frames", frames, 1)
     check_integer("batch", batch, 1)
     check_integer("seed", seed, 0, MAX_SEED + 1 - episodes_per_scene)
-    trained = _trained_policies(policies)
+    trained = [
+        (TrainedPolicy(name, name, k), policy)
+        for name, entry in policies.items()
+        for k, policy in enumerate(entry if isinstance(entry, Sequence) else [entry])
+    ]
+    if not trained:
+        raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
+    for one, policy in trained:
+        check_captures(one.name, policy)
     check_scorers(other_scorers)
     plan = _plan_of(env_options, frames, range(seed, seed + episodes_per_scene), other_scorers)
     run = EvaluationRun(plan, batch=batch)
@@ -129,21 +138,6 @@ def evaluate(
     return replace(result, other_scores=other_scores(result))
 
 
-def _trained_policies(
-    policies: Mapping[str, Policy | Sequence[Policy]],
-) -> list[tuple[TrainedPolicy, Policy]]:
-    trained = [
-        (TrainedPolicy(name, name, k), policy)
-        for name, entry in policies.items()
-        for k, policy in enumerate(entry if isinstance(entry, Sequence) else [entry])
-    ]
-    if not trained:
-        raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
-    for one, policy in trained:
-        check_captures(one.name, policy)
-    return trained
-
-
 def check_scorers(names: Sequence[str]) -> None:
     """Raises a `ValueError` where one of the scorers is unknown."""
     for name in names:
@@ -156,18 +150,17 @@ def check_scorers(names: Sequence[str]) -> None:
 def _plan_of(
     env_options: Mapping[str, Any], frames: int, seeds: Sequence[int], scorers: Sequence[str]
 ) -> EvaluationPlan:
-    from ae_env.options import EnvOptions
-
     given = {k: v for k, v in env_options.items() if k not in ("with_oracle", "autoreset_mode")}
     options = EnvOptions.from_kwargs(given)  # its errors name the argument
     delay = dict(options.delay) if isinstance(options.delay, Mapping) else options.delay
-    condition = Condition(lighting=options.lighting, delay=delay)
     environment = {k: v for k, v in given.items() if k not in CONDITION_ARGUMENTS}
     scenes = options.scenes if isinstance(options.scenes, str) else "given scenes"
     return EvaluationPlan(
         name=f"{scenes}, {options.split} split",
         environment={**environment, "split": options.split},
-        conditions={light_name(options.lighting): condition},
+        conditions={
+            light_name(options.lighting): Condition(lighting=options.lighting, delay=delay)
+        },
         starts=("random",),
         frames=frames,
         seeds=tuple(seeds),
@@ -177,13 +170,7 @@ def _plan_of(
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """One policy of a plan, or one training seed of an agent.
-
-    Args:
-        policy: Name in the tables.
-        name: Name for `agents.make_policy`.
-        index: Number of the training seed.
-    """
+    """One training seed of a policy: its name in the tables, and that for `agents.make_policy`."""
 
     policy: str
     name: str
@@ -213,8 +200,6 @@ class EvaluationRun:
         self.grid = plan.options().make_grid()
         self.episodes = plan_episodes(plan, self.scenes, self.grid)
         self._envs: dict[tuple[Any, ...], VectorEnv] = {}
-        self._training: VectorEnv | None = None
-        self._open_for: Condition | None = None
 
     @property
     def num_tables(self) -> int:
@@ -234,49 +219,44 @@ class EvaluationRun:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close()
-        if self._training is not None:
-            self._training.close()
-            self._training = None
-
-    def _close(self) -> None:
         for envs in self._envs.values():
             envs.close()
         self._envs.clear()
 
+    def _open(self, make: Callable[..., VectorEnv], *key: Any, **arguments: Any) -> VectorEnv:
+        """Environments that `make` makes with `arguments`, or those that are open under `key`.
+
+        A key begins with the condition, whose environments stay open until those of another are
+        needed, or with None for those that stay to the end.
+        """
+        for other in [k for k in self._envs if None not in (k[0], key[0]) and k[0] != key[0]]:
+            self._envs.pop(other).close()
+        if key not in self._envs:
+            self._envs[key] = make(**arguments)
+        return self._envs[key]
+
     def _make_envs(
         self, condition: Condition, num_envs: int, frames: int, *, scored: bool = False
     ) -> VectorEnv:
-        """Environments of a condition, which stay open until those of another are needed.
+        """Environments of a condition.
 
         Only those that are `scored` have the plan's scorer: policies see environments without.
         """
-        if condition != self._open_for:
-            self._close()
-            self._open_for = condition
-        key = num_envs, frames, scored
-        if key in self._envs:
-            return self._envs[key]
         if condition.budget is not None:
-            self._envs[key] = self._make_bracket_envs(condition, scenes=self.scenes, split="all")
-            return self._envs[key]
+            return self._make_brackets(condition, scenes=self.scenes, split="all")
         unused = ("costs",) if scored else ("costs", "reward")
         options = {k: v for k, v in self.plan.arguments(condition).items() if k not in unused}
         options |= {"delay": 0} if scored else {"scorer": _CHEAP}
         if not self.plan.options().in_sequences:  # those must know that they are sequences
             options["scenes"] = self.scenes
-        self._envs[key] = make_envs(options, num_envs=num_envs, frames=frames)
-        return self._envs[key]
+        key = repr(condition), num_envs, frames, scored
+        return self._open(make_envs, *key, env_options=options, num_envs=num_envs, frames=frames)
 
-    def _make_bracket_envs(self, condition: Condition, **options: Any) -> VectorEnv:
-        return gym.make_vec(
-            self.plan.env_id,
-            num_envs=BRACKET_BATCH,
-            autoreset_mode="DISABLED",
-            budget=condition.budget,
-            max_frames=self.plan.max_frames,
-            **{**self.plan.environment, **options},
-        )
+    def _make_brackets(self, condition: Condition, **options: Any) -> VectorEnv:
+        limits = {"budget": condition.budget, "max_frames": self.plan.max_frames}
+        arguments = {**self.plan.environment, **options, **limits, "autoreset_mode": "DISABLED"}
+        make, key = partial(gym.make_vec, self.plan.env_id), (repr(condition), options["split"])
+        return self._open(make, *key, num_envs=BRACKET_BATCH, **arguments)
 
     def score_light(self, condition: Condition, report: Report) -> Arrays:
         """q of every state in every frame of the light of `condition`, whatever the start.
@@ -320,33 +300,24 @@ class EvaluationRun:
         policy = self.make(trained, condition)
         if not _learns(policy):
             return policy
-        with self._training_envs(condition) as envs, errors_of(trained.name, "fit"):
+        if condition.budget is not None:
+            envs = self._make_brackets(condition, split="train")
+        else:  # the same in all conditions, which share score tables
+            base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
+            base = fitting_arguments(base, self.plan.options().resolution)
+            envs = self._open(_training_envs, None, env_options=base)
+        with errors_of(trained.name, "fit"):
             policy.fit(envs, self.plan.seeds[0])
         return policy
 
-    def _training_envs(self, condition: Condition) -> AbstractContextManager[VectorEnv]:
-        """Environments to fit policies on; of frames the same ones, which share score tables."""
-        if condition.budget is not None:
-            return closing(self._make_bracket_envs(condition, split="train"))
-        if self._training is None:
-            base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-            base = fitting_arguments(base, self.plan.options().resolution)
-            self._training = _training_envs(base)
-        return nullcontext(self._training)
-
     def run_policy(
-        self,
-        name: str,
-        policy: Policy,
-        condition: Condition,
-        light: Arrays | None,
-        report: Report,
+        self, name: str, policy: Policy, condition: Condition, light: Arrays, report: Report
     ) -> Track:
-        """Runs `policy` through all episodes of `condition`.
+        """Runs `policy`, which is fitted, through all episodes of `condition`.
 
         Args:
             name: The policy's name in errors.
-            policy: The policy, fitted.
+            policy: The policy.
             condition: Light and delay, or budget.
             light: What `score_light` returns; only a privileged policy needs it.
             report: Called with the frames done since the last call.
@@ -358,8 +329,6 @@ class EvaluationRun:
             return self._run_brackets(name, policy, condition, report)
         oracle: Ints | None = None
         if getattr(policy, "privileged", False):
-            if light is None:
-                raise ValueError(f"policy {name!r} is privileged: it needs the score tables")
             oracle = best_states(light["scores"], light["allowed"])
         frames, episodes = self.plan.frames, self.episodes
         envs = self._make_envs(condition, batch_size(len(episodes), self.batch), frames)
@@ -407,8 +376,9 @@ class EvaluationRun:
         """
         scenes = [self.scenes[i] for i in self.episodes.scene]
         table = np.arange(len(scenes)) % max(self.num_tables, 1)
-        names = ("speed", "defocus", "movement") if light else ()
-        drawn: dict[str, Any] = {name: light[name][table] for name in names}
+        known: dict[str, Any] = {name: values[table] for name, values in light.items()}
+        for name, kind in (("scores", float), ("allowed", bool)):  # the reset frame does not count
+            known[name] = known[name][:, 1:] if light else np.zeros((len(scenes), 0, 0), kind)
         of_policy: dict[str, list[Track]] = {}
         for trained, track in tracks.items():
             of_policy.setdefault(trained.policy, []).append(track)
@@ -419,14 +389,12 @@ class EvaluationRun:
             kinds=np.array([s.kind for s in scenes]),
             hard=np.array([bool(s.hard) for s in scenes]),
             start_states=next(iter(tracks.values())).arrays["start_states"][0],
-            scores=light["scores"][table, 1:] if light else np.zeros((len(scenes), 0, 0)),
-            allowed=light["allowed"][table, 1:] if light else np.zeros((len(scenes), 0, 0), bool),
             tracks={name: Track.of_seeds(own) for name, own in of_policy.items()},
             seed=self.plan.seeds[0],
             delays=self.plan.options(condition).delays,
             plan=self.plan,
             scenes=scenes,
-            **drawn,
+            **known,
         )
 
 
@@ -453,14 +421,13 @@ def fit_policies(
     learners = {name: policy for name, policy in policies.items() if _learns(policy)}
     if not learners:
         return
+    report = progress or (lambda *_: None)
     with closing(_training_envs(env_options, batch)) as envs:
         for i, (name, policy) in enumerate(learners.items()):
-            if progress is not None:
-                progress(i, len(learners), name)
+            report(i, len(learners), name)
             with errors_of(name, "fit"):
                 policy.fit(envs, seed)
-    if progress is not None:
-        progress(len(learners), len(learners), "")
+    report(len(learners), len(learners), "")
 
 
 def _learns(policy: Policy) -> bool:
@@ -480,13 +447,13 @@ def run_batch(
     frames: int,
     *,
     oracle: Ints | None = None,
-) -> dict[str, NDArray[Any]]:
-    """Run one policy over one batch of episodes.
+) -> Arrays:
+    """Run one policy over one batch of episodes, which `envs` are freshly reset to.
 
     Args:
         name: The policy's name in errors.
         policy: The policy.
-        envs: Freshly reset to `batch`.
+        envs: The environments.
         batch: The episodes.
         frames: Actions.
         oracle: (N, frames + 1) best state of every frame, the reset frame first, which a privileged
@@ -495,9 +462,6 @@ def run_batch(
     Returns:
         The arrays of a `Track` without their leading axis, of the valid episodes, and their
         ``start_states`` (n,); ``seconds`` (frames,) that `act` took for the batch.
-
-    Raises:
-        UserCodeError: If the policy raises, or returns something else than allowed states.
     """
     base: Any = envs.unwrapped
     with errors_of(name, "reset"):
@@ -517,24 +481,20 @@ def run_batch(
         seconds.append(time.perf_counter() - begin)
         observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
         masks = action_masks(envs)  # the next frame of a sequence is another scene
-        for key, value in _measured(base.camera, observations["raw"], info).items():
+        codes = signal_codes(observations["raw"], base.camera)
+        shown = {
+            "states": np.array(info["state"], dtype=np.int64),  # with a delay, an older choice
+            "image_mean": linear_signal(observations["raw"], base.camera).mean(axis=(1, 2, 3)),
+            "code_mean": codes.mean(axis=(1, 2, 3), dtype=np.float64) / 255.0,
+            "clipped_high": np.array(info["clipped_high"], dtype=np.float64),
+            "clipped_low": np.array(info["clipped_low"], dtype=np.float64),
+        }
+        for key, value in shown.items():
             seen.setdefault(key, []).append(value)
     return {
         **{key: np.stack(values, axis=1)[batch.valid] for key, values in seen.items()},
         "start_states": start[batch.valid],
         "seconds": np.array(seconds),
-    }
-
-
-def _measured(camera: CameraProfile, raw: NDArray[Any], info: Mapping[str, Any]) -> Arrays:
-    """What a `Track` has of one frame, ``(N,)`` each."""
-    codes = signal_codes(raw, camera).mean(axis=(1, 2, 3), dtype=np.float64)
-    return {
-        "states": np.array(info["state"], dtype=np.int64),  # with a delay, an older choice
-        "image_mean": linear_signal(raw, camera).mean(axis=(1, 2, 3)),
-        "code_mean": codes / 255.0,
-        "clipped_high": np.array(info["clipped_high"], dtype=np.float64),
-        "clipped_low": np.array(info["clipped_low"], dtype=np.float64),
     }
 
 
@@ -566,41 +526,29 @@ def check_captures(name: str, policy: Policy) -> float:
 def other_scores(result: EvaluationResult) -> dict[str, dict[str, float]]:
     """Mean expected score of the states that each policy chose, by scorer and policy.
 
-    Of some scenes of the first seed, all starts and frames; averaged over frames, then training
-    seeds, episodes of a source group, and source groups.
-
-    Args:
-        result: The results in unchanging light, with their plan, which names the scorers.
+    Of some scenes of the first seed of `result`, in unchanging light, all starts and frames;
+    averaged over frames, then training seeds, episodes of a source group, and source groups.
     """
     plan = result.plan
     assert plan is not None
     pairs = len(result.scene_ids) // len(plan.starts)  # of scenes and seeds
     count = pairs // len(plan.seeds)
     scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first
-    chosen = groups_in_turn(scenes, plan.other_scorer_scenes)
     options = plan.options()
-    found: dict[str, dict[str, float]] = {}
+    known = options.make_grid(), options.make_camera()
+    more: dict[str, Any] = {"noise": bool(options.noise), "tolerance": options.tolerance}
+    rows = []
     for name in plan.other_scorers:
-        tables = ScoreTables(
-            options.make_grid(),
-            options.make_camera(),
-            make_scorer(name),
-            noise=bool(options.noise),
-            tolerance=options.tolerance,
-        )
-        means: dict[str, dict[str, list[float]]] = {policy: {} for policy in result.tracks}
-        for scene in chosen:
+        tables = ScoreTables(*known, make_scorer(name), **more)
+        for scene in groups_in_turn(scenes, plan.other_scorer_scenes):
             j = scenes.index(scene)
-            episodes = np.flatnonzero(np.arange(len(result.scene_ids)) % pairs == j)
             scores = tables.table(scene, **result.moves(j)).mean
             for policy, track in result.tracks.items():
-                mean = float(scores[track.states[:, episodes]].mean())
-                means[policy].setdefault(scene.group, []).append(mean)
-        found[name] = {
-            policy: float(np.mean([np.mean(values) for values in groups.values()]))
-            for policy, groups in means.items()
-        }
-    return found
+                rows.append((name, policy, scene.group, scores[track.states[:, j::pairs]].mean()))
+    frame = pd.DataFrame(rows, columns=["scorer", "policy", "group", "score"])
+    groups = frame.groupby(["scorer", "policy", "group"], sort=False).score.mean()
+    means = groups.groupby(["scorer", "policy"], sort=False).mean()
+    return {name: means[name].to_dict() for name in plan.other_scorers}
 
 
 def best_states(scores: NDArray[np.float64], allowed: NDArray[np.bool_]) -> Ints:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -16,6 +19,7 @@ RESAMPLES = 10_000
 LEVEL = 0.95
 #: Below this many source groups an interval would promise too much: values only.
 MIN_GROUPS = 15
+RANK_COLUMNS = ("place", "policy", "tier", "normalised_score", "ci95", "to_best", "to_next")
 #: Standard errors below this are rounding: the two policies do the same.
 _ROUNDING = 1e-12
 
@@ -43,11 +47,6 @@ class Interval:
         """``[low, high]``, or None."""
         return None if self.low is None or self.high is None else [self.low, self.high]
 
-    @property
-    def significant(self) -> bool:
-        """Whether the interval leaves out zero."""
-        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
-
 
 def score_interval(
     gains: Floats, span: Floats, *, resamples: int = RESAMPLES, seed: int = 0
@@ -64,8 +63,8 @@ def score_interval(
         resamples: Number of resamples.
         seed: Seed of the resampling; policies compared under one seed see the same groups.
     """
-    zero = np.zeros_like(np.atleast_2d(gains)[:1])
-    return difference_interval(gains, zero, span, resamples=resamples, seed=seed)
+    nothing = np.zeros((1, len(span)))
+    return difference_interval(gains, nothing, span, resamples=resamples, seed=seed)
 
 
 def difference_interval(
@@ -82,17 +81,8 @@ def difference_interval(
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
         seed: Seed of the resampling.
-
-    Raises:
-        ValueError: If the shapes do not agree.
     """
-    first, second = np.atleast_2d(gains), np.atleast_2d(other)
-    groups = len(span)
-    if first.shape[1] != groups or second.shape[1] != groups:
-        raise ValueError(
-            f"`gains` (={first.shape}) and `other` (={second.shape}) must have one column for each "
-            f"of the {groups} groups of `span`"
-        )
+    first, second, groups = np.atleast_2d(gains), np.atleast_2d(other), len(span)
     value = float((first.mean(0) - second.mean(0)).sum() / span.sum())
     seeds = max(len(first), len(second))
     if groups < MIN_GROUPS:
@@ -130,27 +120,7 @@ def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Flo
 # -- ranking --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Rank:
-    """One line of a ranking.
-
-    Args:
-        policy: Name.
-        score: Normalised score with its own (not simultaneous) interval.
-        tier: 1 for the best; None below 15 source groups.
-        to_best: Paired difference of the scores to the best policy, with its simultaneous interval;
-            None for itself.
-        to_next: The same to the policy below; None for the last.
-    """
-
-    policy: str
-    score: Interval
-    tier: int | None
-    to_best: Interval | None
-    to_next: Interval | None
-
-
-def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLES) -> list[Rank]:
+def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLES) -> pd.DataFrame:
     """Policies from the best to the worst, with the differences that are significant.
 
     Differences of all pairs are bootstrapped together (source groups are drawn once for all
@@ -164,6 +134,12 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
         gains: ``q - q_random`` by policy, ``(K, G)`` per training seed and source group.
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
+
+    Returns:
+        A row for each policy: its ``place``, ``policy``, its ``tier`` (1 for the best; None below
+        15 source groups), ``normalised_score`` with its own (not simultaneous) interval ``ci95``;
+        ``to_best`` and ``to_next`` (None for the best and the last) have the ``other`` policy, the
+        ``difference`` to it, its ``simultaneous_ci95`` and whether that is ``significant``.
     """
     scores = {name: score_interval(own, span, resamples=resamples) for name, own in gains.items()}
     names = sorted(scores, key=lambda name: -scores[name].value)  # ties keep the given order
@@ -171,24 +147,26 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
     if len(span) >= MIN_GROUPS and len(names) > 1:
         widths = _half_widths([gains[name] for name in names], span, resamples)
 
-    def difference(i: int, j: int) -> Interval:
+    def difference(i: int, j: int) -> dict[str, Any]:
         value = scores[names[i]].value - scores[names[j]].value
         half = None if widths is None else float(widths[i, j])
-        low, high = (None, None) if half is None else (value - half, value + half)
-        seeds = max(scores[names[k]].num_seeds for k in (i, j))
-        return Interval(value, low, high, len(span), seeds)
+        return {
+            "other": names[j],
+            "difference": value,
+            "simultaneous_ci95": None if half is None else [value - half, value + half],
+            "significant": half is not None and abs(value) > half,
+        }
 
-    tiers = _tiers(len(names), difference) if widths is not None else [None] * len(names)
-    return [
-        Rank(
-            name,
-            scores[name],
-            tiers[i],
-            difference(i, 0) if i else None,
-            difference(i, i + 1) if i + 1 < len(names) else None,
-        )
-        for i, name in enumerate(names)
-    ]
+    rows = []
+    leader, tier = 0, None if widths is None else 1
+    for i, name in enumerate(names):
+        if tier is not None and i > leader and difference(i, leader)["significant"]:
+            leader, tier = i, tier + 1
+        to_best = difference(i, 0) if i else None
+        to_next = difference(i, i + 1) if i + 1 < len(names) else None
+        score = scores[name]
+        rows.append((i + 1, name, tier, score.value, score.pair, to_best, to_next))
+    return pd.DataFrame(rows, columns=list(RANK_COLUMNS))
 
 
 def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:
@@ -200,21 +178,9 @@ def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:
     ]
     errors = np.zeros((len(gains), len(gains)))
     largest = np.zeros(resamples)
-    for i in range(len(gains)):
-        for j in range(i + 1, len(gains)):
-            change = drawn[i] - drawn[j]
-            error = change.std(ddof=1)
-            errors[i, j] = errors[j, i] = error
-            if error > _ROUNDING:
-                np.maximum(largest, np.abs(change - change.mean()) / error, out=largest)
+    for i, j in combinations(range(len(gains)), 2):
+        change = drawn[i] - drawn[j]
+        error = errors[i, j] = errors[j, i] = change.std(ddof=1)
+        if error > _ROUNDING:
+            np.maximum(largest, np.abs(change - change.mean()) / error, out=largest)
     return errors * float(np.quantile(largest, LEVEL))
-
-
-def _tiers(count: int, difference: Callable[[int, int], Interval]) -> list[int | None]:
-    tiers: list[int | None] = []
-    leader, tier = 0, 1
-    for i in range(count):
-        if i > leader and difference(i, leader).significant:
-            leader, tier = i, tier + 1
-        tiers.append(tier)
-    return tiers

@@ -7,6 +7,7 @@ plan's entries, the scenes' light, and the files of policies, scorers and lighti
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -56,42 +57,21 @@ _MAX_NEIGHBOURS = 200
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work for one process.
+    """A piece of work for one process, and about the time that it takes [ms].
 
-    Args:
-        conditions: Names of the condition whose light is scored, or of those in which a policy is
-            run, which have one delay or budget.
-        trained: The policy; None for the light.
-        cost: About the time that it takes [ms].
+    It scores the light of one condition, or runs a policy in all conditions of one delay or budget.
     """
 
     conditions: tuple[str, ...]
     trained: TrainedPolicy | None
     cost: float
 
-    @property
-    def label(self) -> str:
-        """For the progress bar."""
-        return f"light: {self.conditions[0]}" if self.trained is None else self.trained.name
-
 
 class Jobs(EvaluationRun):
-    """A run of a plan in jobs, whose finished parts are stored.
-
-    Args:
-        plan: The plan, of JSON values.
-        folder: Folder of the finished parts.
-        scenes: Those of the plan; loaded by default.
-        device: Torch device of a learnt agent's network.
-    """
+    """A run of a plan, of JSON values, in jobs; finished parts are stored in `folder`."""
 
     def __init__(
-        self,
-        plan: EvaluationPlan,
-        folder: Path,
-        scenes: list[Scene] | None = None,
-        *,
-        device: str = "cpu",
+        self, plan: EvaluationPlan, folder: Path, scenes: list[Scene] | None = None, *, device: str
     ) -> None:
         plan.protocol()  # raises where an entry cannot be a part of a key
         super().__init__(plan, scenes, device=device)
@@ -115,13 +95,13 @@ class Jobs(EvaluationRun):
         shown = (condition.delay, condition.budget, self.plan.starts)
         return cache_key("policy", [self.light_key(condition), *shown, *own])
 
-    @property
-    def _cameras(self) -> dict[str, Condition]:
-        """The first of the conditions of each delay and budget, by these."""
-        found: dict[str, Condition] = {}
-        for condition in self.plan.all_conditions.values():
-            found.setdefault(_camera(condition), condition)
-        return found
+    @cached_property
+    def _cameras(self) -> list[list[str]]:
+        """Names of the conditions of each delay and budget: a policy is fitted once for each."""
+        found: dict[str, list[str]] = {}
+        for name, condition in self.plan.all_conditions.items():
+            found.setdefault(f"{condition.delay}, {condition.budget}", []).append(name)
+        return list(found.values())
 
     @cached_property
     def privileged(self) -> dict[TrainedPolicy, bool]:
@@ -130,9 +110,10 @@ class Jobs(EvaluationRun):
         Raises:
             ValueError: If a policy is unknown, or does not fit the environment of some condition.
         """
+        conditions = self.plan.all_conditions
         return {
-            trained: bool(getattr(self.make(trained, condition), "privileged", False))
-            for condition in self._cameras.values()
+            trained: bool(getattr(self.make(trained, conditions[names[0]]), "privileged", False))
+            for names in self._cameras
             for trained in self.trained
         }
 
@@ -157,7 +138,8 @@ class Jobs(EvaluationRun):
             nonlocal done
             done += cost
             if progress is not None:
-                progress(int(min(done, total)), int(total), job.label)
+                label = f"light: {job.conditions[0]}" if job.trained is None else job.trained.name
+                progress(int(min(done, total)), int(total), label)
 
         if workers is None:
             workers = core_count() if total > _SMALL_MS else 1
@@ -187,21 +169,16 @@ class Jobs(EvaluationRun):
         for name, condition in conditions.items() if self.num_tables else ():
             lights.setdefault(self.light_key(condition), name)
         found = []
-        for key, name in lights.items():
-            if self.store.get(key) is None:
-                ms = _STATIC_MS if conditions[name].lighting == "static" else _LIGHT_MS
-                found.append(Job((name,), None, ms * frames * self.num_tables))
-        for trained in self.trained:
-            for camera in self._cameras:
-                left = tuple(
-                    name
-                    for name, c in conditions.items()
-                    if _camera(c) == camera and self.store.get(self.policy_key(trained, c)) is None
-                )
-                if left:
-                    fit = _FIT_MS * ("tuned" in trained.name)
-                    cost = fit + len(left) * len(self.episodes) * frames * _FRAME_MS
-                    found.append(Job(left, trained, cost))
+        for name in (name for key, name in lights.items() if self.store.get(key) is None):
+            ms = _STATIC_MS if conditions[name].lighting == "static" else _LIGHT_MS
+            found.append(Job((name,), None, ms * frames * self.num_tables))
+        for trained, names in itertools.product(self.trained, self._cameras):
+            keys = {name: self.policy_key(trained, conditions[name]) for name in names}
+            left = tuple(name for name, key in keys.items() if self.store.get(key) is None)
+            if left:
+                fit = _FIT_MS * ("tuned" in trained.name)
+                cost = fit + len(left) * len(self.episodes) * frames * _FRAME_MS
+                found.append(Job(left, trained, cost))
         return sorted(found, key=lambda job: (job.trained is not None, -job.cost))
 
     def do(self, job: Job, report: Report) -> None:
@@ -214,13 +191,10 @@ class Jobs(EvaluationRun):
             return
         policy = self.fitted(job.trained, conditions[0])
         for condition in conditions:
-            privileged = getattr(policy, "privileged", False)
+            light = self.light(condition) if getattr(policy, "privileged", False) else {}
             track = self.run_policy(
-                job.trained.name,
-                policy,
-                condition,
-                self.light(condition) if privileged else None,
-                lambda frames: report(frames * _FRAME_MS),
+                *(job.trained.name, policy, condition, light),
+                report=lambda frames: report(frames * _FRAME_MS),
             )
             others = {key: value for key, value in vars(track).items() if key != "arrays"}
             self.store.put(self.policy_key(job.trained, condition), {**track.arrays, **others})
@@ -241,8 +215,7 @@ class Jobs(EvaluationRun):
         for trained in self.trained:
             stored = self._stored(self.policy_key(trained, condition))
             arrays = {k: v for k, v in stored.items() if isinstance(v, np.ndarray)}
-            others = {k: v for k, v in stored.items() if k not in arrays}
-            tracks[trained] = Track(arrays, **others)
+            tracks[trained] = Track(arrays, **{k: v for k, v in stored.items() if k not in arrays})
         return self.result(condition, self.light(condition), tracks)
 
     def _rated(self, result: EvaluationResult, condition: Condition) -> EvaluationResult:
@@ -257,11 +230,6 @@ class Jobs(EvaluationRun):
             scores = other_scores(result)
             self.store.put(key, scores)
         return replace(result, other_scores=scores)
-
-
-def _camera(condition: Condition) -> str:
-    """What a policy's context depends on: policies are made and fitted once for each."""
-    return f"{condition.delay}, {condition.budget}"
 
 
 def run_plan(
@@ -329,9 +297,7 @@ def file_content(spec: Any) -> list[str]:
     Args:
         spec: A name, or a mapping of names to weights or from options to files.
     """
-    names: list[Any] = [spec]
-    if isinstance(spec, Mapping):
-        names = [*spec, *spec.values()]
+    names = [*spec, *spec.values()] if isinstance(spec, Mapping) else [spec]
     return [policy_content(name) for name in names if isinstance(name, str)]
 
 
@@ -365,7 +331,7 @@ def _own_files(base: str) -> list[Path]:
         return [file for name in names for file in _named_files(name.partition(":")[2])]
     if head == "recorded":
         return _named_files(tail)
-    file: Path | None = Path(head).expanduser() if head.endswith(".py") else None
+    file = Path(head).expanduser() if head.endswith(".py") else None
     if file is None and tail and "." in head:
         with suppress(ImportError, ValueError):
             found = find_spec(head)

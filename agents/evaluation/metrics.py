@@ -124,8 +124,8 @@ def frames_to_converge(
             to the leading axes of `errors`.
 
     Returns:
-        Frames, ``(...)``, 1 for the first; censored at those that there are, T - `since`, where the
-        error never stays within; and whether it converged.
+        Frames, ``(...)``, 1 for the first, and whether it converged; an episode that never does has
+        all its frames, T - `since`.
 
     >>> frames, _ = frames_to_converge(np.array([[2.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 2.0]]))
     >>> frames.tolist()
@@ -187,13 +187,11 @@ def reversals(evs: Floats) -> Ints:
     """
     steps = np.diff(evs, axis=-1)
     steps = np.where(np.abs(steps) < SAME_EV, 0.0, np.sign(steps))
-    count = np.zeros(evs.shape[:-1], dtype=np.int64)
-    heading = np.zeros(evs.shape[:-1])
-    for i in range(steps.shape[-1]):  # frames without a step keep the heading
-        step = steps[..., i]
-        count += (step * heading) < 0
-        heading = np.where(step != 0, step, heading)
-    return count[()]
+    # Frames without a step keep the heading: that of the last frame with one, the first at latest.
+    moved = np.where(steps != 0, np.arange(steps.shape[-1]), 0)
+    heading = np.take_along_axis(steps, np.maximum.accumulate(moved, axis=-1), axis=-1)
+    count: Ints = (heading[..., :-1] * steps[..., 1:] < 0).sum(axis=-1)
+    return count
 
 
 def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
@@ -223,8 +221,7 @@ def jump(code_means: Floats) -> Floats:
     """
     if code_means.shape[-1] < 2:
         return np.zeros(code_means.shape[:-1])
-    found: Floats = np.abs(np.diff(code_means, axis=-1)).mean(axis=-1)
-    return found
+    return np.asarray(np.abs(np.diff(code_means, axis=-1)).mean(axis=-1))
 
 
 def delayed_states(states: Ints, start_states: Ints, delay: int) -> Ints:

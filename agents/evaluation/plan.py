@@ -7,20 +7,21 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+import pandas as pd
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from ae_env.options import checked_delay
+from ae_env.options import EnvOptions, checked_delay
 from ae_env.scenes.folder import sequence_bounds
+from ae_env.utils.user_files import find_preset
 from agents.rollouts import RolloutPlan
-from simulator.utils.checks import check_integer, check_number, check_word, did_you_mean
+from simulator.utils.checks import check_integer, check_word, did_you_mean
 from simulator.utils.config_file import Configuration, load_yaml
 
 if TYPE_CHECKING:
     from ae_env.grid import ExposureGrid
-    from ae_env.options import EnvOptions
     from ae_env.scenes import Scene
 
 #: Where an episode may begin; see `start_state`.
@@ -28,7 +29,7 @@ STARTS = ("dark", "middle", "bright", "random")
 #: Names of parts of the static condition, which no condition may have.
 _RESERVED = ("all", "hard", "rest")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+./-]*")
-MAX_FRAMES, MAX_SEED, MAX_SCENES = 10_000, 2**32 - 1, 100_000
+MAX_SEED, MAX_SCENES = 2**32 - 1, 100_000
 #: Seeds of two entries of a plan's `seeds` are this far apart: more than any plan has scenes.
 SEED_STRIDE = 2**20
 #: Arguments of the environment that a condition has, and those that the evaluation itself sets.
@@ -57,13 +58,8 @@ class Condition(Configuration):
     """
 
     lighting: Any = "static"
-    delay: Any = 0
+    delay: Annotated[Any, AfterValidator(checked_delay)] = 0
     budget: float | None = None
-
-    @field_validator("delay")
-    @classmethod
-    def _delay(cls, value: Any) -> Any:
-        return checked_delay(value)
 
     @property
     def at_rest(self) -> bool:
@@ -72,7 +68,7 @@ class Condition(Configuration):
 
 
 class EvaluationPlan(Configuration):
-    """Everything that decides an evaluation except the policies' own content.
+    """Everything that decides an evaluation, except the policies' own content.
 
     A plan with `budgets` is of ``ae_env/ExposureBracket-v0``: its measure is the quality of the
     merged picture, its conditions are the budgets, and it has no entries about frames.
@@ -105,13 +101,17 @@ class EvaluationPlan(Configuration):
     environment: dict[str, Any] = Field(default_factory=dict)
     scene_ids: tuple[str, ...] = ()
     max_scenes: int | None = Field(default=None, ge=1, le=MAX_SCENES)
-    conditions: dict[str, Condition] = Field(default_factory=lambda: {"static": Condition()})
-    delays: tuple[int, ...] = (0,)
-    starts: tuple[str, ...] = ("dark", "middle", "bright")
-    frames: int = Field(default=24, ge=1, le=MAX_FRAMES)
-    budgets: tuple[float, ...] | None = Field(default=None, min_length=1)
+    conditions: dict[str, Condition] = Field(
+        default_factory=lambda: {"static": Condition()}, min_length=1
+    )
+    delays: tuple[int, ...] = Field(default=(0,), min_length=1)
+    starts: tuple[str, ...] = Field(default=("dark", "middle", "bright"), min_length=1)
+    frames: int = Field(default=24, ge=1, le=10_000)
+    budgets: tuple[Annotated[float, Field(ge=1e-5, le=3600.0)], ...] | None = Field(
+        default=None, min_length=1
+    )
     max_frames: int = Field(default=3, ge=1, le=4)
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[Annotated[int, Field(ge=0, le=MAX_SEED)], ...] = Field(default=(0,), min_length=1)
     policies: tuple[str, ...] = ()
     other_scorers: tuple[str, ...] = ()
     other_scorer_scenes: int = Field(default=8, ge=1, le=MAX_SCENES)
@@ -130,9 +130,6 @@ class EvaluationPlan(Configuration):
 
     @model_validator(mode="after")
     def _check(self) -> EvaluationPlan:
-        for entry in ("starts", "seeds", "conditions", "delays"):
-            if not getattr(self, entry):
-                raise ValueError(f"`{entry}` must have one entry or more")
         for entry in self._unused:
             field = type(self).model_fields[entry]
             if getattr(self, entry) != field.get_default(call_default_factory=True):
@@ -140,10 +137,6 @@ class EvaluationPlan(Configuration):
                 raise ValueError(f"`{entry}` must not be given in a plan that has {also}")
         for start in self.starts:
             check_word("starts", start, STARTS)
-        for seed in self.seeds:
-            check_integer("seeds", seed, 0, MAX_SEED)
-        for budget in self.budgets or ():
-            check_number("budgets", budget, 1e-5, 3600.0, more=" s")
         for name, condition in self.conditions.items():
             if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:
                 raise ValueError(
@@ -155,19 +148,15 @@ class EvaluationPlan(Configuration):
                 raise ValueError(f"`environment` must not have `{name}`: give it as a condition's")
         for name, condition in self.all_conditions.items():
             try:
-                self._check_condition(condition)
+                options = self.options(condition)
+                options.make_grid(), options.make_camera()
+                options.make_scorer(), options.make_lighting()
+                check_integer(
+                    "delay", max(options.delays), 0, self.frames - 1, more=": below `frames`"
+                )
             except ValueError as error:
                 raise ValueError(f"condition {name!r}: {error}") from error
         return self
-
-    def _check_condition(self, condition: Condition) -> None:
-        options = self.options(condition)
-        options.make_grid(), options.make_camera(), options.make_scorer(), options.make_lighting()
-        if max(options.delays) >= self.frames:
-            raise ValueError(
-                f"`delay` (={max(options.delays)}) must be below `frames` (={self.frames}): no "
-                "decision would show"
-            )
 
     @property
     def measure(self) -> Literal["score", "quality"]:
@@ -212,8 +201,6 @@ class EvaluationPlan(Configuration):
 
     def options(self, condition: Condition | None = None) -> EnvOptions:
         """The checked arguments of the environment in `condition`."""
-        from ae_env.options import EnvOptions
-
         # A bracket's environment sets these itself.
         own = {"grid": "bracket", "depth": "far"} if self.budgets else {}
         return EnvOptions.from_kwargs(own | self.arguments(condition or Condition()))
@@ -225,14 +212,13 @@ class EvaluationPlan(Configuration):
 
     def describe(self, other: Callable[[Any], Any] = repr) -> dict[str, Any]:
         """Every entry as JSON values; objects of a caller's own by the function `other`."""
-
-        def converted(value: Any) -> Any:
-            if isinstance(value, Condition):
-                return {"lighting": value.lighting, "delay": value.delay}
-            return other(value)
-
         entries = {k: v for k, v in dict(self).items() if k not in self._unused}
-        return dict(json.loads(json.dumps(entries, default=converted, allow_nan=False)))
+        if "conditions" in entries:
+            conditions = self.conditions.items()
+            entries["conditions"] = {
+                name: {"lighting": one.lighting, "delay": one.delay} for name, one in conditions
+            }
+        return dict(json.loads(json.dumps(entries, default=other, allow_nan=False)))
 
     def protocol(self) -> dict[str, Any]:
         """JSON values of everything that decides the episodes and their scores.
@@ -263,11 +249,8 @@ def load_plan(name: str | Path) -> EvaluationPlan:
     """The plan of a preset of ``configs/evaluation``, or of a YAML file of one's own.
 
     Raises:
-        ValueError: If there is none, or an entry is unknown, out of range or no JSON value; the
-            message names the file and the entry.
+        ValueError: If there is none, or an entry is unknown, out of range or no JSON value.
     """
-    from ae_env.utils.user_files import find_preset
-
     plan = load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
     plan.protocol()
     return plan
@@ -308,13 +291,10 @@ def plan_scenes(plan: EvaluationPlan) -> list[Scene]:
         scenes = [scenes[i] for i in np.unique(sequence_bounds(scenes)[0])]
     if plan.scene_ids:
         known = {scene.scene_id: scene for scene in scenes}
-        for name in plan.scene_ids:
-            if name not in known:
-                hint = did_you_mean(name, known)
-                raise ValueError(
-                    f"`scene_ids` (={name!r}) must name scenes of the {len(known)} of "
-                    f"{plan.environment.get('scenes', 'bundled')!r}{hint}"
-                )
+        for name in set(plan.scene_ids) - set(known):
+            source = plan.environment.get("scenes", "bundled")
+            text = f"`scene_ids` (={name!r}) must name scenes of the {len(known)} of {source!r}"
+            raise ValueError(text + did_you_mean(name, known))
         scenes = [known[name] for name in plan.scene_ids]
     return groups_in_turn(scenes, plan.max_scenes)
 
@@ -323,8 +303,6 @@ def groups_in_turn(scenes: Sequence[Scene], count: int | None) -> list[Scene]:
     """At most `count` of `scenes`: kinds in turn, and within a kind source groups in turn."""
     if count is None or count >= len(scenes):
         return list(scenes)
-    import pandas as pd
-
     names = pd.DataFrame({"kind": [s.kind for s in scenes], "group": [s.group for s in scenes]})
     repeat = names.groupby("group").cumcount()
     rank = names.groupby("kind").group.transform(lambda own: pd.factorize(own)[0])

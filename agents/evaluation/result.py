@@ -8,23 +8,22 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from agents.evaluation import metrics
 from agents.evaluation.intervals import (
+    RANK_COLUMNS,
     RESAMPLES,
-    Interval,
-    Rank,
     difference_interval,
     rank,
     score_interval,
 )
 from agents.policy_names import is_metering
 from simulator.optics.motion import Movement
+from simulator.utils.checks import check_word
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ae_env.grid import ExposureGrid
     from ae_env.scenes import Scene
     from agents.evaluation.plan import EvaluationPlan
@@ -158,12 +157,12 @@ class EvaluationResult:
 
     def moves(self, episode: int) -> dict[str, Any]:
         """What blur depends on, as arguments of `ae_env.scorers.captures.prepare_scene`."""
-        known = {"speed": self.speed, "defocus": self.defocus}
-        found: dict[str, Any] = {
-            n: 0.0 if v is None else float(v[episode]) for n, v in known.items()
-        }
         drawn = () if self.movement is None else self.movement[episode].tolist()
-        return found | {"movement": Movement(*drawn)}
+        return {
+            "speed": 0.0 if self.speed is None else float(self.speed[episode]),
+            "defocus": 0.0 if self.defocus is None else float(self.defocus[episode]),
+            "movement": Movement(*drawn),
+        }
 
     @cached_property
     def oracle(self) -> Floats:
@@ -174,12 +173,21 @@ class EvaluationResult:
         return mean
 
     @cached_property
+    def _best(self) -> Ints:
+        """The oracle's state in every frame, ties to the lower index, ``(E, T)``."""
+        best: Ints = np.where(self.allowed, self.scores, -np.inf).argmax(axis=-1)
+        return best
+
+    @property
+    def oracle_states(self) -> Ints:
+        """The oracle's state in the last frame, ``(E,)``."""
+        return self._best[:, -1]
+
+    @cached_property
     def delayed_oracle(self) -> Floats:
         """Mean q of the oracle whose decisions take effect after `delays`, ``(E,)``."""
-        best = np.where(self.allowed, self.scores, -np.inf).argmax(axis=-1)
-        late = (metrics.delayed_states(best, self.start_states, d) for d in self.delays)
-        per_frame = metrics.score_of(self.scores, self.grid.mixed(*late))
-        mean: Floats = per_frame.mean(axis=-1)
+        late = (metrics.delayed_states(self._best, self.start_states, d) for d in self.delays)
+        mean: Floats = metrics.score_of(self.scores, self.grid.mixed(*late)).mean(axis=-1)
         return mean
 
     @cached_property
@@ -189,13 +197,6 @@ class EvaluationResult:
             return np.zeros(len(self.groups))
         mean: Floats = metrics.random_score(self.scores, self.allowed).mean(axis=-1)
         return mean
-
-    @cached_property
-    def oracle_states(self) -> Ints:
-        """The oracle's state in the last frame, ties to the lower index, ``(E,)``."""
-        last = np.where(self.allowed[:, -1], self.scores[:, -1], -np.inf)
-        best: Ints = last.argmax(axis=-1).astype(np.int64)
-        return best
 
     def episode_metrics(self, policy: str) -> dict[str, NDArray[Any]]:
         """Every metric of `policy` per training seed and episode, ``(K, E)``.
@@ -253,18 +254,12 @@ class EvaluationResult:
 
     def condition(self, name: str) -> NDArray[np.bool_]:
         """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
-        masks = {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}
-        if name not in masks:
-            raise ValueError(f"`condition` (={name!r}) must be one of {', '.join(masks)}")
-        return masks[name]
+        check_word("condition", name, CONDITIONS)
+        return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
     def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
-        """Mean of a metric: over a source group's episodes, then over groups and seeds.
-
-        Args:
-            policy: Name of the policy.
-            key: Name of the metric, see `episode_metrics`.
-            episodes: Which of the episodes, ``(E,)``; all by default.
+        """Mean of a metric of `episode_metrics`: over a source group's episodes, then over groups
+        and seeds; of the `episodes` that are True, ``(E,)``, or of all.
         """
         members = self.condition("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]
@@ -275,8 +270,6 @@ class EvaluationResult:
     ) -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
-        These are the arguments of `agents.evaluation.intervals`.
-
         Args:
             policy: Name of the policy.
             condition: As of `condition`, or which of the episodes, ``(E,)``.
@@ -286,6 +279,11 @@ class EvaluationResult:
         span = (self.oracle - self.random)[members]
         groups = self.groups[members]
         return metrics.group_means(gains, groups), metrics.group_means(span, groups)
+
+    def normalised(self, policy: str, condition: str | NDArray[np.bool_] = "all") -> float:
+        """Normalised score of a policy over its training seeds; arguments as of `group_gains`."""
+        gains, span = self.group_gains(policy, condition)
+        return float(gains.mean(axis=0).sum() / span.sum())
 
 
 # -- rows -----------------------------------------------------------------------------------------
@@ -328,8 +326,6 @@ def result_rows(
         `ci95` is the 95 % interval of `normalised_score`, None below 15 source groups;
         `ms_per_decision` is amortised over a batch of cameras.
     """
-    import pandas as pd
-
     results = as_results(results)
     static, rows = static_condition(results), []
     for name, result in results.items():
@@ -354,7 +350,11 @@ def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> di
     gains, span = result.group_gains(policy, part)
     interval = score_interval(gains, span, resamples=resamples)
     errors = result.episode_metrics(policy)["ev_error"][:, members]
-    weights = _frame_weights(errors.shape, result.groups[members])
+    # Every source group has the same share of the frames.
+    _, index, counts = np.unique(result.groups[members], return_inverse=True, return_counts=True)
+    share = 1.0 / (len(counts) * counts[index])
+    seeds, _, frames = errors.shape
+    weights = np.broadcast_to(share[None, :, None], errors.shape) / (seeds * frames)
     return {
         "num_groups": interval.num_groups,
         "seed": result.seed,
@@ -372,40 +372,30 @@ def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> di
     }
 
 
-def bracket_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     """A row per budget and policy of an evaluation of brackets, the best policy first.
 
-    Args:
-        results: By budget.
-        ranking: Of `overall_ranking`.
-
-    Returns:
-        `quality` with its 95 % interval `ci95`, `to_best` with `to_best_ci95`, its paired
-        difference to the best policy over all budgets, and the means of `BRACKET_METRICS`.
+    `quality` has its 95 % interval `ci95`; `to_best`, with `to_best_ci95`, is the paired difference
+    to the best policy over all budgets; the other metrics are means.
     """
-    import pandas as pd
-
-    rows: list[dict[str, Any]] = []
-    for result in results.values():
-        assert result.plan is not None
-        assert result.plan.budgets is not None
-        names = [one.policy for one in ranking]
+    names, rows = ranking.policy.tolist(), []
+    plan = next(iter(results.values())).plan
+    assert plan is not None
+    for budget, result in zip(plan.budgets or (), results.values(), strict=True):
         best = result.group_gains(names[0])[0]
         for policy in names:
             gains, span = result.group_gains(policy)
             change = difference_interval(gains, best, span)
-            rows.append(
-                {
-                    "policy": policy,
-                    "budget": result.plan.budgets[len(rows) // len(names)],
-                    "ci95": score_interval(gains, span).pair,
-                    "to_best": change.value,
-                    "to_best_ci95": change.pair,
-                    "num_groups": len(span),
-                    "training_seeds": len(gains),
-                    **{key: result.mean(policy, key) for key in BRACKET_METRICS},
-                }
-            )
+            row = {
+                "policy": policy,
+                "budget": budget,
+                "ci95": score_interval(gains, span).pair,
+                "to_best": change.value,
+                "to_best_ci95": change.pair,
+                "num_groups": len(span),
+                "training_seeds": len(gains),
+            }
+            rows.append(row | {key: result.mean(policy, key) for key in BRACKET_METRICS})
     return pd.DataFrame(rows)
 
 
@@ -421,48 +411,40 @@ def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], quantile: flo
     return float(values.ravel()[order][index])
 
 
-def _frame_weights(shape: tuple[int, ...], groups: NDArray[Any]) -> Floats:
-    """Weights ``(K, E, T)`` that sum to 1 and give every source group the same share."""
-    _, index, counts = np.unique(groups, return_inverse=True, return_counts=True)
-    episode = 1.0 / (len(counts) * counts[index])
-    return np.broadcast_to(episode[None, :, None], shape) / (shape[0] * shape[2])
-
-
 def scene_rows(result: EvaluationResult) -> pd.DataFrame:
     """A row per policy and scene: means over the scene's episodes and the training seeds."""
-    import pandas as pd
-
-    rows = []
+    of_scene = {
+        "scene_id": result.scene_ids,
+        "group": result.groups,
+        "kind": result.kinds,
+        "hard": result.hard.astype(int),
+        "oracle_state": result.oracle_states,
+    }
+    # Of the first episode: a mean of indices would mean nothing.
+    first = dict.fromkeys((*of_scene, "final_state"), "first")
+    found = []
     for policy, track in result.tracks.items():
-        values = result.episode_metrics(policy)
-        for scene in dict.fromkeys(result.scene_ids):
-            own = np.flatnonzero(result.scene_ids == scene)
-            errors = values["ev_error"][:, own]
-            rows.append(
-                {
-                    **{k: float(v[:, own].mean()) for k, v in values.items()},
-                    "policy": policy,
-                    "scene_id": str(scene),
-                    "group": str(result.groups[own[0]]),
-                    "kind": str(result.kinds[own[0]]),
-                    "hard": int(result.hard[own[0]]),
-                    "episodes": len(own),
-                    "oracle": float(result.oracle[own].mean()),
-                    "random": float(result.random[own].mean()),
-                    "ev_error_median": float(np.median(errors)),
-                    "ev_error_p95": float(np.percentile(errors, 95)),
-                    # Of the first episode: a mean of indices would mean nothing.
-                    "final_state": int(track.states[0, own[0], -1]),
-                    "oracle_state": int(result.oracle_states[own[0]]),
-                }
+        values = {k: v.mean(axis=0) for k, v in result.episode_metrics(policy).items()}
+        values |= {"oracle": result.oracle, "random": result.random}
+        errors = result.episode_metrics(policy)["ev_error"]
+        del values["ev_error"]
+        frame = pd.DataFrame({**of_scene, **values, "final_state": track.states[0, :, -1]})
+        scenes = frame.groupby("scene_id", sort=False)
+        rows = scenes.agg({name: first.get(name, "mean") for name in frame})
+        own = [errors[:, result.scene_ids == name] for name in rows.index]
+        found.append(
+            rows.assign(
+                policy=policy,
+                episodes=scenes.size(),
+                ev_error_median=[np.median(e) for e in own],
+                ev_error_p95=[np.percentile(e, 95) for e in own],
             )
-    return pd.DataFrame(rows, columns=list(SCENE_COLUMNS))
+        )
+    return pd.concat(found, ignore_index=True)[list(SCENE_COLUMNS)]
 
 
 def group_rows(result: EvaluationResult) -> pd.DataFrame:
     """Mean score of every source group: a row per group, a column per policy."""
-    import pandas as pd
-
     values = {"oracle q": result.oracle, "random q": result.random}
     for name in result.tracks:
         values[name] = result.episode_metrics(name)["score"].mean(axis=0)
@@ -484,16 +466,8 @@ def difference_rows(
 ) -> pd.DataFrame:
     """Paired differences of every other policy's normalised score to that of `minus`.
 
-    Args:
-        result: The results of one condition.
-        minus: The policy that is subtracted.
-        resamples: Bootstrap resamples.
-
-    Returns:
-        One for each policy and part that has scenes.
+    A row for each policy and part that has scenes.
     """
-    import pandas as pd
-
     rows = []
     for part in result.conditions:
         other, span = result.group_gains(minus, part)
@@ -514,52 +488,19 @@ def difference_rows(
     return pd.DataFrame(rows)
 
 
-def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> list[Rank]:
-    """Policies by their score over all conditions, each condition with the same weight.
-
-    Privileged policies have no rank.
-
-    Args:
-        results: By condition.
-        resamples: Bootstrap resamples.
+def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataFrame:
+    """Policies by their score over all conditions, each with the same weight; none that is
+    privileged. A row for each, as of `agents.evaluation.intervals.rank`.
     """
     first = next(iter(results.values()))
     names = [name for name, track in first.tracks.items() if not track.privileged]
+    if not names:
+        return pd.DataFrame(columns=list(RANK_COLUMNS))
     gains = {
         name: np.mean([r.group_gains(name)[0] for r in results.values()], axis=0) for name in names
     }
-    if not gains:
-        return []
     spans = [result.group_gains(names[0])[1] for result in results.values()]
     return rank(gains, np.mean(spans, axis=0), resamples=resamples)
-
-
-def ranking_rows(ranking: Sequence[Rank]) -> list[dict[str, Any]]:
-    """A ranking as JSON values."""
-    names = [one.policy for one in ranking]
-
-    def change(interval: Interval | None, other: int) -> dict[str, Any] | None:
-        if interval is None:
-            return None
-        return {
-            "other": names[other],
-            "difference": interval.value,
-            "simultaneous_ci95": interval.pair,
-            "significant": interval.significant,
-        }
-
-    return [
-        {
-            "place": i + 1,
-            "policy": one.policy,
-            "tier": one.tier,
-            "normalised_score": one.score.value,
-            "ci95": one.score.pair,
-            "to_best": change(one.to_best, 0),
-            "to_next": change(one.to_next, i + 1),
-        }
-        for i, one in enumerate(ranking)
-    ]
 
 
 def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
@@ -581,11 +522,8 @@ def oracle_histogram(result: EvaluationResult) -> dict[str, dict[str, float]]:
         ``{"iso": {"100": 0.4, ...}, "exposure_time": {...}, "f_number": {...}}``.
     """
     controls = result.grid.controls(result.oracle_states)  # (E, 3)
-    axes = {
-        "iso": result.grid.isos,
-        "exposure_time": result.grid.exposure_times,
-        "f_number": result.grid.f_numbers,
-    }
+    grid = result.grid
+    axes = {"iso": grid.isos, "exposure_time": grid.exposure_times, "f_number": grid.f_numbers}
     return {
         name: {f"{v:g}": float((controls[:, i] == j).mean()) for j, v in enumerate(values)}
         for i, (name, values) in enumerate(axes.items())
@@ -597,10 +535,6 @@ def scores_by_kind(result: EvaluationResult) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     for kind in dict.fromkeys(result.kinds.tolist()):
         own = result.kinds == kind
-        span = metrics.group_means((result.oracle - result.random)[own], result.groups[own])
-        found[kind] = {"groups": len(span)}
-        for name in result.tracks:
-            score = result.episode_metrics(name)["score"].mean(axis=0)
-            gain = metrics.group_means((score - result.random)[own], result.groups[own])
-            found[kind][name] = float(gain.sum() / span.sum())
+        found[kind] = {"groups": len(set(result.groups[own]))}
+        found[kind] |= {name: result.normalised(name, own) for name in result.tracks}
     return found

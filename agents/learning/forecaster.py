@@ -59,9 +59,6 @@ class ForecasterTraining(Configuration):
         bent: Share of the light that is cut at a level above or below, as light is that comes
             through gaps; likewise the share whose pace varies, and the share that is smoothed.
         seed: Seed of light, frames and weights.
-
-    Raises:
-        ValueError: If a value is out of range or an entry is unknown; the message names it.
     """
 
     steps: int = Field(default=10_000, ge=2, le=10**9)
@@ -110,10 +107,7 @@ class LightForecaster(nn.Module):
 def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np.float32]:
     """What the network sees of a frame, (..., 4): changes and exposure in stops, clipping.
 
-    Args:
-        reading: Of the frame.
-        before: Metered EV100 of the frame before it.
-        exposed_at: EV100 that the frame was taken at.
+    `before` is the metered EV100 of the frame before, `exposed_at` that of the settings.
     """
     change, exposure = (reading.ev100 - before) / 2.0, (reading.ev100 - exposed_at) / 4.0
     parts = [change, exposure, reading.saturated, reading.black]
@@ -237,14 +231,10 @@ def _bent(light: Floats, share: float, rng: np.random.Generator) -> Floats:
 
 
 def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
-    """What an average meter reads on frames exposed for the light three frames before.
+    """What an average meter reads on frames exposed for the light three frames before, (B, T).
 
     A frame is 64 luminances, normal in stops with a mean of 1; each exposure is off by about half a
-    stop, and of a grid of whole stops.
-
-    Args:
-        light: (B, T) EV100.
-        rng: Draws the scenes and the errors.
+    stop, and of a grid of whole stops. `light` (B, T) is in EV100; `rng` draws scenes and errors.
 
     Returns:
         The readings, matched where frames clip, and the EV100 of the exposures, (B, T) each.

@@ -64,18 +64,15 @@ class ExposureFeatures(nn.Module):
     The raw alone does not tell a bright scene from a long exposure. A plane of absolute log
     luminance, log2 of the decoded green plus the EV100 of the frame's settings, does; it is the one
     input that made the difference in trials. The planes are first averaged to about 16 x 16, with
-    the maximum of the luminance as another plane: exposure is decided on coarse structure. What
-    the CNN finds is averaged over the quarters of the frame, with its maxima over the whole frame:
-    a network that sees where everything is memorises the training places. The readings of a light
-    meter, mean luminance and clipped share of 4 x 4 zones, are added.
+    the maximum of the luminance as another plane: exposure is decided on coarse structure. The
+    CNN's output is averaged over the quarters of the frame, with its maxima over the whole frame: a
+    network that sees where everything is memorises the training places. Readings of a light meter,
+    mean luminance and clipped share of 4 x 4 zones, are added.
 
     Args:
         observation_space: Observation of a single environment, with a uint8 ``raw``.
         width: Output features.
         dropout: Share of the CNN's channels that a training step leaves out.
-
-    Raises:
-        ValueError: If the raw is not observed as uint8.
     """
 
     def __init__(
@@ -144,8 +141,7 @@ class ExposureFeatures(nn.Module):
         """Histograms of the frame's luminance, ``(B, LIGHT_NUMBERS)``, for a `StateHead`.
 
         Args:
-            codes: As for `forward`.
-            settings: As for `forward`.
+            codes, settings: As for `forward`.
             histogram: (B, 128) shares of all samples by code, where statistics are observed; the
                 brightest of each pixel is then that of each zone.
         """
@@ -287,12 +283,9 @@ class StateHead(nn.Module):
 
 
 class MeterHistory:
-    """What a light meter read in the last frames of each camera, and what was asked for.
+    """What a light meter read in the last `frames` frames of each camera, and what was asked for.
 
-    Args:
-        context: The camera and the grid.
-        num_envs: Cameras.
-        frames: Frames that are kept, the one in hand among them.
+    The frame in hand is among them.
     """
 
     def __init__(self, context: PolicyContext, num_envs: int, frames: int) -> None:
@@ -342,13 +335,10 @@ def with_history(space: gym.spaces.Dict, frames: int) -> gym.spaces.Dict:
 
 
 def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Frames shifted by up to an eighth, all alike, and mirrored half of the time.
+    """Frames (N, 4, H, W) shifted by up to an eighth, all alike, and mirrored half of the time.
 
-    Their light, and so the scores of all states, stay nearly what they were.
-
-    Args:
-        raw: (N, 4, H, W) uint8. Shifted frames continue their border.
-        rng: Draws the shift.
+    Their light, and so the scores of all states, stay nearly what they were: shifted frames
+    continue their border.
     """
     for axis in (2, 3):
         size = raw.shape[axis]
@@ -399,13 +389,9 @@ class Optimisation:
     Args:
         network: What is trained.
         training: Hyperparameters, with ``learning_rate``, the peak, and ``weight_decay``.
-        session: Where the state is kept.
-        steps: Optimiser steps in all.
+        session: Where the state is kept: `store` is its checkpoint, a context manager.
+        steps: Optimiser steps in all; `done` of them are.
         warm_up: Share of the steps in which the learning rate rises.
-
-    Attributes:
-        done: Steps so far.
-        store: The checkpoint, a context manager.
     """
 
     def __init__(
@@ -418,28 +404,23 @@ class Optimisation:
         warm_up: float = 0.3,
     ) -> None:
         self.network, self.done = network, 0
-        rate = training.learning_rate
-        self.optimizer = torch.optim.AdamW(
-            network.parameters(), lr=rate, weight_decay=training.weight_decay
-        )
+        rate, decay = training.learning_rate, training.weight_decay
+        self.optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=decay)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
             self.optimizer, max_lr=rate, total_steps=steps + 1, pct_start=warm_up
         )
-        self._parts: dict[str, Any] = {
-            "network": network,
-            "optimizer": self.optimizer,
-            "schedule": self.schedule,
-        }
-        self.store = session.store(training, self._state)
+        parts: dict[str, Any] = {"network": network, "optimizer": self.optimizer}
+        parts["schedule"] = self.schedule
+
+        def state() -> dict[str, Any]:
+            return {"step": self.done, **{name: part.state_dict() for name, part in parts.items()}}
+
+        self.store = session.store(training, state)
         past = self.store.load()
         if past is not None:
             self.done = int(past["step"])
-            for name, part in self._parts.items():
+            for name, part in parts.items():
                 part.load_state_dict(past[name])
-
-    def _state(self) -> dict[str, Any]:
-        states = {name: part.state_dict() for name, part in self._parts.items()}
-        return {"step": self.done, **states}
 
     def step(self, loss: torch.Tensor) -> None:
         """One step down `loss`.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -17,9 +16,10 @@ from pydantic import Field, ValidationError, model_validator
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.networks import Progress, Session
 from agents.learning.regression import RegressionTraining, train_regression
-from agents.learning.weights import describe_agent, load_agent, save_agent
+from agents.learning.weights import load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
+from simulator.utils.checks import check_word
 from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
@@ -69,14 +69,10 @@ class AgentConfig(Configuration):
             options = EnvOptions.from_kwargs(self.environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
             options.make_lighting()
+            taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
+            check_word("observation", options.observation, taken)  # that its network takes
         except ValueError as error:
             raise ValueError(f"environment: {error}") from error
-        taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
-        if options.observation not in taken:
-            raise ValueError(
-                f"environment: `observation` (={options.observation!r}) must be one of "
-                f"{list(taken)}, which is what the agent's network takes"
-            )
         if self.agent == "ppo":
             hyperparameters.check_batch(self.num_envs)
         try:
@@ -157,8 +153,16 @@ def train_agent(
     if is_trained(config, out):
         return out
     training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
-    curve = LearningCurve(sibling(out, ".csv"))
-    with _logged(curve, progress, tensorboard) as report, ExitStack() as stack:
+    takers: list[Progress] = [LearningCurve(sibling(out, ".csv"))]
+    takers += [] if progress is None else [progress]
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        for take in takers:
+            take(done, total, values)
+
+    with ExitStack() as stack:
+        if tensorboard is not None:
+            takers.insert(0, stack.enter_context(_tensorboard(tensorboard)))
         session, context = Session(checkpoint, report, device, config.card()), None
         if isinstance(training, ForecasterTraining):
             network: Any = train_forecaster(training, session)
@@ -171,7 +175,7 @@ def train_agent(
                 from agents.learning.ppo import train_ppo
 
                 network = train_ppo(envs, training, session)
-    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
+    save_agent(out, config.agent, network, network.width, context, config.card())
     checkpoint.unlink(missing_ok=True)
     return out
 
@@ -188,19 +192,8 @@ def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
 
 
 @contextmanager
-def _logged(
-    curve: LearningCurve, progress: Progress | None, folder: Path | None
-) -> Iterator[Progress]:
-    """What takes each report: the curve, TensorBoard's log in `folder`, and `progress`."""
-    takers: list[Progress] = [curve] if progress is None else [curve, progress]
-
-    def report(done: int, total: int, values: dict[str, float]) -> None:
-        for take in takers:
-            take(done, total, values)
-
-    if folder is None:
-        yield report
-        return
+def _tensorboard(folder: Path) -> Iterator[Progress]:
+    """Takes each report for TensorBoard's log in `folder`."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -211,8 +204,7 @@ def _logged(
             writer.add_scalar(f"train/{name}", value, done)
 
     with SummaryWriter(str(folder)) as writer:
-        takers.insert(0, log)
-        yield report
+        yield log
 
 
 class LearningCurve:
@@ -248,13 +240,10 @@ class LearningCurve:
         means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
         self._rows.append({"frames": done, **means})
         self._recent = []
-        text = io.StringIO()
-        writer = csv.DictWriter(text, self._rows[-1], lineterminator="\n")
-        writer.writeheader()
+        lines = [["frames", *values]]
         for row in self._rows:
-            shown = {name: f"{value:.6g}" for name, value in row.items()}
-            writer.writerow({**shown, "frames": int(row["frames"])})
-        write_atomically(self.path, text.getvalue())
+            lines.append([str(int(row["frames"])), *(f"{row[name]:.6g}" for name in values)])
+        write_atomically(self.path, "".join(",".join(line) + "\n" for line in lines))
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:

@@ -36,14 +36,23 @@ class _Card(BaseModel):
     aliases: dict[str, str]
 
 
-def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, Any]) -> None:
+def save_agent(
+    path: Path,
+    kind: str,
+    module: nn.Module,
+    width: int,
+    context: PolicyContext | None,
+    training: dict[str, Any],
+) -> None:
     """Writes ``path.safetensors`` and ``path.json``.
 
     Args:
         path: File name, with or without one of the two endings.
-        kind: ``"regression"`` or ``"ppo"``.
+        kind: ``"regression"``, ``"ppo"`` or ``"forecaster"``.
         module: Its state is stored.
-        description: JSON values, see `describe_agent`.
+        width: Hidden features of its network.
+        context: That it was trained for; None if for any.
+        training: JSON values that identify the training.
 
     Raises:
         ValueError: If the weights are not finite; nothing is written then.
@@ -59,8 +68,10 @@ def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, 
             aliases[name] = source
     check_finite(tensors, path)
     content = save(tensors)
-    head = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
-    write_pair(path, content, {**head, **description, "aliases": aliases})
+    card = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
+    described = {} if context is None else describe_context(context)
+    card |= {"width": width, "context": described, "training": training, "aliases": aliases}
+    write_pair(path, content, card)
 
 
 def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -101,20 +112,6 @@ def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -
     except RuntimeError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"`weights` (={str(path)!r}) do not fit the network: {text}") from error
-
-
-def describe_agent(
-    width: int, context: PolicyContext | None, training: dict[str, Any]
-) -> dict[str, Any]:
-    """Description of an agent for `save_agent`.
-
-    Args:
-        width: Hidden features of its network.
-        context: That it was trained for; None if for any.
-        training: JSON values that identify the training.
-    """
-    described = {} if context is None else describe_context(context)
-    return {"width": width, "context": described, "training": training}
 
 
 def describe_context(context: PolicyContext) -> dict[str, Any]:

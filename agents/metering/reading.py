@@ -138,17 +138,15 @@ class EVTracker:
     the bound stays. A frame that is all white or all black moves any other estimate half of the
     way to the end of the range.
 
-    With damping the EV that is handed out follows that estimate, keeping `damping` of its distance
-    to it at every frame. It is a number of its own and never read back from the settings: a grid of
-    whole stops does not hold it up. Its past never counts as lying beyond the range: light that
-    comes back after a long night is followed at once.
+    With damping, the EV that is handed out follows the estimate. It is never read back from the
+    settings, so a grid of whole stops does not hold it up, and its past never counts as lying
+    beyond the range: light that comes back after a long night is followed at once.
 
     Args:
         num_envs: Cameras.
         ev_range: Lowest and highest EV100 of the camera's exposure states.
         damping: Share of the distance to the estimate [EV] that remains after a frame, in [0, 1).
-        compensation: Exposure compensation [EV] that is taken off what is handed out: the range of
-            that is so much higher.
+        compensation: Exposure compensation [EV], by which the range of the past is higher.
     """
 
     def __init__(
@@ -184,11 +182,10 @@ class EVTracker:
 class ReferenceFrames:
     """Keeps, for each camera, the best frame of the present light.
 
-    What a search finds on a saturated frame and on a dark one of the same scene differs, because
-    neither shows what the other does: a controller that follows the frame in hand may go to and fro
-    between the two for ever. So it continues to search on the better one for as long as new frames
-    look as that one predicts. Of two frames the less saturated is better; of two that are not
-    saturated, the brighter.
+    Neither a saturated frame nor a dark one shows what the other does: a search on the frame in
+    hand may go to and fro between the two for ever. So it continues on the better one for as long
+    as new frames look as that one predicts. Of two frames the less saturated is better; of two that
+    are not saturated, the brighter.
 
     Args:
         camera: The camera, for its black and white level.
@@ -255,10 +252,7 @@ class ZoneMatcher:
     def match(self, reading: Reading, zones: Floats, exposed_at: Floats) -> Reading:
         """Take in one frame of each camera; what it reads, unsaturated where it was matched.
 
-        Args:
-            reading: What a meter reads in the frames, ``(N,)``.
-            zones: See `zone_signals`.
-            exposed_at: EV100 that they were taken at, ``(N,)``.
+        `zones` are `zone_signals`, `exposed_at` is the EV100 of the frames' settings, ``(N,)``.
         """
         light, saturated = reading.ev100, reading.saturated
         if self._zones is not None:
@@ -272,11 +266,9 @@ class ZoneMatcher:
 
 
 def light_change(before: Floats, now: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """How many stops more signal `now` has than `before`, over what both show.
+    """How many stops more signal `now` has than `before` in the zones that both show.
 
-    Args:
-        before: Mean signals of zones, (..., zones), NaN where one clips.
-        now: Likewise, of the same zones.
+    Both are signals of zones, (..., zones), NaN where one clips.
 
     Returns:
         Stops (...), and whether there was enough to compare; 0 where not.

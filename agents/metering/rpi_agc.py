@@ -183,8 +183,7 @@ class LibcameraAgc:
         return factor, wanted
 
     def _compensated(self, signal: Floats) -> Floats:
-        target: Floats = np.minimum(signal * 2.0**self.compensation, TARGET_LIMIT)
-        return target
+        return np.minimum(signal * 2.0**self.compensation, TARGET_LIMIT)
 
     def split(self, exposure: Floats) -> tuple[Floats, Floats]:
         """Exposure time [s] and gain of `exposure` [s], ``(N,)`` each, by the ladder.
@@ -247,14 +246,9 @@ class ExposureFilter:
 
 
 def zone_factor(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
-    """Factor that brings the weighted mean of the zones to `wanted`, ``(N,)``.
+    """Factor that brings the weighted mean of `zones` (N, 15) to the signals `wanted`, ``(N,)``.
 
     A zone that saturates gives no more, so the factor is raised in several passes.
-
-    Args:
-        zones: Mean signal of each zone, ``(N, 15)``.
-        weights: ``(15,)``.
-        wanted: ``(N,)``.
     """
     factor = np.ones(len(zones))
     done = np.zeros(len(zones), bool)
@@ -290,8 +284,7 @@ def inter_quantile_mean(histogram: Floats, low: float, high: float) -> Floats:
     begin = np.minimum(np.floor(low * total), total - 1.0)
     end = np.maximum(np.floor(high * total), begin + 1.0)
     counted = np.clip(above, begin, end) - np.clip(above - histogram, begin, end)
-    mean: Floats = counted @ (np.arange(bins) + 0.5) / (counted.sum(axis=1) * bins)
-    return mean
+    return np.asarray(counted @ (np.arange(bins) + 0.5) / (counted.sum(axis=1) * bins))
 
 
 #: Least signal from which the light is estimated.
@@ -354,7 +347,6 @@ class RpiAgc(Policy):
     ) -> None:
         super().__init__(context)
         check_word("program", program, MANUAL_PROGRAMS)
-        self.program = program
         check_used(program, exposure_time=exposure_time, iso=iso, flicker_period=flicker_period)
         check_word("metering", metering, tuple(ZONE_WEIGHTS))
         check_word("mode", mode, tuple(LADDERS))
@@ -362,36 +354,34 @@ class RpiAgc(Policy):
         time = PRIORITY_TIME if exposure_time is None else exposure_time
         lens = context.grid.f_numbers[0] if f_number is None else f_number
         self.options = ProgramOptions(compensation, damping, shutter_cap, lens, time, iso)
-        self.speed = check_number("speed", speed, 1e-3, 1.0)
-        self.startup_frames = check_integer("startup_frames", startup_frames, 0)
         max_gain = check_number("max_gain", max_gain, 1.0, 1e5)
         if flicker_period is not None:
             flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
         self.flicker_period = flicker_period
         self.name = f"rpi_agc:{program}"
         ladder = LADDERS[mode]
-        gains = (*ladder.gain[:-1], max(max_gain, 1.0))
+        gains = (*ladder.gain[:-1], max_gain)
         self._ladder = Ladder(ladder.shutter, tuple(min(g, max_gain) for g in gains))
-        by_hand = self.program in ("S", "M")
-        self._settings: dict[str, Any] = {
-            "metering": metering,
-            "constraint": constraint,
-            "ladder": self._ladder,
-            "compensation": compensation,
-            "max_exposure_time": shutter_cap,
-            "exposure_time": time if by_hand else None,
-            "gain": None if iso is None else iso / 100.0,
-            "flicker_period": flicker_period,
-            "speed": self.speed,
-            "startup_frames": self.startup_frames,
-        }
+        self._make_agc = functools.partial(
+            LibcameraAgc,
+            metering=metering,
+            constraint=constraint,
+            ladder=self._ladder,
+            compensation=compensation,
+            max_exposure_time=shutter_cap,
+            exposure_time=time if program in ("S", "M") else None,
+            gain=None if iso is None else iso / 100.0,
+            flicker_period=flicker_period,
+            speed=check_number("speed", speed, 1e-3, 1.0),
+            startup_frames=check_integer("startup_frames", startup_frames, 0),
+        )
         self._chooser = StateChooser(context.grid, program, self.options)
         self.reset(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Begin the start-up frames of `num_envs` cameras."""
         super().reset(num_envs, seed)
-        self._agc = LibcameraAgc(num_envs, **self._settings)
+        self._agc = self._make_agc(num_envs)
         self._damped = np.full(num_envs, np.nan)
         self._previous: NDArray[np.int64] | None = None
 
@@ -433,9 +423,7 @@ class RpiAgc(Policy):
         cost = slower**2 + 0.25 * higher**2 + 4.0 * (aperture**2)[None]
         if self._previous is not None:  # of nominally equal exposures the last one stays
             cost[np.arange(len(cost)), self._previous] -= _STAYS
-        utility = chooser.utility(target, cost)
-        utility -= _FLICKERS * self._flickers(time, target)
-        return utility
+        return chooser.utility(target, cost) - _FLICKERS * self._flickers(time, target)
 
     def _flickers(self, time: Floats, target: Floats) -> Any:
         """1.0 where lamps flicker in a state but not in one near the EV, ``(N, S)``.

@@ -126,16 +126,10 @@ def entropy_reading(
 
 
 def peak(values: Floats, positions: Floats, best: NDArray[np.intp] | None = None) -> Floats:
-    """Where each row of `values` is highest: the top of the parabola through its best three.
+    """Where each row of `values` (N, K) is highest: the top of the parabola through its best three.
 
-    Args:
-        values: ``(N, K)``.
-        positions: ``(K,)``, ascending.
-        best: Index of the highest value of each row, ``(N,)``; by default of equal ones that at the
-            position nearest to 0.
-
-    Returns:
-        ``(N,)``, within `positions`.
+    `positions` (K,) ascend. `best` (N,) are the indices of the highest values; by default, of equal
+    ones, that at the position nearest to 0.
     """
     if best is None:
         best = np.argmax(values.round(9) - 1e-9 * np.abs(positions), axis=1)
@@ -158,13 +152,7 @@ def _shares(codes: NDArray[np.uint8]) -> Floats:
 
 
 def _exposed(shares: Floats, evs: Floats, gain: float = 1.0) -> Floats:
-    """Histograms of sRGB codes of the frames at other exposures, ``(N, K, BINS)``.
-
-    Args:
-        shares: Share of each code of the observation, ``(N, 256)``.
-        evs: Exposures relative to the frame's [EV], ``(K,)``.
-        gain: Factor that is also applied to the signal.
-    """
+    """Histograms ``(N, K, BINS)`` of sRGB codes at other exposures, ``(K,)`` [EV], of `_shares`."""
     below, rest = _edges(tuple(evs), gain)
     cumulated = np.concatenate([np.zeros((len(shares), 1)), np.cumsum(shares, axis=1)], axis=1)
     lower = cumulated[:, below]
@@ -175,11 +163,7 @@ def _exposed(shares: Floats, evs: Floats, gain: float = 1.0) -> Floats:
 
 @functools.lru_cache(maxsize=8)
 def _edges(evs: tuple[float, ...], gain: float) -> tuple[NDArray[np.intp], Floats]:
-    """Where the inner edges of the simulated bins lie among those of the observation's codes.
-
-    Returns:
-        ``(K, BINS - 1)``: the code below, and the part of it.
-    """
+    """The code below each inner edge of the simulated bins (K, BINS - 1), and its part."""
     import torch
 
     from ae_env.scorers.measures import srgb_decode

@@ -46,17 +46,12 @@ class ScoreRegression:
 
     @classmethod
     def fit(cls, features: Floats, scores: Floats, groups: NDArray[Any]) -> ScoreRegression:
-        """Choose the bandwidths by cross-validation over source groups.
+        """Choose the bandwidths by cross-validation over source `groups` (n,): one is never split.
 
         The criterion is the mean score of the state that the regression picks for the groups left
-        out (8 folds); the bandwidth of the EV is chosen first, then that of the sensors. Of those
-        within 0.001 of the best the widest is taken: the criterion is flat, narrow kernels are not
-        safe where few scenes are near.
-
-        Args:
-            features: ``(n, d)``, the metered EV first.
-            scores: ``(n, S)``.
-            groups: Source group of each sample, ``(n,)``: a group is never split.
+        out (8 folds); the bandwidth of the EV, the first feature, is chosen first, then that of the
+        sensors. Of those within 0.001 of the best the widest is taken: the criterion is flat,
+        narrow kernels are not safe where few scenes are near.
         """
         dimensions = features.shape[1]
         folds = np.unique(groups, return_inverse=True)[1] % FOLDS
@@ -130,15 +125,7 @@ class ScoreRegression:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:
-        """Read what `save` wrote.
-
-        Args:
-            path: The file.
-            name: What errors call it.
-
-        Raises:
-            ValueError: If the file is missing or is not one of these.
-        """
+        """Read what `save` wrote; a `ValueError`, where `name` names the file, if it is none."""
         from safetensors import SafetensorError
         from safetensors.numpy import load_file
 

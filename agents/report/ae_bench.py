@@ -14,7 +14,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation.intervals import Rank
 from agents.evaluation.plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
@@ -52,7 +51,7 @@ _MEANS = {
         *("regret", "ev_within_third", "frames_to_converge", "converged", "reversals", "jump"),
         *("clipped_high", "clipped_low"),
     ),
-    "quality": ("log_error", "unseen", "frames"),
+    "quality": ("log_error", "unseen", "frames", "seconds"),
 }
 #: The tables of a page: their tasks, what is said of each, and its columns by heading.
 _COMMON: dict[str, Cell] = {
@@ -63,7 +62,14 @@ _COMMON: dict[str, Cell] = {
     "procedural": "{procedural:.4f}",
     "real": "{real:.4f}",
 }
+_LAST: dict[str, Cell] = {
+    "ms alone": "{ms_alone:.4f}",
+    "seeds": "{training_seeds:.0f}",
+    "author": "{author}",
+    "date": "{date}",
+}
 _FRAMES: dict[str, Cell] = {
+    **_COMMON,
     "regret": "{regret:.4f}",
     "within 1/3 EV": "{ev_within_third:.2%}",
     "frames to converge": "{frames_to_converge:.4f}",
@@ -71,65 +77,37 @@ _FRAMES: dict[str, Cell] = {
     "reversals": "{reversals:.4f}",
     "jump": "{jump:.4f}",
     "white": "{clipped_high:.2%}",
+    **_LAST,
 }
 _BRACKETS: dict[str, Cell] = {
+    **_COMMON,
     "error [EV]": "{log_error:.4f}",
     "unseen": "{unseen:.2%}",
     "frames": "{frames:.4f}",
-}
-_LAST: dict[str, Cell] = {
-    "ms alone": "{ms_alone:.4f}",
-    "seeds": "{training_seeds:.0f}",
-    "author": "{author}",
-    "date": "{date}",
+    **_LAST,
 }
 _TABLES = {
     "still": (
         "Still: `AutoExposure-v0`",
         "Score: normalised over all conditions, each with the same weight; 0 is a random policy, "
         "1 the best state of every frame in that frame's own light.",
-        {**_COMMON, **_FRAMES, **_LAST},
+        _FRAMES,
     ),
     "video": (
         "Video: `AutoExposureVideo-v0`",
         "Score: as above. Nobody reaches 1, as the light to come must be guessed: "
         "`oracle:last_frame`, which is not ranked, knows that of the frame in hand.",
-        {**_COMMON, **_FRAMES, **_LAST},
+        _FRAMES,
     ),
     "bracket": (
         "Bracket: `ExposureBracket-v0`",
         "Score: quality of the merged picture, 1 - mean error / 2 EV, over all time budgets.",
-        {**_COMMON, **_BRACKETS, **_LAST},
+        _BRACKETS,
     ),
 }
 #: What tells a page that this module wrote.
 _MARK = "<!-- written by `ae-env evaluate --append`"
-_PAGE = """\
-# AE-Bench v2
-
-<!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->
-
-40 scenes that nothing was trained on: 24 of the procedural generators, and a view of each of the \
-16 real places of the test split (`ae-env scenes download` fetches them). Three tasks, each a \
-preset of `configs/evaluation`; what the columns mean: [evaluation.md](evaluation.md). Times are \
-those of each row's own machine (`cpu` in the CSV file). [AE-Bench v1](ae-bench/v1.md) is \
-superseded.
-
-Add your own policy with one command for each task that it is for:
-
-    ae-env evaluate --preset ae_bench_v2_still --policy my.py:Mine \\
-        --append {table} --author "Your name"
-
-`_still`, `_video` or `_bracket`; `--observation statistics` shows the policy the statistics of an \
-image processor in place of pixels. A row replaces the one of the same task, policy, observation \
-and author, where there is one, and no other. Send it as a pull request with the two files that \
-the command changes, `{table}` and `{page}`, and, if it may be public, the policy's file.
-
-The plans of all tasks, their scenes and the rules of the environment have the hash `{hash}`, \
-which every row carries; a run under another one is refused.
-
-{tables}
-"""
+_PAGE = Path(__file__).with_name("ae_bench.md")
 
 
 def scene_signature(scene: Scene) -> list[Any]:
@@ -141,12 +119,12 @@ def scene_signature(scene: Scene) -> list[Any]:
     means = _blocks(scene.light.double().clamp(min=2.0**-20))
     exposed = np.log2(means) - scene.reference.log2_exposure
     codes = np.rint(exposed / STEP_EV).astype(int)
-    ev, layout = round(scene.ev100, 2), scene.layout
-    planes = [] if layout is None else [layout.defocus[None]]
-    if layout is not None and layout.subject is not None:
-        planes.append(layout.mask)
+    planes = [] if scene.layout is None else [scene.layout.defocus[None]]
+    if scene.layout is not None and scene.layout.subject is not None:
+        planes.append(scene.layout.mask)
     places = [np.rint(_blocks(plane) / 0.1).astype(int).tolist() for plane in planes]
-    return [scene.scene_id, scene.group, scene.kind, bool(scene.hard), ev, codes.tolist(), places]
+    names = [scene.scene_id, scene.group, scene.kind, bool(scene.hard), round(scene.ev100, 2)]
+    return [*names, codes.tolist(), places]
 
 
 def _blocks(planes: Tensor) -> NDArray[Any]:
@@ -161,15 +139,10 @@ def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
     """sha256 of the plan, or of all plans of its suite, of its scenes, and of `RULES`."""
     protocols: Any = plan.protocol()
     if plan.suite:
-        protocols = [_shared(load_plan(name)) for name in plan.suite]
+        protocols = [load_plan(name).protocol() for name in plan.suite]
+        for protocol in protocols:  # a policy may choose what it is shown
+            protocol["environment"].pop("observation", None)
     return digest(RULES, protocols, [scene_signature(scene) for scene in scenes])
-
-
-def _shared(plan: EvaluationPlan) -> dict[str, Any]:
-    """What decides the episodes of a plan of a suite: a policy may choose what it is shown."""
-    protocol = plan.protocol()
-    shown = {k: v for k, v in protocol["environment"].items() if k != "observation"}
-    return {**protocol, "environment": shown}
 
 
 def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
@@ -184,8 +157,8 @@ def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
     if found != plan.hash:
         raise ValueError(
             f"`hash` of {plan.name!r} is {plan.hash}, but the plan and the light of its scenes "
-            f"give {found}: the plan or what makes the scenes has changed, so results would not "
-            "compare with the published ones; a changed benchmark needs a new name and hash"
+            f"give {found}: something has changed, so results would not compare with the published "
+            "ones; a changed benchmark needs a new name and hash"
         )
 
 
@@ -222,25 +195,16 @@ def check_append(
             without an author would be replaced.
     """
     if plan.task not in _TABLES:
-        raise ValueError(
-            f"`append` (={str(table)!r}): {plan.name} takes no rows any more, AE-Bench v2 has "
-            "superseded it: --preset ae_bench_v2_still"
-        )
-    known = _read_own(table, plan)[_KEY].apply(tuple, axis=1).tolist()
-    if page_of(table) == table:
-        raise ValueError(f"`append` (={str(table)!r}) must be a CSV file, such as mine.csv")
-    page = page_of(table)
+        raise _refusal(table, f"takes no rows of {plan.name}, which AE-Bench v2 has superseded")
+    rows, page = _read_own(table, plan), page_of(table)
+    if page == table:
+        raise _refusal(table, "must be a CSV file, such as mine.csv")
     if page.is_file() and _MARK not in page.read_text(encoding="utf-8", errors="replace"):
-        raise ValueError(
-            f"`append` (={str(table)!r}) would replace {page}, which is not a benchmark's page: "
-            "give the table another name"
-        )
+        raise _refusal(table, f"would replace {page}, which is not a benchmark's page")
     if not policies:
-        raise ValueError(
-            f"`append` (={str(table)!r}): none of the policies gets a row, since privileged "
-            "policies, such as 'oracle', are not ranked"
-        )
+        raise _refusal(table, "gets no row: privileged policies, such as 'oracle', are not ranked")
     seen: dict[str, str] = {}
+    known = rows[_KEY].apply(tuple, axis=1).tolist()
     for policy in policies:
         name = row_name(policy)
         if name in seen:
@@ -254,6 +218,10 @@ def check_append(
                 f"`author` (={author!r}) must be given: {table} has a row of {name!r} without an "
                 "author, which may be another's"
             )
+
+
+def _refusal(table: Path, text: str) -> ValueError:
+    return ValueError(f"`append` (={str(table)!r}) {text}")
 
 
 def append_rows(
@@ -308,9 +276,10 @@ def append_rows(
 def _read_own(table: Path, plan: EvaluationPlan) -> pd.DataFrame:
     """Rows of a table; an error where one has another hash."""
     rows = read_table(table)
-    for row in rows[rows.hash != plan.hash].itertuples():
+    others = set(rows.hash) - {plan.hash}
+    if others:
         raise ValueError(
-            f"{table}: policy {row.policy!r} was measured under the hash {row.hash}, this run "
+            f"{table} has rows that were measured under the hash {', '.join(others)}, this run "
             f"under {plan.hash}: they do not compare"
         )
     return rows
@@ -338,10 +307,10 @@ def read_table(table: Path) -> pd.DataFrame:
     for name in (name for name in COLUMNS if name not in _TEXT):
         numbers = pd.to_numeric(rows[name], errors="coerce")
         wrong = ~np.isfinite(numbers) & ((rows[name] != "") | (name == "score"))
-        for line in np.flatnonzero(wrong):
-            raise ValueError(
-                f"{table}, line {line + 2}: `{name}` (={rows[name][line]!r}) must be a number"
-            )
+        if wrong.any():
+            line = int(wrong.argmax())
+            given = f"`{name}` (={rows[name][line]!r})"
+            raise ValueError(f"{table}, line {line + 2}: {given} must be a number")
     return rows
 
 
@@ -355,48 +324,39 @@ def page_of(table: Path) -> Path:
     return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
 
 
-def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     """The rows of the policies that are ranked: means over all conditions or budgets.
 
     Args:
         results: By condition.
         ranking: Over all conditions.
     """
-    return pd.DataFrame([_row(results, one) for one in ranking])
-
-
-def _row(results: Results, one: Rank) -> dict[str, Any]:
     first = results[static_condition(results)]
-    track = first.tracks[one.policy]
-
-    def mean(key: str) -> float:
-        """Over all conditions, source groups with the same weight."""
-        return float(np.mean([result.mean(one.policy, key) for result in results.values()]))
-
-    def score(real: bool) -> float | None:
-        """Over the groups that are real places, or over the others."""
-        found = []
-        for result in results.values():
-            chosen = is_real(result.groups) == real
-            if not chosen.any():
-                return None
-            gains, span = result.group_gains(one.policy, chosen)
-            found.append(gains.mean(axis=0).sum() / span.sum())
-        return float(np.mean(found))
-
-    low, high = one.score.pair or (None, None)
-    brackets = first.measure == "quality"
-    return {
-        "policy": one.policy,
-        "score": one.score.value,
-        "ci95_low": low,
-        "ci95_high": high,
-        "procedural": score(real=False),
-        "real": score(real=True),
-        **{key: mean(key) for key in _MEANS[first.measure]},
-        "ms_alone": 1000.0 * mean("seconds") if brackets else track.ms_alone,
-        "training_seeds": track.num_seeds,
-    }
+    real = is_real(first.groups)
+    parts = {"procedural": ~real, "real": real}
+    rows = []
+    for one in ranking.itertuples():
+        means = {
+            key: np.mean([result.mean(one.policy, key) for result in results.values()])
+            for key in _MEANS[first.measure]
+        }
+        scores = {
+            name: np.mean([r.normalised(one.policy, part) for r in results.values()])
+            for name, part in parts.items()
+            if part.any()
+        }
+        track = first.tracks[one.policy]
+        low, high = one.ci95 or (None, None)
+        row = {
+            "policy": one.policy,
+            "score": one.normalised_score,
+            "ci95_low": low,
+            "ci95_high": high,
+            "ms_alone": 1000.0 * means["seconds"] if "seconds" in means else track.ms_alone,
+            "training_seeds": track.num_seeds,
+        }
+        rows.append(row | scores | means)
+    return pd.DataFrame(rows)
 
 
 def is_real(groups: NDArray[Any]) -> NDArray[np.bool_]:
@@ -418,6 +378,6 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
         for task, (title, text, columns) in _TABLES.items()
         if (rows.task == task).any()
     ]
-    return _PAGE.format(
+    return _PAGE.read_text(encoding="utf-8").format(
         table=shown(table), page=shown(page_of(table)), hash=plan.hash, tables="\n\n".join(blocks)
     )

@@ -8,13 +8,14 @@ import os
 import re
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
+from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES
 from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.result import (
     MORE_COLUMNS,
@@ -28,7 +29,6 @@ from agents.evaluation.result import (
     group_rows,
     oracle_histogram,
     overall_ranking,
-    ranking_rows,
     result_rows,
     scene_rows,
     scores_by_kind,
@@ -81,17 +81,7 @@ _BY_CONDITION = (
 )
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
-       max-width: 78rem; margin: 2rem auto; padding: 0 1.2rem; }
-h1 { font-size: 1.7rem; } h2 { margin-top: 2.4rem; border-bottom: 1px solid #ddd; }
-img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-size: .86rem; display: block; overflow-x: auto; }
-th, td { padding: .22rem .6rem; border-bottom: 1px solid #e6e6e6; white-space: nowrap; }
-thead th { border-bottom: 2px solid #999; } tbody tr:hover { background: #f5f7fa; }
-code { background: #f3f3f3; padding: .08rem .25rem; border-radius: 3px; }
-pre { background: #f3f3f3; padding: .8rem; overflow-x: auto; } pre code { padding: 0; }
-"""
+_PAGE = Path(__file__).with_name("report.html")
 #: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
 _SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
 
@@ -127,9 +117,9 @@ def to_markdown(
     Args:
         rows: The rows.
         columns: Content of the cells by heading. Texts of a row are shown as they are, whatever
-            they mean to Markdown; of a function, the result is Markdown.
-        missing: Text of a cell a value of which is missing, None or NaN. Columns without any other
-            cell are left out where it is empty.
+            they mean to Markdown; the result of a function is Markdown.
+        missing: Text of a cell a value of which is missing, None or NaN. Where it is empty, columns
+            without any other cell are left out.
 
     >>> rows = [{"a": "x|y", "b": [1, 2]}, {"a": "z", "b": None}]
     >>> print(to_markdown(rows, {"A": "{a}", "B": "{b:.1f}"}))
@@ -143,8 +133,8 @@ def to_markdown(
         heading: [cell(row, content, missing) for row in records]
         for heading, content in columns.items()
     }
+    first = next(iter(cells))
     if not missing:
-        first = next(iter(cells))
         cells = {heading: own for heading, own in cells.items() if heading == first or any(own)}
     return _aligned(pd.DataFrame(cells))
 
@@ -188,20 +178,21 @@ def code(text: object) -> str:
     `a | b` `` `x` ``
     """
     line = " ".join(str(text).split())
-    fence = "`" * (_longest_run(line) + 1)
+    fence = _fence(line, 1)
     pad = " " if line.startswith("`") or line.endswith("`") else ""
     return f"{fence}{pad}{line}{pad}{fence}"
 
 
 def code_block(*lines: str) -> str:
     """Lines from outside as a block of code."""
-    fence = "`" * max(3, max(map(_longest_run, lines), default=0) + 1)
+    fence = _fence("\n".join(lines), 3)
     return "\n".join([fence, *(" ".join(line.splitlines()) for line in lines), fence])
 
 
-def _longest_run(text: str) -> int:
-    """Length of the longest run of backticks."""
-    return max(map(len, re.findall("`+", text)), default=0)
+def _fence(text: str, least: int) -> str:
+    """Backticks, `least` or more, that `text` does not end."""
+    longest = max(map(len, re.findall("`+", text)), default=0)
+    return "`" * max(least, longest + 1)
 
 
 def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
@@ -226,12 +217,8 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
 
     page = MarkdownIt("commonmark", {"html": False}).enable("table")
     page.add_render_rule("image", image)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
-        f"<body>\n{page.render(markdown)}</body>\n</html>\n"
-    )
+    template = string.Template(_PAGE.read_text(encoding="utf-8"))
+    return template.substitute(title=html.escape(title), body=page.render(markdown))
 
 
 # -- files ----------------------------------------------------------------------------------------
@@ -271,19 +258,30 @@ def write_report(
     result = results[static_condition(results)]
     ranking = overall_ranking(results, resamples=resamples)
     if result.measure == "quality":
-        return _write_brackets(folder, results, ranking, command)
+        rows = bracket_rows(results, ranking)
+        assert result.plan is not None
+        meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
+        text = _bracket_report(result.plan, rows, command)
+        return {
+            "results.json": write_results(folder / "results.json", _records(rows), meta),
+            "report.md": write_atomically(folder / "report.md", text),
+        }
     rows = result_rows(results, source=source, split=split, resamples=resamples)
     meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
     title = f"{rows.source[0]}, {rows.split[0]} split"
     title = title if result.plan is None else result.plan.name
-    contract = _records(rows[list(ROW_COLUMNS)])
+    ends = pd.DataFrame([pair or (None, None) for pair in rows.ci95])
+    table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
+    columns = [name for name in ROW_COLUMNS if name != "ci95"]
+    table = table[[*columns, "ci95_low", "ci95_high", *MORE_COLUMNS]]
+    contents = _records(rows[list(ROW_COLUMNS)])
     files = {
-        "results.json": write_results(folder / "results.json", contract, meta),
+        "results.json": write_results(folder / "results.json", contents, meta),
         "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
-        "metrics.csv": _write_csv(folder / "metrics.csv", _metrics(rows)),
+        "metrics.csv": _write_csv(folder / "metrics.csv", table),
     }
     pictures = _write_pictures(folder, results, rows, ranking, title)
-    text = _Report(results, rows, meta, ranking, list(pictures)).markdown(title, next_commands)
+    text = _Report(results, rows, meta, list(pictures)).markdown(title, next_commands)
     page = html_report(text, pictures, f"Exposure policies compared: {title}")
     return {
         **files,
@@ -293,36 +291,25 @@ def write_report(
     }
 
 
-def _write_brackets(
-    folder: Path, results: Results, ranking: Sequence[Rank], command: str
-) -> dict[str, Path]:
-    first = next(iter(results.values()))
-    assert first.plan is not None
-    rows = bracket_rows(results, ranking)
-    meta = result_meta(command, first.seed) | {"plan": first.plan.protocol()}
-    text = _bracket_report(first.plan, rows, command)
-    return {
-        "results.json": write_results(folder / "results.json", _records(rows), meta),
-        "report.md": write_atomically(folder / "report.md", text),
-    }
-
-
 def _write_pictures(
-    folder: Path, results: Results, rows: pd.DataFrame, ranking: Sequence[Rank], title: str
+    folder: Path, results: Results, rows: pd.DataFrame, ranking: pd.DataFrame, title: str
 ) -> dict[str, Path]:
     result = results[static_condition(results)]
-    order = [one.policy for one in ranking]
+    order = ranking.policy.tolist()
     order += [name for name in result.tracks if name not in order]
-    shown = pd.concat([rows, _overall_rows(ranking)]) if len(results) > 1 else rows
+    if len(results) > 1:
+        together = ranking[["policy", "normalised_score", "ci95"]]
+        named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
+        rows = pd.concat([rows, together.assign(**named)])
     pictures = {
-        "scores.png": plot_scores(folder / "scores.png", shown, title),
+        "scores.png": plot_scores(folder / "scores.png", rows, title),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
     }
-    known = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
-    scores = {one.policy: one.score.value for one in ranking if one.policy in known}
+    alone = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
+    ranked = ranking[ranking.policy.isin(list(alone))]
+    scores = dict(zip(ranked.policy, ranked.normalised_score, strict=True))
     if scores:
-        costs = {name: known[name] for name in scores}
-        pictures["cost.png"] = plot_cost(folder / "cost.png", costs, scores)
+        pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores)
     return pictures | path_sheets(folder, result, order)
 
 
@@ -337,45 +324,26 @@ def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
     return write_atomically(path, text)
 
 
-def _metrics(rows: pd.DataFrame) -> pd.DataFrame:
-    """Every metric of every policy in every condition, the ends of intervals in two columns."""
-    pairs = [pair or (None, None) for pair in rows.ci95]
-    plain = rows[[name for name in ROW_COLUMNS if name != "ci95"]]
-    ends = pd.DataFrame(pairs, columns=["ci95_low", "ci95_high"])
-    return pd.concat([plain, ends, rows[list(MORE_COLUMNS)]], axis=1)
-
-
-def _overall_rows(ranking: Sequence[Rank]) -> pd.DataFrame:
-    """Rows of all conditions together, for the plot of the scores."""
-    rows = [(r.policy, r.score.value, r.score.pair, r.score.num_groups) for r in ranking]
-    columns = ["policy", "normalised_score", "ci95", "num_groups"]
-    return pd.DataFrame(rows, columns=columns).assign(condition="all conditions")
-
-
-def _meta(
-    results: Results, ranking: Sequence[Rank], command: str, resamples: int
-) -> dict[str, Any]:
+def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
-    plan, best = result.plan, best_meter(result)
-    described = None
-    if plan is not None:
-        described = plan.describe()
+    best, described, differences = best_meter(result), None, []
+    if result.plan is not None:
+        described = result.plan.describe()
         protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
         described["sha256"] = digest(protocol)
-    differences = pd.DataFrame()
     if best is not None:
-        differences = difference_rows(result, best, resamples=resamples)
+        differences = _records(difference_rows(result, best, resamples=resamples))
     return {
         **result_meta(command, result.seed),
         "plan": described,
         "episodes": len(result.scene_ids),
         "scenes": len(set(result.scene_ids.tolist())),
         "frames": result.scores.shape[1],
-        "ranking": ranking_rows(ranking),
+        "ranking": _records(ranking),
         "by_kind": scores_by_kind(result),
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
-        "differences_to_best_meter": _records(differences),
+        "differences_to_best_meter": differences,
         "training_seeds": training_seed_rows(result),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
@@ -401,25 +369,23 @@ def _bracket_report(plan: EvaluationPlan, rows: pd.DataFrame, command: str) -> s
     return "\n\n".join(parts) + "\n"
 
 
+@dataclass
 class _Report:
     """The parts of ``report.md`` of an evaluation of frames."""
 
-    def __init__(
-        self,
-        results: Results,
-        rows: pd.DataFrame,
-        meta: Mapping[str, Any],
-        ranking: Sequence[Rank],
-        pictures: Sequence[str],
-    ) -> None:
-        self.results, self.rows, self.meta = results, rows, meta
-        self.ranking, self.pictures = ranking, pictures
-        self.static = static_condition(results)
-        self.result = results[self.static]
-        by = rows.replace({"condition": {"all": self.static}})
+    results: Results
+    rows: pd.DataFrame
+    meta: Mapping[str, Any]
+    pictures: Sequence[str]
+
+    def __post_init__(self) -> None:
+        self.static = static_condition(self.results)
+        self.result = self.results[self.static]
+        by = self.rows.replace({"condition": {"all": self.static}})
         #: Of each condition as a whole.
-        self.by = by[by.condition.isin(list(results))]
-        self.scores = {one.policy: one.score.value for one in ranking}
+        self.by = by[by.condition.isin(list(self.results))]
+        ranking = self.meta["ranking"]
+        self.scores = {row["policy"]: row["normalised_score"] for row in ranking}
 
     def markdown(self, title: str, next_commands: Sequence[str]) -> str:
         """The report as Markdown."""
@@ -465,7 +431,7 @@ class _Report:
         ]
 
     def _ranking(self) -> list[str]:
-        if not self.ranking:
+        if not self.scores:
             return []
         over = f"all {len(self.results)} conditions, each with the same weight"
         columns: dict[str, Cell] = {
@@ -613,14 +579,15 @@ def _change(change: Mapping[str, Any] | None) -> str | None:
 def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
     """Share of the episodes in which each value of each control is the oracle's, as a table."""
     labels: dict[str, Callable[[float], str]] = {
-        "iso": lambda v: f"ISO {v:g}",
+        "iso": "ISO {:g}".format,
         "exposure_time": format_exposure_time,
-        "f_number": lambda v: f"f/{v:g}",
+        "f_number": "f/{:g}".format,
     }
-    rows = []
-    for name, own in histogram.items():
-        shares = [f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()]
-        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
+    shares = {
+        name.replace("_", " "): [f"{labels[name](float(v))}: {own:.0%}" for v, own in found.items()]
+        for name, found in histogram.items()
+    }
+    rows = [{"control": name, "share": ", ".join(own)} for name, own in shares.items()]
     return to_markdown(rows, {"control": "{control}", "share": "{share}"})
 
 
@@ -638,7 +605,7 @@ def _plan_part(plan: EvaluationPlan, described: Mapping[str, Any]) -> list[str]:
 
 
 def summary(
-    results: EvaluationResult | Results, ranking: Sequence[Rank] | None = None
+    results: EvaluationResult | Results, ranking: pd.DataFrame | None = None
 ) -> list[tuple[str, pd.DataFrame]]:
     """Tables of an evaluation for the terminal: titles, and frames of texts.
 
@@ -651,28 +618,39 @@ def summary(
     result = results[static]
     ranking = overall_ranking(results) if ranking is None else ranking
     if result.measure == "quality":
-        return [
-            ("quality of the merged picture, by time of all frames", _budgets(results, ranking))
+        lines = [
+            {
+                "policy": one.policy,
+                "all": f"{one.normalised_score:.4f}",
+                "95 % interval": _interval(one.ci95, ".4f"),
+                **{name: f"{r.normalised(one.policy):.4f}" for name, r in results.items()},
+            }
+            for one in ranking.itertuples()
         ]
+        title = "quality of the merged picture, by time of all frames"
+        return [(title, pd.DataFrame(lines))]
     if len(results) == 1:
         rows = result_rows(result, resamples=2000)
         table = rows.pivot(index="policy", columns="condition", values="normalised_score")
         table = table.loc[list(result.tracks), list(result.conditions)].map("{:.3f}".format)
         pairs = rows[rows.condition == "all"].set_index("policy").ci95
         table["95 % interval (all)"] = [_interval(pair) for pair in pairs[table.index]]
+        table = table.reset_index()
         title = "normalised score: 0 is random, 1 the best state of every frame"
     else:
-        table = pd.DataFrame(
+        lines = [
             {
-                "tier": ["-" if one.tier is None else str(one.tier) for one in ranking],
-                "policy": [one.policy for one in ranking],
-                "all conditions": [f"{one.score.value:.3f}" for one in ranking],
-                "95 % interval": [_interval(one.score.pair) for one in ranking],
-                static: [f"{_normalised(result, one.policy):.3f}" for one in ranking],
+                "tier": "-" if one.tier is None else str(one.tier),
+                "policy": one.policy,
+                "all conditions": f"{one.normalised_score:.3f}",
+                "95 % interval": _interval(one.ci95),
+                static: f"{result.normalised(one.policy):.3f}",
             }
-        ).set_index("tier")
+            for one in ranking.itertuples()
+        ]
+        table = pd.DataFrame(lines)
         title = f"normalised score over {len(results)} conditions, and in {static!r}"
-    tables = [(title, table.reset_index())]
+    tables = [(title, table)]
     groups = group_rows(result)
     if len(groups) < MIN_GROUPS:
         for first in range(0, len(groups), _GROUPS_ABREAST):
@@ -680,25 +658,6 @@ def summary(
             own = own.rename_axis("policy").reset_index()
             tables.append(("mean score of every source group", own))
     return tables
-
-
-def _budgets(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
-    """The quality that each policy reaches in each budget, as texts."""
-    rows = [
-        {
-            "policy": one.policy,
-            "all": f"{one.score.value:.4f}",
-            "95 % interval": _interval(one.score.pair, ".4f"),
-            **{name: f"{_normalised(r, one.policy):.4f}" for name, r in results.items()},
-        }
-        for one in ranking
-    ]
-    return pd.DataFrame(rows)
-
-
-def _normalised(result: EvaluationResult, policy: str) -> float:
-    gains, span = result.group_gains(policy)
-    return float(gains.mean(axis=0).sum() / span.sum())
 
 
 def _interval(pair: list[float] | None, form: str = ".3f") -> str:

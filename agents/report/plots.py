@@ -23,6 +23,7 @@ from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
@@ -67,24 +68,16 @@ def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
         for interval, height in zip(own.ci95, heights, strict=True):
             if interval is not None:
                 axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
-        axes.plot(
-            own.normalised_score,
-            heights,
-            color=colour,
-            marker=marker,
-            linestyle="none",
-            markersize=6,
-            label=f"{part} ({parts[part].num_groups.iloc[0]} groups)",
-        )
+        label = f"{part} ({parts[part].num_groups.iloc[0]} groups)"
+        marks = {"color": colour, "marker": marker, "markersize": 6, "linestyle": "none"}
+        axes.plot(own.normalised_score, heights, label=label, **marks)
     axes.axvline(1.0, color="0.35", lw=1.0)
     axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
     axes.axvline(0.0, color="0.75", lw=1.0, ls=":")
     axes.set_yticks(range(len(names)), [_text(name) for name in names])
     axes.set_ylim(-0.6, len(names) - 0.4)
     axes.set_xlabel("normalised score (random 0, oracle 1); bars: 95 % interval")
-    axes.grid(axis="x", color="0.92")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    _tidy(axes, axis="x", color="0.92")
     columns = 2 if len(shown) > 3 else 3
     axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
     if title:
@@ -119,9 +112,7 @@ def plot_convergence(
         panel.set_yticks([0, 1, 2, 4, 8, 16], ["0", "1", "2", "4", "8", "16"], fontsize=8)
         panel.set_ylim(0, None)
         panel.xaxis.get_major_locator().set_params(integer=True)
-        panel.grid(color="0.93")
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.tick_params(labelsize=8)
+        _tidy(panel, labelsize=8)
     for panel in panels.flat[len(results) :]:
         panel.set_visible(False)
     for panel in panels[-1]:
@@ -153,9 +144,7 @@ def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figu
         panel.set_ylabel(f"{value} in training", fontsize=9)
         if value != "reward":  # an error, which falls
             panel.set_yscale("log")
-        panel.grid(color="0.93")
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.tick_params(which="both", labelsize=8)
+        _tidy(panel, labelsize=8)
     if len(curves) > 1:
         lines = panels[0].get_lines()
         figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
@@ -164,8 +153,8 @@ def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figu
 
 def line_style(index: int) -> dict[str, str]:
     """Colour and dashes of a policy by its position in the ranking."""
-    dashes = _DASHES[index // len(PALETTE) % len(_DASHES)]
-    return {"color": PALETTE[index % len(PALETTE)], "linestyle": dashes}
+    round_, colour = divmod(index, len(PALETTE))
+    return {"color": PALETTE[colour], "linestyle": _DASHES[round_ % len(_DASHES)]}
 
 
 def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> list[str]:
@@ -175,7 +164,7 @@ def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> lis
     ['a', 'c']
     """
     front: list[str] = []
-    for name in sorted(costs, key=lambda n: (costs[n], -scores[n])):
+    for name in sorted(scores, key=lambda n: (costs[n], -scores[n])):
         if not front or scores[name] > scores[front[-1]]:
             front.append(name)
     return front
@@ -192,14 +181,9 @@ def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float
     figure = _figure(7.5, 4.6)
     axes = figure.add_subplot()
     front = pareto_front(costs, scores)
-    axes.step(
-        [costs[n] for n in front],
-        [scores[n] for n in front],
-        where="post",
-        color="0.6",
-        lw=1.0,
-        label="nothing else is both faster and better",
-    )
+    steps = [costs[n] for n in front], [scores[n] for n in front]
+    label = "nothing else is both faster and better"
+    axes.step(*steps, where="post", color="0.6", lw=1.0, label=label)
     for i, name in enumerate(scores):
         position = costs[name], scores[name]
         axes.plot(*position, "o", color=line_style(i)["color"], markersize=6)
@@ -209,19 +193,16 @@ def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float
     axes.margins(x=0.18)
     axes.set_xlabel("time of a decision for one camera alone [ms]")
     axes.set_ylabel("normalised score (random 0, oracle 1)")
-    axes.grid(color="0.93")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    _tidy(axes)
     axes.legend(frameon=False, fontsize=8, loc="lower right")
     return _write(path, figure)
 
 
 def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
-    """Write contact sheets of one scene's states with the paths of the policies.
+    """Write contact sheets of one scene's states with the paths of the best policies.
 
     Args:
-        folder: Folder of ``contact_sheet.webp``, and of ``contact_sheet_2.webp`` for further
-            policies; only the best of them are shown.
+        folder: Folder of ``contact_sheet.webp``, and of ``contact_sheet_2.webp`` for more policies.
         result: The results in unchanging light.
         order: Policies, the best first.
 
@@ -235,19 +216,17 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
         return {}
     kinds = result.kinds.tolist()
     episode = next((kinds.index(kind) for kind in _KINDS if kind in kinds), 0)
-    options = result.plan.options()
+    options, start = result.plan.options(), int(result.start_states[episode])
     files = {}
     for k, first in enumerate(range(0, min(len(order), _SHEETS * _PATHS), _PATHS)):
-        paths = {}
-        for name in order[first : first + _PATHS]:
-            states = result.tracks[name].states[0, episode, :_PATH_FRAMES]
-            paths[name] = [int(result.start_states[episode]), *map(int, states)]
+        shown = order[first : first + _PATHS]
+        states = {name: result.tracks[name].states[0, episode, :_PATH_FRAMES] for name in shown}
         picture = contact_sheet(
             result.scenes[episode],
             camera=options.make_camera(),
             grid=result.grid,
             scorer=options.make_scorer(),
-            path=paths,
+            path={name: [start, *own.tolist()] for name, own in states.items()},
             **result.moves(episode),
         )
         name = "contact_sheet.webp" if k == 0 else f"contact_sheet_{k + 1}.webp"
@@ -263,6 +242,15 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def _tidy(axes: Axes, labelsize: int | None = None, color: str = "0.93", **grid: Any) -> None:
+    """A grid below the marks, no frame, and small labels of the ticks where there are panels."""
+    axes.grid(color=color, **grid)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if labelsize is not None:
+        axes.tick_params(which="both", labelsize=labelsize)
+
+
 def _text(name: str) -> str:
     """A name as Matplotlib shows it: without formulas."""
     return name.replace("$", r"\$")
@@ -275,15 +263,7 @@ def _write(path: Path, figure: Figure) -> Path:
 
 
 def write_palette_png(path: Path, picture: Image.Image) -> Path:
-    """Write a picture as PNG with a palette of 256 colours: a third of the bytes, no visible loss.
-
-    Args:
-        path: File to write; its folder must exist.
-        picture: The picture.
-
-    Returns:
-        `path`.
-    """
+    """Write a picture as PNG of 256 colours: a third of the bytes, no visible loss."""
     stream = io.BytesIO()
     indexed = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     indexed.save(stream, format="PNG", optimize=True)
@@ -315,16 +295,16 @@ _INK, _PAPER, _ORACLE, _CHOSEN = "#202020", "#ffffff", "#b0b0b0", "#c0392b"
 
 @dataclass
 class Recording:
-    """One policy's episode.
+    """One policy's episode: lists with a value for every frame.
 
     Args:
         name: Of the policy.
-        pictures: (H, W, 3) uint8 of every frame.
-        ev100: EV100 of the settings of every frame.
-        best: EV100 of the best state of every frame.
-        scores: Score of every frame.
-        states: Index of the state of every frame.
-        regrets: Best state's expected score less that of the frame's state, of every frame.
+        pictures: (H, W, 3) uint8.
+        ev100: EV100 of the settings.
+        best: EV100 of the best state.
+        scores: Score of the frame.
+        states: Index of the state.
+        regrets: Best state's expected score less that of the frame's state.
     """
 
     name: str
@@ -411,16 +391,13 @@ def _panel(recording: Recording, frame: int) -> Image.Image:
         while draw.textlength(text, font) > PICTURE and font.size > 7:
             font = ImageFont.load_default(int(font.size) - 1)
         draw.text((0, 2 + 15 * i), text, _INK, font)
-    picture = Image.fromarray(recording.pictures[frame]).resize((PICTURE, PICTURE))
-    panel.paste(picture, (0, TITLE))
-    top, bottom = TITLE + PICTURE + 4, TITLE + PICTURE + CHART - 4
+    panel.paste(Image.fromarray(recording.pictures[frame]).resize((PICTURE, PICTURE)), (0, TITLE))
+    bottom, height = TITLE + PICTURE + CHART - 4, CHART - 8
     low, high = min(recording.best + recording.ev100), max(recording.best + recording.ev100)
+    step, scale = PICTURE / max(len(recording.best) - 1, 1), max(high - low, 1.0)
 
     def points(values: Sequence[float]) -> list[tuple[float, float]]:
-        step, scale = PICTURE / max(len(recording.best) - 1, 1), max(high - low, 1.0)
-        return [
-            (i * step, bottom - (v - low) / scale * (bottom - top)) for i, v in enumerate(values)
-        ]
+        return [(i * step, bottom - (v - low) / scale * height) for i, v in enumerate(values)]
 
     draw.line(points(recording.best), fill=_ORACLE, width=3)
     if frame:

@@ -24,7 +24,7 @@ from simulator import (
     RawImage,
     exposure_ratio,
 )
-from simulator.capture.plan import DEFAULT_TOLERANCE
+from simulator.capture.exposure import DEFAULT_TOLERANCE
 from simulator.training.data import settings_parameters
 from simulator.utils.compute import computes_bfloat16
 

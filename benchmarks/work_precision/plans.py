@@ -33,8 +33,8 @@ from benchmarks.work_precision.trials import (
     trials,
 )
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, PreparedScene, RawImage
-from simulator.capture.sensor import exposed_light
-from simulator.noise.noise_level_function import missing_variance, noise_variance, top_up_table
+from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
+from simulator.noise.noise_level_function import noise_variance
 from simulator.training.scenes import Split
 
 #: Photographs of each scene, and fair states of it; a third as many are any others of the grid.
@@ -105,7 +105,7 @@ def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Te
     exposure = prepared.exposure(settings)
     # What is white is white, however bright: its neighbours' noise is pooled with it.
     light = exposed_light(prepared.blurred_light.blurred(exposure), exposure).clamp_(max=1.0)
-    (table,) = top_up_table([exposure.source_noise], [exposure.target])
+    table = exposure_table([exposure])[0, 1:]
     return light, missing_variance(light, table, exposure.remaining_variance).clamp(min=0.0)
 
 

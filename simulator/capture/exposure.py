@@ -1,27 +1,34 @@
 """Exposure of one capture: the steps from a scene's light to the sensor, and why they are taken.
 
-`decide` looks at numbers only, and says for each step whether it runs and why. Captures follow the
-`Exposure` that it returns, and `simulator.capture.plan.SimulationPlan` shows it.
+`decide` looks at numbers only. Captures follow the `Exposure` that it returns, and
+`simulator.capture.plan.SimulationPlan` shows it.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+import sys
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 import torch
 
-from simulator.capture.layout import Layout
-from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
-from simulator.noise.noise_level_function import NoiseLevelFunction, top_up_table
+from simulator.camera import CameraProfile
+from simulator.capture.statistics import DenoisedLight
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import kernel_energy
 from simulator.optics.motion import Path
-from simulator.raw.develop import ABOVE_WHITE
+from simulator.settings import CameraSettings, exposure_ratio
+from simulator.utils.checks import check_number
 
+if TYPE_CHECKING:
+    from simulator.capture.prepared_scene import Layout, PreparedScene
+
+#: Error that a capture may have, in units of the target's noise: by default the distribution of a
+#: pixel may move by a tenth of its noise's standard deviation.
+DEFAULT_TOLERANCE = 0.1
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
 SIGNAL_LIMIT = 1e6
@@ -32,16 +39,50 @@ LIGHT_LIMIT = 1e9
 RATIO_LIMIT = 2.0**107
 #: Most negative signal that a companded 8-bit code shows; the offset under its square root.
 PEDESTAL = 1.0 / 1024.0
-#: Rounding error of float32 in a transition, as a share of the light.
-ROUNDING = 2.0**-20
-#: Root mean square light hidden by white, over what a density that falls with the square of the
-#: light would have.
-HIDDEN_LIGHT = 0.3
+#: Discs of defocus may be as wide as the frame, on small frames this wide [pixel]: the memory that
+#: a blur takes grows with the square of it.
+MAX_DISC_PX = 512.0
 #: Second moment of a streak over that of a disc of the same extent, per axis: (1/12) / (1/16).
 _STREAK_TO_DISC = 4.0 / 3.0
-#: Relative error of the noise's standard deviation for each stop of ISO beyond the calibration:
-#: without their last ISOs the Z6's table is off by 0.03 to 0.05, the 70D's by 0.17 to 0.25.
-EXTRAPOLATION_ERROR = 0.1
+#: Settings whose targets are remembered for a scene at a time.
+_MOST_TARGETS = 4096
+
+
+def check_tolerance(tolerance: float) -> float:
+    """`tolerance` as a float.
+
+    Raises:
+        ValueError: Unless it is a finite number >= 0.
+    """
+    return check_number("tolerance", tolerance, 0.0, sys.float_info.max)
+
+
+class Target(NamedTuple):
+    """Exposure ratio from a scene's reference to the settings of a capture, and its noise."""
+
+    ratio: float
+    nlf: NoiseLevelFunction
+
+
+class Targets(dict[CameraSettings, Target]):
+    """`Target` of each settings in front of one scene, worked out when it is first asked for."""
+
+    def __init__(self, reference: CameraSettings, camera: CameraProfile, box_factor: int) -> None:
+        super().__init__()
+        self._reference, self._camera, self._box_factor = reference, camera, box_factor
+
+    def __missing__(self, settings: CameraSettings) -> Target:
+        if len(self) >= _MOST_TARGETS:
+            self.clear()
+        nlf = _averaged_nlf(self._camera, settings.iso, self._box_factor)
+        self[settings] = found = Target(exposure_ratio(self._reference, settings), nlf)
+        return found
+
+
+@functools.lru_cache(maxsize=4096)
+def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
+    """Noise of `box_factor` squared sensor pixels averaged."""
+    return camera.nlf(iso).scaled(1.0 / box_factor**2)
 
 
 class Step(NamedTuple):
@@ -55,6 +96,8 @@ class Step(NamedTuple):
         extent: Extent of its blur [pixel], where it is one.
         residual: Error that it makes itself where it runs, as far as that is known.
         network: The network that it runs, if any.
+        operations: Arithmetic operations that it takes, all pixels together, in a plan; those of a
+            network once for all settings.
     """
 
     name: str
@@ -64,51 +107,7 @@ class Step(NamedTuple):
     extent: float = 0.0
     residual: float = 0.0
     network: DenoisedLight | None = None
-
-
-class TransitionInputs(NamedTuple):
-    """What decides which steps a capture takes.
-
-    Args:
-        ratio: Exposure ratio from the source to the target.
-        source: Noise of the source, at its own exposure.
-        target: Noise that the capture should have.
-        tolerance: Error that the capture may have: the cheapest way within it is taken, or else
-            the one with the least error. At 0 that is always the one with the least.
-        noise: Whether a capture is wanted; else the light without noise, in which noise of the
-            source cannot count as part of the target's.
-        statistics: Of the light as it was recorded.
-        residuals: Errors of networks on that light.
-        networks: The results of the noise modules that there are, the cheapest first.
-        defocus_px: Diameter of the defocus disc [pixel].
-        motion_px: Length of the longest path of motion [pixel].
-        layout: See `Exposure`.
-        path: See `Exposure`; None where the motion is a streak along the rows.
-        subject_path: See `Exposure`.
-        f_number: Effective f-number of the target.
-        aperture_px: Largest diameter of the blur that the opening aperture adds [pixel], inf where
-            it is not known; None where no defocus was estimated.
-        opens: Whether the aperture opens.
-        opens_denoised: Whether it is opened by a network that needs the noise-reduced light.
-    """
-
-    ratio: float
-    source: NoiseLevelFunction
-    target: NoiseLevelFunction
-    tolerance: float
-    noise: bool
-    statistics: LightStatistics
-    residuals: ResidualStatistics
-    networks: tuple[DenoisedLight, ...] = ()
-    defocus_px: float = 0.0
-    motion_px: float = 0.0
-    layout: Layout | None = None
-    path: Path | None = None
-    subject_path: Path | None = None
-    f_number: float = 1.0
-    aperture_px: float | None = None
-    opens: bool = False
-    opens_denoised: bool = False
+    operations: int = 0
 
 
 @dataclass(frozen=True)
@@ -133,9 +132,10 @@ class Exposure:
             None where it does not.
         remaining_variance: (H, W) share of the source's noise variance that the blurs leave, beyond
             `energy`: of all of them with a layout, else of `opened_to`; None for all.
+        noise: Whether a capture is wanted; else the light without noise, in which noise of the
+            source cannot count as part of the target's.
         steps: Noise reduction, aperture, defocus and motion blur, in the order in which they run:
             why each runs or is left out.
-        inputs: What that was decided on; None where it was not.
     """
 
     ratio: float
@@ -150,8 +150,8 @@ class Exposure:
     denoised: DenoisedLight | None = None
     opened_to: float | None = None
     remaining_variance: torch.Tensor | None = None
+    noise: bool = True
     steps: tuple[Step, ...] = field(default=(), compare=False)
-    inputs: TransitionInputs | None = field(default=None, compare=False, repr=False)
 
     @cached_property
     def source_noise(self) -> NoiseLevelFunction:
@@ -185,72 +185,159 @@ class Exposure:
         return (*self.lens_blur, self.motion_px, self.path, self.subject_path)
 
 
-def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
-    """Exposures as the columns of a batch: (B, 5, 4) float32, columns are the planes R, G1, G2, B.
-
-    The rows: exposure ratio; then the rows of `top_up_table`.
-    """
-    table = np.empty((len(exposures), 5, 4), np.float32)
-    table[:, 0] = np.array([exposure.ratio for exposure in exposures])[:, None]
-    table[:, 1:] = top_up_table([e.source_noise for e in exposures], [e.target for e in exposures])
-    return table
-
-
 # -- deciding ---------------------------------------------------------------------------------
 
 
-def decide(inputs: TransitionInputs) -> Exposure:
-    """The exposure of a capture, without what `BlurredLight.with_remaining_noise` knows of it."""
-    steps = _decide_steps(inputs)
-    noise_reduction, aperture, defocus, motion_blur = steps
+class _Wanted(NamedTuple):
+    """A capture that is decided on."""
+
+    scene: PreparedScene
+    ratio: float
+    target: NoiseLevelFunction
+    noise: bool
+    extents: dict[str, float]  # of its blurs [pixel]; inf where that is not known
+    along_rows: bool  # whether the motion is a streak along the rows
+    opens: bool  # whether the aperture opens
+
+
+def decide(
+    scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
+) -> Exposure:
+    """The exposure of a capture; see `PreparedScene.exposure`."""
+    (ratio, target), f_number = scene.targets[settings], settings.effective_f_number
+    ratio = min(scene.gain * gain * ratio, RATIO_LIMIT)
+    motion_px, path, subject_path = _motion(scene, settings.exposure_time)
+    blur = scene.aperture_blur
+    extents = {
+        "aperture": 0.0 if blur is None else blur.extent(f_number),
+        "defocus": disc_px(scene, f_number) if scene.defocus else 0.0,
+        "motion_blur": motion_px,
+    }
+    opens = blur is not None and f_number < blur.f_number
+    wanted = _Wanted(scene, ratio, target, noise, extents, path is None, opens)
+    noise_reduction = _decide_noise_reduction(wanted)
+    denoised = noise_reduction.network
+    aperture, defocus, motion_blur = _decide_blurs(wanted, noise_reduction)
     defocus_px = defocus.extent if defocus.runs else 0.0
-    moves, denoised = motion_blur.runs, noise_reduction.network
-    subject_path = inputs.subject_path if moves else None
-    return Exposure(
-        ratio=inputs.ratio,
-        source=inputs.source if denoised is None else NoiseLevelFunction.zero(),
-        target=inputs.target,
+    moves = motion_blur.runs
+    subject_path = subject_path if moves else None
+    exposure = Exposure(
+        ratio=ratio,
+        source=scene.nlf if denoised is None else NoiseLevelFunction.zero(),
+        target=target,
         motion_px=motion_blur.extent if moves else 0.0,
         defocus_px=defocus_px,
-        layout=inputs.layout if defocus_px or subject_path is not None else None,
-        path=inputs.path if moves else None,
+        layout=scene.layout if defocus_px or subject_path is not None else None,
+        path=path if moves else None,
         subject_path=subject_path,
         denoised=denoised,
-        opened_to=inputs.f_number if aperture.runs else None,
-        steps=steps,
-        inputs=inputs,
+        opened_to=f_number if aperture.runs else None,
+        noise=noise,
+        steps=(noise_reduction, aperture, defocus, motion_blur),
     )
+    if exposure.source.is_zero:
+        return exposure
+    return scene.blurred_light.with_remaining_noise(exposure)
 
 
-def _decide_steps(inputs: TransitionInputs) -> tuple[Step, ...]:
-    """`Exposure.steps`.
+def _motion(scene: PreparedScene, time: float) -> tuple[float, Path | None, Path | None]:
+    """Length of the longest path in an exposure [pixel], and both paths.
+
+    That of the background is None for a streak along the rows, that of the subject where it does
+    not move on its own.
+    """
+    layout, movement, height = scene.layout, scene.movement, scene.light.shape[-2]
+    apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0
+    if not (scene.image_speed or apart):
+        return 0.0, None, None
+    moment = scene.image_speed, time, height
+    length = scene.image_speed * time * height
+    if apart:
+        own = movement.subject_path(*moment)
+        return max(length, own.length), movement.path(*moment), own
+    return length, None if movement.along_rows else movement.path(*moment), None
+
+
+def disc_px(scene: PreparedScene, f_number: float) -> float:
+    """Diameter of the defocus disc at `f_number` [pixel]."""
+    diameter = scene.defocus * 4.0 / f_number
+    most = max(*scene.light.shape[-2:], MAX_DISC_PX)
+    if diameter > most:
+        raise ValueError(
+            f"`defocus` (={scene.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel at "
+            f"f/{f_number:.3g}: it must be at most {most:g} pixel, as wide as the frame "
+            f"({MAX_DISC_PX:g} on smaller ones)"
+        )
+    return diameter
+
+
+def _decide_noise_reduction(wanted: _Wanted) -> Step:
+    """The cheapest of all ways within the tolerance, or else the one with the least error."""
+    name, (scene, ratio, target, noise, extents, *_) = "noise_reduction", wanted
+    if scene.nlf.is_zero:
+        return Step(name, False, "the source carries no noise")
+    statistics, residuals = scene.blurred_light.statistics, scene.blurred_light.residuals
+    error_of = statistics.excess_error if noise else statistics.relative_noise
+    error, networks = error_of(ratio, scene.nlf, target), scene.denoised_lights
+    if not networks:
+        return Step(name, False, "the simulator has no noise module", error)
+
+    def own_error(network: DenoisedLight) -> float:  # 0 where it was not measured
+        found = network.residual
+        return 0.0 if found is None else residuals.error(found, ratio, target, noise=noise)
+
+    blur = scene.aperture_blur
+    if blur is not None and blur.needs_denoised and extents["aperture"]:
+        # Blur averages noise, too: not counted on.
+        reason = "the aperture module works on the noise-reduced light only" + _WITHOUT
+        network = networks[-1]
+        return Step(name, True, reason, error, 0.0, own_error(network), network)
+    if error <= scene.tolerance:
+        reason = "the source's noise beyond the target's is within the tolerance"
+        if not noise:
+            reason = "the source's noise is small against the target's"
+        elif error == 0.0:
+            reason = "the target is at least as noisy: noise is added up to it"
+        return Step(name, False, reason, error)
+    best, least = networks[0], math.inf
+    for network in networks:
+        residual = own_error(network)
+        if residual < least:
+            best, least = network, residual
+        if residual <= scene.tolerance:
+            break
+    if error <= least:
+        return Step(name, False, "no network would make a smaller error than the noise", error)
+    reason = "the source is noisier than the target"
+    if not noise:
+        reason = "the light is wanted without noise"
+    return Step(name, True, reason + _WITHOUT, error, 0.0, least, best)
+
+
+def _decide_blurs(wanted: _Wanted, noise_reduction: Step) -> list[Step]:
+    """Aperture, defocus and motion blur.
 
     Noise that stays widens a pixel's distribution, blur that is missing shifts it: squares add.
     Several missing blurs shift it the same way and add up; the error of each is what it adds to the
     square, so that the root of the sum of squares of all errors is right for any set of steps.
     """
-    noise_reduction = _decide_noise_reduction(inputs)
+    scene = wanted.scene
     missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
     # No network can mend it: blur has the tolerance to itself.
-    if missing_noise > inputs.tolerance or not inputs.networks:
+    if missing_noise > scene.tolerance or not scene.denoised_lights:
         missing_noise = 0.0
-    extents = {
-        "aperture": inputs.aperture_px or 0.0,
-        "defocus": inputs.defocus_px,
-        "motion_blur": inputs.motion_px,
-    }
     disc = row = 0.0
-    if any(extents.values()):
-        disc, row = _curvature(inputs, noise_reduction.network)
+    if any(wanted.extents.values()):
+        disc, row = _curvature(wanted, noise_reduction.network)
     blurs, missing_blur = [], 0.0
-    for name, extent in extents.items():
+    for name, extent in wanted.extents.items():
         if not extent:
-            blurs.append(Step(name, False, _without_blur(name, inputs)))
+            blurs.append(Step(name, False, _without_blur(name, wanted)))
             continue
         curvature = row if name == "motion_blur" else disc
         error = math.inf if extent == math.inf else curvature * extent * extent
         together = missing_blur + error
-        left_out = math.hypot(missing_noise, together) <= inputs.tolerance
+        left_out = math.hypot(missing_noise, together) <= scene.tolerance
         added = math.sqrt(error * (together + missing_blur)) if error else 0.0
         if left_out:
             missing_blur = together
@@ -260,83 +347,34 @@ def _decide_steps(inputs: TransitionInputs) -> tuple[Step, ...]:
         if not left_out and added < math.inf:
             reason += _WITHOUT
         blurs.append(Step(name, not left_out, reason, added, extent))
-    return noise_reduction, *blurs
+    return blurs
 
 
-def _curvature(inputs: TransitionInputs, network: DenoisedLight | None) -> tuple[float, float]:
+def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, float]:
     """`LightStatistics.curvature` of the light that is blurred."""
-    if inputs.tolerance == 0.0:  # no blur is left out, however small
+    scene, extents = wanted.scene, wanted.extents
+    if scene.tolerance == 0.0:  # no blur is left out, however small
         return math.inf, math.inf
-    if not (inputs.defocus_px or inputs.motion_px or inputs.aperture_px != math.inf):
+    if not (extents["defocus"] or extents["motion_blur"] or extents["aperture"] != math.inf):
         return math.inf, math.inf  # not needed: the network need not run for it
-    light = inputs.statistics if network is None else network.statistics
-    disc, row = light.curvature(inputs.ratio, inputs.target)
+    light = scene.blurred_light.statistics if network is None else network.statistics
+    disc, row = light.curvature(wanted.ratio, wanted.target)
     # No second difference exceeds the Laplacian, in the root mean square: (k u)^4 <= |k|^4.
-    return disc, row if inputs.path is None else _STREAK_TO_DISC * disc
+    return disc, row if wanted.along_rows else _STREAK_TO_DISC * disc
 
 
-def _decide_noise_reduction(inputs: TransitionInputs) -> Step:
-    """The cheapest of all ways within the tolerance, or else the one with the least error."""
-    name = "noise_reduction"
-    if inputs.source.is_zero:
-        return Step(name, False, "the source carries no noise")
-    error = _noise_error(inputs)
-    if not inputs.networks:
-        return Step(name, False, "the simulator has no noise module", error)
-    if inputs.opens_denoised and inputs.aperture_px:  # blur averages noise, too: not counted on
-        reason = "the aperture module works on the noise-reduced light only" + _WITHOUT
-        network = inputs.networks[-1]
-        return Step(name, True, reason, error, 0.0, _network_error(inputs, network), network)
-    if error <= inputs.tolerance:
-        return Step(name, False, _small_noise(inputs, error), error)
-    best, least = inputs.networks[0], math.inf
-    for network in inputs.networks:
-        residual = _network_error(inputs, network)
-        if residual < least:
-            best, least = network, residual
-        if residual <= inputs.tolerance:
-            break
-    if error <= least:
-        return Step(name, False, "no network would make a smaller error than the noise", error)
-    reason = "the source is noisier than the target"
-    if not inputs.noise:
-        reason = "the light is wanted without noise"
-    return Step(name, True, reason + _WITHOUT, error, 0.0, least, best)
-
-
-def _network_error(inputs: TransitionInputs, network: DenoisedLight) -> float:
-    """Error of a network itself, in units of the target's noise; 0 where it was not measured."""
-    if network.residual is None:
-        return 0.0
-    return inputs.residuals.error(network.residual, inputs.ratio, inputs.target, noise=inputs.noise)
-
-
-def _noise_error(inputs: TransitionInputs) -> float:
-    """Error of leaving the source's noise in, in units of the target's."""
-    error_of = inputs.statistics.excess_error if inputs.noise else inputs.statistics.relative_noise
-    return error_of(inputs.ratio, inputs.source, inputs.target)
-
-
-def _small_noise(inputs: TransitionInputs, error: float) -> str:
-    if not inputs.noise:
-        return "the source's noise is small against the target's"
-    if error == 0.0:
-        return "the target is at least as noisy: noise is added up to it"
-    return "the source's noise beyond the target's is within the tolerance"
-
-
-def _without_blur(name: str, inputs: TransitionInputs) -> str:
+def _without_blur(name: str, wanted: _Wanted) -> str:
     """Reason why a blur would do nothing."""
     if name == "motion_blur":
         return "the image does not move"
-    estimated = inputs.aperture_px is not None
+    estimated = wanted.scene.aperture_blur is not None
     if name == "defocus":
         if estimated:
             return "none is given for the whole frame: each pixel's was estimated"
         return "the scene is taken as far or in focus throughout"
     if not estimated:
         return "the scene is taken as in focus: `depth` is not 'unknown'"
-    if inputs.opens:
+    if wanted.opens:
         return "the picture was found to be in focus throughout"
     return "the aperture does not open; what is blurred in the source stays so"
 
@@ -357,44 +395,3 @@ _BLUR_REASONS = {
         "the image moves by {extent:.2g} pixel during the exposure, which would hardly show",
     ),
 }
-
-
-# -- predicting -------------------------------------------------------------------------------
-
-
-def predict_errors(
-    exposure: Exposure, clipped_source: float, depth_error: float
-) -> dict[str, float]:
-    """`simulator.capture.plan.SimulationPlan.errors` of an exposure that `decide` returned.
-
-    Args:
-        exposure: The exposure.
-        clipped_source: Share of the pixels that are saturated in the source.
-        depth_error: Error due to a depth that is not known, in units of the target's noise.
-    """
-    inputs = cast(TransitionInputs, exposure.inputs)
-    extrapolated = abs(exposure.target.extrapolation) if inputs.noise else 0.0
-    return {
-        "left out": exposure.left_out,
-        "network": exposure.steps[0].residual,
-        "clipped highlights": _hidden_highlights(inputs, clipped_source),
-        "unknown depth": depth_error,
-        "ISO": EXTRAPOLATION_ERROR * extrapolated,
-        "rounding": ROUNDING * inputs.statistics.relative_level(inputs.ratio, inputs.target),
-    }
-
-
-def _hidden_highlights(inputs: TransitionInputs, share: float) -> float:
-    """Error of what a `share` of the pixels, saturated in the source, would show when darker.
-
-    Light above white is taken to be distributed as natural highlights are, with a density that
-    falls with its square; what is white stands for twice that, its median.
-    """
-    ratio, target = inputs.ratio, inputs.target
-    if not share or ratio >= 1.0 or ratio <= 0.0:
-        return 0.0
-    shown = min(ABOVE_WHITE * ratio, 1.0)
-    square = shown**2 * (1.0 - ratio) + 2.0 * shown * ratio * math.log(ratio)
-    square += ratio * (1.0 - ratio) + ratio * (1.0 - shown) ** 2
-    variance = sum(s * ratio + r for s, r in zip(target.shot, target.read, strict=True))
-    return HIDDEN_LIGHT * math.sqrt(share * square / max(variance / 4.0, 1e-30))

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import functools
 import math
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from simulator.camera import get_camera
-from simulator.capture.exposure import Exposure, Step, TransitionInputs
-from simulator.capture.sensor import NoiseBalance, Transitions, record
-from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.capture.exposure import SIGNAL_LIMIT, Exposure, Step
+from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
+from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction, noise_variance
+from simulator.raw.develop import ABOVE_WHITE
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_number
+from simulator.utils.compute import parallel_ranges
 
-#: Error that a capture may have, in units of the target's noise: by default the distribution of a
-#: pixel may move by a tenth of its noise's standard deviation.
-DEFAULT_TOLERANCE = 0.1
+if TYPE_CHECKING:
+    from simulator.capture.prepared_scene import PreparedScene
+
 #: Factors on predicted errors, below which 90 % of the measured ones are: `ae-env bench
 #: work-precision` on validation scenes. The network's comes on top of its own `spread`.
 _BOUND = {
@@ -36,45 +36,25 @@ _BOUND = {
 #: clipped or rounded in the source.
 _LEAST_BOUND = 0.05
 #: Arithmetic operations per sample of the steps whose cost does not depend on anything.
-_OPERATIONS = {
-    "exposure": 2,
-    "aperture": 4,
-    "motion_blur": 6,
-    "noise": 14,
-    "clip_and_quantise": 6,
-}
+_OPERATIONS = {"exposure": 2, "aperture": 4, "motion_blur": 6, "noise": 14, "clip_and_quantise": 6}
+#: Rounding error of float32 in a transition, as a share of the light.
+ROUNDING = 2.0**-20
+#: Root mean square light hidden by white, over what a density that falls with the square of the
+#: light would have.
+HIDDEN_LIGHT = 0.3
+#: Relative error of the noise's standard deviation for each stop of ISO beyond the calibration:
+#: without their last ISOs the Z6's table is off by 0.03 to 0.05, the 70D's by 0.17 to 0.25.
+EXTRAPOLATION_ERROR = 0.1
+#: Errors of the estimated map of defocus: its relative error of the blur that it adds, the blur
+#: that it cannot see [pixel of diameter], and the factor by which what a blurred picture changes
+#: when it is blurred again understates what it would change if it were sharpened.
+DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
+_TINY = torch.finfo(torch.float32).tiny
+#: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
+_BALANCED = 2**15
 #: Reasons why no noise is added.
 _ONLY_LIGHT = "only the light is wanted"
 _ENOUGH_NOISE = "no pixel lacks noise: the source has the target's already, or more"
-
-
-def check_tolerance(tolerance: float) -> float:
-    """`tolerance` as a float.
-
-    Raises:
-        ValueError: Unless it is a finite number >= 0.
-    """
-    return check_number("tolerance", tolerance, 0.0, sys.float_info.max)
-
-
-@dataclass(frozen=True)
-class PlannedStep:
-    """One step of a transition.
-
-    Args:
-        name: Its name in `SimulationPlan.modules`.
-        runs: Whether it runs.
-        reason: Why it does, or does not.
-        error: Error of leaving it out, in units of the target's noise; 0 if it runs.
-        operations: Arithmetic operations that it takes, all pixels together; those of a network
-            once for all settings.
-    """
-
-    name: str
-    runs: bool
-    reason: str
-    error: float
-    operations: int
 
 
 @dataclass(frozen=True)
@@ -94,6 +74,8 @@ class SimulationPlan:
         balance: The source's noise against the target's.
         clipped_source: Share of the pixels that are saturated in the source: what they would show
             at a darker exposure is unknown.
+        tolerance: Error that the capture may have.
+        samples: Samples of the raw.
     """
 
     settings: CameraSettings
@@ -101,31 +83,27 @@ class SimulationPlan:
     errors: Mapping[str, float]
     balance: NoiseBalance
     clipped_source: float
+    tolerance: float
+    samples: int
 
     @functools.cached_property
-    def steps(self) -> tuple[PlannedStep, ...]:
+    def steps(self) -> tuple[Step, ...]:
         """Every step in order, with the reason why it runs or not."""
-        wanted, lacks, reason = self._inputs.noise, self.balance.lacks_noise, _ONLY_LIGHT
+        wanted, lacks, reason = self.exposure.noise, self.balance.lacks_noise, _ONLY_LIGHT
         if wanted:
             reason = "" if lacks else _ENOUGH_NOISE
-        samples = self._inputs.statistics.light.numel()
         steps = (
             Step("exposure", True, ""),
             *self.exposure.steps,
             Step("noise", wanted and lacks, reason),
             Step("clip_and_quantise", wanted, "" if wanted else _ONLY_LIGHT),
         )
-        return tuple(_planned(step, samples) for step in steps)
+        return tuple(_planned(step, self.samples) for step in steps)
 
     @property
     def exposure_ratio(self) -> float:
         """How much brighter than the source the result is."""
         return self.exposure.ratio
-
-    @property
-    def tolerance(self) -> float:
-        """Error that the capture may have."""
-        return self._inputs.tolerance
 
     @property
     def network(self) -> str | None:
@@ -144,7 +122,7 @@ class SimulationPlan:
     @property
     def extrapolated(self) -> float:
         """Stops by which the target's ISO lies outside the camera's calibration."""
-        return abs(self.exposure.target.extrapolation) if self._inputs.noise else 0.0
+        return abs(self.exposure.target.extrapolation) if self.exposure.noise else 0.0
 
     @property
     def error_bound(self) -> float:
@@ -154,10 +132,6 @@ class SimulationPlan:
         factors = {**_BOUND, "network": spread * _BOUND["network"]}
         parts = (factors.get(name, 1.0) * error for name, error in self.errors.items())
         return math.hypot(_LEAST_BOUND, *parts)
-
-    @property
-    def _inputs(self) -> TransitionInputs:
-        return cast(TransitionInputs, self.exposure.inputs)
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -208,8 +182,7 @@ class SimulationPlan:
             f"{_short(self.error_bound)}{': ' * bool(parts)}{', '.join(parts)} "
             f"(tolerance {self.tolerance:g}: {within})\n"
             f"cost {_counted(self.operations)} operations, about {_short(max(capture, 0.01))} ms a "
-            "capture"
-            f"{once}"
+            f"capture{once}"
         )
 
     def details(self) -> str:
@@ -218,9 +191,8 @@ class SimulationPlan:
         for step in self.steps:
             if step.reason:
                 error = f" (error {_short(step.error)})" if step.error else ""
-                lines.append(
-                    f"{'runs' if step.runs else 'left out'} {step.name}: {step.reason}{error}"
-                )
+                verb = "runs" if step.runs else "left out"
+                lines.append(f"{verb} {step.name}: {step.reason}{error}")
         if self.excess_noise:
             lines.append(
                 f"noise variance {1.0 + self.excess_noise:.4g} times the target's, white included"
@@ -252,9 +224,8 @@ def _counted(number: int) -> str:
 def seconds_per_operation() -> float:
     """Time of one of the operations that `SimulationPlan` counts, measured on this machine [s]."""
     light = torch.zeros(4, 128, 128)
-    exposure = Exposure(
-        1.0, NoiseLevelFunction.zero(), NoiseLevelFunction((1e-4,) * 4, (1e-7,) * 4)
-    )
+    noises = NoiseLevelFunction.zero(), NoiseLevelFunction((1e-4,) * 4, (1e-7,) * 4)
+    exposure = Exposure(1.0, *noises)
     transition, camera = Transitions.of([light], [exposure]), get_camera("nikon_z6")
     signals, keys, times = torch.empty(1, 4, 128, 128), np.ones(1, np.uint64), []
     for _ in range(5):
@@ -265,11 +236,124 @@ def seconds_per_operation() -> float:
     return min(times) / (each * light.numel())
 
 
-def _planned(step: Step, samples: int) -> PlannedStep:
+def _planned(step: Step, samples: int) -> Step:
+    """`step` as a plan shows it; what runs leaves no error."""
     reason = step.reason.format(extent=step.extent, error=step.error)
     if not step.runs:
-        return PlannedStep(step.name, False, reason, step.error, 0)
+        return step._replace(reason=reason)
     if step.network is not None:
-        return PlannedStep(step.name, True, reason, 0.0, step.network.operations)
-    per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
-    return PlannedStep(step.name, True, reason, 0.0, per_sample * samples)
+        operations = step.network.operations
+    else:  # else of the taps of a disc
+        per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)
+        operations = per_sample * samples
+    return step._replace(reason=reason, error=0.0, operations=operations)
+
+
+# -- predicted errors -------------------------------------------------------------------------
+
+
+def predict_errors(
+    scene: PreparedScene, settings: CameraSettings, exposure: Exposure
+) -> dict[str, float]:
+    """`SimulationPlan.errors` of the exposure that was decided for `settings`."""
+    ratio, target = exposure.ratio, exposure.target
+    extrapolated = abs(target.extrapolation) if exposure.noise else 0.0
+    return {
+        "left out": exposure.left_out,
+        "network": exposure.steps[0].residual,
+        "clipped highlights": _hidden_highlights(ratio, target, scene.saturated_share),
+        "unknown depth": _depth_error(scene, settings, exposure),
+        "ISO": EXTRAPOLATION_ERROR * extrapolated,
+        "rounding": ROUNDING * scene.statistics.relative_level(ratio, target),
+    }
+
+
+def _hidden_highlights(ratio: float, target: NoiseLevelFunction, share: float) -> float:
+    """Error of what a `share` of the pixels, saturated in the source, would show when darker.
+
+    Light above white is taken to be distributed as natural highlights are, with a density that
+    falls with its square; what is white stands for twice that, its median.
+    """
+    if not share or ratio >= 1.0 or ratio <= 0.0:
+        return 0.0
+    shown = min(ABOVE_WHITE * ratio, 1.0)
+    square = shown**2 * (1.0 - ratio) + 2.0 * shown * ratio * math.log(ratio)
+    square += ratio * (1.0 - ratio) + ratio * (1.0 - shown) ** 2
+    variance = sum(s * ratio + r for s, r in zip(target.shot, target.read, strict=True))
+    return HIDDEN_LIGHT * math.sqrt(share * square / max(variance / 4.0, 1e-30))
+
+
+def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Exposure) -> float:
+    """Error due to a depth that is not known, in units of the target's noise.
+
+    Where noise is wanted it is that of a capture, in which white is white.
+    """
+    blur, noise, ratio = scene.aperture_blur, exposure.noise, exposure.ratio
+    if blur is None or settings.effective_f_number == blur.f_number:  # no map is needed
+        return 0.0
+    wider = (blur.f_number / settings.effective_f_number) ** 2
+    disc = scene.statistics.blur_change(ratio, scene.nlf, exposure.target, noise=noise)
+    if wider <= 1.0:  # what a smaller aperture would sharpen stays blurred
+        return KEPT_BLUR_ERROR * disc * blur.mean_square_diameter * (1.0 - wider)
+    added = 0.0
+    if exposure.opened_to is not None:
+        light = scene.light if exposure.denoised is None else exposure.denoised.light
+        lights = light, scene.blurred_light.source(exposure)
+        sharp, opened = (part * ratio for part in lights)
+        if noise:
+            sharp, opened = sharp.clamp_(max=1.0), opened.clamp_(max=1.0)
+        wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
+        added = float(((opened - sharp).square_() / wanted).double().mean().sqrt())
+    return math.hypot(disc * MISSED_BLUR**2 * (wider - 1.0), DEPTH_ERROR * added)
+
+
+# -- the source's noise against the target's --------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NoiseBalance:
+    """The source's noise in a capture against the noise that the capture should have.
+
+    Args:
+        relative_excess_variance: Mean over the pixels of the variance beyond the target's,
+            relative to it.
+        lacks_noise: Whether any pixel has less noise than the target.
+    """
+
+    relative_excess_variance: float
+    lacks_noise: bool
+
+
+def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
+    """Compares the source's noise in one image with the target's.
+
+    Args:
+        light: (4, H, W) at the exposure of the prepared scene.
+        exposure: Its exposure; neither its ratio nor its noise are in `light` yet.
+    """
+    target, remaining = exposure.target, exposure.remaining_variance
+    if exposure.source_noise.is_zero:
+        return NoiseBalance(0.0, not target.is_zero)
+    table = exposure_table([exposure])[0, 1:]
+    height, width = light.shape[-2:]
+    rows = max(1, _BALANCED // width)
+    parts = [slice(top, top + rows) for top in range(0, height, rows)]
+    relative, lacks = np.zeros(4), np.zeros(4, bool)
+
+    def balance(first: int, last: int) -> None:
+        for plane in range(first, last):
+            if table[0, plane] >= 0.0 and table[1, plane] > 0.0:
+                lacks[plane] = True  # at every pixel, whatever its light
+                continue
+            for part in parts:
+                signal = (light[plane, part] * exposure.ratio).clamp_(0.0, SIGNAL_LIMIT)
+                share = None if remaining is None else remaining[part]
+                missing = missing_variance(signal, table[:, plane], share)
+                lacks[plane] |= bool((missing > 0).any())
+                wanted = signal.mul_(target.shot[plane]).add_(target.read[plane])
+                missing.clamp_(max=0.0)
+                relative[plane] -= float((missing / wanted.clamp_(min=_TINY)).sum())
+
+    parallel_ranges(balance, 4, threads=None if len(parts) > 4 else 1)
+    share = abs(float(relative.sum())) / light.numel()
+    return NoiseBalance(min(share, VARIANCE_LIMIT), bool(lacks.any()))  # finite over no noise, too

@@ -1,49 +1,165 @@
-"""The light of a scene, ready to be exposed at any settings."""
+"""A scene ready to be exposed at any settings: its light, and how it lies before the lens."""
 
 from __future__ import annotations
 
 import copy
-import functools
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from scipy.ndimage import distance_transform_edt
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.exposure import (
-    RATIO_LIMIT,
+    DEFAULT_TOLERANCE,
     Exposure,
-    TransitionInputs,
+    Targets,
+    check_tolerance,
     decide,
-    predict_errors,
+    disc_px,
 )
-from simulator.capture.layout import Layout
-from simulator.capture.plan import DEFAULT_TOLERANCE, SimulationPlan, check_tolerance
-from simulator.capture.sensor import Transitions, exposed_light, noise_balance, record
+from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
+from simulator.capture.sensor import (
+    Noise,
+    Transitions,
+    check_noise,
+    exposed_light,
+    record,
+    sweep_keys,
+)
 from simulator.capture.statistics import DenoisedLight, LightStatistics
-from simulator.noise.generator import Noise, check_noise, sweep_keys
-from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
-from simulator.optics.motion import ALONG_ROWS, Movement, Path
+from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
+from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.image import check_packed, new_frame
-from simulator.settings import CameraSettings, exposure_ratio
-from simulator.utils.checks import check_number
+from simulator.settings import CameraSettings
+from simulator.utils.checks import check_number, check_type
 
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
 #: Fastest image [frame heights per second]: even 1/1000 s smears it over the whole frame.
 MAX_IMAGE_SPEED = 1000.0
-#: Discs of defocus may be as wide as the frame, on small frames this wide [pixel]: the memory that
-#: a blur takes grows with the square of it.
-MAX_DISC_PX = 512.0
-#: Errors of the estimated map of defocus: its relative error of the blur that it adds, the blur
-#: that it cannot see [pixel of diameter], and the factor by which what a blurred picture changes
-#: when it is blurred again understates what it would change if it were sharpened.
-DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
+#: Levels that `Layout.shares` counts defocus in.
+_LEVELS = 255
+
+
+class Shares(NamedTuple):
+    """A layout's pixels, counted; K sorts of them.
+
+    Args:
+        defocus: (K,) circle of confusion relative to the largest.
+        subject: (K,) bool, whether they are the subject's.
+        share: (K,) of all pixels.
+    """
+
+    defocus: np.ndarray
+    subject: np.ndarray
+    share: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where a scene is out of focus, and where its subject is.
+
+    Args:
+        defocus: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's
+            `defocus`; 0 is the plane of focus.
+        subject: (H, W) bool, the pixels of the subject, which may move apart from the rest; None
+            for no subject.
+
+    Raises:
+        ValueError: If a shape, a type or a value is none of these.
+    """
+
+    defocus: torch.Tensor
+    subject: torch.Tensor | None = None
+
+    def __post_init__(self) -> None:
+        found, mask = self.defocus, self.subject
+        check_type("defocus", found, torch.Tensor)
+        check_type("subject", mask, torch.Tensor, None)
+        if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
+            raise ValueError(f"`defocus` (shape {tuple(found.shape)}) must be (H, W) in [0, 1]")
+        object.__setattr__(self, "defocus", found.detach().float().cpu().contiguous())
+        if mask is None:
+            return
+        if mask.dtype != torch.bool or mask.shape != found.shape:
+            raise ValueError(
+                f"`subject` ({mask.dtype}, shape {tuple(mask.shape)}) must be bool of the shape of "
+                f"`defocus`, {tuple(found.shape)}"
+            )
+        count = int(mask.count_nonzero())
+        known = mask.cpu().contiguous() if 0 < count < mask.numel() else None
+        object.__setattr__(self, "subject", known)
+
+    @classmethod
+    def from_depth(cls, depth: torch.Tensor, distance: float, *, in_focus: float) -> Layout:
+        """The layout of a scene whose depth is known; the subject is what is in focus.
+
+        The circle of confusion goes with the difference of the inverse distances.
+
+        Args:
+            depth: (H, W) distance [m], above 0.
+            distance: At which the lens is focused [m].
+            in_focus: Largest relative circle of confusion of the subject.
+
+        Raises:
+            ValueError: If an argument is out of range.
+        """
+        if not isinstance(depth, torch.Tensor) or not bool((depth > 0.0).all()):
+            raise ValueError("`depth` must be a torch tensor with every value above 0 and not NaN")
+        if not 0.0 < distance < math.inf:
+            raise ValueError(f"`distance` (={distance}) must be above 0 and finite")
+        check_number("in_focus", in_focus, 0.0, 1.0)
+        apart = (1.0 / depth.double() - 1.0 / distance).abs()
+        relative = (apart / apart.max().clamp(min=1e-12)).float()
+        return cls(relative, relative <= in_focus)
+
+    def averaged(self, factor: int) -> Layout:
+        """Means over `factor` x `factor` pixels; the subject is where it has most of them."""
+
+        def mean(values: torch.Tensor) -> torch.Tensor:
+            return F.avg_pool2d(values[None].double(), factor)[0]
+
+        subject = None if self.subject is None else mean(self.subject) > 0.5
+        return Layout(mean(self.defocus).float().clamp(max=1.0), subject)
+
+    def cut(self, rows: slice, columns: slice) -> Layout:
+        """A window of it."""
+        subject = None if self.subject is None else self.subject[rows, columns]
+        return Layout(self.defocus[rows, columns], subject)
+
+    @cached_property
+    def shares(self) -> Shares:
+        """The pixels, counted by defocus (in steps of 1/255) and subject."""
+        levels = (self.defocus * _LEVELS).round().int().numpy()
+        if self.subject is not None:
+            levels = levels + (_LEVELS + 1) * self.subject.numpy()
+        sorts, counts = np.unique(levels, return_counts=True)
+        subject = sorts > _LEVELS
+        defocus = (sorts - (_LEVELS + 1) * subject) / _LEVELS
+        return Shares(defocus, subject, counts / levels.size)
+
+    @cached_property
+    def mask(self) -> torch.Tensor:
+        """(1, H, W) float32, 1 where the subject is."""
+        assert self.subject is not None
+        return self.subject[None].float()
+
+    @cached_property
+    def behind(self) -> torch.Tensor:
+        """(H, W) int64, the pixel of the background nearest to each, counted row by row."""
+        assert self.subject is not None
+        rows, columns = distance_transform_edt(
+            self.subject.numpy(), return_distances=False, return_indices=True
+        )
+        return torch.from_numpy(rows.astype(np.int64) * self.subject.shape[1] + columns)
 
 
 class HasPrepared(Protocol):
@@ -104,18 +220,17 @@ class PreparedScene:
     layout: Layout | None = None
     tolerance: float = DEFAULT_TOLERANCE
     blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
+    targets: Targets = field(init=False)
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
         known = self.denoised_lights, self.nlf, self.aperture_blur
-        if cached is None or not cached.is_of(self.light, *known):
-            same_light = cached is not None and cached.light is self.light
+        same_light = cached is not None and cached.light is self.light
+        if cached is None or not same_light or cached.known != known:
             if not same_light:  # a copy's light was checked before
                 object.__setattr__(self, "light", check_packed("light", self.light))
             for denoised in self.denoised_lights:
-                if not isinstance(denoised, DenoisedLight):
-                    found = type(denoised).__name__
-                    raise ValueError(f"`denoised_lights` (={found}) must be DenoisedLight")
+                check_type("denoised_lights", denoised, DenoisedLight)
                 if denoised.shape not in (None, self.light.shape):
                     raise ValueError(
                         f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
@@ -127,7 +242,7 @@ class PreparedScene:
         unit = " frame heights per second"
         check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
         check_number("defocus", self.defocus, 0.0, math.inf)
-        self._disc(4.0)
+        disc_px(self, 4.0)
         check_number("gain", self.gain, 0.0, sys.float_info.max)
         if self.layout is not None and self.layout.defocus.shape != self.light.shape[-2:]:
             raise ValueError(
@@ -135,9 +250,11 @@ class PreparedScene:
                 f"width of `light`, {tuple(self.light.shape[-2:])}"
             )
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
+        targets = Targets(self.reference, self.camera, self.box_factor)
+        object.__setattr__(self, "targets", targets)
 
     def changed(self, **values: Any) -> PreparedScene:
-        """A copy of the same light with other values, which are known to be right.
+        """A copy of the same light and camera with other values, which are known to be right.
 
         Nothing is checked, as `dataclasses.replace` would: an environment makes one an episode.
         """
@@ -167,86 +284,21 @@ class PreparedScene:
     ) -> Exposure:
         """Exposure of a capture at `settings`, without the steps that `tolerance` leaves out.
 
-        Tens of microseconds: the statistics of the light are worked out once.
-
         Args:
             settings: Settings to simulate.
             noise: Whether the capture will be noisy; if not, noise of the source cannot count as
                 part of the target's.
             gain: Light relative to this scene's.
         """
-        exposure = decide(self._inputs(settings, noise, gain))
-        if exposure.source.is_zero:
-            return exposure
-        return self.blurred_light.with_remaining_noise(exposure)
-
-    def _inputs(self, settings: CameraSettings, noise: bool, gain: float) -> TransitionInputs:
-        if not isinstance(settings, CameraSettings):
-            raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
-        f_number, blur = settings.effective_f_number, self.aperture_blur
-        motion_px, path, subject_path = 0.0, None, None
-        if self.image_speed or self._subject_moves:
-            motion_px, path, subject_path = self._motion(settings.exposure_time)
-        return TransitionInputs(
-            ratio=min(self.gain * gain * exposure_ratio(self.reference, settings), RATIO_LIMIT),
-            source=self.nlf,
-            target=_averaged_nlf(self.camera, settings.iso, self.box_factor),
-            tolerance=self.tolerance,
-            noise=noise,
-            statistics=self.blurred_light.statistics,
-            residuals=self.blurred_light.residuals,
-            networks=self.denoised_lights,
-            defocus_px=self._disc(f_number) if self.defocus else 0.0,
-            motion_px=motion_px,
-            layout=self.layout,
-            path=path,
-            subject_path=subject_path,
-            f_number=f_number,
-            aperture_px=None if blur is None else blur.extent(f_number),
-            opens=blur is not None and f_number < blur.f_number,
-            opens_denoised=blur is not None and blur.needs_denoised,
-        )
-
-    @property
-    def _subject_moves(self) -> bool:
-        """Whether there is a subject that moves apart from the rest."""
-        subject = None if self.layout is None else self.layout.subject
-        return subject is not None and self.movement.subject_speed > 0.0
-
-    def _motion(self, time: float) -> tuple[float, Path | None, Path | None]:
-        """Length of the longest path in an exposure [pixel], and both paths.
-
-        That of the background is None for a streak along the rows, that of the subject where it
-        does not move on its own.
-        """
-        moment = self.image_speed, time, self.light.shape[-2]
-        length = self.image_speed * time * self.light.shape[-2]
-        if self._subject_moves:
-            own = self.movement.subject_path(*moment)
-            return max(length, own.length), self.movement.path(*moment), own
-        return length, None if self.movement.along_rows else self.movement.path(*moment), None
-
-    def _disc(self, f_number: float) -> float:
-        """Diameter of the defocus disc at `f_number` [pixel]."""
-        diameter = self.defocus * 4.0 / f_number
-        if diameter > MAX_DISC_PX and diameter > max(self.light.shape[-2:]):
-            most = max(*self.light.shape[-2:], MAX_DISC_PX)
-            raise ValueError(
-                f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel "
-                f"at f/{f_number:.3g}: it must be at most {most:g} pixel, as wide as the frame "
-                f"({MAX_DISC_PX:g} on smaller ones)"
-            )
-        return diameter
+        check_type("settings", settings, CameraSettings)
+        return decide(self, settings, noise=noise, gain=gain)
 
     def plan(
         self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
     ) -> SimulationPlan:
         """Steps, reasons, predicted error and cost of a capture at `settings`.
 
-        Args:
-            settings: Settings to simulate.
-            noise: False plans `expected`, the light without noise, instead of a capture.
-            gain: Light relative to this scene's.
+        Without `noise`, of `expected`; the arguments are those of `exposure`.
         """
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
@@ -254,48 +306,17 @@ class PreparedScene:
         return SimulationPlan(
             settings=settings,
             exposure=exposure,
-            errors=self.predicted_errors(settings, exposure),
+            errors=predict_errors(self, settings, exposure),
             balance=noise_balance(light, exposure),
             clipped_source=self.saturated_share,
+            tolerance=self.tolerance,
+            samples=self.light.numel(),
         )
-
-    def predicted_errors(self, settings: CameraSettings, exposure: Exposure) -> dict[str, float]:
-        """`SimulationPlan.errors` of the exposure that `exposure` returned for `settings`."""
-        noise = exposure.inputs is None or exposure.inputs.noise
-        depth = self._depth_error(settings, exposure, noise)
-        return predict_errors(exposure, self.saturated_share, depth)
-
-    def _depth_error(self, settings: CameraSettings, exposure: Exposure, noise: bool) -> float:
-        """Error due to a depth that is not known, in units of the target's noise.
-
-        Where noise is wanted it is that of a capture, in which white is white.
-        """
-        blur = self.aperture_blur
-        if blur is None or settings.effective_f_number == blur.f_number:  # no map is needed
-            return 0.0
-        wider = (blur.f_number / settings.effective_f_number) ** 2
-        noises = self.nlf, exposure.target
-        disc = self.statistics.blur_change(exposure.ratio, *noises, noise=noise)
-        if wider <= 1.0:  # what a smaller aperture would sharpen stays blurred
-            return KEPT_BLUR_ERROR * disc * blur.mean_square_diameter * (1.0 - wider)
-        missed = disc * MISSED_BLUR**2 * (wider - 1.0)
-        return math.hypot(missed, DEPTH_ERROR * self._added_blur(exposure, noise))
-
-    def _added_blur(self, exposure: Exposure, noise: bool) -> float:
-        """What the blur of the opening aperture changes, in units of the target's noise."""
-        if exposure.opened_to is None:
-            return 0.0
-        light = self.light if exposure.denoised is None else exposure.denoised.light
-        lights, white = (light, self.blurred_light.source(exposure)), 1.0 if noise else float("inf")
-        sharp, opened = ((part * exposure.ratio).clamp_(max=white) for part in lights)
-        wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
-        return float(((opened - sharp).square_() / wanted).double().mean().sqrt())
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
 
-        Shot and read noise are compared apart, so that a mixed case is stated too high rather than
-        too low.
+        Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
         exposure = self.exposure(settings)
         source = exposure.source_noise.scaled(float(self.box_factor**2))
@@ -314,9 +335,7 @@ class PreparedScene:
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
         """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped.
 
-        Args:
-            settings: Settings to simulate.
-            gain: Light relative to this scene's.
+        The light is `gain` times this scene's.
         """
         exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
@@ -347,7 +366,7 @@ class PreparedScene:
         Args:
             settings: Settings to simulate.
             seed: Seed of the noise, >= 0.
-            noise: ``"exact"`` draws it, ``"bank"`` looks it up (`simulator.noise.generator`),
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up (`simulator.capture.sensor`),
                 ``"sensor"`` draws it with the camera's row noise and the tails of its read noise
                 (`CameraProfile.read_noise`).
 
@@ -376,8 +395,7 @@ class PreparedScene:
 
         Args:
             states: Settings to simulate.
-            seed: See `capture`.
-            noise: See `capture`.
+            seed, noise: See `capture`.
             gain: (S,) light of each state relative to this scene's, where it depends on the
                 exposure time, as flickering light does; None for the same.
             row_gain: (S, H) light of each row relative to that; None where all rows have the same.
@@ -438,17 +456,10 @@ class PreparedScene:
 
         Args:
             states: Settings to simulate.
-            seed: See `capture`.
-            noise: See `capture`.
+            seed, noise: See `capture`.
 
         Yields:
             One capture (4, H, W) per state.
         """
         for settings in states:
             yield self.expose([settings], seed=seed, noise=noise)[0]
-
-
-@functools.lru_cache(maxsize=4096)
-def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
-    """Noise of `box_factor` squared sensor pixels averaged."""
-    return camera.nlf(iso).scaled(1.0 / box_factor**2)

@@ -1,9 +1,23 @@
 """The sensor: from linear light to the numbers that the camera records.
 
-The order is physical, and it matters: exposed light, not clipped -> motion and defocus blur of
-that unclipped light -> the light of each row, where it flickers -> noise of that signal -> clip ->
-quantise, each of the last two once. (Exposure and blur are linear and change places here: one blur
-then serves many exposures.)
+The order is physical, and it matters: exposed light, not clipped -> motion and defocus blur of that
+light -> the light of each row, where it flickers -> noise of that signal -> clip -> quantise, each
+of the last two once. (Exposure and blur are linear: one blur here serves many exposures.)
+
+*The missing variance*: a pixel of signal x whose source has the noise (shot1, read1) carries
+``a shot1 x + a^2 read1`` after the exposure ratio a (`NoiseLevelFunction.exposed`). To carry the
+target's noise (shot2, read2) it lacks the variance
+
+    D(x) = (read2 - a^2 read1) + (shot2 - a shot1) max(x, 0).
+
+Where D is positive, noise of that variance is added, and mean and variance are exact. Where D is
+negative the source is noisier than the target: nothing is added, and -D is the excess variance.
+A blur averages the source's noise: where it leaves only a share r of the variance, the other share
+``(1 - r) (a shot1 max(x, 0) + a^2 read1)`` is missing, too.
+
+*The noise of a frame* is a function of its key and of nothing else. Drawing 4 x 128 x 128 normals
+takes about 70 microseconds, everything else that a capture needs about 30: hence a bank of normals,
+looked up in hashed pieces.
 
 `record` is the one way from light to frames: sweeps, the full run and the environment all take it.
 On the CPU it is one fused kernel, which works in blocks of 256 samples that stay in the first-level
@@ -16,38 +30,24 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numba
 import numpy as np
 import torch
+from scipy.special import ndtri
 
 from simulator.camera import CameraProfile
-from simulator.capture.exposure import PEDESTAL, SIGNAL_LIMIT, Exposure, exposure_table
-from simulator.noise.generator import (
-    BANK_SIZE,
-    BLOCK,
-    KEY_STEP,
-    STRIDE,
-    Noise,
-    draw_block,
-    frame_normals,
-    mixed_word,
-    noise_bank,
-    noise_keys,
-)
-from simulator.noise.noise_level_function import (
-    VARIANCE_LIMIT,
-    ReadNoise,
-    missing_variance,
-    plane_tensor,
-    top_up_table,
-)
+from simulator.capture.exposure import PEDESTAL, SIGNAL_LIMIT, Exposure
+from simulator.noise.generator import BLOCK, draw_block, drawn_normals
+from simulator.noise.noise_level_function import ReadNoise, plane_tensor
+from simulator.settings import CameraSettings
+from simulator.utils.checks import check_integer, check_word
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
-#: A sample at or below this signal counts as clipped low: ten stops below white.
-LOW_CLIP = 2.0**-10
-#: A sample at or above this signal counts as clipped high.
-HIGH_CLIP = 1.0 - 1e-6
+#: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
+#: and tails of the camera's read noise (`simulator.noise.noise_level_function`).
+Noise = Literal["exact", "bank", "sensor"]
 #: Samples of a plane that one thread works on at a time, and at least, in units of blocks.
 _UNIT_BLOCKS = 256
 _WORTH_A_THREAD = 4 * 64 * 64 * 4
@@ -61,11 +61,143 @@ _OFF, _BANK, _DRAWN = 0, 1, 2
 _NO_BANK = np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
 _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
-_START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
-_TINY = torch.finfo(torch.float32).tiny
-#: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
-_BALANCED = 2**15
 _jit = functools.partial(kernel, fastmath=_FAST, boundscheck=False)
+
+
+def check_noise(noise: str) -> None:
+    """Raises a `ValueError` unless `noise` is a kind of noise."""
+    check_word("noise", noise, get_args(Noise))
+
+
+# -- keys: 64 bits from a seed and from the numbers that frames differ by ----------------------
+#
+# A chain of splitmix64 (Steele, Lea and Flood 2014) over the seed and the bits of the numbers.
+KEY_STEP = np.uint64(0x9E3779B97F4A7C15)
+_MULTIPLIERS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_SHIFTS = np.uint64(30), np.uint64(27), np.uint64(31)
+
+
+def mixed(words: Any) -> Any:
+    """The finaliser of splitmix64: a bijection of uint64, one or an array of them."""
+    words = (words ^ (words >> _SHIFTS[0])) * _MULTIPLIERS[0]
+    words = (words ^ (words >> _SHIFTS[1])) * _MULTIPLIERS[1]
+    return words ^ (words >> _SHIFTS[2])
+
+
+#: The same inside kernels.
+mixed_word = kernel()(mixed)
+
+
+@kernel()
+def _fold(keys, bits):  # type: ignore[no-untyped-def]
+    for frame in range(len(keys)):
+        key = mixed_word(keys[frame] + KEY_STEP)
+        for number in range(bits.shape[1]):
+            key = mixed_word((key ^ bits[frame, number]) + KEY_STEP)
+        keys[frame] = key
+
+
+def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndarray:
+    """Keys of B frames.
+
+    Args:
+        seeds: (B,) or a single integer, >= 0.
+        numbers: Numbers that the noise of the frames differs by, each (B,) or a single one: the
+            frame of an episode, the settings of a capture.
+
+    Returns:
+        (B,) uint64, each a function of its seed and its numbers and of nothing else.
+
+    Raises:
+        ValueError: If a seed is not an integer >= 0.
+    """
+    given = np.asarray(seeds)
+    if given.dtype.kind not in "iu" or (given.dtype.kind == "i" and given.min(initial=0) < 0):
+        raise ValueError(f"`seeds` (={seeds!r}) must be integers >= 0")
+    columns = [np.asarray(number, np.float64) for number in numbers]
+    count = next((len(values) for values in (given, *columns) if values.ndim), 1)
+    keys, folded = np.empty(count, np.uint64), np.empty((count, len(columns)))
+    keys[:] = given
+    for column, values in enumerate(columns):
+        folded[:, column] = values
+    _fold(keys, folded.view(np.uint64))
+    return keys
+
+
+def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
+    """(S,) uint64 keys of the noise of a sweep's frames, which differ by their settings.
+
+    Raises:
+        ValueError: Unless `seed` is an integer >= 0 of at most 64 bits.
+    """
+    seed = check_integer("seed", seed, 0, 2**64 - 1)
+    numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)
+    return noise_keys(seed, *numbers.reshape(-1, 3).T)
+
+
+# -- the bank ---------------------------------------------------------------------------------
+#
+# It holds the 2**20 quantiles (i + 1/2) / 2**20 of the normal distribution in a fixed random order.
+# A frame reads it in blocks of 256 samples; where each block starts (any multiple of 16) and its
+# sign come from a hash of the frame's key and the block's number. Every start is as likely as any
+# other, so each sample has the bank's distribution exactly, and two samples share a value only by
+# the chance that blocks overlap.
+
+#: Number of different normals.
+BANK_SIZE = 2**20
+#: A block starts at a multiple of this: one cache line of float32.
+STRIDE = 16
+_SHUFFLE_SEED = 20210616
+_SINGLES = np.uint64(0x5851F42D4C957F2D)  # keeps single normals apart from a frame's blocks
+_START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
+
+
+@functools.cache
+def noise_bank() -> np.ndarray:
+    """The bank, read-only: (BANK_SIZE + BLOCK,) float32; the end repeats the beginning."""
+    quantiles = ndtri((np.arange(BANK_SIZE) + 0.5) / BANK_SIZE).astype(np.float32)
+    np.random.default_rng(_SHUFFLE_SEED).shuffle(quantiles)
+    bank = np.concatenate([quantiles, quantiles[:BLOCK]])
+    bank.flags.writeable = False
+    return bank
+
+
+@kernel()
+def _singles(keys, bank, out):  # type: ignore[no-untyped-def]
+    for i in range(len(out)):
+        for j in range(out.shape[1]):
+            word = mixed_word((keys[i] ^ _SINGLES) + KEY_STEP * np.uint64(j + 1))
+            value = np.float64(bank[word & np.uint64(BANK_SIZE - 1)])
+            out[i, j] = -value if word >> np.uint64(63) else value
+
+
+def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
+    """(B, count) float64: `count` standard normals for each key, apart from its frame's noise."""
+    out = np.empty((len(keys), count))
+    _singles(keys, noise_bank(), out)
+    return out
+
+
+def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
+    """Standard normals of a frame of `shape` (P, H, W), float32.
+
+    They are what `record` adds, as an array: for other devices and for tests.
+
+    Args:
+        key: 64 bits, from `noise_keys`.
+        shape: Planes, height and width.
+        noise: How the key becomes normals.
+    """
+    planes, height, width = shape
+    if noise != "bank":
+        return drawn_normals(key, (planes, height, width))
+    blocks = -(-height * width // BLOCK)
+    turns = np.arange(1, planes * blocks + 1, dtype=np.uint64) * KEY_STEP
+    words = mixed(np.uint64(key) + turns)
+    starts = (words & _START_BITS).astype(np.int64) * STRIDE
+    signs = np.where(words >> np.uint64(63), np.float32(-1), np.float32(1))
+    values = noise_bank()[starts[:, None] + np.arange(BLOCK)] * signs[:, None]
+    return values.reshape(planes, blocks * BLOCK)[:, : height * width].reshape(shape)
 
 
 # -- a batch of frames ------------------------------------------------------------------------
@@ -78,7 +210,7 @@ class Transitions:
     Args:
         light: (4, H, W) each, contiguous float32: blurred already, at the exposure of its
             prepared scene. Several may be the same.
-        table: (B, 5, 4) of `simulator.capture.exposure.exposure_table`.
+        table: (B, 5, 4) of `exposure_table`.
         remaining_variance: `Exposure.remaining_variance` of each, contiguous float32; None for
             all of the variance. None in place of the sequence where no frame has any.
     """
@@ -100,12 +232,11 @@ class Transitions:
     def in_bands(self, row_gain: np.ndarray) -> Transitions:
         """The same where rows have light of their own: the bands of flickering light.
 
-        The light of each row multiplies the blurred light before there is noise, so that the noise
-        is that of the banded signal: exact for motion along the rows; other motion blurs across
-        rows that do not share their light. The source's own noise is multiplied with
-        its light: its variance by the square of the row's gain, r^2. What the top-up takes away for
-        it has the variance times r: exact for shot noise, whose variance is worked out from the
-        banded signal, and off by r (1 - r) of the source's read noise.
+        The light of each row multiplies the blurred light before there is noise: exact for motion
+        along the rows; other motion blurs across rows that do not share their light. The source's
+        own noise is multiplied with its light, its variance by the square of the row's gain, r^2.
+        What the top-up takes away for it has the variance times r: exact for shot noise, and off by
+        r (1 - r) of the source's read noise.
 
         Args:
             row_gain: (B, H) light of each row relative to the frame's.
@@ -127,7 +258,7 @@ class Transitions:
         It is part of the calibrated read noise: the rest of that is what has to be drawn.
         """
         table = self.table.copy()
-        table[:, 2] -= 1.0 / (12.0 * np.square(np.array(camera.span, np.float32)))
+        table[:, 2] -= 1.0 / (12.0 * np.square(camera.digits[0]))
         return replace(self, table=table)
 
     def averaged_table(self) -> np.ndarray:
@@ -151,6 +282,46 @@ class Transitions:
         if (self.table[:, 1:3] > 0.0).any():
             return True
         return any(share is not None for share in self.shares())
+
+
+def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
+    """Exposures as the columns of a batch: (B, 5, 4) float32, columns are the planes R, G1, G2, B.
+
+    The rows: exposure ratio; shot and read noise that is missing, negative where the source has
+    more; shot and read noise of the source on the target's scale.
+    """
+    pairs = [(exposure.source_noise, exposure.target) for exposure in exposures]
+    rows = [t.shot + t.read + s.shot + s.read for s, t in pairs]  # flat: numpy reads them faster
+    noises = np.array(rows).reshape(-1, 4, 4)
+    noises[:, :2] -= noises[:, 2:]  # in float64: both may be nearly the same
+    table = np.empty((len(exposures), 5, 4), np.float32)
+    table[:, 0] = np.array([exposure.ratio for exposure in exposures])[:, None]
+    table[:, 1:] = noises
+    return table
+
+
+def missing_variance(
+    signal: torch.Tensor, table: np.ndarray, remaining_variance: torch.Tensor | None = None
+) -> torch.Tensor:
+    """D(x) of each pixel; negative where the source is noisier.
+
+    Args:
+        signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
+        table: (4, 4), rows 1 to 4 of `exposure_table`, or (4,), its column for that plane.
+        remaining_variance: (H, W) share of the source's variance that a blur has left; None for
+            all of it.
+
+    Returns:
+        float32, of the shape of `signal`.
+    """
+    shot, read, source_shot, source_read = (
+        plane_tensor(row, signal.device) if row.ndim else row.item() for row in table
+    )
+    bright = signal.float().clamp(min=0.0)
+    missing = (bright * shot).add_(read)
+    if remaining_variance is not None:
+        missing = missing + (1.0 - remaining_variance) * (bright * source_shot + source_read)
+    return missing
 
 
 def record(
@@ -214,11 +385,7 @@ def record(
 
 def exposed_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     """Light on the sensor, (4, H, W), of `light` that has the blur of `exposure` already."""
-    return _limited(light * exposure.ratio)
-
-
-def _limited(signal: torch.Tensor) -> torch.Tensor:
-    return signal.clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
+    return (light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
 
 def record_stepwise(
@@ -231,7 +398,7 @@ def record_stepwise(
 ) -> None:
     """`record` on any device: the reference of the fused kernel. Fills `signals`."""
     for i, (light, table) in enumerate(zip(transitions.light, transitions.table, strict=True)):
-        signal = _limited(light * table[0, 0].item())
+        signal = (light * table[0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
         if keys is not None:
             missing = missing_variance(signal, table[1:], transitions.shares()[i])
             normals = frame_normals(int(keys[i]), tuple(light.shape), noise)
@@ -276,77 +443,7 @@ def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tens
     return numbers.sub_(black).div_(span)
 
 
-# -- excess variance --------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class NoiseBalance:
-    """The source's noise in a capture against the noise that the capture should have.
-
-    Args:
-        relative_excess_variance: Mean over the pixels of the variance beyond the target's,
-            relative to it.
-        lacks_noise: Whether any pixel has less noise than the target.
-    """
-
-    relative_excess_variance: float
-    lacks_noise: bool
-
-
-def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
-    """Compares the source's noise in one image with the target's.
-
-    Args:
-        light: (4, H, W) at the exposure of the prepared scene.
-        exposure: Its exposure; neither its ratio nor its noise are in `light` yet.
-    """
-    source, target = exposure.source_noise, exposure.target
-    if source.is_zero:
-        return NoiseBalance(0.0, not target.is_zero)
-    (table,), remaining = top_up_table([source], [target]), exposure.remaining_variance
-    height, width = light.shape[-2:]
-    rows = max(1, _BALANCED // width)
-    parts = [slice(top, top + rows) for top in range(0, height, rows)]
-    relative, lacks = np.zeros(4), np.zeros(4, bool)
-
-    def balance(first: int, last: int) -> None:
-        for plane in range(first, last):
-            if table[0, plane] >= 0.0 and table[1, plane] > 0.0:
-                lacks[plane] = True  # at every pixel, whatever its light
-                continue
-            for part in parts:
-                signal = (light[plane, part] * exposure.ratio).clamp_(0.0, SIGNAL_LIMIT)
-                share = None if remaining is None else remaining[part]
-                missing = missing_variance(signal, table[:, plane], share)
-                lacks[plane] |= bool((missing > 0).any())
-                wanted = signal.mul_(target.shot[plane]).add_(target.read[plane])
-                missing.clamp_(max=0.0)
-                relative[plane] -= float((missing / wanted.clamp_(min=_TINY)).sum())
-
-    parallel_ranges(balance, 4, threads=None if len(parts) > 4 else 1)
-    share = abs(float(relative.sum())) / light.numel()
-    return NoiseBalance(min(share, VARIANCE_LIMIT), bool(lacks.any()))  # finite over no noise, too
-
-
 # -- the fused kernel -------------------------------------------------------------------------
-
-
-@functools.lru_cache(maxsize=64)
-def sensor_table(camera: CameraProfile) -> np.ndarray:
-    """How `camera` digitises a signal: (5, 4) float32, columns are the planes R, G1, G2, B.
-
-    The rows: digital numbers from black to white, digital number of black, largest one that counts
-    as clipped low, smallest one that counts as clipped high, largest one.
-    """
-    span, black = (np.array(v, np.float32)[:, None] for v in (camera.span, camera.black_level))
-    numbers = np.arange(int(camera.white_level) + 1, dtype=np.float32)
-    signals = (numbers - black) / span  # (4, W)
-    low = (signals <= LOW_CLIP).sum(axis=1) - 1
-    high = len(numbers) - (signals >= HIGH_CLIP).sum(axis=1)
-    white = np.full(4, camera.white_level)
-    table = np.stack([span[:, 0], black[:, 0], low, high, white]).astype(np.float32)
-    table.flags.writeable = False
-    return table
 
 
 @_jit()
@@ -371,7 +468,7 @@ def _rounded(x, span, black, white):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _digitise(size, light, bound, ratio, sensor, out):  # type: ignore[no-untyped-def]
-    """Digital numbers of light, without noise; `sensor` is of `sensor_table`."""
+    """Digital numbers of light, without noise; `sensor` is of `CameraProfile.digits`."""
     span, black, white = sensor
     for j in range(size):
         out[j] = _rounded(_exposed(light[j], ratio, bound), span, black, white)
@@ -441,22 +538,14 @@ def _as_signals(numbers, black, span, out):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _in_bank(key, block):  # type: ignore[no-untyped-def]
-    """Where in the bank a block of a frame starts, and its sign (`simulator.noise.generator`)."""
+    """Where in the bank a block of a frame starts, and its sign (`frame_normals`)."""
     word = mixed_word(key + KEY_STEP * np.uint64(block + 1))
     return np.int64(word & _START_BITS) * STRIDE, -_ONE if word >> np.uint64(63) else _ONE
 
 
 @_jit()
 def _record(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    samples,
-    light,
-    remaining_variance,
-    exposure,
-    noise_source,
-    sensor,
-    outputs,
+    first, last, samples, light, remaining_variance, exposure, noise_source, sensor, outputs
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order."""
     (keys, drawn, bank), (codes, numbers, signals, counts) = noise_source, outputs
@@ -528,30 +617,21 @@ def _record_fused(
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
-    empty, flat = (0, 4, 0), (frames, 4, samples)
+    keys = np.zeros(frames, np.uint64) if keys is None else keys
+    given = ((codes, np.uint8), (numbers, np.uint16), (signals, np.float32))
+    outputs = [
+        np.empty((0, 4, 0), dtype) if out is None else out.reshape(frames, 4, samples)
+        for out, dtype in given
+    ]
     fixed = (
         samples,
         addresses(light),
         np.zeros(frames, np.uintp) if remaining is None else addresses(remaining),
         transitions.table,
-        (
-            np.zeros(frames, np.uint64) if keys is None else keys,
-            drawn,
-            noise_bank() if drawn == _BANK else _NO_BANK,
-        ),
-        sensor_table(camera),
-        (
-            np.empty(empty, np.uint8) if codes is None else codes.reshape(flat),
-            np.empty(empty, np.uint16) if numbers is None else numbers.reshape(flat),
-            np.empty(empty, np.float32) if signals is None else signals.reshape(flat),
-            counts,
-        ),
+        (keys, drawn, noise_bank() if drawn == _BANK else _NO_BANK),
+        camera.digits,
+        (*outputs, counts),
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     parallel_ranges(lambda first, last: _record(first, last, *fixed), units, least=least)
     return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)
-
-
-_TINY = torch.finfo(torch.float32).tiny
-#: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
-_BALANCED = 2**15

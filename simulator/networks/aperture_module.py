@@ -70,9 +70,8 @@ class ApertureModule(nn.Module):
             f_target: (B,) effective f-number wanted; where it is not smaller, the image stays.
         """
         if not self.has_map:
-            opened = self._opened if self.preset == "paper" else self._opened_as_released
             opens = (f_target < f_source)[:, None, None, None]
-            return torch.where(opens, opened(image, f_source, f_target), image)
+            return torch.where(opens, self._opened(image, f_source, f_target), image)
         diameter = self.defocus(image, deviation)
         added = added_blur(diameter, f_source[:, None, None], f_target[:, None, None])
         return DiscBank(image).blurred(added[:, None])
@@ -83,50 +82,32 @@ class ApertureModule(nn.Module):
         return self.preset == "compact"
 
     def defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Circle of confusion of each pixel of the source (B, H, W) [pixel]; see `usable_defocus`.
-
-        Raises:
-            ValueError: If the preset has no such map.
-        """
+        """Circle of confusion of the source (B, H, W) [pixel]; see `usable_defocus`."""
         return usable_defocus(self.estimate_defocus(image, deviation), image)
 
     def estimate_defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """The network's map (B, H, W) [pixel]; each pixel depends on its neighbourhood alone.
-
-        Raises:
-            ValueError: If the preset has no such map.
-        """
+        """The network's map (B, H, W) [pixel]; each pixel depends on its neighbourhood alone."""
         if not isinstance(self.network, DefocusMap):
             raise ValueError(f"`preset` (={self.preset!r}) must be 'compact' to have a defocus map")
-        return self.network.diameter(image, deviation)
+        return to_diameter(self.network(image, deviation))
 
     def _opened(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
-        # One scalar per image is divided out before the network and multiplied in after it. So it
-        # sees every exposure alike and commutes with exposure, like the compact one.
-        scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
         f_numbers = torch.stack([f_source, f_target], dim=1).float()
         # Eighteen normalisations in a row: bfloat16 would change half of the residual.
         with torch.autocast(image.device.type, enabled=False):
+            if self.preset == "ncs":
+                return image + self.network(image.float(), f_numbers)  # type: ignore[no-any-return]
+            # One scalar per image is divided out before the network and multiplied in after it. So
+            # it sees every exposure alike and commutes with exposure, like the compact one.
+            scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
             residual = self.network((image / scale).float(), f_numbers)
             # A picture without detail has a constant residual; without it, it stays as it is.
             flat = self.network(image.new_zeros(len(image), 4, 1, 1).float(), f_numbers)
-        opened: Tensor = image + (residual - flat) * scale
-        return opened
-
-    def _opened_as_released(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
-        f_numbers = torch.stack([f_source, f_target], dim=1).float()
-        with torch.autocast(image.device.type, enabled=False):
-            opened: Tensor = image + self.network(image.float(), f_numbers)
-        return opened
+        return image + (residual - flat) * scale  # type: ignore[no-any-return]
 
 
 def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:
-    """The map that pictures are blurred by: zero where the picture shows no defocus.
-
-    Args:
-        diameter: (B, H, W) as `ApertureModule.estimate_defocus` gives it [pixel].
-        image: (B, 4, H, W) that it was estimated from.
-    """
+    """The map (B, H, W) that `image` is blurred by: zero where that shows no defocus."""
     return BLUR_FACTOR * dead_zone(diameter) * is_defocused(diameter, image)[:, None, None]
 
 
@@ -136,10 +117,6 @@ def is_defocused(diameter: Tensor, image: Tensor) -> Tensor:
     Blur up to 1.5 pixels is hard to tell from softness, and a false map costs a sharp picture more
     than a missed one costs a blurred picture. So a picture counts as in focus throughout unless a
     twentieth of its detail (weighed by local contrast) is blurred by more than `IN_FOCUS`.
-
-    Args:
-        diameter: (B, H, W) estimated circle of confusion [pixel].
-        image: (B, 4, H, W).
     """
     grey = image.mean(dim=1, keepdim=True)
     mean = box_mean(grey, _USABLE_WINDOW)
@@ -183,10 +160,6 @@ class DefocusMap(nn.Module):
     Defocus removes fine detail first: the energies of neighbouring difference-of-disc bands,
     relative to the contrast of the neighbourhood, tell by how much. They do not depend on the
     exposure. The network works at half the resolution (pixel unshuffle).
-
-    Args:
-        width: Channels of the network.
-        dilations: Dilation of each residual block.
     """
 
     def __init__(self, width: int = 48, dilations: tuple[int, ...] = (1, 2, 4, 1)) -> None:
@@ -204,14 +177,9 @@ class DefocusMap(nn.Module):
                 block.second.weight.mul_(0.3)  # type: ignore[operator, union-attr]
 
     def forward(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Logarithm of the blur, ``log(diameter + 0.3)``.
+        """``log(diameter + 0.3)`` of the blur (B, H, W), the diameter in pixels of `image`.
 
-        Args:
-            image: (B, 4, H, W) raw with little noise, any exposure; H, W >= 1.
-            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
-
-        Returns:
-            (B, H, W); the diameter is in pixels of `image`.
+        `deviation` (B, 4, H, W) is that of the noise which was removed from `image`.
         """
         height, width = image.shape[-2:]
         features = F.pad(
@@ -224,10 +192,6 @@ class DefocusMap(nn.Module):
         size = features.shape[-2:]
         fine = F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
         return fine[:, 0, :height, :width]
-
-    def diameter(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Diameter of the circle of confusion of each pixel (B, H, W), in pixels of `image`."""
-        return to_diameter(self(image, deviation))
 
 
 def to_diameter(log_blur: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from simulator.utils.cache import LruCache, cache_key, content_digest, disk_cache
+from simulator.utils.checks import check_word
 
 #: ``"memory"``, or ``"disk"``: both in memory and in files that later runs find.
 Where = Literal["memory", "disk"]
@@ -19,17 +20,11 @@ MEMORY_BYTES = 2**28
 class NetworkCache:
     """Results by the content of everything that they depend on: inputs, numbers and weights.
 
-    Args:
-        where: Where results are cached; None caches nothing.
-        max_bytes: Most bytes in memory.
-
-    Raises:
-        ValueError: If `where` is unknown.
+    With `where` None nothing is cached; `max_bytes` bounds those in memory.
     """
 
     def __init__(self, where: Where | None, *, max_bytes: int = MEMORY_BYTES) -> None:
-        if where is not None and where not in get_args(Where):
-            raise ValueError(f"`cache` (={where!r}) must be None or one of {list(get_args(Where))}")
+        check_word("cache", where, get_args(Where), None)
         self.where = where
         self.memory: LruCache[tuple[Tensor, int]] = LruCache(max_bytes)
         self._disk = disk_cache() if where == "disk" else None
@@ -47,7 +42,7 @@ class NetworkCache:
     ) -> Tensor:
         """The result of `make`, or an earlier one of the same inputs: the same values, bit by bit.
 
-        A stored result that is not finite, or of another shape, is made again.
+        A stored result that is not finite, or not of `shape`, is made again.
 
         Args:
             kind: Of the result, part of its key.

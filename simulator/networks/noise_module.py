@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from simulator.capture.sensor import frame_normals, noise_keys
 from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet
-from simulator.noise.generator import frame_normals, noise_keys
 from simulator.optics.discs import box_mean
 from simulator.utils.checks import check_word
 
@@ -36,19 +36,9 @@ _LARGEST = 5.0
 _LEVEL = 8.0
 
 
-class Size(NamedTuple):
-    """Channels of each level, the finest first, and residual blocks on the coarsest."""
-
-    widths: tuple[int, ...]
-    blocks: int
-
-
-#: The family; each level has half the resolution of the one before.
-SIZES = {
-    "nano": Size((16, 24, 32), 2),
-    "compact": Size((32, 48, 80, 96), 2),
-    "large": Size((48, 96, 176, 256), 2),
-}
+#: The family: channels of each level, the finest first, each with half the resolution of the one
+#: before.
+SIZES = {"nano": (16, 24, 32), "compact": (32, 48, 80, 96), "large": (48, 96, 176, 256)}
 
 
 class Stabiliser(NamedTuple):
@@ -56,11 +46,8 @@ class Stabiliser(NamedTuple):
 
     ``z = 2 y / (sqrt(shot y + c) + sqrt(c))`` with ``c = read + 3/8 shot^2``: the generalised
     Anscombe transform less its value at 0, in a form that stays exact as shot goes to 0, where it
-    becomes ``y / sigma``. Below 0 it goes on as a straight line.
-
-    Args:
-        shot: (B, 4, 1, 1) slope of the noise variance.
-        root: (B, 4, 1, 1) ``sqrt(c)``, above 0.
+    becomes ``y / sigma``. Below 0 it goes on as a straight line. `root` is ``sqrt(c)``, above 0;
+    both are (B, 4, 1, 1).
     """
 
     shot: Tensor
@@ -99,24 +86,19 @@ class Denoiser(nn.Module):
     The network sees the stabilised picture less its mean over 17 x 17 pixels, how that mean
     differs from the one over 65 x 65, the level itself, and how linear the stabilisation is.
     What it takes away is corrected such that the mean over about 136 x 136 pixels stays: noise has
-    a mean of zero, so nothing else may be taken on average.
-
-    Args:
-        size: Name in `SIZES`.
+    a mean of zero, so nothing else may be taken on average. `size` is a name in `SIZES`.
     """
 
     def __init__(self, size: str = "compact") -> None:
         super().__init__()
-        widths, blocks = SIZES[size]
+        widths = SIZES[size]
         self.stride = 2 ** (len(widths) - 1)
         self.head = nn.Conv2d(16, widths[0], 3, padding=1)
         self.encode = nn.ModuleList(ResidualBlock(w, bias=True) for w in widths[:-1])
         self.down = nn.ModuleList(
             nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in itertools.pairwise(widths)
         )
-        self.coarsest = nn.Sequential(
-            *(ResidualBlock(widths[-1], bias=True) for _ in range(blocks))
-        )
+        self.coarsest = nn.Sequential(*(ResidualBlock(widths[-1], bias=True) for _ in range(2)))
         self.up = nn.ModuleList(
             nn.ConvTranspose2d(coarse, fine, 2, stride=2)
             for fine, coarse in itertools.pairwise(widths)
@@ -134,15 +116,12 @@ class Denoiser(nn.Module):
         nn.init.zeros_(self.tail.weight)  # it starts by changing nothing
 
     def forward(self, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """Noise-reduced image.
+        """Noise-reduced image (B, 4, H, W), float32.
 
         Args:
             image: (B, 4, H, W) noisy raw, any exposure; H, W >= 1.
             shot: (B, 4) slope of the noise variance, on the same scale.
             read: (B, 4) noise variance at zero signal.
-
-        Returns:
-            (B, 4, H, W) float32.
         """
         clean = self.uncorrected(image, self.surroundings(image, shot, read), shot, read)
         # In training a residual that is the same everywhere must cost something.
@@ -157,11 +136,7 @@ class Denoiser(nn.Module):
     def uncorrected(self, image: Tensor, far: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """The network alone; a pixel depends on those within 80 pixels, and on place modulo 8.
 
-        Args:
-            image: See `forward`; may be a part of a frame.
-            far: `surroundings` there.
-            shot: See `forward`.
-            read: See `forward`.
+        `image` may be a part of a frame; `far` is its `surroundings`.
         """
         height, width = image.shape[-2:]
         stabiliser = Stabiliser.of(shot, read)
@@ -231,13 +206,7 @@ def _coarse_mean(x: Tensor, cells: int) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """``x + conv(relu(conv(x)))``, 3 x 3.
-
-    Args:
-        width: Channels.
-        dilation: Of the first convolution.
-        bias: Whether the convolutions have biases.
-    """
+    """``x + conv(relu(conv(x)))``, 3 x 3, the first dilated."""
 
     def __init__(self, width: int, *, dilation: int = 1, bias: bool = False) -> None:
         super().__init__()
@@ -288,15 +257,12 @@ class NoiseModule(nn.Module):
         return round(counter.get_total_flops() / side**2)
 
     def forward(self, exposed: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """The raw with little noise; one without noise (shot = read = 0) as it is.
+        """The raw with little noise, float32; one without noise (shot = read = 0) as it is.
 
         Args:
             exposed: (B, 4, H, W) raw on the scale of the target.
             shot: (B, 4) slope of its noise variance on that scale.
             read: (B, 4) noise variance at zero signal.
-
-        Returns:
-            (B, 4, H, W) float32.
         """
         if self.commutes:
             result = self.network(exposed, shot, read)
@@ -309,10 +275,7 @@ class NoiseModule(nn.Module):
 
 
 def _sample(image: Tensor) -> Tensor:
-    """Standard normals (1, 4, H, W) for an image (B, 4, H, W); the same for every one of its size.
-
-    Results of the noise module are shared between captures of all seeds.
-    """
+    """Standard normals (1, 4, H, W), the same for every image of this size: results are shared."""
     normals = frame_normals(int(noise_keys(_SAMPLE_SEED)[0]), tuple(image.shape[1:]))
     return torch.from_numpy(normals)[None].to(image.device)
 

@@ -37,15 +37,6 @@ MULTIPLE = 16
 _STOPS_OF_F22 = 9
 
 
-def _checked(variant: Variant, widths: Sequence[int]) -> tuple[int, ...]:
-    """`widths` as a tuple, of a known variant."""
-    check_word("variant", variant, get_args(Variant))
-    checked, least = tuple(widths), 2 if variant == "paper" else 5
-    if len(checked) < least or not all(isinstance(w, int) and w >= 1 for w in checked):
-        raise ValueError(f"`widths` (={widths!r}) must be {least} or more integers >= 1")
-    return checked
-
-
 def _left(variant: Variant, widths: tuple[int, ...]) -> tuple[int, ...]:
     """Channels per level on the way up, coarsest first: the paper's, or one level finer in ncs."""
     return widths[-2::-1] if variant == "paper" else (*widths[-3::-1], widths[0])
@@ -82,15 +73,7 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
     A flat map, and so every 1 x 1 map, becomes exactly `shift`. Convolutions leave deviations of
     1e-7 in a flat image; each normalisation would multiply them by up to ``1 / sqrt(eps)`` = 300,
     and after three layers they would be the image. Deviations below `FLAT` are that rounding.
-
-    Args:
-        x: (B, C, H, W), any H, W >= 1.
-        scale: (B, C), of each sample and channel.
-        shift: (B, C).
-        eps: Added to the variance, which is the biased one, > 0.
-
-    Returns:
-        (B, C, H, W), the dtype of `x`; statistics are at least float32.
+    `x` is (B, C, H, W), `scale` and `shift` are (B, C); statistics are at least float32.
 
     >>> flat = torch.full((1, 1, 3, 3), 0.1)
     >>> instance_norm(flat, torch.ones(1, 1), torch.full((1, 1), 0.25)).unique().item()
@@ -105,21 +88,15 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
     return torch.addcmul(shift.to(wide)[:, :, None, None], centred, gain).to(x.dtype)
 
 
-def _leaky_level(inputs: int, outputs: int) -> nn.Sequential:
-    """Two convolutions, each with LeakyReLU."""
-    layers = [(convolution(i, outputs), nn.LeakyReLU(LEAK)) for i in (inputs, outputs)]
-    return nn.Sequential(*(layer for pair in layers for layer in pair))
-
-
-def _normalised_level(inputs: int, outputs: int) -> nn.Sequential:
-    """Two convolutions, borders zero, each with batch normalisation and ReLU."""
+def _level(inputs: int, outputs: int, variant: Variant) -> nn.Sequential:
+    """Two convolutions with LeakyReLU; or, borders zero, with batch normalisation and ReLU."""
     layers: list[nn.Module] = []
     for channels in (inputs, outputs):
-        layers += [
-            nn.Conv2d(channels, outputs, 3, padding=1),
-            nn.BatchNorm2d(outputs),
-            nn.ReLU(),
-        ]
+        if variant == "paper":
+            layers += [convolution(channels, outputs), nn.LeakyReLU(LEAK)]
+        else:
+            plain = nn.Conv2d(channels, outputs, 3, padding=1)
+            layers += [plain, nn.BatchNorm2d(outputs), nn.ReLU()]
     return nn.Sequential(*layers)
 
 
@@ -138,9 +115,6 @@ class UNet(nn.Module):
         widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1; by
             default `WIDTHS`.
 
-    Raises:
-        ValueError: If an argument is none of these.
-
     Source: Brooks et al. 2019, Unprocessing Images for Learned Raw Denoising. Two things differ
     from what its authors released: two convolutions a level, not three, and replicated borders.
 
@@ -150,17 +124,17 @@ class UNet(nn.Module):
 
     def __init__(self, variant: Variant = "paper", *, widths: Sequence[int] | None = None) -> None:
         super().__init__()
-        widths = _checked(variant, WIDTHS.get(variant, ()) if widths is None else widths)
+        check_word("variant", variant, get_args(Variant))
+        widths = WIDTHS[variant] if widths is None else tuple(widths)
         self.variant, left = variant, _left(variant, widths)
-        level = _leaky_level if variant == "paper" else _normalised_level
         self.encoder = nn.ModuleList(
-            level(previous, width) for previous, width in zip((8, *widths), widths, strict=False)
+            _level(previous, width, variant)
+            for previous, width in zip((8, *widths), widths, strict=False)
         )
+        skips, below = widths[-2::-1], (widths[-1], *left[:-1])
         self.decoder = nn.ModuleList(
-            level(skip + below, width)
-            for skip, below, width in zip(
-                widths[-2::-1], (widths[-1], *left[:-1]), left, strict=True
-            )
+            _level(skip + coarse, width, variant)
+            for skip, coarse, width in zip(skips, below, left, strict=True)
         )
         if variant == "paper":
             self.tail = convolution(widths[0], 4)
@@ -170,14 +144,10 @@ class UNet(nn.Module):
             self.tail = nn.Conv2d(widths[0], 4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Residual of a raw.
+        """Residual (B, 4, H, W) of a raw, to be added to it.
 
-        Args:
-            x: (B, 8, H, W), any H, W >= 1: the raw and its noise-level map, or for ``"ncs"`` the
-                raw and the same with a sample of its noise.
-
-        Returns:
-            (B, 4, H, W), to be added to the raw.
+        `x` is (B, 8, H, W), any H, W >= 1: the raw and its noise-level map, or for ``"ncs"`` the
+        raw and the same with a sample of its noise.
         """
         paper, (height, width) = self.variant == "paper", x.shape[-2:]
         x = x if paper else _padded(x)
@@ -205,9 +175,6 @@ def light_of_aperture(f_number: Tensor) -> Tensor:
 
     Thirds of stops go linearly between: 1, 4/3, 5/3, 2.
 
-    Args:
-        f_number: (B,) effective f-numbers, such as sqrt(2) ** 9 for f/22.
-
     >>> light = light_of_aperture(torch.tensor([2.0 ** (9 / 2), 2.0 ** (26 / 6), 4.0]))
     >>> [round(value, 5) for value in light.tolist()]
     [1.0, 1.33333, 32.0]
@@ -222,10 +189,6 @@ class ApertureNorm(nn.Module):
 
     ``A(x) = (w_s [n1, n2] + b_s) * (x - mean(x)) / std(x) + (w_m [n1, n2] + b_m)``, per channel,
     mean and deviation over the map. The paper's variant starts at b_s = 1, b_m = 0.
-
-    Args:
-        width: Channels, >= 1.
-        variant: Of the network.
     """
 
     def __init__(self, width: int, variant: Variant = "paper") -> None:
@@ -247,13 +210,7 @@ class NormalisedConvolution(nn.Module):
     """Convolution and aperture normalisation.
 
     The paper's has no bias, as the normalisation cancels it, and replicated borders; the authors'
-    weights have one, and borders are zero.
-
-    Args:
-        inputs: Input channels, >= 1.
-        outputs: Output channels, >= 1.
-        kernel: 3 or 1.
-        variant: Of the network.
+    weights have one, and borders are zero. `kernel` is 3 or 1.
     """
 
     def __init__(
@@ -296,11 +253,6 @@ class SkipAttention(nn.Module):
     zero, so that of A is ``w_m [n1, n2] + b_m`` whatever the image, the convolution in front and
     the scale; the sum of the two is again one linear function of the f-numbers. In the paper's
     variant only this function is computed, and learnt; the released one computes the maps.
-
-    Args:
-        width: Channels of skip and of gate, >= 1.
-        inner: Channels inside, >= 1.
-        variant: Of the network.
     """
 
     def __init__(self, width: int, inner: int, variant: Variant = "paper") -> None:
@@ -367,9 +319,6 @@ class AttentionUNet(nn.Module):
         variant: ``"paper"`` or ``"ncs"``.
         widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1.
 
-    Raises:
-        ValueError: If an argument is none of these.
-
     Source: Ouyang et al. 2021, Neural Camera Simulators, section 3.3; its figure's unstated sizes
     as in Oktay et al. 2018, Attention U-Net (half the channels inside the spatial attention).
 
@@ -382,8 +331,8 @@ class AttentionUNet(nn.Module):
         self, variant: Variant = "paper", *, widths: Sequence[int] = ATTENTION_WIDTHS
     ) -> None:
         super().__init__()
-        widths = _checked(variant, widths)
-        self.variant = variant
+        check_word("variant", variant, get_args(Variant))
+        self.variant, widths = variant, tuple(widths)
         fine, coarse = widths[-2::-1], widths[:0:-1]
         # Released: inside the attention of the finest level there are as many as outside.
         inner = _left(variant, widths) if variant == "ncs" else [max(f // 2, 1) for f in fine]
@@ -405,23 +354,11 @@ class AttentionUNet(nn.Module):
                 self.tail.bias.zero_()  # type: ignore[union-attr]
 
     def forward(self, image: Tensor, f_numbers: Tensor) -> Tensor:
-        """Residual of an image.
+        """Residual (B, 4, H, W) of an image (B, 4, H, W) of order one, to be added to it.
 
-        Args:
-            image: (B, 4, H, W), any H, W >= 1, of order one.
-            f_numbers: (B, 2), effective f-numbers of source and target, in [0.5, 1024].
-
-        Returns:
-            (B, 4, H, W), to be added to the image.
-
-        Raises:
-            ValueError: If `f_numbers` is not a pair for each image.
+        `f_numbers` (B, 2) are the effective ones of source and target, in [0.5, 1024].
         """
-        batch, _, height, width = image.shape
-        if f_numbers.shape != (batch, 2):
-            shape = tuple(f_numbers.shape)
-            raise ValueError(f"`f_numbers` (of shape {shape}) must have shape ({batch}, 2)")
-        paper = self.variant == "paper"
+        paper, (height, width) = self.variant == "paper", image.shape[-2:]
         x = image if paper else _padded(image)
         if paper:
             aperture = f_numbers.to(image) / F_NUMBER_UNIT

@@ -25,9 +25,8 @@ from simulator.utils.files import sibling, write_atomically
 
 def _all_three(preset: Any) -> nn.ModuleDict:
     aperture = ApertureModule(preset)
-    return nn.ModuleDict(
-        {"exposure": ExposureModule(), "noise": NoiseModule(preset), "aperture": aperture}
-    )
+    both = {"exposure": ExposureModule(), "noise": NoiseModule(preset)}
+    return nn.ModuleDict({**both, "aperture": aperture})
 
 
 def _noise_alone(preset: Any) -> nn.ModuleDict:
@@ -57,20 +56,15 @@ def build_modules(preset: str) -> nn.ModuleDict:
 def list_pretrained() -> list[str]:
     """Names of the weights that come with the package."""
     folder = resources.files("simulator").joinpath("pretrained")
-    if not folder.is_dir():
-        return []
-    files = [f.name for f in folder.iterdir()]
-    return sorted(name.removesuffix(".json") for name in files if name.endswith(".json"))
+    names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
+    return sorted(name.removesuffix(".json") for name in names if name.endswith(".json"))
 
 
 def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, Any]) -> None:
     """Writes ``path.safetensors`` and ``path.json``, the card with the hash of the weights.
 
-    Args:
-        path: File name, with or without one of the two endings.
-        modules: Their state is stored.
-        preset: Name that `build_modules` makes them from.
-        card: JSON values: how they were trained and what they score.
+    The `modules` are what `build_modules` makes of `preset`; the entries of `card`, JSON values,
+    say how they were trained and what they score.
 
     Raises:
         ValueError: If the weights are not finite; nothing is written then.
@@ -87,10 +81,9 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
 
 
 def write_pair(path: Path, content: bytes, card: dict[str, Any]) -> None:
-    """Writes the card, then the weights whose hash it holds.
+    """Writes the card, then the weights whose hash it holds; `read_pair` reads them in reverse.
 
-    `read_pair` reads them the other way round: whatever other processes write in between, weights
-    never come with a card that is older than they are.
+    Whatever other processes write in between, weights never come with an older card.
     """
     write_atomically(sibling(path, ".json"), json.dumps(card, indent=1) + "\n")
     write_atomically(sibling(path, ".safetensors"), content)
@@ -104,31 +97,30 @@ def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             is not that of the weights.
     """
     card_file, file = sibling(path, ".json"), sibling(path, ".safetensors")
+    given = f"`weights` (={str(path)!r})"
     try:
         content, text = file.read_bytes(), card_file.read_bytes()
     except OSError as error:
-        raise ValueError(f"`weights` (={str(path)!r}) cannot be read: {error}") from error
+        raise ValueError(f"{given} cannot be read: {error}") from error
     try:
         card = json.loads(text)
+        if not isinstance(card, dict):
+            raise ValueError("it must hold a JSON object")
     except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"`weights` (={str(path)!r}): {card_file.name} is damaged: {error}; train them again"
-        ) from error
-    if not isinstance(card, dict):
-        raise ValueError(f"`weights` (={str(path)!r}): {card_file.name} must hold a JSON object")
+        damage = f"{card_file.name} is damaged: {error}; train them again"
+        raise ValueError(f"{given}: {damage}") from error
     digest = hashlib.sha256(content).hexdigest()
     if card.get("sha256", digest) != digest:
         raise ValueError(
-            f"`weights` (={str(path)!r}): the hash of {file.name} (={digest[:12]}...) must be that "
-            f"in {card_file.name} (={str(card['sha256'])[:12]}...): one of them is damaged or of "
+            f"{given}: the hash of {file.name} (={digest[:12]}...) must be that in "
+            f"{card_file.name} (={str(card['sha256'])[:12]}...): one of them is damaged or of "
             "another training, or being written at this moment; train or copy both again"
         )
     try:
         tensors = load(content)
     except SafetensorError as error:
-        raise ValueError(
-            f"`weights` (={str(path)!r}): {file.name} cannot be read: {error}; train them again"
-        ) from error
+        damage = f"{file.name} cannot be read: {error}; train them again"
+        raise ValueError(f"{given}: {damage}") from error
     check_finite(tensors, path)
     return tensors, card
 
@@ -137,17 +129,14 @@ def check_finite(tensors: Mapping[str, Tensor], path: str | Path) -> None:
     """Raises a `ValueError` that names the first of `tensors` that holds a NaN or an infinity."""
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise ValueError(
-                f"`weights` (={str(path)!r}) must be finite: their training has failed ({name}); "
-                "train again with a lower learning_rate"
-            )
+            rule = f"must be finite ({name} is not): train again with a lower learning_rate"
+            raise ValueError(f"`weights` (={str(path)!r}) {rule}")
 
 
 def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     """Trained modules, in evaluation mode, and their model card.
 
-    Args:
-        name: One of `list_pretrained()`, or the path of a ``.safetensors`` file with its ``.json``.
+    `name` is one of `list_pretrained()`, or the path of a ``.safetensors`` file with its ``.json``.
 
     Raises:
         ValueError: If there is no such file, its hash is not the card's, or its tensors are not
@@ -191,19 +180,17 @@ def _hint(name: str, known: list[str]) -> str:
 
 
 def _check_card(card: dict[str, Any], name: str | Path) -> None:
+    rule = None
     if card.get("format") != FORMAT_VERSION:
-        raise ValueError(
-            f"`weights` (={str(name)!r}): the .json must be a model card of format "
-            f"{FORMAT_VERSION}, got {card.get('format')!r}"
-        )
-    if "sha256" not in card:
-        raise ValueError(f"`weights` (={str(name)!r}): the .json must hold the hash, `sha256`")
-    preset = card.get("preset")
-    if not isinstance(preset, str) or preset not in BUILDERS:
-        raise ValueError(
-            f"`weights` (={str(name)!r}): unknown preset {preset!r} in the .json, the presets are "
-            f"{list(BUILDERS)}"
-        )
+        found = f"{FORMAT_VERSION}, got {card.get('format')!r}"
+        rule = f"the .json must be a model card of format {found}"
+    elif "sha256" not in card:
+        rule = "the .json must hold the hash, `sha256`"
+    elif card.get("preset") not in list(BUILDERS):
+        found = card.get("preset")
+        rule = f"unknown preset {found!r} in the .json, the presets are {list(BUILDERS)}"
+    if rule is not None:
+        raise ValueError(f"`weights` (={str(name)!r}): {rule}")
 
 
 # -- the weights that the paper's authors released ------------------------------------------------

@@ -1,9 +1,4 @@
-"""Sensor noise: the standard normals of a frame, a function of its key and of nothing else.
-
-*Keys*: 64 bits from a seed and from the numbers that frames differ by, such as the settings of a
-sweep or the frame of an episode. *The bank* (``"bank"``): normals looked up in a table, in hashed
-pieces. *Exact draws* (``"exact"``): normals drawn by counting. Drawing 4 x 128 x 128 of them takes
-about 70 microseconds, everything else that a capture needs about 30: hence the bank.
+"""Normals drawn by counting: each block of a frame from its number and the frame's key.
 
 This module imports numba.
 """
@@ -12,40 +7,17 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
-from scipy.special import ndtri
 
-from simulator.settings import CameraSettings
-from simulator.utils.checks import check_integer, check_word
+from simulator.utils.checks import check_integer
 from simulator.utils.compute import kernel, parallel_ranges
 
-#: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
-#: and tails of the camera's read noise (`simulator.noise.noise_level_function`).
-Noise = Literal["exact", "bank", "sensor"]
-
-
-def check_noise(noise: str) -> None:
-    """Raises a `ValueError` unless `noise` is a kind of noise."""
-    check_word("noise", noise, get_args(Noise))
-
-
-def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
-    """Standard normals of a frame of `shape` (P, H, W), float32.
-
-    They are what `simulator.capture.sensor` adds, as an array: for other devices and for tests.
-
-    Args:
-        key: 64 bits, from `noise_keys`.
-        shape: Planes, height and width.
-        noise: How the key becomes normals.
-    """
-    planes, height, width = shape
-    make = bank_normals if noise == "bank" else drawn_normals
-    return make(key, (planes, height, width))
+#: Samples that are made in one piece; blocks do not reach over the end of a plane.
+BLOCK = 256
 
 
 def noise_generator(seed: int, *key: int | float) -> torch.Generator:
@@ -60,128 +32,6 @@ def noise_generator(seed: int, *key: int | float) -> torch.Generator:
     words = [check_integer("seed", seed, 0), *(int(np.float64(k).view(np.uint64)) for k in key)]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
-
-
-# -- keys -------------------------------------------------------------------------------------
-#
-# A chain of splitmix64 (Steele, Lea and Flood 2014) over the seed and the bits of the numbers.
-KEY_STEP = np.uint64(0x9E3779B97F4A7C15)
-_MULTIPLIERS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_SHIFTS = np.uint64(30), np.uint64(27), np.uint64(31)
-
-
-def mixed(words: Any) -> Any:
-    """The finaliser of splitmix64: a bijection of uint64, one or an array of them."""
-    words = (words ^ (words >> _SHIFTS[0])) * _MULTIPLIERS[0]
-    words = (words ^ (words >> _SHIFTS[1])) * _MULTIPLIERS[1]
-    return words ^ (words >> _SHIFTS[2])
-
-
-#: The same inside kernels.
-mixed_word = kernel()(mixed)
-
-
-@kernel()
-def _fold(keys, bits):  # type: ignore[no-untyped-def]
-    for frame in range(len(keys)):
-        key = mixed_word(keys[frame] + KEY_STEP)
-        for number in range(bits.shape[1]):
-            key = mixed_word((key ^ bits[frame, number]) + KEY_STEP)
-        keys[frame] = key
-
-
-def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndarray:
-    """Keys of B frames.
-
-    Args:
-        seeds: (B,) or a single integer, >= 0.
-        numbers: Numbers that the noise of the frames differs by, each (B,) or a single one: the
-            frame of an episode, the settings of a capture.
-
-    Returns:
-        (B,) uint64, each a function of its seed and its numbers and of nothing else.
-
-    Raises:
-        ValueError: If a seed is not an integer >= 0.
-    """
-    given = np.asarray(seeds)
-    if given.dtype.kind not in "iu" or (given.dtype.kind == "i" and given.min(initial=0) < 0):
-        raise ValueError(f"`seeds` (={seeds!r}) must be integers >= 0")
-    columns = [np.asarray(number, np.float64) for number in numbers]
-    count = next((len(values) for values in (given, *columns) if values.ndim), 1)
-    keys, folded = np.empty(count, np.uint64), np.empty((count, len(columns)))
-    keys[:] = given
-    for column, values in enumerate(columns):
-        folded[:, column] = values
-    _fold(keys, folded.view(np.uint64))
-    return keys
-
-
-def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
-    """(S,) uint64 keys of the noise of a sweep's frames, which differ by their settings.
-
-    Raises:
-        ValueError: Unless `seed` is an integer >= 0 of at most 64 bits.
-    """
-    seed = check_integer("seed", seed, 0, 2**64 - 1)
-    numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)
-    return noise_keys(seed, *numbers.reshape(-1, 3).T)
-
-
-# -- the bank ---------------------------------------------------------------------------------
-#
-# It holds the 2**20 quantiles (i + 1/2) / 2**20 of the normal distribution in a fixed random order.
-# A frame reads it in blocks of 256 samples; where each block starts (any multiple of 16) and its
-# sign come from a hash of the frame's key and the block's number. Every start is as likely as any
-# other, so each sample has the bank's distribution exactly, and two samples share a value only by
-# the chance that blocks overlap.
-
-#: Number of different normals.
-BANK_SIZE = 2**20
-#: Samples that are read in one piece; blocks do not reach over the end of a plane.
-BLOCK = 256
-#: A block starts at a multiple of this: one cache line of float32.
-STRIDE = 16
-_SHUFFLE_SEED = 20210616
-_SINGLES = np.uint64(0x5851F42D4C957F2D)  # keeps single normals apart from a frame's blocks
-
-
-@functools.cache
-def noise_bank() -> np.ndarray:
-    """The bank, read-only: (BANK_SIZE + BLOCK,) float32; the end repeats the beginning."""
-    quantiles = ndtri((np.arange(BANK_SIZE) + 0.5) / BANK_SIZE).astype(np.float32)
-    np.random.default_rng(_SHUFFLE_SEED).shuffle(quantiles)
-    bank = np.concatenate([quantiles, quantiles[:BLOCK]])
-    bank.flags.writeable = False
-    return bank
-
-
-@kernel()
-def _singles(keys, bank, out):  # type: ignore[no-untyped-def]
-    for i in range(len(out)):
-        for j in range(out.shape[1]):
-            word = mixed_word((keys[i] ^ _SINGLES) + KEY_STEP * np.uint64(j + 1))
-            value = np.float64(bank[word & np.uint64(BANK_SIZE - 1)])
-            out[i, j] = -value if word >> np.uint64(63) else value
-
-
-def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
-    """(B, count) float64: `count` standard normals for each key, apart from its frame's noise."""
-    out = np.empty((len(keys), count))
-    _singles(keys, noise_bank(), out)
-    return out
-
-
-def bank_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
-    """`frame_normals` from the bank."""
-    planes, samples = shape[0], shape[1] * shape[2]
-    blocks = -(-samples // BLOCK)
-    turns = np.arange(1, planes * blocks + 1, dtype=np.uint64) * KEY_STEP
-    words = mixed(np.uint64(key) + turns)
-    starts = (words & np.uint64(BANK_SIZE // STRIDE - 1)).astype(np.int64) * STRIDE
-    signs = np.where(words >> np.uint64(63), np.float32(-1), np.float32(1))
-    values = noise_bank()[starts[:, None] + np.arange(BLOCK)] * signs[:, None]
-    return values.reshape(planes, blocks * BLOCK)[:, :samples].reshape(shape)
 
 
 # -- exact draws: each block of a frame from its number and the frame's key --------------------
@@ -301,7 +151,7 @@ def _draw(first, last, key, blocks, out):  # type: ignore[no-untyped-def]
 
 
 def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
-    """`frame_normals` drawn."""
+    """`simulator.capture.sensor.frame_normals`, drawn."""
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     out = np.empty((planes, samples), np.float32)

@@ -1,16 +1,4 @@
-"""Noise of a pixel: its variance at each signal, the variance that is missing, its distribution.
-
-*The missing variance*: a pixel of signal x whose source has the noise (shot1, read1) carries
-``a shot1 x + a^2 read1`` after the exposure ratio a (`NoiseLevelFunction.exposed`). To carry the
-target's noise (shot2, read2) it lacks the variance
-
-    D(x) = (read2 - a^2 read1) + (shot2 - a shot1) max(x, 0).
-
-Where D is positive, noise of that variance is added, and mean and variance are exact. Where D is
-negative the source is noisier than the target: nothing is added, and -D is the excess variance.
-A blur averages the source's noise: where it leaves only a share r of the variance, the other share
-``(1 - r) (a shot1 max(x, 0) + a^2 read1)`` is missing, too. The fused kernel for the CPU
-(`simulator.capture.sensor`) computes the same, from the same table.
+"""Noise of a pixel: its variance at each signal, and its distribution.
 
 *The distribution of read noise*: normal and independent from pixel to pixel, unless captures ask
 for ``noise="sensor"``. Real read noise has a part that is the same along a row of the sensor, and
@@ -129,49 +117,6 @@ def noise_variance(signal: Tensor, nlf: NoiseLevelFunction) -> Tensor:
     """Variance ``read + shot * max(signal, 0)`` of each pixel, (..., 4, H, W) float32."""
     shot, read = nlf_tensors(nlf, signal.device)
     return signal.float().clamp(min=0.0) * shot + read
-
-
-# -- the variance that is missing -------------------------------------------------------------
-
-
-def top_up_table(
-    sources: Sequence[NoiseLevelFunction], targets: Sequence[NoiseLevelFunction]
-) -> np.ndarray:
-    """Coefficients of D for B pairs of noises, on the target's scale.
-
-    Returns:
-        (B, 4, 4) float64, columns are the planes R, G1, G2, B. The rows: shot and read noise that
-        is missing (negative where the source has more); shot and read noise of the source.
-    """
-    pairs = zip(sources, targets, strict=True)
-    rows = [t.shot + t.read + s.shot + s.read for s, t in pairs]  # flat: numpy reads them faster
-    table = np.array(rows).reshape(-1, 4, 4)
-    table[:, :2] -= table[:, 2:]  # in float64: both may be nearly the same
-    return table
-
-
-def missing_variance(
-    signal: Tensor, table: np.ndarray, remaining_variance: Tensor | None = None
-) -> Tensor:
-    """D(x) of each pixel; negative where the source is noisier.
-
-    Args:
-        signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
-        table: (4, 4), one entry of `top_up_table`, or (4,), its column for that plane.
-        remaining_variance: (H, W) share of the source's variance that a blur has left; None for
-            all of it.
-
-    Returns:
-        float32, of the shape of `signal`.
-    """
-    shot, read, source_shot, source_read = (
-        plane_tensor(row, signal.device) if row.ndim else row.item() for row in table
-    )
-    bright = signal.float().clamp(min=0.0)
-    missing = (bright * shot).add_(read)
-    if remaining_variance is not None:
-        missing = missing + (1.0 - remaining_variance) * (bright * source_shot + source_read)
-    return missing
 
 
 # -- the distribution of read noise -----------------------------------------------------------

@@ -12,6 +12,7 @@ such a scene can teach about defocus, and then converted to metres for a lens of
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import temperature_tint
 from simulator.radiance.procedural import (
     Drawing,
@@ -75,9 +76,6 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
         rng: Source of all randomness; the same state gives the same picture.
         size: Height and width [packed pixels], at least 16.
         focus: One of `FOCUSES`.
-
-    Raises:
-        ValueError: If an argument is invalid; the message proposes the nearest name.
     """
     check_word("focus", focus, FOCUSES)
     check_integer("size", size, 16, more=" packed pixels")
@@ -97,19 +95,15 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     light = _soften(picture, rng.uniform(0.05, 0.09))
     illuminance = float(f"{log_uniform(rng, 1.0, 20_000.0):.4g}")
     drawing = Drawing(light, illuminance, temperature_tint(rng.uniform(-0.1, 1.0)))
-    far = float(log_uniform(rng, 0.02, 1.0))
+    far = math.exp(rng.uniform(math.log(0.02), math.log(1.0)))
     return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
 
 
 def draw_layout(name: str, height: int, width: int) -> Layout:
-    """The layout of a picture without depth, as if it lay over procedural depth.
+    """The layout of a picture of so many packed pixels, as if it lay over procedural depth.
 
-    The subject is the nearest thing. Focus is on it in eight of ten layouts, in the others on
-    something behind it.
-
-    Args:
-        name: Decides the layout.
-        height, width: Of the picture [packed pixels].
+    `name` decides it. The subject is the nearest thing. Focus is on it in eight of ten layouts, in
+    the others on something behind it.
     """
     rng = np.random.default_rng([zlib.crc32(f"layout {name}".encode()), 0])
     focus = str(rng.choice(_LAYOUT_FOCUSES, p=_LAYOUT_SHARES))
@@ -130,7 +124,7 @@ def draw_layout(name: str, height: int, width: int) -> Layout:
 
 
 def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[float, np.ndarray]:
-    """Focus distance and depth at which a scene has `blur`.
+    """Focus distance [m] and depth (H, W) float32 [m] at which a scene has `blur`.
 
     Solves the thin-lens relation ``c = f**2 / (N (s - f)) * (z - s) / z`` (c signed, on the sensor)
     for the focus distance s and the depths z, at `FOCAL_LENGTH` and `F_NUMBER`.
@@ -139,9 +133,6 @@ def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[fl
         blur: (H, W) signed circle of confusion [packed pixels].
         far: Inverse distance [1/m] where `blur` is largest.
         pixel_pitch: Distance between packed pixels [m].
-
-    Returns:
-        Focus distance [m] and (H, W) float32 depth [m].
     """
     # With inverse distances D = 1/z, F = 1/s: c = f^2 / N * (F - D) / (1 - f F).
     scale = FOCAL_LENGTH**2 / (F_NUMBER * pixel_pitch)
@@ -192,11 +183,7 @@ def _put_thing(
     level: float,
     sides: tuple[float, float] = _SIDES,
 ) -> tuple[tuple[slice, slice], tuple[slice, slice], np.ndarray, np.ndarray]:
-    """Adds one thing to `blur` and `surface`, wherever it is the nearest.
-
-    Returns:
-        Its rows and columns in the frame and in itself, where it is seen there, and its tone.
-    """
+    """Adds one thing: its place in the frame and in itself, where it is seen, its tone."""
     size = blur.shape[0]
     side = int(rng.uniform(*sides) * size)
     top, left = (int(rng.integers(-side // 3, size - 2 * side // 3)) for _ in range(2))
@@ -277,7 +264,7 @@ def _add_highlights(rng: np.random.Generator, light: np.ndarray, surface: np.nda
     """Adds small discs of 5 to 100 times white to `light`, each on one thing only, at its depth."""
     size = surface.shape[0]
     for _ in range(int(rng.integers(3, 30))):
-        radius, value = rng.uniform(0.5, 3.0), log_uniform(rng, 5.0, 100.0)
+        radius, value = rng.uniform(0.5, 3.0), math.exp(rng.uniform(math.log(5.0), math.log(100.0)))
         y, x = rng.uniform(4.0, size - 5.0, 2)
         colour = np.exp2(rng.normal(0.0, 0.3, 3)) * [1.0, 0.0, 1.0] + [0.0, 1.0, 0.0]
         row, column = round(y), round(x)

@@ -33,7 +33,7 @@ _USUAL_EXPONENT = 20
 
 
 def read_radiance(path: str | Path) -> np.ndarray:
-    """Linear light of an .hdr or .exr file.
+    """Linear light of an .hdr or .exr file, (3, H, W) float32 of arbitrary scale.
 
     Values that are not light are repaired, and the repair is logged: NaN and negative values
     (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
@@ -42,14 +42,11 @@ def read_radiance(path: str | Path) -> np.ndarray:
         path: The file. Its primaries are taken to be sRGB's, as those files usually have; alpha and
             further channels are ignored; a file with luminance only is grey.
 
-    Returns:
-        (3, H, W) float32 of arbitrary scale, finite and at least 0.
-
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, holds no light or is neither kind, or claims more
-            pixels than `simulator.utils.files` allows for a file of its length.
+        ValueError: If the file cannot be read, holds no light, or claims more pixels than
+            `simulator.utils.files` allows for a file of its length.
     """
     path = as_path(path)
     if not path.is_file():
@@ -143,22 +140,18 @@ def perspective(
     field_of_view: float = FIELD_OF_VIEW,
     pitch: float = 0.0,
 ) -> np.ndarray:
-    """A pin-hole view into an equirectangular panorama (gnomonic projection).
+    """A pin-hole view (3, size, size) into an equirectangular panorama (gnomonic).
+
+    Sampled bilinearly at least as densely as the panorama has pixels, then box-averaged, so that
+    small lamps keep their energy.
 
     Args:
         panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
             latitudes from +90 degrees.
-        azimuth: Longitude of the view's middle [degrees].
+        azimuth, pitch: Longitude and latitude of the view's middle [degrees].
         size: Height and width of the view [pixels].
         field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
-        pitch: Angle of the view's middle above the horizon [degrees].
-
-    Returns:
-        (3, size, size) float32. Sampled bilinearly at least as densely as the panorama has
-        pixels, then box-averaged, so that small lamps keep their energy.
     """
-    if not 0.0 < field_of_view <= 150.0:
-        raise ValueError(f"`field_of_view` (={field_of_view!r}) must be in (0, 150] degrees")
     half = math.tan(math.radians(field_of_view) / 2.0)
     per_radian = panorama.shape[2] / (2.0 * math.pi)
     dense = max(1, math.ceil(per_radian / (size / (2.0 * half))))

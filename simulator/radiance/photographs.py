@@ -105,10 +105,6 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     Returns:
         (3, H, W) float32, at least 0; 1.0 at the photograph's white, above in the highlights.
     """
-    if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        raise ValueError(
-            f"`image` ({image.dtype}, shape {image.shape}) must be uint8, (H, W) or (H, W, 3)"
-        )
     colour = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
     codes = colour[:, :, :3].transpose(2, 0, 1).astype(np.float64)
     shown = np.clip((codes + rng.uniform(-0.5, 0.5, codes.shape)) / 255.0, 0.0, 1.0)

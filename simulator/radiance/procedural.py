@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from simulator.radiance.light import temperature_tint
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import check_word
 from simulator.utils.compute import kernel
 
 #: Part of every cache key: raise it with any change of the drawings.
@@ -75,16 +75,7 @@ def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np
 
 
 def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = None) -> np.ndarray:
-    """Reflectance of a dead-leaves picture.
-
-    Args:
-        rng: Source of all randomness.
-        size: Height and width [pixels].
-        style: Appearance of the leaves.
-
-    Returns:
-        (3, size, size) float32 reflectance in linear sRGB, in [0.005, 0.97].
-    """
+    """Reflectance of dead leaves, (3, size, size) float32 linear sRGB in [0.005, 0.97]."""
     style = LeafStyle() if style is None else style
     leaves = _draw_leaves(rng, size, style)
     label = paint_leaves(size, *leaves)
@@ -238,20 +229,15 @@ class Drawing:
 def draw(
     kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE, *, lens: bool = True
 ) -> Drawing:
-    """A picture of `kind`.
+    """A picture of `kind`, one of `list_kinds()`.
 
     Args:
-        kind: One of `list_kinds()`.
+        kind: Its kind.
         rng: Source of all randomness; the same state gives the same picture.
         size: Height and width [pixels].
         lens: Whether it has the softness of a lens; without, it is for a camera that has its own.
-
-    Raises:
-        ValueError: If there is no such kind; the message proposes the nearest name.
     """
-    if kind not in _KINDS:
-        hint = did_you_mean(kind, _KINDS)
-        raise ValueError(f"`kind` (={kind!r}) must be one of {list_kinds()}{hint}")
+    check_word("kind", kind, tuple(_KINDS))
     drawing = _KINDS[kind](rng, size)
     return replace(drawing, light=_lens(drawing.light)) if lens else drawing
 

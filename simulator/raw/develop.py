@@ -131,15 +131,11 @@ def render_srgb(
 
 
 def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
-    """Packed raws that `develop` turns into these pictures, without balance or colour matrix.
+    """Packed raws (B, 4, H, W) that `develop` turns into these pictures, without balance or matrix.
 
-    What a camera's own processing did besides (its tone curve, sharpening, compression) stays in.
-
-    Args:
-        pictures: (B, 3, H, W) sRGB, uint8 or floating point in [0, 1].
-
-    Returns:
-        (B, 4, H, W) float32 in [0, 1]: each pixel becomes a packed one, its planes at one place.
+    Each pixel becomes a packed one, its planes at one place. What a camera's own processing did
+    besides (its tone curve, sharpening, compression) stays in. `pictures` are (B, 3, H, W) sRGB,
+    uint8 or floating point in [0, 1].
 
     >>> picture = torch.tensor([0, 17, 118, 255], dtype=torch.uint8).expand(1, 3, 1, 4)
     >>> develop(develop_inverse(picture)).mul(255.0).round()[0, 0, 0]
@@ -211,11 +207,8 @@ def srgb_from_camera(colour_matrix: Matrix) -> torch.Tensor:
     So (1, 1, 1) maps to (1, 1, 1). This is what dcraw's ``cam_xyz_coeff`` does, and what the DNG
     specification 1.4, chapter 6, does for a scene lit by the matrix's own illuminant.
 
-    Args:
-        colour_matrix: (3, 3) XYZ (D65) to camera RGB, any positive scale.
-
     Raises:
-        ValueError: If it is not 3 x 3 and finite, or has no such inverse.
+        ValueError: If `colour_matrix` is not 3 x 3 and finite, or has no such inverse.
     """
     matrix = torch.as_tensor(colour_matrix, dtype=torch.float64)
     if matrix.shape != (3, 3) or not bool(torch.isfinite(matrix).all()):
@@ -268,13 +261,7 @@ def srgb_encode(linear: torch.Tensor) -> torch.Tensor:
 
 
 def demosaic_half(packed: torch.Tensor) -> torch.Tensor:
-    """RGB at half the sensor's resolution: R, the mean of both greens, B of each 2 x 2 tile.
-
-    Args:
-        packed: (B, 4, H, W), planes R, G1, G2, B, any range.
-
-    Returns:
-        (B, 3, H, W), dtype and device of `packed`.
+    """RGB (B, 3, H, W) at half the sensor's resolution: R, the mean of both greens, B of each tile.
 
     Nothing is interpolated, so noise stays white and no artefact can be mistaken for detail; R and
     B lie half a packed pixel apart, which nobody sees at this size.
@@ -291,19 +278,17 @@ def demosaic_half(packed: torch.Tensor) -> torch.Tensor:
 
 
 def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tensor:
-    """RGB at the sensor's resolution with the linear 5 x 5 filters of Malvar, He and Cutler.
+    """RGB (B, 3, 2H, 2W) with the linear 5 x 5 filters of Malvar, He and Cutler.
+
+    A missing colour is its bilinear estimate plus a share of the Laplacian of the colour that is
+    there: 1/2 for green, 5/8 at greens, 3/4 for red at blue and blue at red. The border is
+    mirrored about its last pixel, so every colour stays on its own rows and columns. The result may
+    overshoot the input's range at edges.
 
     Args:
         packed: (B, 4, H, W), planes R, G1, G2, B, H, W >= 2, floating point, any range. White
             balance it first: the filters take the planes' detail to be alike.
         cfa: Where in the 2 x 2 tile each plane lies.
-
-    Returns:
-        (B, 3, 2H, 2W), dtype and device of `packed`; it may overshoot the input's range at edges.
-
-    A missing colour is its bilinear estimate plus a share of the Laplacian of the colour that is
-    there: 1/2 for green, 5/8 at greens, 3/4 for red at blue and blue at red. The border is
-    mirrored about its last pixel, so every colour stays on its own rows and columns.
 
     Source: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
     Bayer-patterned color images", ICASSP 2004, figure 2.
@@ -337,9 +322,9 @@ def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tens
 def _neighbours(padded: torch.Tensor, row: int, column: int) -> tuple[torch.Tensor, ...]:
     """Sums over the 5 x 5 neighbourhood of every pixel at (row, column) of its tile.
 
-    Returns the centre; left + right and above + below at distance 1; the same at distance 2; the
-    four diagonals. Sums of shifted views, not a convolution: the same bits on every device and in
-    every batch, where a GPU's convolution would round to TF32.
+    The centre; left + right and above + below at distance 1; the same at 2; the four diagonals.
+    Sums of shifted views, not a convolution: the same bits on every device and in every batch,
+    where a GPU's convolution would round to TF32.
     """
     height, width = padded.shape[1] - 4, padded.shape[2] - 4
 
@@ -369,24 +354,18 @@ def _mirror(mosaic: torch.Tensor, dim: int) -> torch.Tensor:
 
 
 def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
-    """Light of a raw whose clipped planes are raised until the pixel is neutral.
+    """Light (4, H, W) float32 of a raw whose clipped planes are raised until the pixel is neutral.
 
     All planes clip at the same number, but the white of the scene is another number in each: a
     clipped lamp that is darkened as it was recorded turns pink. Here a clipped plane takes the mean
     level (value times white balance gain) of the pixel's unclipped planes, or twice the highest of
     all where every plane is clipped, if that is above white. Nothing is lowered, as a clipped value
-    is a lower bound of the light; pixels that are not saturated stay as they are.
+    is a lower bound of the light; pixels that are not `saturated`, (H, W), stay as they are, and
+    `raw.data` itself is returned where no plane has to be raised.
 
     On 92 views of radiance maps, clipped in 3 and 10 % of green, the chromaticity of partly clipped
     pixels is off by 0.029 in the mean (0.052 with the highest unclipped level, 0.088 as recorded),
     that of wholly clipped ones by 0.090 (0.263 as recorded).
-
-    Args:
-        raw: The raw.
-        saturated: (H, W) bool, its `RawImage.saturated`.
-
-    Returns:
-        (4, H, W) float32; `raw.data` itself where no plane has to be raised.
     """
     values = raw.data[:, saturated]  # (4, N)
     red, green, blue = raw.white_balance

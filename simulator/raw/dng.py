@@ -13,12 +13,12 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from enum import IntEnum
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import tifffile
+from tifffile import DATATYPE
 
 from simulator import __version__
 from simulator.raw.image import RawImage, unpack_mosaic
@@ -53,10 +53,7 @@ _STRIP_ROWS = 32
 class OwnRecord:
     """A note of `write_dng` in the EXIF comment: values that the standard tags would round.
 
-    Args:
-        settings: Exact exposure settings.
-        box_factor: Sensor pixels averaged per side into one pixel.
-        colour_matrix_source: Where the colour matrix comes from; empty for the neutral default.
+    The source of the colour matrix is empty for the neutral default.
     """
 
     settings: CameraSettings
@@ -65,13 +62,10 @@ class OwnRecord:
 
     def to_comment(self) -> bytes:
         """Value of the EXIF tag UserComment."""
-        fields = {
-            "iso": self.settings.iso,
-            "exposure_time": self.settings.exposure_time,
-            "f_number": self.settings.f_number,
-            "box_factor": self.box_factor,
-            "colour_matrix_source": self.colour_matrix_source,
-        }
+        names = ("iso", "exposure_time", "f_number")
+        fields = {name: getattr(self.settings, name) for name in names}
+        fields["box_factor"] = self.box_factor
+        fields["colour_matrix_source"] = self.colour_matrix_source
         return COMMENT_PREFIX + json.dumps(fields).encode("ascii")
 
 
@@ -116,61 +110,55 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
     make, model = camera.make, camera.model
     if model == "unknown":
         model = camera.name
+    aspect = raw.metadata.get("pixel_aspect", 1.0)
     unique = model if model.lower().startswith(make.lower()) else f"{make} {model}"
     return {
-        "NewSubfileType": Tag(TiffType.LONG, [0]),  # a full-resolution image
-        "ImageWidth": Tag(TiffType.LONG, [width]),
-        "ImageLength": Tag(TiffType.LONG, [height]),
-        "BitsPerSample": Tag(TiffType.SHORT, [16]),
-        "Compression": Tag(TiffType.SHORT, [_UNCOMPRESSED]),
-        "PhotometricInterpretation": Tag(TiffType.SHORT, [_COLOUR_FILTER_ARRAY]),
-        "Make": Tag(TiffType.ASCII, make),
-        "Model": Tag(TiffType.ASCII, model),
-        "Orientation": Tag(TiffType.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
-        "SamplesPerPixel": Tag(TiffType.SHORT, [1]),
-        "RowsPerStrip": Tag(TiffType.LONG, [height]),
-        "PlanarConfiguration": Tag(TiffType.SHORT, [1]),
-        "Software": Tag(TiffType.ASCII, f"{SOFTWARE_NAME} {__version__}"),
-        "DateTime": Tag(TiffType.ASCII, _date(raw)),
-        "CFARepeatPatternDim": Tag(TiffType.SHORT, [2, 2]),
-        "CFAPattern": Tag(TiffType.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),
-        "DNGVersion": Tag(TiffType.BYTE, [1, 4, 0, 0]),
-        "DNGBackwardVersion": Tag(TiffType.BYTE, [1, 1, 0, 0]),
-        "UniqueCameraModel": Tag(TiffType.ASCII, unique),
-        "CFAPlaneColor": Tag(TiffType.BYTE, [0, 1, 2]),
-        "CFALayout": Tag(TiffType.SHORT, [_RECTANGULAR]),
-        "WhiteLevel": Tag(TiffType.LONG, [round(camera.white_level)]),
-        "ColorMatrix1": Tag(TiffType.SRATIONAL, [v for row in matrix for v in row]),
-        "CalibrationIlluminant1": Tag(TiffType.SHORT, [D65]),
-        "AsShotNeutral": Tag(TiffType.RATIONAL, [_neutral(g) for g in raw.white_balance]),
-        "BaselineExposure": Tag(TiffType.SRATIONAL, [0.0]),
+        "NewSubfileType": Tag(DATATYPE.LONG, [0]),  # a full-resolution image
+        "ImageWidth": Tag(DATATYPE.LONG, [width]),
+        "ImageLength": Tag(DATATYPE.LONG, [height]),
+        "BitsPerSample": Tag(DATATYPE.SHORT, [16]),
+        "Compression": Tag(DATATYPE.SHORT, [_UNCOMPRESSED]),
+        "PhotometricInterpretation": Tag(DATATYPE.SHORT, [_COLOUR_FILTER_ARRAY]),
+        "Make": Tag(DATATYPE.ASCII, make),
+        "Model": Tag(DATATYPE.ASCII, model),
+        "Orientation": Tag(DATATYPE.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
+        "SamplesPerPixel": Tag(DATATYPE.SHORT, [1]),
+        "RowsPerStrip": Tag(DATATYPE.LONG, [height]),
+        "PlanarConfiguration": Tag(DATATYPE.SHORT, [1]),
+        "Software": Tag(DATATYPE.ASCII, f"{SOFTWARE_NAME} {__version__}"),
+        "DateTime": Tag(DATATYPE.ASCII, _date(raw)),
+        "CFARepeatPatternDim": Tag(DATATYPE.SHORT, [2, 2]),
+        "CFAPattern": Tag(DATATYPE.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),
+        "DNGVersion": Tag(DATATYPE.BYTE, [1, 4, 0, 0]),
+        "DNGBackwardVersion": Tag(DATATYPE.BYTE, [1, 1, 0, 0]),
+        "UniqueCameraModel": Tag(DATATYPE.ASCII, unique),
+        "CFAPlaneColor": Tag(DATATYPE.BYTE, [0, 1, 2]),
+        "CFALayout": Tag(DATATYPE.SHORT, [_RECTANGULAR]),
+        "WhiteLevel": Tag(DATATYPE.LONG, [round(camera.white_level)]),
+        "ColorMatrix1": Tag(DATATYPE.SRATIONAL, [v for row in matrix for v in row]),
+        "CalibrationIlluminant1": Tag(DATATYPE.SHORT, [D65]),
+        # A grey card's values: one over the gains, to the 12 digits that matter.
+        "AsShotNeutral": Tag(
+            DATATYPE.RATIONAL, [float(f"{1.0 / gain:.12g}") for gain in raw.white_balance]
+        ),
+        "BaselineExposure": Tag(DATATYPE.SRATIONAL, [0.0]),
         **_black_tags(raw),
-        **_scale_tags(raw),
+        **({} if aspect == 1.0 else {"DefaultScale": Tag(DATATYPE.RATIONAL, [aspect, 1])}),
         **_noise_tags(raw),
     }
-
-
-def _neutral(gain: float) -> float:
-    """A grey card's value in AsShotNeutral: one over the gain, to the 12 digits that matter."""
-    return float(f"{1.0 / gain:.12g}")
 
 
 def _black_tags(raw: RawImage) -> dict[str, Tag]:
     black = raw.camera.black_level
     whole = all(b == round(b) for b in black)
-    kind = TiffType.LONG if whole else TiffType.RATIONAL
+    kind = DATATYPE.LONG if whole else DATATYPE.RATIONAL
     values = [round(b) for b in black] if whole else list(black)
     if len(set(black)) == 1:
         return {"BlackLevel": Tag(kind, values[:1])}
     tile = [values[0]] * 4
     for value, (row, column) in zip(values, raw.camera.cfa.offsets, strict=True):
         tile[2 * row + column] = value
-    return {"BlackLevelRepeatDim": Tag(TiffType.SHORT, [2, 2]), "BlackLevel": Tag(kind, tile)}
-
-
-def _scale_tags(raw: RawImage) -> dict[str, Tag]:
-    aspect = raw.metadata.get("pixel_aspect", 1.0)
-    return {} if aspect == 1.0 else {"DefaultScale": Tag(TiffType.RATIONAL, [aspect, 1])}
+    return {"BlackLevelRepeatDim": Tag(DATATYPE.SHORT, [2, 2]), "BlackLevel": Tag(kind, tile)}
 
 
 def _noise_tags(raw: RawImage) -> dict[str, Tag]:
@@ -180,7 +168,7 @@ def _noise_tags(raw: RawImage) -> dict[str, Tag]:
     for planes in ((0,), (1, 2), (3,)):
         pairs += [float(np.mean([noise.shot[p] for p in planes]))]
         pairs += [float(np.mean([noise.read[p] for p in planes]))]
-    return {"NoiseProfile": Tag(TiffType.DOUBLE, pairs)}
+    return {"NoiseProfile": Tag(DATATYPE.DOUBLE, pairs)}
 
 
 def _exif_tags(raw: RawImage) -> dict[str, Tag]:
@@ -189,17 +177,17 @@ def _exif_tags(raw: RawImage) -> dict[str, Tag]:
     source = (camera.colour_matrix_source or "given") if camera.colour_matrix else ""
     record = OwnRecord(settings, raw.box_factor, source)
     return {
-        "ExposureTime": Tag(TiffType.RATIONAL, [settings.exposure_time]),
-        "FNumber": Tag(TiffType.RATIONAL, [settings.f_number]),
+        "ExposureTime": Tag(DATATYPE.RATIONAL, [settings.exposure_time]),
+        "FNumber": Tag(DATATYPE.RATIONAL, [settings.f_number]),
         # 65535 sends readers to RecommendedExposureIndex, which SensitivityType 2 announces.
-        "PhotographicSensitivity": Tag(TiffType.SHORT, [min(iso, 65535)]),
-        "SensitivityType": Tag(TiffType.SHORT, [2]),
-        "RecommendedExposureIndex": Tag(TiffType.LONG, [iso]),
-        "ExifVersion": Tag(TiffType.UNDEFINED, b"0230"),
-        "DateTimeOriginal": Tag(TiffType.ASCII, _date(raw)),
-        "DateTimeDigitized": Tag(TiffType.ASCII, _date(raw)),
-        "FocalLength": Tag(TiffType.RATIONAL, [float(raw.metadata.get("focal_length", 0.0))]),
-        "UserComment": Tag(TiffType.UNDEFINED, record.to_comment()),
+        "PhotographicSensitivity": Tag(DATATYPE.SHORT, [min(iso, 65535)]),
+        "SensitivityType": Tag(DATATYPE.SHORT, [2]),
+        "RecommendedExposureIndex": Tag(DATATYPE.LONG, [iso]),
+        "ExifVersion": Tag(DATATYPE.UNDEFINED, b"0230"),
+        "DateTimeOriginal": Tag(DATATYPE.ASCII, _date(raw)),
+        "DateTimeDigitized": Tag(DATATYPE.ASCII, _date(raw)),
+        "FocalLength": Tag(DATATYPE.RATIONAL, [float(raw.metadata.get("focal_length", 0.0))]),
+        "UserComment": Tag(DATATYPE.UNDEFINED, record.to_comment()),
     }
 
 
@@ -215,27 +203,11 @@ def _date(raw: RawImage) -> str:
 # -- TIFF -----------------------------------------------------------------------------------------
 
 
-class TiffType(IntEnum):
-    """Field types of TIFF 6.0."""
-
-    BYTE = 1
-    ASCII = 2
-    SHORT = 3
-    LONG = 4
-    RATIONAL = 5
-    UNDEFINED = 7
-    SRATIONAL = 10
-    DOUBLE = 12
-
-
-_FORMATS = {1: "B", 3: "H", 4: "I", 5: "I", 10: "i", 12: "d"}
-
-
 @dataclass(frozen=True)
 class Tag:
     """A field to write: its type and its values (rationals as numbers, text as ``str``)."""
 
-    type: TiffType
+    type: DATATYPE
     values: Sequence[float] | str | bytes
 
     def encode(self) -> tuple[int, bytes]:
@@ -246,10 +218,12 @@ class Tag:
         if isinstance(self.values, bytes):
             return len(self.values), self.values
         flat: list[Any] = list(self.values)
-        if self.type in (TiffType.RATIONAL, TiffType.SRATIONAL):
-            signed = self.type == TiffType.SRATIONAL
+        if self.type in (DATATYPE.RATIONAL, DATATYPE.SRATIONAL):
+            signed = self.type == DATATYPE.SRATIONAL
             flat = [part for v in flat for part in as_rational(v, signed=signed)]
-        return len(self.values), struct.pack(f"<{len(flat)}{_FORMATS[self.type]}", *flat)
+        return len(self.values), struct.pack(
+            f"<{len(flat)}{tifffile.TIFF.DATA_FORMATS[self.type][-1]}", *flat
+        )
 
 
 def as_rational(value: float, *, signed: bool = False) -> tuple[int, int]:
@@ -288,18 +262,14 @@ def _pack_directory(tags: Mapping[str, Tag], offset: int) -> bytes:
 
 
 def tiff_head(tags: Mapping[str, Tag], exif: Mapping[str, Tag], size: int) -> bytes:
-    """A little-endian TIFF file of one strip of pixels, up to where the strip begins.
+    """A little-endian TIFF file of one strip of `size` bytes, up to where the strip begins.
 
-    Args:
-        tags: Its directory. The position and length of the strip and of the EXIF directory are
-            filled in.
-        exif: Its EXIF directory.
-        size: Length of the strip [byte].
+    The positions of the strip and of the EXIF directory are filled in.
     """
 
     def directory(strip_at: int, exif_at: int) -> bytes:
         positions = {"StripOffsets": strip_at, "StripByteCounts": size, "ExifTag": exif_at}
-        own = {name: Tag(TiffType.LONG, [value]) for name, value in positions.items()}
+        own = {name: Tag(DATATYPE.LONG, [value]) for name, value in positions.items()}
         return _pack_directory({**tags, **own}, 8)
 
     exif_at = 8 + len(directory(0, 0))

@@ -105,6 +105,11 @@ class RawImage:
 def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
     """Bayer mosaic of digital numbers to a packed raw.
 
+    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
+
+        R  G1
+        G2 B
+
     Args:
         mosaic: (2H, 2W) digital numbers, any integer or float dtype. An odd last row or column is
             dropped.
@@ -112,11 +117,6 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
 
     Returns:
         (4, H, W) float32, planes R, G1, G2, B; black-subtracted, 1.0 at sensor white.
-
-    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
-
-        R  G1
-        G2 B
     """
     if mosaic.ndim != 2 or min(mosaic.shape) < 2:
         raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
@@ -142,11 +142,7 @@ def unpack_mosaic(
 ) -> np.ndarray:
     """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`.
 
-    Args:
-        data: The packed raw.
-        camera: See `pack_mosaic`.
-        first: First packed row of the part that is wanted.
-        last: Where that part ends; by default with the frame.
+    Of packed rows `first` to `last`, by default of all.
     """
     planes = data.detach().float().cpu().contiguous().numpy()
     _, height, width = planes.shape
@@ -224,15 +220,10 @@ def _split(row, left_black, left_span, right_black, right_span, left, right):  #
 
 @kernel()
 def pack_rows(mosaic, tile, black, span, first, planes):  # type: ignore[no-untyped-def]
-    """Fill rows of the planes (4, H, W) float32 from `first` on: ``(mosaic - black) / span``.
+    """Fill rows of `planes` (4, H, W) float32 from `first` on: ``(mosaic - black) / span``.
 
-    Args:
-        mosaic: (2R, 2W or more) digital numbers of those rows.
-        tile: (2, 2) plane at each position of the colour filter array.
-        black: (4,) float64.
-        span: (4,) float64, from black to white.
-        first: Row of the planes.
-        planes: Written to.
+    `mosaic` (2R, 2W or more) holds those rows, `tile` (2, 2) the plane at each position; `black`
+    and `span` are (4,) float64.
     """
     for y in range(len(mosaic) // 2):
         for row in range(2):
@@ -254,18 +245,7 @@ def _weave(left, left_black, left_span, right, right_black, right_span, white, r
 
 @kernel()
 def unpack_rows(planes, tile, black, span, white, first, last, mosaic):  # type: ignore[no-untyped-def]
-    """The inverse of `pack_rows`, rounded and clipped to [0, white]; in float32, as captures are.
-
-    Args:
-        planes: (4, H, W) float32.
-        tile: (2, 2) plane at each position of the colour filter array.
-        black: (4,) float32.
-        span: (4,) float32.
-        white: Largest number, float32.
-        first: Row of the planes.
-        last: Row of the planes.
-        mosaic: (2 (last - first), 2W) uint16, written to.
-    """
+    """The inverse of `pack_rows`, rounded and clipped to [0, white], in float32 as captures are."""
     for y in range(first, last):
         for row in range(2):
             p, q = tile[row]
@@ -275,15 +255,7 @@ def unpack_rows(planes, tile, black, span, white, first, last, mosaic):  # type:
 
 @kernel()
 def mark_saturated(planes, limits, first, last, marks):  # type: ignore[no-untyped-def]
-    """Mark the pixels of rows `first` to `last` where some plane reaches its limit.
-
-    Args:
-        planes: (4, H, W) float32.
-        limits: (4,) float32.
-        first: Row of the planes.
-        last: Row of the planes.
-        marks: (H, W) bool, written to.
-    """
+    """Set `marks` (H, W) in rows `first` to `last` where a plane reaches its limit (4,) float32."""
     r, g1, g2, b = limits
     for y in range(first, last):
         row = marks[y]

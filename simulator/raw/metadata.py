@@ -42,13 +42,8 @@ _NAMES = (
     *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),
     *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
-    *(
-        "StandardOutputSensitivity",
-        "DateTimeOriginal",
-        "FocalLength",
-        "UserComment",
-        "DefaultScale",
-    ),
+    *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
+    "DefaultScale",
 )
 _NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
@@ -60,14 +55,10 @@ _MAX_DIRECTORIES, _MAX_TAGS, _MAX_VALUES = 64, 4096, 2**18
 
 
 def read_directories(stream: BinaryIO) -> list[Directory]:
-    """The tags of all directories of a TIFF-structured file, SubIFDs and EXIF included.
+    """The tags of all directories of a TIFF-structured file, SubIFDs and EXIF included, in order.
 
-    Args:
-        stream: The file. At most a few megabytes of it are read, whatever it claims.
-
-    Returns:
-        One directory each that holds any of the tags above, in reading order. Damaged directories
-        and tags are left out; the list is empty if the file is not TIFF-structured.
+    At most a few megabytes of the file are read, whatever it claims. Damaged directories and tags
+    are left out; the list is empty if the file is not TIFF-structured.
     """
     head = _read_at(stream, 0, 8)
     form = {b"II": tifffile.TIFF.CLASSIC_LE, b"MM": tifffile.TIFF.CLASSIC_BE}.get(head[:2])
@@ -201,12 +192,7 @@ def is_raw_container(stream: BinaryIO) -> bool:
 
 
 def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple[str, str]:
-    """Make and model as the camera recorded them; ``("", "")`` where the file does not say.
-
-    Args:
-        stream: The file.
-        directories: Its TIFF directories, empty for other containers.
-    """
+    """Make and model as the camera recorded them; ``("", "")`` where the file does not say."""
     for tags in directories:
         if "Model" in tags:
             return str(tags.get("Make", ("",))[0]), str(tags["Model"][0])
@@ -270,7 +256,7 @@ def normalised_model(make: str, model: str) -> str:
 # -- the meaning of DNG tags that LibRaw does not pass on -----------------------------------------
 
 #: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
-_LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
+LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
 _EXPOSURE = {
     "iso": "RecommendedExposureIndex",
     "exposure_time": "ExposureTime",
@@ -307,12 +293,6 @@ def read_own_record(directories: Sequence[Directory]) -> OwnRecord | None:
     return OwnRecord(settings, min(max(1, box_factor), _MAX_BOX_FACTOR), source)
 
 
-def read_long_iso(directories: Sequence[Directory]) -> float | None:
-    """The ISO speed that does not fit EXIF's 16 bits, None where the file has none."""
-    values = (first_numbers(directories, name) for name in _LONG_ISO)
-    return next((float(v[0]) for v in values if v and v[0] > 0), None)
-
-
 def read_colour_matrix(
     directories: Sequence[Directory],
 ) -> tuple[tuple[float, float, float], ...] | None:
@@ -340,12 +320,11 @@ def read_colour_matrix(
 
 
 def read_noise_profile(directories: Sequence[Directory]) -> NoiseLevelFunction | None:
-    """The noise level function of a DNG's NoiseProfile, None if it has none.
+    """The noise level function of a DNG's NoiseProfile, None if it has none that can be one.
 
     The tag holds pairs (S, O), one for all colour planes or one per plane in the order of
     CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
-    (DNG specification 1.4). Values that cannot be a noise profile are ignored: negative slopes, and
-    variances that no capture has.
+    (DNG specification 1.4).
     """
     values = first_numbers(directories, "NoiseProfile")
     colours = first_numbers(directories, "CFAPlaneColor") or (0, 1, 2)
@@ -368,11 +347,8 @@ def read_black_level(
 ) -> tuple[float, float, float, float] | None:
     """Black level per plane R, G1, G2, B with its fraction; None for other forms of the tag.
 
-    Args:
-        directories: The file's.
-        cfa: Order of the colour filter array at `origin`.
-        origin: Row and column of the file's array where the mosaic begins. The tag's tile begins
-            at the corner of the ActiveArea (DNG specification 1.4).
+    `cfa` is the order at `origin`, the row and column of the file's array where the mosaic begins.
+    The tag's tile begins at the corner of the ActiveArea (DNG specification 1.4).
     """
     tags = next((tags for tags in directories if "BlackLevel" in tags), None)
     if tags is None or "BlackLevelDeltaH" in tags or "BlackLevelDeltaV" in tags:

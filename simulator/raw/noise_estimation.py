@@ -9,35 +9,12 @@ quantile of block variances, which withstands texture in most of a level's block
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 from simulator.utils.compute import kernel, parallel_ranges
-
-
-@kernel()
-def summed_area(image, total):  # type: ignore[no-untyped-def]
-    """Sum over all pixels above and to the left of each corner of a pixel.
-
-    Args:
-        image: (H, W), any number type.
-        total: (H + 1, W + 1) float64, written to.
-    """
-    height, width = image.shape
-    columns = np.zeros(width)
-    total[0] = 0.0
-    for y in range(height):
-        columns += image[y]
-        row, value = total[y + 1], 0.0
-        row[0] = 0.0
-        for x in range(width):
-            value += columns[x]
-            row[x + 1] = value
-
 
 _BLOCK, _STEP = 8, 4
 #: Share of each level's blocks that is used: those with the least slope.
@@ -54,15 +31,6 @@ _CLIPPED = 0.01
 #: Texture only adds: levels above the fit by more than this are left out (relative).
 _ENVELOPE, _INLIER = 0.05, 0.15
 _TINY = 1e-14
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """Statistics of the usable blocks of all planes, each (N,)."""
-
-    mean: np.ndarray
-    energy: np.ndarray  # mean square of the high-pass: the noise variance on a smooth surface
-    slope: np.ndarray  # spread of the four quarters' means
 
 
 def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
@@ -98,18 +66,18 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
     floor = float(planes.min())
     if np.mean(planes == floor) < 1e-3:
         floor = -np.inf  # the lowest value, not a clip
-    blocks = _block_statistics(planes, white, floor)
-    if len(blocks.mean) < _MIN_BLOCKS:
+    mean, energy, slope = _block_statistics(planes, white, floor)
+    if len(mean) < _MIN_BLOCKS:
         raise ValueError(
-            f"`data` (shape {tuple(planes.shape)}, {len(blocks.mean)} unclipped blocks) must have "
+            f"`data` (shape {tuple(planes.shape)}, {len(mean)} unclipped blocks) must have "
             f"at least {_MIN_BLOCKS} unclipped blocks of {_BLOCK} x {_BLOCK} to estimate the "
             "noise; give `nlf`"
         )
     shot, read = 0.0, 1.0
-    levels = _level_sets(blocks)
+    levels = _level_sets(mean, slope)
     for _ in range(3):
         # A level set spans a range of signals: correct for the change of the variance inside it.
-        level, variance, weight = _variance_by_level(blocks, levels, shot, read)
+        level, variance, weight = _variance_by_level(mean, energy, levels, shot, read)
         # Close to a clip the noise is cut off: leave out levels within three standard deviations.
         sigma = np.sqrt(variance)
         clear = (level + 3 * sigma < white) & (level - 3 * sigma > floor)
@@ -129,8 +97,22 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
+@kernel()
+def summed_area(image, total):  # type: ignore[no-untyped-def]
+    """Fill `total` (H + 1, W + 1) by the sums over all pixels above and to the left of a corner."""
+    height, width = image.shape
+    columns = np.zeros(width)
+    total[0] = 0.0
+    for y in range(height):
+        columns += image[y]
+        row, value = total[y + 1], 0.0
+        row[0] = 0.0
+        for x in range(width):
+            value += columns[x]
+            row[x + 1] = value
+
+
 def _sums(image: np.ndarray) -> np.ndarray:
-    """(H + 1, W + 1) sum over all pixels above and to the left of each corner of a pixel."""
     total = np.empty((image.shape[0] + 1, image.shape[1] + 1))
     summed_area(image, total)
     return total
@@ -149,8 +131,8 @@ def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.n
     return mean
 
 
-def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks:
-    """Overlapping blocks of all planes; the clipped ones are left out."""
+def _block_statistics(planes: np.ndarray, white: float, floor: float) -> list[np.ndarray]:
+    """`_blocks_of` all planes."""
     found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3] * len(planes)
 
     def look(first: int, last: int) -> None:
@@ -159,11 +141,15 @@ def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks
 
     if min(planes.shape[1:]) >= _BLOCK + 2:
         parallel_ranges(look, len(planes))
-    return _Blocks(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return [np.concatenate(parts) for parts in zip(*found, strict=True)]
 
 
 def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarray, ...]:
-    """Mean, energy and slope of the blocks of one plane; see `_Blocks`."""
+    """Statistics (N,) of the overlapping blocks of one plane that are not clipped.
+
+    The mean, the mean square of the high-pass (the noise variance on a smooth surface), and the
+    spread of the four quarters' means.
+    """
     # Immerkaer's [1 -2 1] x [1 -2 1]: blind to slopes and to curvature along one axis; over 6,
     # white noise has the same variance after it.
     rows = plane[:-2] - 2.0 * plane[1:-1] + plane[2:]
@@ -178,26 +164,21 @@ def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarra
     return _box_mean(total, _BLOCK)[keep], energy[keep], slope[keep]
 
 
-def _level_sets(blocks: _Blocks) -> list[np.ndarray]:
+def _level_sets(mean: np.ndarray, slope: np.ndarray) -> list[np.ndarray]:
     """The smooth blocks of equally populated levels, as indices."""
-    count = len(blocks.mean)
-    levels = int(np.clip(count // _BLOCKS_PER_LEVEL, 1, _MAX_LEVELS))
-    found = []
-    for members in np.array_split(np.argsort(blocks.mean, kind="stable"), levels):
-        slope = blocks.slope[members]
-        found.append(members[slope <= np.quantile(slope, _SMOOTH)])
-    return found
+    levels = int(np.clip(len(mean) // _BLOCKS_PER_LEVEL, 1, _MAX_LEVELS))
+    sets = np.array_split(np.argsort(mean, kind="stable"), levels)
+    return [own[slope[own] <= np.quantile(slope[own], _SMOOTH)] for own in sets]
 
 
 def _variance_by_level(
-    blocks: _Blocks, levels: list[np.ndarray], shot: float, read: float
+    mean: np.ndarray, energy: np.ndarray, levels: list[np.ndarray], shot: float, read: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Level, noise variance and number of blocks of each level set, each (L,)."""
-    expected = np.maximum(shot * np.maximum(blocks.mean, 0.0) + read, _TINY)
-    relative = blocks.energy / expected
+    relative = energy / np.maximum(shot * np.maximum(mean, 0.0) + read, _TINY)
     rows = []
     for smooth in levels:
-        level = float(blocks.mean[smooth].mean())
+        level = float(mean[smooth].mean())
         scale = max(shot * max(level, 0.0) + read, _TINY)
         variance = scale * np.quantile(relative[smooth], _QUANTILE) / _QUANTILE_OF_NOISE
         rows.append((level, max(float(variance), _TINY), len(smooth)))

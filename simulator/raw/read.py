@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -19,6 +19,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.dng import ORIENTATIONS, OwnRecord
 from simulator.raw.image import RawImage, pack_mosaic
 from simulator.raw.metadata import (
+    LONG_ISO,
     Directory,
     camera_identity,
     first,
@@ -30,7 +31,6 @@ from simulator.raw.metadata import (
     read_black_level,
     read_colour_matrix,
     read_directories,
-    read_long_iso,
     read_noise_profile,
     read_own_record,
 )
@@ -48,6 +48,7 @@ COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
 #: Compression of DNGs that LibRaw decodes: none, lossless JPEG, deflate; and GoPro's.
 _COMPRESSIONS, _VC5 = (1, 7, 8), 9
 _LETTERS = {0: "R", 1: "G", 2: "B"}
+_SETTINGS = ("iso", "exposure_time", "f_number")
 _DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
 #: What LibRaw raises; NotImplementedError is a RuntimeError.
 _LIBRAW_ERRORS = (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError)
@@ -56,10 +57,16 @@ _LIBRAW_ERRORS = (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError)
 class RawFileError(ValueError):
     """A file that is not a Bayer raw, or not a whole one; the message says what it is."""
 
-    @classmethod
-    def of(cls, path: Path, text: str) -> RawFileError:
-        """An error about the file at `path`, which is called by its name alone."""
-        return cls(f"`path` (={path.name!r}) {text}")
+
+@contextmanager
+def _errors_name(path: Path) -> Iterator[None]:
+    """Errors about the content of the file at `path` name it."""
+    try:
+        yield
+    except RawFileError as error:
+        raise RawFileError(f"`path` (={path.name!r}) {error}") from None
+    except OSError as error:
+        raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
 
 
 def read_raw(
@@ -110,33 +117,31 @@ def read_raw(
         missing = "is no ordinary file" if path.exists() else "does not exist"
         what = "is a folder" if path.is_dir() else missing
         raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
-    try:
+    with _errors_name(path):
         return _read(path, settings, camera, nlf)
-    except OSError as error:
-        raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Settings that a raw file states, without reading its pixels.
+    """``iso``, ``exposure_time`` [s] and ``f_number`` that a raw file states, where it does.
 
-    Returns:
-        ``iso``, ``exposure_time`` [s] and ``f_number``, of which those are missing that the file
-        does not state; the exposure time is the exact stop that the recorded one stands for.
+    No pixel is read; the exposure time is the exact stop that the recorded one stands for.
 
     Raises:
         RawFileError: (a `ValueError`) If the file is no raw that can be read.
     """
     path = as_path(path)
-    try:
+    with _errors_name(path):
         with path.open("rb") as stream:
             directories = read_directories(stream)
-    except OSError as error:
-        raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
-    own = read_own_record(directories)
-    if own is not None:
-        return {name: getattr(own.settings, name) for name in ("iso", "exposure_time", "f_number")}
-    stated = _stated_exposure(path, directories)
-    values = dict(zip(("iso", "exposure_time", "f_number"), map(float, stated), strict=True))
+        own = read_own_record(directories)
+        if own is not None:
+            return {name: getattr(own.settings, name) for name in _SETTINGS}
+        try:
+            with rawpy.imread(str(path)) as raw:
+                stated = _exposure(raw, directories)
+        except _LIBRAW_ERRORS as error:
+            raise _unreadable(error, directories) from None
+    values = dict(zip(_SETTINGS, map(float, stated), strict=True))
     known = {name: value for name, value in values.items() if np.isfinite(value) and value > 0}
     if "exposure_time" in known:
         known["exposure_time"] = snap_exposure_time(known["exposure_time"])
@@ -154,7 +159,7 @@ def _read(
         make, model = camera_identity(stream, directories)
         # LibRaw takes some headerless files for a camera's from their size alone.
         known_kind = bool(model) or is_raw_container(stream)
-    _check_structure(path, known_kind, directories)
+    _check_structure(directories, known_kind, path.stat().st_size)
     own = read_own_record(directories)
     with ExitStack() as opened:
         decoded = None if own is None else _decode_own_dng(path, directories, own)
@@ -164,11 +169,9 @@ def _read(
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
     if float(packed.max()) > _WHITE_TOLERANCE:
-        times, level = f"{float(packed.max()):.3g}", f"{profile.white_level:g}"
-        logger.warning(
-            f"{path.name}: its digital numbers reach {times} times white; its white level "
-            f"(={level}) is wrong: give `camera` with the right one"
-        )
+        text = "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: "
+        text += "give `camera` with the right one"
+        logger.warning(text, path.name, float(packed.max()), profile.white_level)
     box_factor = own.box_factor if own is not None else 1
     noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
@@ -191,48 +194,35 @@ def _read(
     )
 
 
-def _check_structure(path: Path, known_kind: bool, directories: Sequence[Directory]) -> None:
-    """Raises a `RawFileError` if the file cannot be a whole Bayer raw, as its structure tells."""
+def _check_structure(directories: Sequence[Directory], known_kind: bool, size: int) -> None:
+    """Raises unless a file of `size` bytes can be a whole Bayer raw, as its structure tells."""
     if not known_kind:
-        raise RawFileError.of(
-            path,
+        raise RawFileError(
             "must be a camera raw that LibRaw reads, but names no camera: it is a file of another "
             "kind, truncated or damaged; read a bare array with numpy.fromfile and "
-            "RawImage.from_mosaic",
+            "RawImage.from_mosaic"
         )
-    lost = missing_bytes(directories, os.stat(path).st_size)
+    lost = missing_bytes(directories, size)
     if lost:
-        raise RawFileError.of(
-            path,
-            f"must be a whole file, but its directory names {lost} bytes beyond its end: it is "
-            "truncated",
-        )
+        raise RawFileError(f"must be whole, but names {lost} bytes beyond its end: truncated")
     kinds = [tags.get("PhotometricInterpretation") for tags in directories]
     if (LINEAR_RAW,) in kinds and (COLOUR_FILTER_ARRAY,) not in kinds:
-        raise RawFileError.of(
-            path,
-            "must be a Bayer raw, but is a linear DNG: already demosaicked, its noise is no longer "
-            "per pixel",
-        )
+        raise RawFileError("must be a Bayer raw, but is a linear DNG: demosaicked already")
     for tags, kind in zip(directories, kinds, strict=True):
         if kind != (COLOUR_FILTER_ARRAY,):
             continue
         height, width = ((numbers(tags, n) or (0,))[0] for n in ("ImageLength", "ImageWidth"))
         pixels = numbers(tags, "StripOffsets") or numbers(tags, "TileOffsets")
         if min(height, width) < 1 or not pixels:
-            raise RawFileError.of(
-                path,
-                f"must hold an image, but its directory names {height:g} x {width:g} pixels at "
-                f"{tags.get('StripOffsets', 'no position')}: it is damaged",
-            )
+            found = f"{height:g} x {width:g} pixels at {tags.get('StripOffsets', 'no position')}"
+            raise RawFileError(f"must hold an image, but names {found}: it is damaged")
 
 
 def _settings(path: Path, exposure: Sequence[float], own: OwnRecord | None) -> CameraSettings:
     """Settings from the file: exact from our own DNGs, else as a camera records them."""
     if own is not None:
         return own.settings
-    iso, seconds, f_number = (float(v) for v in exposure)
-    values = {"iso": iso, "exposure_time": seconds, "f_number": f_number}
+    values = dict(zip(_SETTINGS, map(float, exposure), strict=True))
     missing = [k for k, v in values.items() if not (np.isfinite(v) and v > 0)]
     if missing:
         raise ValueError(
@@ -291,11 +281,8 @@ def _profile(
 
 def _match(make: str, model: str) -> CameraProfile | None:
     wanted = normalised_model(make, model)
-    for name in list_cameras():
-        profile = get_camera(name)
-        if normalised_model(profile.make, profile.model) == wanted:
-            return profile
-    return None
+    profiles = (get_camera(name) for name in list_cameras())
+    return next((p for p in profiles if normalised_model(p.make, p.model) == wanted), None)
 
 
 def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None:
@@ -372,8 +359,7 @@ def _decode_own_dng(
     tile = first_numbers(directories, "CFAPattern")
     letters = "".join(_LETTERS.get(int(colour), "?") for colour in tile)
     if letters not in {p.value for p in BayerPattern}:
-        raise RawFileError.of(
-            path,
+        raise RawFileError(
             f"must have a Bayer tile of 0 (R), 1 (G), 2 (B), but its CFAPattern is {tile}: damaged",
         )
     black = read_black_level(directories, BayerPattern(letters), (0, 0))
@@ -385,15 +371,13 @@ def _decode_own_dng(
     red, green, blue = neutral if known else (1.0, 1.0, 1.0)
     flips = {orientation: flip for flip, orientation in ORIENTATIONS.items()}
     orientation = next(iter(first_numbers(directories, "Orientation")), 1)
-    extra: dict[str, Any] = {"flip": flips.get(int(orientation), 0)}
-    moment = str((first(directories, "DateTimeOriginal") or ("",))[0])
+    moment = None
     with suppress(ValueError):  # blanks where it is not known
-        extra["datetime"] = datetime.strptime(moment.strip(), "%Y:%m:%d %H:%M:%S").isoformat()
+        text = str((first(directories, "DateTimeOriginal") or ("",))[0])
+        moment = datetime.strptime(text.strip(), "%Y:%m:%d %H:%M:%S")
     focal_length = next(iter(first_numbers(directories, "FocalLength")), 0.0)
-    if focal_length > 0:
-        extra["focal_length"] = float(focal_length)
     scale = first_numbers(directories, "DefaultScale")
-    extra |= _pixel_aspect(scale[0] / scale[1] if len(scale) == 2 and scale[1] > 0 else 1.0)
+    aspect = scale[0] / scale[1] if len(scale) == 2 and scale[1] > 0 else 1.0
     return _Decoded(
         mosaic=mosaic,
         cfa=BayerPattern(letters),
@@ -404,7 +388,7 @@ def _decode_own_dng(
         colour_matrix=read_colour_matrix(directories),
         colour_matrix_source=_DNG_MATRIX,
         exposure=(own.settings.iso, own.settings.exposure_time, own.settings.f_number),
-        extra=extra,
+        extra=_extra(flips.get(int(orientation), 0), moment, focal_length, aspect),
     )
 
 
@@ -424,7 +408,7 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
         order = "<u2" if stream.read(2) == b"II" else ">u2"
         strip = np.fromfile(stream, order, width * height, offset=start - 2)
     if strip.size < width * height:
-        raise RawFileError.of(path, "became shorter while it was read")
+        raise RawFileError("became shorter while it was read")
     return strip.reshape(height, width).astype(np.uint16, copy=False)
 
 
@@ -437,18 +421,18 @@ def _decode_with_libraw(
         # No pixel is decoded before one is asked for.
         bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, os.stat(path).st_size)
         if bomb:
-            raise RawFileError.of(path, bomb)
+            raise RawFileError(bomb)
         return _from_libraw(path, raw, directories)
     except _LIBRAW_ERRORS as error:
-        raise _unreadable(path, error, directories) from None
+        raise _unreadable(error, directories) from None
 
 
 def _from_libraw(path: Path, raw: rawpy.RawPy, directories: Sequence[Directory]) -> _Decoded:
     sizes = raw.sizes
     if raw.raw_type != rawpy.RawType.Flat:
         text = "must be a Bayer raw, but has every colour at every pixel (linear or Foveon)"
-        raise RawFileError.of(path, text)
-    indices = _tile_indices(path, raw)
+        raise RawFileError(text)
+    indices = _tile_indices(raw)
     cfa = BayerPattern("".join(raw.color_desc.decode()[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
     black = [float(raw.black_level_per_channel[i]) for i in order]
@@ -460,13 +444,9 @@ def _from_libraw(path: Path, raw: rawpy.RawPy, directories: Sequence[Directory])
     matrix, matrix_source = _colour_matrix(raw, directories)
     mosaic = raw.raw_image_visible
     if min(mosaic.shape) < 2:
-        raise RawFileError.of(path, "must hold an image, but is empty")
-    other, extra = raw.other, dict[str, Any](flip=int(sizes.flip))
-    if other.timestamp is not None and other.timestamp.timestamp() > 0:
-        extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
-    if np.isfinite(other.focal_length) and other.focal_length > 0:
-        extra["focal_length"] = float(other.focal_length)
-    extra |= _pixel_aspect(sizes.pixel_aspect)
+        raise RawFileError("must hold an image, but is empty")
+    moment = raw.other.timestamp
+    known = moment is not None and moment.timestamp() > 0
     return _Decoded(
         mosaic=mosaic,
         cfa=cfa,
@@ -477,11 +457,16 @@ def _from_libraw(path: Path, raw: rawpy.RawPy, directories: Sequence[Directory])
         colour_matrix=matrix,
         colour_matrix_source=matrix_source,
         exposure=_exposure(raw, directories),
-        extra=extra,
+        extra=_extra(
+            int(sizes.flip),
+            moment.replace(tzinfo=None) if known else None,
+            raw.other.focal_length,
+            sizes.pixel_aspect,
+        ),
     )
 
 
-def _tile_indices(path: Path, raw: rawpy.RawPy) -> list[int]:
+def _tile_indices(raw: rawpy.RawPy) -> list[int]:
     """LibRaw's colour indices of the 2 x 2 tile at the origin of the visible area."""
     try:
         pattern = raw.raw_pattern
@@ -489,7 +474,7 @@ def _tile_indices(path: Path, raw: rawpy.RawPy) -> list[int]:
         pattern = None
     shape = None if pattern is None else pattern.shape
     if shape == (6, 6):
-        raise RawFileError.of(path, "must be a Bayer raw, but has Fujifilm's X-Trans array")
+        raise RawFileError("must be a Bayer raw, but has Fujifilm's X-Trans array")
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
     description = raw.color_desc.decode()
     if shape == (2, 2):
@@ -501,7 +486,7 @@ def _tile_indices(path: Path, raw: rawpy.RawPy) -> list[int]:
         description = letters
     array = f"{description or 'monochrome'} in {shape or 'no'} tile"
     text = f"must be a Bayer raw (R, G, B in a 2 x 2 tile), but its colour array is {array}"
-    raise RawFileError.of(path, text)
+    raise RawFileError(text)
 
 
 def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
@@ -531,43 +516,41 @@ def _colour_matrix(
 
 
 def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory]) -> tuple[float, float, float]:
-    other = raw.other
-    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
-    return iso, other.shutter_speed, other.aperture
+    iso = raw.other.iso_speed
+    if iso == 65535:  # it does not fit EXIF's 16 bits
+        stated = (first_numbers(directories, name) for name in LONG_ISO)
+        iso = next((float(v[0]) for v in stated if v and v[0] > 0), iso)
+    return iso, raw.other.shutter_speed, raw.other.aperture
 
 
-def _stated_exposure(path: Path, directories: Sequence[Directory]) -> tuple[float, float, float]:
-    """ISO, exposure time [s] and f-number that a raw states; no pixel is decoded."""
-    try:
-        with rawpy.imread(str(path)) as raw:
-            return _exposure(raw, directories)
-    except _LIBRAW_ERRORS as error:
-        raise _unreadable(path, error, directories) from None
-
-
-def _unreadable(path: Path, error: Exception, directories: Sequence[Directory]) -> RawFileError:
+def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileError:
     """Why LibRaw cannot read a file that its directory does not call cut short."""
     tags = _mosaic_directory(directories)
     compression = next(iter(tags.get("Compression", ())), 1)
     if "WhiteLevel" in tags and compression not in _COMPRESSIONS:
         kind = " (VC-5, GoPro's)" if compression == _VC5 else ""
-        return RawFileError.of(
-            path,
+        return RawFileError(
             f"cannot be decoded: LibRaw lacks its compression, {compression}{kind}; convert it to "
-            "an uncompressed DNG",
+            "an uncompressed DNG"
         )
     reason = error.args[0] if error.args else error
     reason = reason.decode() if isinstance(reason, bytes) else reason
-    return RawFileError.of(
-        path,
-        f"must be a whole camera raw, but LibRaw cannot read it ({reason}): it is a file of "
-        "another kind, truncated or damaged",
-    )
+    rule = "it is a file of another kind, truncated or damaged"
+    return RawFileError(f"must be a camera raw, but LibRaw cannot read it ({reason}): {rule}")
 
 
-def _pixel_aspect(aspect: float) -> dict[str, float]:
-    """Entry of the metadata for pixels that are not square; 8 to 1 and beyond is damage."""
-    return {"pixel_aspect": float(aspect)} if aspect != 1.0 and 0.125 < aspect < 8.0 else {}
+def _extra(
+    flip: int, moment: datetime | None, focal_length: float, aspect: float
+) -> dict[str, Any]:
+    """Entries of the metadata; a pixel aspect of 8 to 1 and beyond is damage."""
+    extra: dict[str, Any] = {"flip": flip}
+    if moment is not None:
+        extra["datetime"] = moment.isoformat()
+    if np.isfinite(focal_length) and focal_length > 0:
+        extra["focal_length"] = float(focal_length)
+    if aspect != 1.0 and 0.125 < aspect < 8.0:
+        extra["pixel_aspect"] = float(aspect)
+    return extra
 
 
 def _mosaic_directory(directories: Sequence[Directory]) -> Directory:
@@ -603,5 +586,5 @@ def _white_level(
     if white <= max(black):
         levels = f"white {white:g}, black {tuple(black)}"
         text = f"must have a white level above its black levels, but says {levels}"
-        raise RawFileError.of(path, text)
+        raise RawFileError(text)
     return float(white)

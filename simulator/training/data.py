@@ -1,9 +1,4 @@
-"""Pairs of captures, and crops for the noise stage, as batches: the same step gives the same batch.
-
-A picture for the noise stage is light at the pitch of the photosites, seen through the colour
-filter array, or a recorded mosaic with little noise. Averages over k x k samples of a plane, as of
-a frame that was reduced, are among its crops.
-"""
+"""Pairs of captures, and crops for the noise stage, as batches: a step always gives the same."""
 
 from __future__ import annotations
 
@@ -30,8 +25,8 @@ from simulator.reference.sequences import Pair, Stage, draw_settings, select_pai
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.settings import CameraSettings, exposure_ratio
 
-#: Called with the number of scenes that are rendered, and of all.
-Progress = Callable[[int, int], None]
+#: Called with the share that is done, in [0, 1], and the latest values.
+Progress = Callable[[float, dict[str, float]], None]
 #: Samples averaged per side and plane, and how often.
 _AVERAGED = (1, 2, 3, 4, 6, 8)
 _AVERAGED_SHARE = (0.55, 0.2, 0.08, 0.07, 0.05, 0.05)
@@ -47,6 +42,10 @@ _WEIGHTS = {"radiance": 3.0, "photograph": 3.0, "leaves": 1.5, "linear": 0.7, "c
 _CLEAN_RATIO = 16.0
 
 _CLEAN = NoiseLevelFunction.zero()
+
+
+def no_progress(*_: object) -> None:
+    """Shows no progress."""
 
 
 class Batch(NamedTuple):
@@ -94,17 +93,8 @@ def draw_sequences(
 class ReferencePairs:
     """Pairs of one stage, photographed by the reference camera whenever they are asked for.
 
-    The pairs are chosen once, at construction. Light behind every aperture is rendered once; a
-    batch then costs the exposure and the noise of its crops. The noise is new every time: a pair
-    that is shown twice was photographed twice.
-
-    Args:
-        sequences: Scenes and settings.
-        camera: The body.
-        stage: Stage to train, see `simulator.reference.sequences.select_pairs`.
-        seed: Seed of pairs, crops and noise.
-        blurred_light: Rendered light to share between stages; filled as needed.
-        progress: Called while the light is rendered.
+    Light behind every aperture is rendered once, into `blurred_light`, which stages may share. The
+    noise is new every time: a pair that is shown twice was photographed twice.
 
     Raises:
         ValueError: If the sequences hold no pair for this stage.
@@ -118,7 +108,7 @@ class ReferencePairs:
         *,
         seed: int = 0,
         blurred_light: dict[tuple[str, int], Tensor] | None = None,
-        progress: Progress | None = None,
+        progress: Progress = no_progress,
     ) -> None:
         self.sequences, self.camera, self.stage, self.seed = sequences, camera, stage, seed
         self.pairs: list[Pair] = select_pairs(list(sequences), stage, camera.camera)
@@ -126,7 +116,16 @@ class ReferencePairs:
             raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
         self._blurred_light = {} if blurred_light is None else blurred_light
         self._defocus: dict[tuple[str, int], Tensor] = {}
-        self._render(progress)
+        wanted = {}
+        for pair in self.pairs:
+            sequence = sequences[pair.sequence]
+            for settings in (sequence.settings[pair.source], sequence.settings[pair.target]):
+                wanted[_light_key(sequence.scene, settings)] = sequence.scene, settings.f_number
+        for done, (key, (scene, f_number)) in enumerate(wanted.items()):
+            progress(done / len(wanted), {})
+            if key not in self._blurred_light:
+                self._blurred_light[key] = camera.blurred_light(scene, f_number)
+        progress(1.0, {})
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch:
         """The pairs of one step.
@@ -136,34 +135,11 @@ class ReferencePairs:
             size: Pairs.
             crop: Height and width of the crops [packed pixel].
             process: Rank among several processes, each of which gets pairs of its own.
-
-        Raises:
-            ValueError: If a scene is smaller than `crop`.
         """
-        words = [self.seed, len(self.stage), step, process]
-        rng = np.random.default_rng(words)
+        rng = np.random.default_rng([self.seed, len(self.stage), step, process])
         chosen = rng.integers(len(self.pairs), size=size)
         generator = noise_generator(self.seed, step, process, len(self.stage))
-        items = [self._pair(self.pairs[i], crop, rng, generator) for i in chosen]
-        return Batch(*(torch.stack([item[name] for item in items]) for name in Batch._fields))
-
-    def _render(self, progress: Progress | None) -> None:
-        wanted: dict[int, dict[int, CameraSettings]] = {}
-        for pair in self.pairs:
-            settings = self.sequences[pair.sequence].settings
-            for index in (pair.source, pair.target):
-                by_stop = wanted.setdefault(pair.sequence, {})
-                by_stop[settings[index].aperture_stop] = settings[index]
-        for done, (index, by_stop) in enumerate(sorted(wanted.items())):
-            if progress is not None:
-                progress(done, len(wanted))
-            scene = self.sequences[index].scene
-            for chosen in by_stop.values():
-                key = _light_key(scene, chosen)
-                if key not in self._blurred_light:
-                    self._blurred_light[key] = self.camera.blurred_light(scene, chosen.f_number)
-        if progress is not None:
-            progress(len(wanted), len(wanted))
+        return stacked([self._pair(self.pairs[i], crop, rng, generator) for i in chosen])
 
     def _pair(
         self, pair: Pair, crop: int, rng: np.random.Generator, generator: torch.Generator
@@ -174,12 +150,9 @@ class ReferencePairs:
         k = self.camera.box_factor
         height, width = (n // k for n in scene.size)
         if crop > min(height, width):
-            raise ValueError(
-                f"`crop` (={crop}) must not exceed the {height} x {width} pixels of scene "
-                f"{scene.scene_id!r}"
-            )
-        top = int(rng.integers(height - crop + 1))
-        left = int(rng.integers(width - crop + 1))
+            most = f"the {height} x {width} pixels of scene {scene.scene_id!r}"
+            raise ValueError(f"`crop` (={crop}) must not exceed {most}")
+        top, left = (int(rng.integers(n - crop + 1)) for n in (height, width))
         # The one symmetry of a mosaic: transposed, G1 and G2 change places. Mirrored, its planes
         # would lie where no photosites are.
         transposed = rng.random() < 0.5
@@ -197,28 +170,17 @@ class ReferencePairs:
 
         _, noisy = record(source)
         signal, sample = record(target)
-        nlf = self.camera.camera.nlf(source.iso).scaled(1.0 / k**2)
+        defocus = scene.scene_id, source.aperture_stop
+        if defocus not in self._defocus:
+            diameter = self.camera.blur_diameter(scene, source.effective_f_number)
+            self._defocus[defocus] = diameter
         return {
             "source": noisy,
             "target": self.camera.clip(signal, target.iso),
             "sample": sample,
-            "ratio": torch.tensor(exposure_ratio(source, target), dtype=torch.float32),
-            "shot": torch.tensor(nlf.shot),
-            "read": torch.tensor(nlf.read),
-            "f_source": torch.tensor(source.effective_f_number),
-            "f_target": torch.tensor(target.effective_f_number),
-            "parameters": torch.tensor(
-                [*settings_parameters(source), *settings_parameters(target)]
-            ),
-            "defocus": cut(self._blur(pair, source)),
+            "defocus": cut(self._defocus[defocus]),
+            **stated_fields(source, target, self.camera.camera.nlf(source.iso).scaled(1.0 / k**2)),
         }
-
-    def _blur(self, pair: Pair, settings: CameraSettings) -> Tensor:
-        scene = self.sequences[pair.sequence].scene
-        key = (scene.scene_id, settings.aperture_stop)
-        if key not in self._defocus:
-            self._defocus[key] = self.camera.blur_diameter(scene, settings.effective_f_number)
-        return self._defocus[key]
 
 
 def _light_key(scene: ReferenceScene, settings: CameraSettings) -> tuple[str, int]:
@@ -226,13 +188,29 @@ def _light_key(scene: ReferenceScene, settings: CameraSettings) -> tuple[str, in
     return scene.scene_id, 0 if scene.depth is None else settings.aperture_stop
 
 
+def stacked(items: list[dict[str, Tensor]]) -> Batch:
+    """A batch of pairs, each given by its fields."""
+    return Batch(*(torch.stack([item[name] for item in items]) for name in Batch._fields))
+
+
+def stated_fields(
+    source: CameraSettings, target: CameraSettings, nlf: NoiseLevelFunction
+) -> dict[str, Tensor]:
+    """The fields of a `Batch` that a pair's settings and its source's noise decide."""
+    return {
+        "ratio": torch.tensor(exposure_ratio(source, target), dtype=torch.float32),
+        "shot": torch.tensor(nlf.shot),
+        "read": torch.tensor(nlf.read),
+        "f_source": torch.tensor(source.effective_f_number),
+        "f_target": torch.tensor(target.effective_f_number),
+        "parameters": torch.tensor([*settings_parameters(source), *settings_parameters(target)]),
+    }
+
+
 def settings_parameters(settings: CameraSettings) -> tuple[float, float, float]:
     """Parameters for the baselines: log2 of ISO / 100, exposure time [s] and f-number."""
-    return (
-        math.log2(settings.iso / 100.0),
-        math.log2(settings.exposure_time),
-        math.log2(settings.effective_f_number),
-    )
+    values = settings.iso / 100.0, settings.exposure_time, settings.effective_f_number
+    return tuple(math.log2(value) for value in values)  # type: ignore[return-value]
 
 
 # -- crops of the noise stage ---------------------------------------------------------------------
@@ -257,22 +235,17 @@ class DetailPicture:
     light: Tensor
     nlf: NoiseLevelFunction = _CLEAN
 
-    def __post_init__(self) -> None:
-        if self.light.ndim != 3 or self.light.shape[0] not in (3, 4):
-            raise ValueError(
-                f"`light` (shape {tuple(self.light.shape)}) of {self.name!r} must be (3, H, W) "
-                "or (4, H, W)"
-            )
+    @property
+    def photosites(self) -> int:
+        """Samples per packed pixel and side: a recorded mosaic is packed already."""
+        return 1 if self.light.shape[0] == 4 else 2
 
 
 class NoiseBatch(NamedTuple):
     """B crops with and without noise.
 
-    Args:
-        noisy: (B, 4, H, W) as recorded: clipped, whole digital numbers where nothing is averaged.
-        clean: (B, 4, H, W) their light, clipped at white.
-        shot: (B, 4) slope of the noise variance.
-        read: (B, 4) noise variance at zero signal.
+    `noisy` (B, 4, H, W) is as recorded: clipped, whole digital numbers where nothing is averaged.
+    `clean` is its light, clipped at white. The noise variance is ``read + shot * clean``, (B, 4).
     """
 
     noisy: Tensor
@@ -282,12 +255,14 @@ class NoiseBatch(NamedTuple):
 
 
 class DetailCrops:
-    """Batches of the noise stage.
+    """Batches of the noise stage, at ISO 50 to 25,600 of one of the cameras.
+
+    Half of the crops have read noise of 0.4 to 7 times as much, as other sensors have. Averages
+    over k x k samples of a plane, as of a frame that was reduced, are among the crops.
 
     Args:
         pictures: Sources, at least one of 16 packed pixels a side or more.
-        cameras: Cameras whose noise is added, each at ISO 50 to 25,600; half of the crops have
-            read noise of 0.4 to 7 times as much, as other sensors have.
+        cameras: Cameras whose noise is added.
         seed: Seed of everything drawn.
     """
 
@@ -305,30 +280,17 @@ class DetailCrops:
         self._shares = weights / weights.sum()
         self.pairs = list(pictures)
         #: Side of the largest crop that there is [packed pixel].
-        self.largest = max(min(p.light.shape[1:]) // _photosites(p) for p in self.pairs)
+        self.largest = max(min(p.light.shape[1:]) // p.photosites for p in self.pairs)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> NoiseBatch:
-        """The crops of one step.
-
-        Args:
-            step: Number of the step.
-            size: Crops.
-            crop: Height and width of the crops [packed pixel].
-            process: Rank among several processes, each of which gets crops of its own.
-        """
+        """`size` crops of one step, see `ReferencePairs.batch`."""
         rng = np.random.default_rng([self.seed, 0xDE7A, step, process])
         generator = noise_generator(self.seed, step, process, 0xDE7A)
         items = [_recorded(*self._draw(crop, rng), generator) for _ in range(size)]
         return NoiseBatch(*(torch.stack(parts) for parts in zip(*items, strict=True)))
 
     def captures(self, index: int, count: int, crop: int) -> NoiseBatch:
-        """`count` captures of one crop, which differ by their noise.
-
-        Args:
-            index: Number of the crop.
-            count: Captures.
-            crop: Height and width [packed pixel].
-        """
+        """`count` captures of crop number `index`, which differ by their noise."""
         generator = noise_generator(self.seed, index, 0xCA9)
         drawn = self._draw(crop, np.random.default_rng([self.seed, 0xCA9, index]))
         items = [_recorded(*drawn, generator) for _ in range(count)]
@@ -339,9 +301,7 @@ class DetailCrops:
     ) -> tuple[Tensor, Tensor, Tensor, CameraProfile, int]:
         """Light, shot and read noise, camera and averaged samples of a crop."""
         if crop > self.largest:
-            raise ValueError(
-                f"`crop` (={crop}) must not exceed the largest picture, {self.largest}"
-            )
+            raise ValueError(f"`crop` (={crop}) must not exceed the largest, {self.largest}")
         while True:
             kind = self.kinds[int(rng.choice(len(self.kinds), p=self._shares))]
             picture = kind[int(rng.integers(len(kind)))]
@@ -351,7 +311,11 @@ class DetailCrops:
                 continue
             planes, nlf = made
             camera = self.cameras[int(rng.integers(len(self.cameras)))]
-            shot, read = _noise(camera, rng)
+            known = camera.nlf(float(np.exp2(rng.uniform(*_ISO))))
+            shot, read = np.array(known.shot), np.array(known.read)
+            if rng.random() < 0.5:  # a sensor like it
+                shot = shot * np.exp(rng.normal(0.0, 0.4))
+                read = read * np.exp(rng.uniform(-1.0, 2.0))
             shot, read = shot / k**2, read / k**2
             level = float(np.exp2(rng.uniform(*_LEVEL)))
             scale = level / max(float(planes.mean()), 1e-12)
@@ -364,22 +328,17 @@ class DetailCrops:
             return planes * scale, shots, reads, camera, k
 
 
-def _photosites(picture: DetailPicture) -> int:
-    """Samples of a picture per packed pixel and side: a recorded mosaic is packed already."""
-    return 1 if picture.light.shape[0] == 4 else 2
-
-
 def _planes(
     picture: DetailPicture, crop: int, k: int, rng: np.random.Generator
 ) -> tuple[Tensor, NoiseLevelFunction] | None:
     """A crop averaged by k, its mean arbitrary, and the noise in it; None if it is too small."""
-    mosaic, side = picture.light.shape[0] == 4, crop * k * _photosites(picture)
+    side = crop * k * picture.photosites
     height, width = picture.light.shape[1:]
     if side > min(height, width):
         return None
     top, left = (int(rng.integers(n - side + 1)) for n in (height, width))
     part = picture.light[:, top : top + side, left : left + side]
-    if mosaic:  # flipping packed planes would not be flipping the mosaic
+    if picture.photosites == 1:  # flipping packed planes would not be flipping the mosaic
         if rng.random() < 0.5:
             part = part.transpose(-2, -1)[[0, 2, 1, 3]]
         return average_planes(part, k), picture.nlf.scaled(1.0 / k**2)
@@ -402,16 +361,6 @@ def _other_colours(light: Tensor, rng: np.random.Generator) -> Tensor:
     gains = np.exp2([rng.uniform(-1.6, 0.4), 0.0, rng.uniform(-1.6, 0.4)])
     matrix = torch.from_numpy((mix * gains[:, None]).astype(np.float32))
     return torch.einsum("ij,jhw->ihw", matrix, light).clamp(min=0.0)
-
-
-def _noise(camera: CameraProfile, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(shot, read), each (4,) float64, of a camera at a random ISO, or of one like it."""
-    nlf = camera.nlf(float(np.exp2(rng.uniform(*_ISO))))
-    shot, read = np.array(nlf.shot), np.array(nlf.read)
-    if rng.random() < 0.5:
-        shot = shot * np.exp(rng.normal(0.0, 0.4))
-        read = read * np.exp(rng.uniform(-1.0, 2.0))
-    return shot, read
 
 
 def _recorded(

@@ -15,8 +15,9 @@ import functools
 import io
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -26,20 +27,20 @@ import torch
 from torch import Tensor, nn
 
 from simulator.camera import CameraProfile, get_camera
-from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
-from simulator.networks.noise_module import NoiseModule
+from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import Pair, any_pairs, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.data import Batch, settings_parameters
-from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, expose
+from simulator.training.data import Batch, no_progress, stacked, stated_fields
+from simulator.training.losses import expose
 from simulator.training.train import (
     SimulatorConfig,
     TrainingProgress,
     first_modules,
     make_accelerator,
     save_trained,
+    stage_loss,
     train_stage,
 )
 from simulator.utils.cache import LruCache
@@ -66,6 +67,9 @@ _LOW_ISO, _LOW_NOISE, _GREY = 400.0, 0.25, 0.119
 #: Most bytes of captures in memory; one of 4 x 512 x 768 takes 6 million.
 _CACHED = 2**31
 
+#: What the files do not state of a camera.
+_LAYOUT = attrgetter("name", "cfa", "black_level", "white_level")
+
 Balance = tuple[float, float, float]
 
 
@@ -73,13 +77,7 @@ Balance = tuple[float, float, float]
 
 
 def packed_camera(name: str) -> CameraProfile:
-    """The built-in camera `name` with the levels of the dataset, and its noise on that scale.
-
-    Args:
-        name: ``"nikon_z6"`` or ``"canon_70d"``.
-
-    Raises:
-        ValueError: If the dataset does not have the camera.
+    """The built-in camera ``"nikon_z6"`` or ``"canon_70d"`` with the levels of the dataset.
 
     >>> packed_camera("canon_70d").black_level
     (2048.0, 2048.0, 2048.0, 2048.0)
@@ -94,12 +92,7 @@ def packed_camera(name: str) -> CameraProfile:
 class PackedCapture:
     """One capture: a row of the table.
 
-    Args:
-        file: Its ``.npy`` file.
-        camera: The body.
-        settings: The exposure settings.
-        white_balance: Gains of R, G, B, green 1; None if not stated.
-        nlf: Noise as the row states it; None if it does not.
+    `white_balance` (gains, green 1) and `nlf` are None where the row does not state them.
     """
 
     file: Path
@@ -114,11 +107,10 @@ class PackedCapture:
         return self.nlf or self.camera.nlf(self.settings.iso)
 
     def read(self) -> RawImage:
-        """Read the capture from its file.
+        """Read the capture from its file; nothing pickled is loaded.
 
         Raises:
-            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers;
-                pickled objects are refused.
+            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers.
         """
         try:
             array = np.load(self.file, allow_pickle=False)
@@ -148,12 +140,7 @@ class PackedCapture:
 
 @dataclass(frozen=True)
 class CapturedSequence:
-    """Captures of one static scene with different settings.
-
-    Args:
-        name: Folder of the sequence.
-        captures: The captures in the order of the table, read when they are asked for.
-    """
+    """Captures of one static scene with different settings, in the order of the table."""
 
     name: str
     captures: tuple[PackedCapture, ...]
@@ -201,10 +188,8 @@ def _tables(name: str, folder: str | os.PathLike[str]) -> list[Path]:
 def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[CapturedSequence]:
     rows = _cells(table)
     if not set(COLUMNS) <= set(rows.columns):
-        raise ValueError(
-            f"`{table}` (columns: {', '.join(rows.columns) or 'none'}) must have the columns "
-            f"{', '.join(COLUMNS)}, and may have wb and noiseprofile"
-        )
+        found, needed = (", ".join(names) for names in (rows.columns, COLUMNS))
+        raise ValueError(f"`{table}` (columns: {found}) must have the columns {needed}")
     if camera is None:
         camera = "nikon_z6" if "wb" in rows.columns else "canon_70d"
     profile = packed_camera(camera) if isinstance(camera, str) else camera
@@ -225,10 +210,7 @@ def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[
     if lost:
         logger.warning("%s: %d of %d files are not there, %s", table, len(lost), len(rows), lost[0])
     if not captures:
-        raise ValueError(
-            f"`{table}` ({len(rows)} rows) must list .npy files that are there, as "
-            "SEQUENCE/NAME.npy or NAME.npy beside the table"
-        )
+        raise ValueError(f"`{table}` ({len(rows)} rows) must list .npy files that are there")
     return [CapturedSequence(name, tuple(own)) for name, own in captures.items()]
 
 
@@ -298,18 +280,14 @@ def _white_balances(table: Path) -> dict[PurePosixPath, Balance]:
 
 
 def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImage]) -> None:
-    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``.
+    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``, in a new folder.
 
     The table has the columns that the authors' script for the camera writes. It records an exposure
-    time as a camera does: one within 3 % of a nominal stop is read back as that stop.
-
-    Args:
-        folder: Where to; new or empty.
-        raws: At least one capture, all of one `packed_camera`: the files do not state levels.
+    time as a camera does: one within 3 % of a nominal stop is read back as that stop. All captures
+    must be of one `packed_camera`: the files do not state levels.
 
     Raises:
-        ValueError: If `folder` holds something already, there is no capture, or a camera is not
-            one that the dataset has.
+        ValueError: If `folder` holds something already, or `raws` is empty or of another camera.
     """
     folder = Path(folder).expanduser()
     if folder.exists() and any(folder.iterdir()):
@@ -317,12 +295,10 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
     if not raws:
         raise ValueError("`raws` (=[]) must hold at least one capture")
     name = raws[0].camera.name
-    known, nikon = _layout_of(packed_camera(name)), name == "nikon_z6"
+    known, nikon = packed_camera(name), name == "nikon_z6"
     for camera in (raw.camera for raw in raws):
-        if _layout_of(camera) != known:
-            raise ValueError(
-                f"`raws` (one of {_layout_of(camera)}) must all be of packed_camera({name!r})"
-            )
+        if _LAYOUT(camera) != _LAYOUT(known):
+            raise ValueError(f"`raws` (one of {_LAYOUT(camera)}) must all be of {_LAYOUT(known)}")
     rows: list[list[object]] = [[*COLUMNS, *(["wb"] if nikon else []), "noiseprofile"]]
     for index, raw in enumerate(raws):
         stem = f"capture_{index:03d}"
@@ -335,10 +311,6 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
     text = io.StringIO()
     csv.writer(text).writerows(rows)
     write_atomically(folder / PARAMETERS, text.getvalue())
-
-
-def _layout_of(camera: CameraProfile) -> tuple[Any, ...]:
-    return camera.name, camera.cfa.value, camera.black_level, camera.white_level
 
 
 def _profile_text(nlf: NoiseLevelFunction, *, colours: bool) -> str:
@@ -374,10 +346,8 @@ def split_dataset(
         return named[False], named[True]
     every = sorted(named[False] + named[True], key=lambda sequence: sequence.name)
     if len(every) < 2:
-        raise ValueError(
-            f"`folder` (={str(folder)!r}) must hold two sequences or more, of two captures or "
-            f"more each, to train on one and measure on another; it holds {len(every)}"
-        )
+        rule = f"must hold two sequences of two captures or more; it holds {len(every)}"
+        raise ValueError(f"`folder` (={str(folder)!r}) {rule}")
     count = max(1, round(TEST_SHARE * len(every)))
     held_out = set(np.random.default_rng(seed).permutation(len(every))[:count].tolist())
     train = [sequence for index, sequence in enumerate(every) if index not in held_out]
@@ -387,32 +357,24 @@ def split_dataset(
 def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pair]:
     """The pairs that a stage is trained on (paper, section 4.2).
 
-    Args:
-        sequences: The sequences to choose from.
-        stage: ``"exposure"`` or ``"baseline"``: any two captures of a sequence. ``"noise"``: the
-            same f-number, a target at ISO 400 or less with at most a quarter of the source's noise
-            variance at mid grey. ``"aperture"``: a target that is more open, and for a tenth of
-            the pairs one that is as open.
+    ``"exposure"`` and ``"baseline"``: any two captures of a sequence. ``"noise"``: the same
+    f-number, a target at ISO 400 or less with at most a quarter of the source's noise variance at
+    mid grey. ``"aperture"``: a target that is more open, and for a tenth of the pairs one that is
+    as open.
 
     Raises:
         ValueError: If there is no such pair.
     """
     pairs = opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
     if stage == "noise":
-        pairs = [p for p in pairs if _is_cleaner(*_captures(sequences, p))]
+        pairs = [pair for pair in pairs if _is_cleaner(sequences[pair.sequence], pair)]
     if not pairs:
         raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
     return pairs
 
 
-def _captures(
-    sequences: Sequence[CapturedSequence], pair: Pair
-) -> tuple[PackedCapture, PackedCapture]:
-    captures = sequences[pair.sequence].captures
-    return captures[pair.source], captures[pair.target]
-
-
-def _is_cleaner(source: PackedCapture, target: PackedCapture) -> bool:
+def _is_cleaner(sequence: CapturedSequence, pair: Pair) -> bool:
+    source, target = sequence.captures[pair.source], sequence.captures[pair.target]
     if source.settings.aperture_stop != target.settings.aperture_stop:
         return False
     exposed = source.noise.exposed(exposure_ratio(source.settings, target.settings))
@@ -424,13 +386,7 @@ def _is_cleaner(source: PackedCapture, target: PackedCapture) -> bool:
 
 
 class CapturedPairs:
-    """Pairs of one stage; the same step gives the same batch.
-
-    Args:
-        sequences: Real captures.
-        stage: See `captured_pairs`.
-        seed: Seed of pairs and crops.
-    """
+    """Pairs of one stage of `captured_pairs`; the same step gives the same batch."""
 
     def __init__(self, sequences: Sequence[CapturedSequence], stage: str, *, seed: int = 0) -> None:
         self.sequences, self.stage, self.seed = sequences, stage, seed
@@ -449,31 +405,24 @@ class CapturedPairs:
         for item in items:  # pictures of several sizes: what they have in common
             for name in ("source", "target", "sample", "defocus"):
                 item[name] = item[name][..., : smallest[0], : smallest[1]]
-        return Batch(*(torch.stack([item[name] for item in items]) for name in Batch._fields))
+        return stacked(items)
 
     def _pair(self, pair: Pair, crop: int, rng: np.random.Generator) -> dict[str, Tensor]:
-        source, target = _captures(self.sequences, pair)
+        captures = self.sequences[pair.sequence].captures
+        source, target = captures[pair.source], captures[pair.target]
         light, sample = self._read(source), self._read(target)
         top, left = (int(rng.integers(max(n - crop, 0) + 1)) for n in light.shape[1:])
         light, sample = (
             t[:, top : top + crop, left : left + crop].clamp(max=1.0) for t in (light, sample)
         )
         if light.shape != sample.shape:
-            raise ValueError(
-                f"`{target.file}` must be as large as the other captures of its sequence"
-            )
-        settings, nlf = (source.settings, target.settings), source.noise
+            raise ValueError(f"`{target.file}` must be as large as the others of its sequence")
         return {
             "source": light,
             "target": sample,
             "sample": sample,
-            "ratio": torch.tensor(exposure_ratio(*settings), dtype=torch.float32),
-            "shot": torch.tensor(nlf.shot),
-            "read": torch.tensor(nlf.read),
-            "f_source": torch.tensor(settings[0].effective_f_number),
-            "f_target": torch.tensor(settings[1].effective_f_number),
-            "parameters": torch.tensor([v for s in settings for v in settings_parameters(s)]),
             "defocus": torch.zeros(light.shape[1:]),  # not known, and not used
+            **stated_fields(source.settings, target.settings, source.noise),
         }
 
     def _read(self, capture: PackedCapture) -> Tensor:
@@ -485,14 +434,11 @@ class CapturedPairs:
 
 
 class CapturedNoiseLoss(nn.Module):
-    """L1 of the exposed and denoised source against the target, as in the paper.
+    """L1 of the exposed and denoised source against the target; pixels above 0.99 do not count."""
 
-    Source pixels above 0.99 are left out.
-    """
-
-    def __init__(self, exposure: ExposureModule, noise: NoiseModule) -> None:
+    def __init__(self, modules: Any) -> None:
         super().__init__()
-        self.exposure, self.noise = exposure, noise
+        self.exposure, self.noise = modules["exposure"], modules["noise"]
 
     def forward(self, batch: Batch) -> Mapping[str, Tensor]:
         """The loss on `batch`, and the error relative to not denoising."""
@@ -512,20 +458,12 @@ def train_on_captures(
     *,
     command: str,
     device: str = "cpu",
-    progress: TrainingProgress | None = None,
+    progress: TrainingProgress = no_progress,
 ) -> Path:
-    """Trains the stages of `config` on real captures and writes the weights with their card.
+    """Trains the stages of `config` on real captures, as `train_and_save` does on simulated ones.
 
-    A stage that is done or half done resumes from its checkpoint.
-
-    Args:
-        config: A training of preset ``"paper"``, ``"pc"`` or ``"dl"``; its camera, body and scenes
-            do not matter.
-        sequences: To train on.
-        path: File name of the weights; checkpoints go into its folder.
-        command: The command line that does it again, for the card.
-        device: ``"cpu"`` or ``"cuda"``.
-        progress: Called every few steps.
+    The preset is ``"paper"``, ``"pc"`` or ``"dl"``; camera, body and scenes of `config` do not
+    matter.
 
     Returns:
         The file of the weights.
@@ -535,35 +473,25 @@ def train_on_captures(
     """
     check_word("preset", config.preset, ("paper", "pc", "dl"))
     accelerator = make_accelerator(config, device, None)
-    made, start = first_modules(config)
-    modules: Any = made
-    losses: dict[str, Callable[[], nn.Module]] = {
-        "exposure": lambda: ExposureLoss(modules["exposure"]),
-        "noise": lambda: CapturedNoiseLoss(modules["exposure"], modules["noise"]),
-        "aperture": lambda: ApertureLoss(*(modules[name] for name in STAGES[:3])),
-        "baseline": lambda: BaselineLoss(modules["baseline"]),
-    }
+    modules, start = first_modules(config)
     names = [name for name in STAGES if name in config.stages()]
     stages: dict[str, dict[str, Any]] = {}
+    values, known = config.card(), [sequence.name for sequence in sequences]
     for number, name in enumerate(names, start=1):
         pairs = CapturedPairs(sequences, name, seed=config.seed)
-        values = config.card()
+        entries = ("preset", "seed", "precision", *names[:number])
         clock = train_stage(
             name,
-            losses[name](),
+            CapturedNoiseLoss(modules) if name == "noise" else stage_loss(name, modules),
             modules[name],
             pairs,
             config.stages()[name],
             accelerator,
             checkpoint=path.parent / f"{name}.checkpoint",
-            identity=[
-                {key: values[key] for key in ("preset", "seed", "precision", *names[:number])},
-                start,
-                [sequence.name for sequence in sequences],
-            ],
-            progress=None if progress is None else functools.partial(progress, name),
+            identity=[{entry: values[entry] for entry in entries}, start, known],
+            progress=functools.partial(progress, name),
         )
         stages[name] = clock.card(len(pairs.pairs))
     done = {"start": start, "sequences": len(sequences), "stages": stages}
-    save_trained(path, made, config, command, **done)
+    save_trained(path, modules, config, command, **done)
     return sibling(path, ".safetensors")

@@ -1,8 +1,7 @@
 """Scenes for the reference camera, and pictures of real detail, that train and test the networks.
 
-All of it is light at the pitch of the photosites: procedural scenes, dead leaves, charts and smooth
-shading are drawn there; photographs, radiance maps and raws of a folder of real files (see
-docs/networks.md) are cut out at it and never enlarged.
+All of it is light at the pitch of the photosites: some is drawn there; photographs, radiance maps
+and raws of a folder of real files (see docs/networks.md) are cut out at it and never enlarged.
 
 The split by source group is fixed: drawn groups by their index, files by name (`detail_split`). The
 same place, subject or photographer's series is in one split only, and the scenes of a split stay
@@ -18,7 +17,7 @@ import logging
 import math
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -34,12 +33,7 @@ from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.thin_lens import Lens
 from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
-from simulator.radiance.light import (
-    camera_light,
-    mean_anchor,
-    reference_settings,
-    temperature_tint,
-)
+from simulator.radiance.light import camera_light, mean_anchor, reference_settings, temperature_tint
 from simulator.radiance.maps import (
     AZIMUTHS,
     EV100_RANGE,
@@ -61,29 +55,27 @@ logger = logging.getLogger(__name__)
 Split = Literal["train", "validation", "test"]
 
 #: Index of the first procedural group of each split.
+#: Index of the first procedural group of each split.
 FIRST_INDEX = {"train": 0, "validation": 100_000, "test": 200_000}
 #: Groups whose split was fixed before the hash decided; all others follow `detail_split`.
 _FIXED: dict[Split, tuple[str, ...]] = {
-    "train": ("bridge", "dawn", "forest", "lobby"),
+    "train": (
+        *("bridge", "dawn", "forest", "lobby"),
+        *("colour_checker", "pantone_strip", "gopro_courtyard"),
+    ),
     "validation": ("StillLife", "city"),
-    "test": ("Desk", "apartment", "lab", "park", "sunset", "venice", "warehouse"),
+    "test": ("Desk", "apartment", "lab", "park", "sunset", "venice", "warehouse", "camera_box"),
 }
-#: Folders of radiance maps and of photographs.
-_MAP_FOLDERS, _PHOTOGRAPH_FOLDER = ("hdri_pool", "hdri_cc0", "openexr_bsd"), "photo_pool"
+#: Folders of radiance maps.
+_MAP_FOLDERS = ("hdri_pool", "hdri_cc0", "openexr_bsd")
 #: Shares of the source groups: training, validation; the rest tests.
 _TRAIN, _VALIDATION = 0.62, 0.70
-#: Raws of known subjects: file name (its beginning) to group and split.
-_RAWS: dict[str, tuple[str, Split]] = {
-    "CRW_0101": ("colour_checker", "train"),
-    "CRW_0104": ("colour_checker", "train"),
-    "CRW_0105": ("colour_checker", "train"),
-    "CRW_0112": ("pantone_strip", "train"),
-    "CRW_0113": ("pantone_strip", "train"),
-    "CRW_0117": ("camera_box", "test"),
-    "CRW_0118": ("camera_box", "test"),
-    "CRW_0119": ("camera_box", "test"),
-    "GOPR0024": ("gopro_courtyard", "train"),
-    "GOPR9231": ("gopro_courtyard", "train"),
+#: Raws of known subjects: beginning of the file name by group.
+_RAWS = {
+    "colour_checker": ("CRW_0101", "CRW_0104", "CRW_0105"),
+    "pantone_strip": ("CRW_0112", "CRW_0113"),
+    "camera_box": ("CRW_0117", "CRW_0118", "CRW_0119"),
+    "gopro_courtyard": ("GOPR0024", "GOPR9231"),
 }
 #: Brightest light of a picture, in its medians: lamps beyond it would be all that a mean shows.
 _BRIGHTEST = 64.0
@@ -141,26 +133,31 @@ def detail_split(group: str) -> Split:
 def detail_pictures(
     split: Split, *, data: Path | None, drawn: int | None = None, seed: int = 0
 ) -> list[DetailPicture]:
-    """The pictures of a split.
+    """The pictures of a split: of the folder of real files `data`, if given, and drawn ones.
 
-    Args:
-        split: ``"train"``, ``"validation"`` or ``"test"``.
-        data: Folder of real files; None uses drawn pictures only. What is missing in it is logged.
-        drawn: Dead leaves, and as many charts and smooth pictures; 60 to train on, else 8.
-        seed: Seed of the drawn pictures.
-
-    Raises:
-        ValueError: If `split` is no split.
+    Of each kind (dead leaves, charts, smooth pictures) `drawn` are drawn; 60 to train on, else 8.
+    What is missing in the folder is logged.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     pictures: list[DetailPicture] = []
     if data is None:
         logger.warning("no folder of real files (AE_ENV_DATA): training on drawn pictures only")
     else:
-        pictures += _maps(data, split)
+        for path, group in radiance_files(data, split):
+            light = read_radiance(path)
+            light = light / max(float(np.median(light[1])), 1e-6 * float(light.max()))
+            clipped = torch.from_numpy(np.minimum(light, _BRIGHTEST))
+            pictures.append(DetailPicture(path.stem, group, "radiance", clipped))
         pictures += photograph_pictures(data, split)
         pictures += recorded_mosaics(data, split)
-        pictures += _linear(data, split)
+        for path, group in _files(data, "intel_tau_small", (".png",), split):
+            import cv2
+
+            frame = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            light = np.ascontiguousarray(frame[:, :, ::-1].transpose(2, 0, 1), np.float32)
+            pictures.append(
+                DetailPicture(path.stem, group, "linear", torch.from_numpy(light / 65535.0))
+            )
     pictures += _drawings(split, _DRAWN[split] if drawn is None else drawn, seed)
     return pictures
 
@@ -168,74 +165,51 @@ def detail_pictures(
 def radiance_files(data: Path, split: Split) -> Iterator[tuple[Path, str]]:
     """Radiance maps of a split, each with its source group."""
     for folder in _MAP_FOLDERS:
-        for path in _files(data / folder, RADIANCE_SUFFIXES):
-            group = _groups(data).get(path.name, path.stem)
-            if detail_split(group) == split:
-                yield path, group
-
-
-def _maps(data: Path, split: Split) -> Iterator[DetailPicture]:
-    for path, group in radiance_files(data, split):
-        light = read_radiance(path)
-        light = light / max(float(np.median(light[1])), 1e-6 * float(light.max()))
-        clipped = torch.from_numpy(np.minimum(light, _BRIGHTEST))
-        yield DetailPicture(path.stem, group, "radiance", clipped)
+        yield from _files(data, folder, RADIANCE_SUFFIXES, split)
 
 
 def photograph_pictures(data: Path, split: Split) -> Iterator[DetailPicture]:
     """Photographs of a split, unprocessed to linear light, 1.0 at the photograph's white."""
-    for path in _files(data / _PHOTOGRAPH_FOLDER, (".jpg", ".png")):
-        group = _groups(data).get(path.name, path.stem)
-        if detail_split(group) == split:
-            rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
-            with Image.open(path) as picture:
-                light = unprocess(np.asarray(picture.convert("RGB")), rng)
-            yield DetailPicture(path.stem, group, "photograph", torch.from_numpy(light))
+    for path, group in _files(data, "photo_pool", (".jpg", ".png"), split):
+        rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
+        with Image.open(path) as picture:
+            light = unprocess(np.asarray(picture.convert("RGB")), rng)
+        yield DetailPicture(path.stem, group, "photograph", torch.from_numpy(light))
 
 
 def recorded_mosaics(data: Path, split: Split) -> Iterator[DetailPicture]:
     """Raws of real sensors at low ISO, of a split."""
-    for path in _files(data / "canon_crw_cc0", (".CRW",)):
-        group, belongs = _RAWS.get(path.stem, (path.stem, detail_split(path.stem)))
-        if belongs == split:
-            raw = read_raw(path)
-            yield DetailPicture(path.stem, group, "mosaic", raw.data, raw.noise)
+    for path, group in _files(data, "canon_crw_cc0", (".CRW",), split):
+        raw = read_raw(path)
+        yield DetailPicture(path.stem, group, "mosaic", raw.data, raw.noise)
     description = data / "gopro_raw" / "meta.json"
     if not description.is_file():
         return
-    for name, meta in json.loads(description.read_text(encoding="utf-8")).items():
-        group, belongs = _RAWS.get(name.partition("_")[0], (name, detail_split(name)))
-        if belongs != split:
-            continue
-        with Image.open(description.parent / name) as picture:
+    described = json.loads(description.read_text(encoding="utf-8"))
+    for path, group in _files(data, "gopro_raw", (".png",), split):
+        meta = described[path.name]
+        with Image.open(path) as picture:
             mosaic = np.asarray(picture).astype(np.float32)
-        planes = np.stack([mosaic[i::2, j::2] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))])
+        planes = np.stack([mosaic[i::2, j::2] for i in (0, 1) for j in (0, 1)])
         black = np.array(meta["black"], np.float32)[:, None, None]
         light = torch.from_numpy((planes - black) / (meta["white"] - black))
         slope, offset = (float(v) for v in meta["dng_tags"]["NoiseProfile"].strip("()").split(","))
-        yield DetailPicture(
-            name, group, "mosaic", light, NoiseLevelFunction((slope,) * 4, (offset,) * 4)
-        )
+        noise = NoiseLevelFunction((slope,) * 4, (offset,) * 4)
+        yield DetailPicture(path.name, group, "mosaic", light, noise)
 
 
-def _linear(data: Path, split: Split) -> Iterator[DetailPicture]:
-    """Demosaicked linear frames."""
-    for path in _files(data / "intel_tau_small", (".png",)):
-        if detail_split(path.stem) == split:
-            import cv2
-
-            image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
-            light = image[:, :, ::-1].transpose(2, 0, 1).astype(np.float32) / 65535.0
-            yield DetailPicture(
-                path.stem, path.stem, "linear", torch.from_numpy(np.ascontiguousarray(light))
-            )
-
-
-def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    files = sorted(p for p in folder.glob("*") if p.suffix in suffixes)
+def _files(
+    data: Path, folder: str, suffixes: tuple[str, ...], split: Split
+) -> Iterator[tuple[Path, str]]:
+    """Files of a split in a folder of `data`, each with its source group."""
+    files = sorted(p for p in (data / folder).glob("*") if p.suffix in suffixes)
     if not files:
-        logger.warning("no %s files in %s: they are left out", " or ".join(suffixes), folder)
-    return files
+        logger.warning("no %s files in %s: they are left out", " or ".join(suffixes), data / folder)
+    for path in files:
+        group = _groups(data).get(path.name, path.stem)
+        group = next((g for g, names in _RAWS.items() if path.name.startswith(names)), group)
+        if detail_split(group) == split:
+            yield path, group
 
 
 @cache
@@ -252,12 +226,11 @@ def _groups(data: Path) -> dict[str, str]:
 
 
 def _drawings(split: Split, number: int, seed: int) -> Iterator[DetailPicture]:
+    first = FIRST_INDEX[split]
     for kind, make in (("leaves", _leaves), ("chart", _chart), ("smooth", _smooth)):
         for index in range(number):
-            name = f"{kind}-{seed}-{FIRST_INDEX[split] + index:06d}"
-            rng = np.random.default_rng(
-                [zlib.crc32(kind.encode()), seed, FIRST_INDEX[split], index]
-            )
+            name = f"{kind}-{seed}-{first + index:06d}"
+            rng = np.random.default_rng([zlib.crc32(kind.encode()), seed, first, index])
             yield DetailPicture(name, name, kind, torch.from_numpy(make(rng)))
 
 
@@ -275,9 +248,8 @@ def _leaves(rng: np.random.Generator) -> np.ndarray:
 
 def _chart(rng: np.random.Generator) -> np.ndarray:
     """Text, gratings, zone plates and checks in two colours."""
-    paper, ink = (np.exp2(rng.uniform(-5.0, 0.0, (2, 1))) * rng.uniform(0.6, 1.0, (2, 3)))[
-        :, :, None
-    ]
+    levels = np.exp2(rng.uniform(-5.0, 0.0, (2, 1))) * rng.uniform(0.6, 1.0, (2, 3))
+    paper, ink = levels[:, :, None]
     row, column = np.mgrid[:_SIZE, :_SIZE].astype(np.float32)
     kind = int(rng.integers(4))
     if kind == 0:
@@ -342,21 +314,21 @@ def reference_scenes(
             whatever `number` is.
         size: Height and width [packed pixels], half as many as photosites; pictures that are
             smaller keep their size, and are left out below 128 and below `size`, which is logged.
-        data: Folder of real files (see docs/networks.md), for radiance maps and further
-            photographs; None leaves them out.
+        data: Folder of real files (see docs/networks.md), for radiance maps and more photographs.
         seed: Seed of the procedural groups; part of their names.
 
     Raises:
         FileNotFoundError: If there is no folder `data`.
-        ValueError: If an argument is invalid.
+        ValueError: If another argument is invalid.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     check_integer("number", number, 0, MOST_GROUPS)
     check_integer("size", size, 16, more=" packed pixels")
     check_integer("seed", seed, 0)
     scenes = [_procedural(camera, FIRST_INDEX[split], i, size, seed) for i in range(number)]
-    for picture in (*_bundled_photographs(split), *_real_pictures(data, split)):
-        scenes += _cut_out(picture, camera, size)
+    scenes += _bundled_photographs(split, camera, size)
+    if data is not None:
+        scenes += _real_pictures(Path(data), split, camera, size)
     return scenes
 
 
@@ -365,73 +337,61 @@ def _procedural(
 ) -> ReferenceScene:
     """The scene at `position` of the split that begins at index `first`."""
     block, within = divmod(position, _FLAT_EVERY)
-    flat = within == _FLAT_EVERY - 1
-    kinds = list_kinds()
-    kind = kinds[block % len(kinds)] if flat else "depth"
     rng = np.random.default_rng([zlib.crc32(b"reference"), seed, first + position])
     depth, lens = None, Lens()
-    if flat:
+    if within == _FLAT_EVERY - 1:
+        kind = list_kinds()[block % len(list_kinds())]
         drawing = draw(kind, rng, 2 * size, lens=False)
     else:
-        focus = FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
+        kind, focus = "depth", FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
         drawn = draw_depth(rng, 2 * size, focus)
         drawing = drawn.drawing
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
         depth, lens = torch.from_numpy(depths), Lens(FOCAL_LENGTH, distance)
-    name = f"reference-{seed}-{first + position:06d}-{kind}"
-    return _scene(
-        drawing.light,
-        camera,
-        drawing.illuminance,
-        illuminant=drawing.illuminant,
-        scene_id=name,
-        group=name,
-        kind=kind,
-        source="procedural, ae-env (MIT)",
-        depth=depth,
-        lens=lens,
-    )
+    name, source = f"reference-{seed}-{first + position:06d}-{kind}", "procedural, ae-env (MIT)"
+    about = {"scene_id": name, "group": name, "kind": kind, "source": source}
+    light = {"lux": drawing.illuminance, "illuminant": drawing.illuminant}
+    return _scene(drawing.light, camera, **light, **about, depth=depth, lens=lens)
 
 
 def _scene(
     rgb: np.ndarray,
     camera: CameraProfile,
-    lux: float,
     *,
-    scale_known: bool = True,
+    scene_id: str,
+    source: str,
+    lux: float | None = None,
     illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
     **fields: Any,
 ) -> ReferenceScene:
     """A scene of one pixel to a photosite under `lux`, moved into `ILLUMINANCE`.
 
     Light is relative to the reference settings: under less of it they expose longer, and `light`
-    stays as it is. Where the scale of `rgb` is unknown, its mean is set to a usual exposure.
+    stays as it is. Where its scale is unknown (`lux` is None) its mean is set to a usual exposure.
     """
+    stated = lux
+    if lux is None:
+        lux = assumed_illuminance(scene_id)
+        source += f"; light of unknown scale, {lux:g} lux assumed"
     light, reference, white_balance = camera_light(
-        rgb,
-        camera,
-        illuminance=lux if scale_known else None,
-        ev100=incident_ev100(lux),
-        illuminant=illuminant,
+        rgb, camera, illuminance=stated, ev100=incident_ev100(lux), illuminant=illuminant
     )
     within = min(max(lux, ILLUMINANCE[0]), ILLUMINANCE[1])
     if within != lux:
         reference = reference_settings(-reference.log2_exposure + math.log2(within / lux))
     return ReferenceScene(
+        scene_id=scene_id,
         light=light[[0, 1, 3]],
         reference=reference,
         illuminance=within,
         white_balance=white_balance,
+        source=source,
         **fields,
     )
 
 
 def packed_pitch(camera: CameraProfile) -> float:
-    """Distance between packed pixels of `camera` [m], twice the sensor's.
-
-    Raises:
-        ValueError: If the camera does not know it.
-    """
+    """Distance between packed pixels of `camera` [m], twice the sensor's, which must be known."""
     if camera.pixel_pitch_um is None:
         raise ValueError(
             f"`pixel_pitch_um` (=None) of camera {camera.name!r} must be known where there is depth"
@@ -442,25 +402,9 @@ def packed_pitch(camera: CameraProfile) -> float:
 # -- pictures without depth -----------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    """Linear light (3, H, W), its pixels as sharp as photosites see.
-
-    Args:
-        views: By scene id; the parts of it that become scenes.
-        illuminance, tint: The light, where it is known.
-    """
-
-    group: str
-    kind: str
-    views: dict[str, np.ndarray]
-    source: str
-    illuminance: float | None = None
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    in_focus: bool = True
-
-
-def _bundled_photographs(split: Split) -> Iterator[_Picture]:
+def _bundled_photographs(
+    split: Split, camera: CameraProfile, size: int
+) -> Iterator[ReferenceScene]:
     """scikit-image's photographs, of which nobody knows what was in focus."""
     for photograph in PHOTOGRAPHS:
         validates = photograph.name == VALIDATION_PHOTOGRAPH
@@ -469,37 +413,44 @@ def _bundled_photographs(split: Split) -> Iterator[_Picture]:
         rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
         light = unprocess(read_photograph(photograph.file), rng)
         low, high = (math.log(v) for v in photograph.illuminance)
-        yield _Picture(
-            photograph.name,
-            "photograph",
-            {photograph.name: light},
-            f"scikit-image {photograph.file}: {photograph.credit}",
-            illuminance=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
-            tint=temperature_tint(rng.uniform(*photograph.tint)),
+        yield from _cut_out(
+            light,
+            camera,
+            size,
+            lux=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
+            illuminant=temperature_tint(rng.uniform(*photograph.tint)),
+            scene_id=photograph.name,
+            group=photograph.name,
+            kind="photograph",
+            source=f"scikit-image {photograph.file}: {photograph.credit}",
             in_focus=False,
         )
 
 
-def _real_pictures(data: Path | None, split: Split) -> Iterator[_Picture]:
+def _real_pictures(
+    data: Path, split: Split, camera: CameraProfile, size: int
+) -> Iterator[ReferenceScene]:
     """Radiance maps and photographs of a folder of real files."""
-    if data is None:
-        return
-    if not Path(data).is_dir():
+    if not data.is_dir():
         raise FileNotFoundError(f"`data` (={str(data)!r}) must be an existing folder")
-    for path, group in radiance_files(Path(data), split):
-        image = read_radiance(path)
-        yield _Picture(group, "radiance", _views(path.stem, image), path.name)
-    for photograph in photograph_pictures(Path(data), split):
-        yield _Picture(
-            photograph.group,
-            "photograph",
-            {photograph.name: _sharpened(photograph.light.numpy())},
-            f"photo_pool {photograph.name}",
+    for path, group in radiance_files(data, split):
+        about = {"group": group, "kind": "radiance", "source": path.name}
+        for name, view in _views(path.stem, read_radiance(path)):
+            yield from _cut_out(view, camera, size, scene_id=name, **about)
+    for photograph in photograph_pictures(data, split):
+        yield from _cut_out(
+            _sharpened(photograph.light.numpy()),
+            camera,
+            size,
+            scene_id=photograph.name,
+            group=photograph.group,
+            kind="photograph",
+            source=f"photo_pool {photograph.name}",
             in_focus=photograph.name not in _BLURRED,
         )
 
 
-def _views(name: str, image: np.ndarray) -> dict[str, np.ndarray]:
+def _views(name: str, image: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Four square cuts out of a panorama's band of 45 degrees around the horizon; other pictures as
     they are.
 
@@ -507,15 +458,14 @@ def _views(name: str, image: np.ndarray) -> dict[str, np.ndarray]:
     """
     height, width = image.shape[1:]
     if abs(width / height - 2.0) > 0.01:
-        return {name: _sharpened(image)}
+        yield name, _sharpened(image)
+        return
     side = width // 8 * 2
     top = (height - side) // 2
-    views = {}
     for azimuth in AZIMUTHS:
         left = round((azimuth / 360.0 + 0.5) * width) - side // 2
         columns = np.arange(left, left + side) % width
-        views[f"{name}-{azimuth:03.0f}"] = image[:, top : top + side, columns]
-    return views
+        yield f"{name}-{azimuth:03.0f}", image[:, top : top + side, columns]
 
 
 def _sharpened(light: np.ndarray) -> np.ndarray:
@@ -538,30 +488,17 @@ def _edge_ratio(values: np.ndarray) -> float:
     return float(near / max(far, 1e-12))
 
 
-def _cut_out(picture: _Picture, camera: CameraProfile, size: int) -> Iterator[ReferenceScene]:
-    """The middle of each view, at most 2 x `size` photosites a side."""
-    for name, view in picture.views.items():
-        side = min(2 * size, *(n // 2 * 2 for n in view.shape[1:]))
-        if side < 2 * min(size, LEAST_VIEW):
-            logger.info("%s: too coarse (%d photosites a side), left out", name, side)
-            continue
-        top, left = ((n - side) // 2 for n in view.shape[1:])
-        lux, source = picture.illuminance, picture.source
-        if lux is None:
-            lux = assumed_illuminance(name)
-            source += f"; light of unknown scale, {lux:g} lux assumed"
-        yield _scene(
-            view[:, top : top + side, left : left + side],
-            camera,
-            lux,
-            scale_known=picture.illuminance is not None,
-            illuminant=picture.tint,
-            scene_id=name,
-            group=picture.group,
-            kind=picture.kind,
-            source=source,
-            in_focus=picture.in_focus,
-        )
+def _cut_out(
+    view: np.ndarray, camera: CameraProfile, size: int, *, scene_id: str, **fields: Any
+) -> Iterator[ReferenceScene]:
+    """The middle of a picture, at most 2 x `size` photosites a side; nothing of a coarse one."""
+    side = min(2 * size, *(n // 2 * 2 for n in view.shape[1:]))
+    if side < 2 * min(size, LEAST_VIEW):
+        logger.info("%s: too coarse (%d photosites a side), left out", scene_id, side)
+        return
+    top, left = ((n - side) // 2 for n in view.shape[1:])
+    part = view[:, top : top + side, left : left + side]
+    yield _scene(part, camera, scene_id=scene_id, **fields)
 
 
 def mosaic_scenes(
@@ -570,13 +507,8 @@ def mosaic_scenes(
     """The middle of real raws at low ISO: flat art and far views, in focus throughout.
 
     For the aperture: their noise is small, but it is there, so they are no truth to denoise. They
-    cannot be defocused, as each plane has but a quarter of the photosites.
-
-    Args:
-        split: See `reference_scenes`; groups are split by `detail_split`.
-        camera: Camera that photographs them; their colours are left as they were recorded.
-        data: Folder of real files.
-        size: Height and width [packed pixels], at most.
+    cannot be defocused, as each plane has but a quarter of the photosites. At most `size` packed
+    pixels a side; colours are left as they were recorded.
     """
     for picture in recorded_mosaics(data, split):
         height, width = picture.light.shape[1:]
@@ -600,9 +532,6 @@ def assumed_illuminance(name: str) -> float:
     """Light [lux] assumed for a picture of unknown scale, in `ILLUMINANCE`, by a hash of its name.
 
     The assumption is log-uniform, and drawn for each view, so that a few maps cover the range.
-
-    >>> assumed_illuminance("lab-090") == assumed_illuminance("lab-090")
-    True
     """
     low, high = EV100_RANGE
     fraction = (assumed_ev100(name) - low) / (high - low)
@@ -615,17 +544,10 @@ def draped_scenes(
 ) -> Iterator[ReferenceScene]:
     """Scenes without depth laid over procedural depth, `copies` of each, in its source group.
 
-    Dead leaves have texture everywhere; real pictures also have smooth surfaces with sharp edges,
-    and a network that learns the map of defocus from leaves alone takes the smooth ones for
-    blurred. A picture that is in focus throughout, laid over depth, shows what defocus does to such
-    surfaces.
-
-    Args:
-        scenes: Scenes to drape; passed over are those with depth, those with a blur of their own,
-            and those that are not at the pitch of the photosites.
-        camera: Camera in whose pixels blur is stated.
-        copies: Depths per scene; every third has everything in focus.
-        seed: Seed of the depths.
+    A network that learns the map of defocus from dead leaves alone, which have texture everywhere,
+    takes smooth surfaces for blurred. Real pictures that are in focus, laid over depth, show what
+    defocus does to such surfaces. Every third has everything in focus. Passed over are scenes with
+    depth, those with a blur of their own, and those that are not at the pitch of the photosites.
     """
     number = 0
     for scene in scenes:
@@ -651,19 +573,6 @@ def draped_scenes(
 # -- photographs with depth -----------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _DepthPhotograph:
-    """A photograph and its ground-truth disparity [pixels], not finite where unknown."""
-
-    name: str
-    image: np.ndarray
-    disparity: np.ndarray
-    dioptres_per_pixel: float
-    offset: float
-    illuminance: float
-    source: str
-
-
 def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> list[ReferenceScene]:
     """Photographs with measured depth, for testing only, each with two settings of the focus.
 
@@ -671,78 +580,48 @@ def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> lis
     that has one. The lens is focused on the front (95 % of the picture are farther) or on
     the median depth, and its focal length chosen such that the circle of confusion at f/11 reaches
     6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is the larger).
-
-    Args:
-        camera: Camera in whose colours light is stated, and in whose pixels blur is.
-        data: Folder that holds ``depth_cones``; without it only ``stereo_motorcycle``, which is
-            inside scikit-image's wheel.
+    One is inside scikit-image's wheel, the other in ``depth_cones`` of the folder `data`.
     """
-    photographs = [_motorcycle()]
+    wheel = resources.files("skimage.data")
+    with wheel.joinpath("motorcycle_left.png").open("rb") as stream, Image.open(stream) as picture:
+        image = np.asarray(picture)
+    with wheel.joinpath("motorcycle_disp.npz").open("rb") as stream, np.load(stream) as arrays:
+        disparity = fill_from_nearest(arrays["arr_0"])
+    # Calibration as scikit-image states it: z = baseline * focal length / (disparity + offset).
+    inverse = (disparity + 31.086) * (1.0 / (0.193001 * 994.978))
+    source = "scikit-image stereo_motorcycle (Middlebury 2014); 500 lux assumed"
+    scenes = list(_focused("motorcycle", image, inverse, camera, source))
     folder = None if data is None else Path(data) / "depth_cones"
     if folder is not None and folder.is_dir():
-        photographs.append(_cones(folder))
-    return [scene for photograph in photographs for scene in _focused(photograph, camera)]
+        image = tifffile.imread(folder / "left_rgb.tif").astype(np.uint8)
+        disparity = tifffile.imread(folder / "Cones_LEFT_GT.tif")
+        disparity = fill_from_nearest(np.where(disparity > 0, disparity, np.nan))  # 0 is "no data"
+        # The 2003 sets come without calibration: that of Middlebury's 2006 sets (focal length 3740
+        # pixels at full size, baseline 0.16 m) is assumed, at a quarter of the size.
+        inverse = disparity * (1.0 / (0.16 * 3740.0 / 4.0))
+        source = "Middlebury 2003 Cones; calibration of the 2006 set and 500 lux assumed"
+        scenes += _focused("cones", image, inverse, camera, source)
+    return scenes
 
 
-def _motorcycle() -> _DepthPhotograph:
-    folder = resources.files("skimage.data")
-    with folder.joinpath("motorcycle_left.png").open("rb") as stream, Image.open(stream) as picture:
-        image = np.asarray(picture)
-    with folder.joinpath("motorcycle_disp.npz").open("rb") as stream, np.load(stream) as arrays:
-        disparity = arrays["arr_0"]
-    # Calibration as scikit-image states it: z = baseline * focal length / (disparity + offset).
-    return _DepthPhotograph(
-        name="motorcycle",
-        image=image,
-        disparity=disparity,
-        dioptres_per_pixel=1.0 / (0.193001 * 994.978),
-        offset=31.086,
-        illuminance=500.0,
-        source="scikit-image stereo_motorcycle (Middlebury 2014); 500 lux assumed",
-    )
-
-
-def _cones(folder: Path) -> _DepthPhotograph:
-    image = tifffile.imread(folder / "left_rgb.tif").astype(np.uint8)
-    disparity = tifffile.imread(folder / "Cones_LEFT_GT.tif")
-    # 0 is "no data". The 2003 sets come without calibration: that of Middlebury's 2006 sets (focal
-    # length 3740 pixels at full size, baseline 0.16 m) is assumed, at a quarter of the size.
-    return _DepthPhotograph(
-        name="cones",
-        image=image,
-        disparity=np.where(disparity > 0, disparity, np.nan),
-        dioptres_per_pixel=1.0 / (0.16 * 3740.0 / 4.0),
-        offset=0.0,
-        illuminance=500.0,
-        source="Middlebury 2003 Cones; calibration of the 2006 set and 500 lux assumed",
-    )
-
-
-def _focused(photograph: _DepthPhotograph, camera: CameraProfile) -> Iterator[ReferenceScene]:
-    rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
-    height, width = (n // 2 * 2 for n in photograph.disparity.shape)
-    light = unprocess(photograph.image, rng)[:, :height, :width]
-    disparity = fill_from_nearest(photograph.disparity)[:height, :width]
-    inverse = (disparity + photograph.offset) * photograph.dioptres_per_pixel
+def _focused(
+    group: str, image: np.ndarray, inverse: np.ndarray, camera: CameraProfile, source: str
+) -> Iterator[ReferenceScene]:
+    """A photograph of known `inverse` depth (H, W) [1/m], focused on its front and its middle."""
+    height, width = (n // 2 * 2 for n in inverse.shape)
+    rng = np.random.default_rng(zlib.crc32(group.encode()))
+    light, inverse = unprocess(image, rng)[:, :height, :width], inverse[:height, :width]
     far, middle, front, near = np.quantile(inverse, [0.02, 0.5, 0.95, 0.98])
     depth = torch.from_numpy((1.0 / inverse).astype(np.float32))
+    about = {"group": group, "kind": "depth_photograph", "source": source}
     for name, focus in (("front", front), ("middle", middle)):
         spread = max(near - focus, focus - far)
         # c = f^2 (F - D) / (N (1 - f F)), solved for the focal length f at the largest |F - D|.
         area = _PHOTOGRAPH_BLUR * packed_pitch(camera) * F_NUMBER / spread
         focal_length = 0.5 * (math.sqrt((area * focus) ** 2 + 4.0 * area) - area * focus)
         lens = Lens(float(focal_length), float(1.0 / focus))
-        yield _scene(
-            light,
-            camera,
-            photograph.illuminance,
-            scene_id=f"{photograph.name}-{name}",
-            group=photograph.name,
-            kind="depth_photograph",
-            source=photograph.source,
-            depth=depth,
-            lens=lens,
-        )
+        scene_id = f"{group}-{name}"
+        yield _scene(light, camera, lux=500.0, scene_id=scene_id, **about, depth=depth, lens=lens)
 
 
 def fill_from_nearest(values: np.ndarray) -> np.ndarray:

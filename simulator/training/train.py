@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -29,13 +29,7 @@ from simulator.capture.statistics import BLOCK, Residual, ResidualStatistics, wi
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import build_modules, load_modules, save_modules
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import (
-    DRAPED,
-    MOSAIC,
-    BodyError,
-    ReferenceCamera,
-    ReferenceScene,
-)
+from simulator.reference.camera import DRAPED, MOSAIC, BodyError, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
 from simulator.training.data import (
@@ -43,8 +37,10 @@ from simulator.training.data import (
     DetailCrops,
     DetailPicture,
     NoiseBatch,
+    Progress,
     ReferencePairs,
     draw_sequences,
+    no_progress,
 )
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
 from simulator.training.scenes import (
@@ -64,17 +60,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Splits that a training uses, and the procedural scenes that it validates on.
-_SPLITS: tuple[Split, ...] = ("train", "validation")
+#: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
 #: Fixed batches that a trained stage is validated on.
 _VALIDATION_STEPS, _VALIDATION_BATCH = 8, 8
 #: Pairs that each stage is trained on, see `simulator.reference.sequences.select_pairs`.
-_PAIRS: dict[str, Stage] = {
-    "exposure": "exposure",
-    "aperture": "aperture",
-    "baseline": "all",
-}
+_PAIRS: dict[str, Stage] = {"exposure": "exposure", "aperture": "aperture", "baseline": "all"}
 #: Share of the budget in which the learning rate rises.
 _RISE = 0.05
 #: Largest norm of a gradient.
@@ -175,10 +166,8 @@ class SimulatorConfig(Configuration):
                 raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
         for name, stage in self.stages().items():
             if name != "noise" and stage.crop > self.scenes.size:
-                raise ValueError(
-                    f"`{name}.crop` (={stage.crop}) must not exceed `scenes.size` "
-                    f"(={self.scenes.size})"
-                )
+                rule = f"must not exceed `scenes.size` (={self.scenes.size})"
+                raise ValueError(f"`{name}.crop` (={stage.crop}) {rule}")
         return self
 
     def stages(self) -> dict[str, StageConfig]:
@@ -220,101 +209,6 @@ class Batches(Protocol):
         """The pairs of one step."""
 
 
-def train_and_save(
-    config: SimulatorConfig,
-    path: Path,
-    *,
-    command: str,
-    device: str = "cpu",
-    tensorboard: bool = False,
-    make_scenes: SceneMaker | None = None,
-    make_pictures: PictureMaker | None = None,
-    progress: TrainingProgress | None = None,
-) -> Path:
-    """Trains the stages of `config` and writes the weights with their model card.
-
-    A stage that is done or half done resumes from its checkpoint.
-
-    Args:
-        config: The training.
-        path: File name of the weights; checkpoints and logs go into its folder.
-        command: The command line that does it again, for the card.
-        device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
-        tensorboard: Whether to log to ``tensorboard`` in that folder.
-        make_scenes: Gives the scenes of a split, `scenes_of` by default; not called for a noise
-            module alone.
-        make_pictures: Gives the pictures of a split for the noise stage, `pictures_of` by default.
-        progress: Called while scenes are rendered and every few steps.
-
-    Returns:
-        The file of the weights.
-
-    Raises:
-        ValueError: If `config.start` is not weights of this preset.
-    """
-    folder = path.parent
-    accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
-    modules, start = first_modules(config)
-    makers = make_scenes or scenes_of, make_pictures or pictures_of
-    sources = {split: _Source(config, *makers, split) for split in _SPLITS}
-    if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
-        progress = None
-    stages: dict[str, dict[str, Any]] = {}
-    for name, stage in config.stages().items():
-        pairs = sources["train"].pairs(name, _with_title(progress, f"{name}: rendering"))
-        loss = _loss(name, modules)
-        clock = train_stage(
-            name,
-            loss,
-            modules[name],
-            pairs,
-            stage,
-            accelerator,
-            checkpoint=folder / f"{name}.checkpoint",
-            identity=config.card(last_stage=name),
-            progress=None if progress is None else functools.partial(progress, f"{name}: training"),
-        )
-        held_out = sources["validation"].pairs(name, None)
-        values = validate(loss, held_out, stage.crop, accelerator)
-        stages[name] = clock.card(len(pairs.pairs)) | {"validation": values}
-    is_main = accelerator.is_main_process
-    accelerator.end_training()
-    if is_main:
-        done = {"start": start, "scenes": sources["train"].kinds, "stages": stages}
-        residual = _calibration(modules, sources["validation"])
-        save_trained(path, modules, config, command, **done, residual=residual)
-    return sibling(path, ".safetensors")
-
-
-def _calibration(modules: nn.ModuleDict, source: _Source) -> dict[str, Any] | None:
-    """What the card says of the error that a noise module leaves, if there is one."""
-    if "noise" not in modules:
-        return None
-    return calibrate(cast(NoiseModule, modules["noise"].cpu().eval()), source.crops).to_card()
-
-
-def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any] | None]:
-    """The modules that a training begins with, and what the card of its start says, if any.
-
-    Raises:
-        ValueError: If `config.start` is not weights of this preset.
-    """
-    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
-        torch.default_generator.manual_seed(config.seed)
-        modules = build_modules(config.preset)
-    return modules, None if config.start is None else load_start(config, modules)
-
-
-def save_trained(
-    path: Path, modules: nn.ModuleDict, config: SimulatorConfig, command: str, **entries: Any
-) -> None:
-    """Writes trained weights, and a card of the configuration, of `entries` and of their origin."""
-    meta = result_meta(command, config.seed)
-    origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
-    card = {"training": config.card(), **entries, **origin}
-    save_modules(path, modules.to("cpu").eval(), config.preset, card)
-
-
 def scenes_of(config: SimulatorConfig, split: Split) -> list[ReferenceScene]:
     """The scenes of a split that a training's configuration names."""
     radiance, folder = config.scenes.radiance or "", data_folder()
@@ -338,32 +232,107 @@ def pictures_of(config: SimulatorConfig, split: Split) -> list[DetailPicture]:
     return detail_pictures(split, data=data_folder(), seed=config.seed)
 
 
-def load_start(config: SimulatorConfig, modules: nn.ModuleDict) -> dict[str, Any]:
-    """Loads the weights that a training goes on from into `modules`; what their card says.
+def train_and_save(
+    config: SimulatorConfig,
+    path: Path,
+    *,
+    command: str,
+    device: str = "cpu",
+    tensorboard: bool = False,
+    make_scenes: SceneMaker = scenes_of,
+    make_pictures: PictureMaker = pictures_of,
+    progress: TrainingProgress = no_progress,
+) -> Path:
+    """Trains the stages of `config` and writes the weights with their model card.
+
+    A stage that is done or half done resumes from its checkpoint.
+
+    Args:
+        config: The training.
+        path: File name of the weights; checkpoints and logs go into its folder.
+        command: The command line that does it again, for the card.
+        device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
+        tensorboard: Whether to log to ``tensorboard`` in that folder.
+        make_scenes, make_pictures: Give the scenes of a split, and its noise stage's pictures.
+        progress: Called while scenes are rendered and every few steps.
+
+    Returns:
+        The file of the weights.
 
     Raises:
         ValueError: If `config.start` is not weights of this preset.
     """
-    assert config.start is not None
+    folder = path.parent
+    accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
+    modules, start = first_modules(config)
+    train, validation = (
+        _Source(config, make_scenes, make_pictures, split) for split in ("train", "validation")
+    )
+    if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
+        progress = no_progress
+    stages: dict[str, dict[str, Any]] = {}
+    for name, stage in config.stages().items():
+        pairs = train.pairs(name, functools.partial(progress, f"{name}: rendering"))
+        loss = stage_loss(name, modules)
+        clock = train_stage(
+            name,
+            loss,
+            modules[name],
+            pairs,
+            stage,
+            accelerator,
+            checkpoint=folder / f"{name}.checkpoint",
+            identity=config.card(last_stage=name),
+            progress=functools.partial(progress, f"{name}: training"),
+        )
+        values = validate(loss, validation.pairs(name), stage.crop, accelerator)
+        stages[name] = clock.card(len(pairs.pairs)) | {"validation": values}
+    is_main = accelerator.is_main_process
+    accelerator.end_training()
+    if is_main:
+        residual = None
+        if "noise" in modules:
+            noise: Any = modules["noise"].cpu().eval()
+            residual = calibrate(noise, validation.crops).to_card()
+        done = {"start": start, "scenes": train.kinds, "stages": stages, "residual": residual}
+        save_trained(path, modules, config, command, **done)
+    return sibling(path, ".safetensors")
+
+
+def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any] | None]:
+    """The modules that a training begins with, and what the card of its start says, if any.
+
+    Raises:
+        ValueError: If `config.start` is not weights of this preset.
+    """
+    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
+        torch.default_generator.manual_seed(config.seed)
+        modules = build_modules(config.preset)
+    if config.start is None:
+        return modules, None
     try:
         started, card = load_modules(config.start)
     except ValueError as error:
         raise ValueError(f"`start` (={config.start!r}): {error}") from None
     if card["preset"] != config.preset:
-        raise ValueError(
-            f"`start` (={config.start!r}) must be weights of preset {config.preset!r}, "
-            f"got {card['preset']!r}"
-        )
+        rule = f"must be weights of preset {config.preset!r}, got {card['preset']!r}"
+        raise ValueError(f"`start` (={config.start!r}) {rule}")
     modules.load_state_dict(started.state_dict())
-    return {key: card.get(key) for key in ("sha256", "training", "stages", "start")}
+    return modules, {key: card.get(key) for key in ("sha256", "training", "stages", "start")}
+
+
+def save_trained(
+    path: Path, modules: nn.ModuleDict, config: SimulatorConfig, command: str, **entries: Any
+) -> None:
+    """Writes trained weights, and a card of the configuration, of `entries` and of their origin."""
+    meta = result_meta(command, config.seed)
+    origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
+    card = {"training": config.card(), **entries, **origin}
+    save_modules(path, modules.to("cpu").eval(), config.preset, card)
 
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:
-    """Accelerate's plumbing for this training.
-
-    Raises:
-        ImportError: If the extra ``train`` is not installed.
-    """
+    """Accelerate's plumbing for this training; an `ImportError` without the extra ``train``."""
     try:
         from accelerate import Accelerator
         from accelerate.state import AcceleratorState
@@ -387,10 +356,7 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
 
 
 class _Source:
-    """Scenes, pictures and pairs of one split, made when a stage asks for them.
-
-    Light that is rendered for a stage serves the next.
-    """
+    """Scenes, pictures and pairs of one split, made when a stage asks for them."""
 
     def __init__(
         self,
@@ -417,13 +383,10 @@ class _Source:
         """Crops of the noise stage."""
         pictures = self._make_pictures(self.config, self.split)
         self.kinds.update(picture.kind for picture in pictures)
-        return DetailCrops(
-            pictures, [get_camera(name) for name in list_cameras()], self.config.seed
-        )
+        cameras = [get_camera(name) for name in list_cameras()]
+        return DetailCrops(pictures, cameras, self.config.seed)
 
-    def pairs(
-        self, stage: str, progress: Callable[[int, int], None] | None
-    ) -> ReferencePairs | DetailCrops:
+    def pairs(self, stage: str, progress: Progress = no_progress) -> ReferencePairs | DetailCrops:
         """The pairs that `stage` is trained or validated on."""
         if stage == "noise":
             return self.crops
@@ -450,13 +413,8 @@ def _is_useful_for(scene: ReferenceScene, stage: str) -> bool:
     return scene.kind not in (DRAPED, MOSAIC)
 
 
-def _with_title(progress: TrainingProgress | None, title: str) -> Callable[[int, int], None] | None:
-    if progress is None:
-        return None
-    return lambda done, total: progress(title, done / max(total, 1), {})
-
-
-def _loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
+def stage_loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
+    """What a stage of the training minimises."""
     known: Any = modules
     if stage == "exposure":
         return ExposureLoss(known["exposure"])
@@ -477,44 +435,32 @@ def train_stage(
     *,
     checkpoint: Path,
     identity: Any,
-    progress: Callable[[float, dict[str, float]], None] | None = None,
+    progress: Progress = no_progress,
 ) -> Clock:
-    """Trains `trained` until the stage's budget is used up.
+    """Trains `trained`, which `loss` holds, until the stage's budget is used up.
 
-    A stage that was interrupted resumes from its last checkpoint, at most 20 s back. Batches are
-    drawn by step, so where the budget is in steps it goes on as if it had not been interrupted.
-
-    Args:
-        name: Of the stage, for log and checkpoint.
-        loss: Maps a `Batch` to a mapping with ``"loss"``; holds `trained`.
-        trained: The module whose parameters change.
-        pairs: Where the batches come from.
-        stage: Budget, batch, crop and learning rate.
-        accelerator: Devices, precision, processes.
-        checkpoint: File of the state.
-        identity: JSON value; a checkpoint of another training is not taken over.
-        progress: Called every few steps with the share of the stage that is done, in [0, 1], and
-            the latest values.
-
-    Returns:
-        Steps and seconds that were used.
+    A stage that was interrupted resumes from its last `checkpoint`, at most 20 s back, if that is
+    of the same `identity` (a JSON value). Batches are drawn by step, so where the budget is in
+    steps it goes on as if it had not been interrupted.
 
     Raises:
         ValueError: If the loss is not finite.
     """
-    from accelerate.utils import send_to_device
+    from accelerate.utils import broadcast, send_to_device
 
-    device = accelerator.device
+    device, process = accelerator.device, accelerator.process_index
     loss.requires_grad_(False)
     loss.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    clock = Clock(stage, on_cpu=device.type == "cpu")
-    parts = _parts(trained, stage, accelerator)
-    optimizer, average = parts["optimizer"], parts["average"]
-    writes = accelerator.is_main_process
+    trained.requires_grad_(True)
+    optimizer = torch.optim.AdamW(trained.parameters(), lr=stage.learning_rate, weight_decay=1e-4)
+    average = AveragedModel(trained, multi_avg_fn=get_ema_multi_avg_fn(stage.average))  # type: ignore[no-untyped-call]
+    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer, "average": average}
+    if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
+        parts["scaler"] = accelerator.scaler
+    clock, writes = Clock(stage, on_cpu=device.type == "cpu"), accelerator.is_main_process
     state = _resume(checkpoint, [name, identity], clock, parts, writes=writes)
     wrapped, stepper = accelerator.prepare(loss, optimizer)
     means: dict[str, float] = {}
-    process = accelerator.process_index
     clock.start()
     with state:
         while clock.share < 1.0:
@@ -528,25 +474,15 @@ def train_stage(
             stepper.zero_grad()
             average.update_parameters(trained)
             clock.tick()
-            _share_clock(clock, accelerator)
+            if accelerator.num_processes > 1:  # each step waits for all: they must stop together
+                seconds = torch.tensor(clock.seconds, dtype=torch.float32, device=device)
+                clock.seconds = float(broadcast(seconds))
             if clock.step % _LOG_EVERY == 0 or clock.share >= 1.0:
                 accelerator.log({f"{name}/{k}": v for k, v in means.items()}, step=clock.step)
-                if progress is not None:
-                    progress(clock.share, means)
+                progress(clock.share, means)
             state.save_when_due()
     trained.load_state_dict(average.module.state_dict())
     return clock
-
-
-def _parts(trained: nn.Module, stage: StageConfig, accelerator: Accelerator) -> dict[str, Any]:
-    """What has a state while a module is trained: the module, its optimiser, its average."""
-    trained.requires_grad_(True)
-    optimizer = torch.optim.AdamW(trained.parameters(), lr=stage.learning_rate, weight_decay=1e-4)
-    average = AveragedModel(trained, multi_avg_fn=get_ema_multi_avg_fn(stage.average))  # type: ignore[no-untyped-call]
-    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer, "average": average}
-    if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
-        parts["scaler"] = accelerator.scaler
-    return parts
 
 
 def _resume(
@@ -569,13 +505,9 @@ def _resume(
 
 @dataclass
 class Clock:
-    """Steps and time that a stage has used of its budget.
+    """Steps and seconds that a stage has used of its budget.
 
-    Args:
-        stage: The budget.
-        on_cpu: Whether minutes are processor minutes of this process or wall-clock minutes.
-        step: Steps so far.
-        seconds: Time so far.
+    On a CPU, minutes are processor minutes of this process, else wall-clock minutes.
     """
 
     stage: StageConfig
@@ -620,24 +552,8 @@ def learning_rate(share: float, peak: float) -> float:
     return peak * 0.5 * (1.0 + math.cos(math.pi * (share - _RISE) / (1.0 - _RISE)))
 
 
-def _share_clock(clock: Clock, accelerator: Accelerator) -> None:
-    """Sets every process's clock by the main one's.
-
-    All of them must stop after the same step, as each step waits for all of them.
-    """
-    if accelerator.num_processes > 1:
-        from accelerate.utils import broadcast
-
-        seconds = torch.tensor(clock.seconds, dtype=torch.float32, device=accelerator.device)
-        clock.seconds = float(broadcast(seconds))
-
-
 def _update_means(means: dict[str, float], values: dict[str, torch.Tensor], name: str) -> None:
-    """Updates the running means by the values of a step.
-
-    Raises:
-        ValueError: If the loss is not finite.
-    """
+    """Updates the running means by the values of a step; the loss must be finite."""
     for key, value in values.items():
         number = float(value.detach())
         if key == "loss" and not math.isfinite(number):
@@ -676,37 +592,29 @@ def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
 
     Several captures of each crop tell what is systematic from what is noise. The first half of the
     crops fills the tables; the second half tells how far single crops are from them.
-
-    Args:
-        noise: In evaluation mode.
-        crops: Of the validation split.
     """
     half = _CROPS // 2
-    blocks = [_measure(noise, crops, index) for index in range(_CROPS)]
+    measured = [_measure(noise, crops, index) for index in range(_CROPS)]
     error, bias, left = (
-        np.concatenate([getattr(b, name) for b in blocks[:half]])
-        for name in ("wiener_error", "bias", "variance")
+        np.concatenate([values[i] for values, _ in measured[:half]]) for i in range(3)
     )
     bias, left = (np.maximum(_means_at_knots(error, v), 0.0) for v in (bias, left))
     first = Residual(_KNOTS, bias, left, 1.0)
     ratios = []
-    for own in blocks[half:]:
-        predicted = own.statistics.error(first, 1.0, own.statistics.nlf, noise=False)
-        found = max(float((own.bias + own.variance).mean()), 0.0) ** 0.5
+    for (_, own_bias, own_left), statistics in measured[half:]:
+        predicted = statistics.error(first, 1.0, statistics.nlf, noise=False)
+        found = max(float((own_bias + own_left).mean()), 0.0) ** 0.5
         ratios.append(found / max(predicted, 1e-6))
     return Residual(_KNOTS, bias, left, max(1.0, float(np.quantile(ratios, 0.9))))
 
 
-class _Measured(NamedTuple):
-    """Errors of a network on one crop, in blocks, in units of the noise's variance."""
+def _measure(
+    noise: NoiseModule, crops: DetailCrops, index: int
+) -> tuple[list[np.ndarray], ResidualStatistics]:
+    """Wiener error, squared bias and variance of a network's output in the blocks of one crop.
 
-    wiener_error: np.ndarray
-    bias: np.ndarray
-    variance: np.ndarray
-    statistics: ResidualStatistics
-
-
-def _measure(noise: NoiseModule, crops: DetailCrops, index: int) -> _Measured:
+    The latter two are in units of the noise's variance.
+    """
     batch = crops.captures(index, _CAPTURES, min(_SIDE, crops.largest))
     error = noise(batch.noisy, batch.shot, batch.read).double() - batch.clean.double()
     scale = variance_map(batch.clean, batch.shot, batch.read).double()[0]
@@ -719,7 +627,7 @@ def _measure(noise: NoiseModule, crops: DetailCrops, index: int) -> _Measured:
         F.avg_pool2d((v / scale)[None], BLOCK)[0].mean(dim=0).flatten().numpy()
         for v in (bias, variance)
     ]
-    return _Measured(expected, squares[0], squares[1], ResidualStatistics(batch.noisy[0], nlf))
+    return [expected, *squares], ResidualStatistics(batch.noisy[0], nlf)
 
 
 def _means_at_knots(error: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import glob
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 import threading
@@ -48,11 +49,9 @@ def cache_dir() -> Path:
 
 
 def cache_key(kind: str, parts: Any) -> str:
-    """Key of a result: its kind, and a hash of all that it depends on and the package's version.
+    """Key of a result: its kind (a folder), and a hash of the package's version and `parts`.
 
-    Args:
-        kind: Name of a folder, such as ``"scenes"``.
-        parts: JSON value; the order of names does not matter.
+    These are a JSON value of all that the result depends on.
 
     >>> cache_key("a", {"b": 1, "c": 2}) == cache_key("a", {"c": 2, "b": 1})
     True
@@ -153,19 +152,16 @@ class Store:
         if max_bytes is not None:
             check_integer("max_bytes", max_bytes, 0)
         self.folder, self.max_bytes = Path(folder), max_bytes
-        self._uncounted: int | None = None  # bytes written since the files were last counted
+        self._uncounted = math.inf  # bytes written since the files were last counted
 
     def path(self, key: str) -> Path:
         """The file of a result."""
         return self.folder / f"{key}.safetensors"
 
     def get(self, key: str) -> dict[str, Any] | None:
-        """The values of a result by name, as `put` got them; None if not there or damaged.
+        """The values under a `cache_key` as `put` got them, tensors on the CPU.
 
-        Tensors are on the CPU.
-
-        Args:
-            key: As `cache_key` makes it.
+        None if there are none, or they are damaged.
         """
         path = self.path(key)
         try:
@@ -184,12 +180,7 @@ class Store:
         return values
 
     def put(self, key: str, values: Mapping[str, Any]) -> None:
-        """Stores a result.
-
-        Args:
-            key: As `cache_key` makes it.
-            values: By name; tensors, numpy arrays of numbers, and what JSON can hold.
-        """
+        """Stores tensors, numpy arrays of numbers and JSON values under a `cache_key`."""
         content = _encode(values)
         if self.max_bytes is not None and len(content) > self.max_bytes:
             return
@@ -202,11 +193,10 @@ class Store:
         if self.max_bytes is None:
             return
         # Counting files takes longer than writing one: count when a sixteenth was written.
-        uncounted = None if self._uncounted is None else self._uncounted + len(content)
-        if uncounted is None or uncounted >= self.max_bytes // 16:
+        self._uncounted += len(content)
+        if self._uncounted >= self.max_bytes // 16:
             self._trim(self.max_bytes)
-            uncounted = 0
-        self._uncounted = uncounted
+            self._uncounted = 0.0
 
     def usage(self) -> dict[str, tuple[int, int]]:
         """Number of files and bytes by the kind of their keys."""
@@ -222,12 +212,10 @@ class Store:
         Raises:
             OSError: If a file cannot be removed.
         """
-        paths = [path for path, _ in self._files()]
-        for path in paths:
+        for path, _ in self._files():
             path.unlink(missing_ok=True)
-        for folder in {path.parent for path in paths}:
-            with suppress(OSError):
-                folder.rmdir()
+            with suppress(OSError):  # while others are in it
+                path.parent.rmdir()
 
     def _files(self) -> list[tuple[Path, os.stat_result]]:
         found = []
@@ -239,10 +227,7 @@ class Store:
         return found
 
     def _trim(self, max_bytes: int) -> None:
-        """Removes the files used longest ago until a sixteenth of the bound is free.
-
-        So the bound holds until the files are counted again.
-        """
+        """Removes the files used longest ago until a sixteenth is free, till the next count."""
         files = self._files()
         total = sum(stat.st_size for _, stat in files)
         recent = time.time() - _ABANDONED

@@ -21,33 +21,6 @@ _LOGGER = logging.getLogger(__name__)
 INTERVAL = 20.0
 
 
-def load_checkpoint(path: str | Path) -> dict[str, Any] | None:
-    """The content of the file of a `Checkpoint`, with its tensors on the CPU.
-
-    Nothing but tensors and plain values is unpickled (``weights_only=True``), so a checkpoint from
-    somebody else runs no code.
-
-    Returns:
-        The state; None where there is no file, and, with a warning in the log, where it is damaged.
-    """
-    path = Path(path)
-    if not path.is_file():
-        return None
-    try:
-        with zipfile.ZipFile(path) as archive:  # torch itself does not look at the checksums
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise ValueError(f"wrong checksum of {damaged}")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(state, dict):
-            raise ValueError(f"it holds a {type(state).__name__}, not a dict")
-    except Exception as error:  # zipfile, pickle and torch raise whatever damaged bytes lead to
-        reason = str(error).strip().partition("\n")[0]
-        _LOGGER.warning("checkpoint %s is damaged, training restarts: %s", path, reason)
-        return None
-    return state
-
-
 class Checkpoint:
     """The checkpoint of one training, written now and then while the training runs.
 
@@ -79,18 +52,29 @@ class Checkpoint:
         self._saved = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:
-        """The state to resume from; None, with a warning in the log, if the file does not fit."""
-        stored = None if self.path is None else load_checkpoint(self.path)
-        if stored is None:
+        """The state to resume from, tensors on the CPU; None if there is no file that fits.
+
+        A warning in the log says why it does not. Nothing but tensors and plain values is
+        unpickled, so a checkpoint from somebody else runs no code.
+        """
+        if self.path is None or not self.path.is_file():
             return None
-        if stored.get("identity") != self.identity:
-            _LOGGER.warning(
-                "checkpoint %s is of a training with other settings or of another version: "
-                "training restarts",
-                self.path,
-            )
+        try:
+            with zipfile.ZipFile(self.path) as archive:  # torch does not look at the checksums
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise ValueError(f"wrong checksum of {damaged}")
+            stored = torch.load(self.path, map_location="cpu", weights_only=True)
+            identity, state = stored["identity"], dict(stored["state"])
+        except Exception as error:  # zipfile, pickle and torch raise whatever damage leads to
+            reason = str(error).strip().partition("\n")[0]
+            _LOGGER.warning("checkpoint %s is damaged, training restarts: %s", self.path, reason)
             return None
-        return dict(stored["state"])
+        if identity != self.identity:
+            text = "checkpoint %s is of other settings or of another version: training restarts"
+            _LOGGER.warning(text, self.path)
+            return None
+        return state
 
     def save(self) -> None:
         """Writes the state now, whole or not at all.

@@ -20,7 +20,7 @@ import sys
 import threading
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -52,11 +52,7 @@ _IMPORTS = re.compile(r"^\s*from ((?:simulator|ae_env)[\w.]*) import (\([^)]*\)|
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator of a function that numba compiles when it is first called.
-
-    Args:
-        options: Options of `numba.njit`, such as ``fastmath``.
-    """
+    """Decorator of a function that numba compiles when first called, with options of `njit`."""
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
@@ -71,11 +67,6 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
         return dispatcher
 
     return compiled
-
-
-def _is_kept(dispatcher: Any) -> bool:
-    """Whether what is compiled of a kernel is kept for other processes."""
-    return hasattr(getattr(dispatcher, "_cache", None), "_cache_file")
 
 
 def _adapt_cache(dispatcher: Any, module: Path) -> None:
@@ -129,7 +120,8 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
         if function.__module__.partition(".")[0] in _PACKAGES:
             if not self.warned and multiprocessing.parent_process() is None:  # children are many
                 self.warned = True
-                logger.warning(_KEPT if _is_kept(event.data["dispatcher"]) else _NOT_KEPT)
+                cache = getattr(event.data["dispatcher"], "_cache", None)
+                logger.warning(_KEPT if hasattr(cache, "_cache_file") else _NOT_KEPT)
             logger.info("compiling %s.%s", function.__module__, function.__name__)
             if self.depth == 1:
                 bar = progress_bar("compiling the simulator", _FIRST_KERNELS, done=self.compiled)
@@ -143,8 +135,7 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
             self.shown.close()
 
 
-_announcer = _Announcer()
-event.register("numba:compile", _announcer)  # type: ignore[no-untyped-call]
+event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 # Images are given to kernels by their addresses: a batch need not lie in one piece of memory.
@@ -168,7 +159,6 @@ def as_pointer(typing, address):  # type: ignore[no-untyped-def]
 
 # -- threads --------------------------------------------------------------------------------------
 
-_POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process and size
 _inside = threading.local()
 
 
@@ -183,10 +173,10 @@ def parallel_ranges(
     """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
 
     The caller's thread takes the first share. A task that calls `parallel_ranges` itself gets one
-    share. Returns when all shares are done.
+    share. Returns when all shares are done; an error in any of them is raised here.
 
     Args:
-        task: Safe to run on several threads at once; an error in any share is raised here.
+        task: Safe to run on several threads at once.
         count: Number of items, >= 0.
         least: Items below which another thread is not worth waking.
         threads: Most threads to use; `thread_count()` by default.
@@ -197,9 +187,8 @@ def parallel_ranges(
             task(0, count)
         return
     bounds = [count * i // shares for i in range(shares + 1)]
-    others: list[Future[None]] = [
-        _pool(shares - 1).submit(_run, task, first, last) for first, last in pairwise(bounds[1:])
-    ]
+    pool = _pool(os.getpid(), shares - 1)
+    others = [pool.submit(_run, task, first, last) for first, last in pairwise(bounds[1:])]
     try:
         _run(task, 0, bounds[1])
     finally:
@@ -215,18 +204,17 @@ def _run(task: Callable[[int, int], object], first: int, last: int) -> None:
     task(first, last)
 
 
-def _pool(size: int) -> ThreadPoolExecutor:
-    key = (os.getpid(), size)
-    if key not in _POOLS:
-        _POOLS[key] = ThreadPoolExecutor(size, thread_name_prefix="simulator")
-    return _POOLS[key]
+@functools.cache
+def _pool(process: int, size: int) -> ThreadPoolExecutor:
+    """The threads of a process; a forked child must not use its parent's."""
+    return ThreadPoolExecutor(size, thread_name_prefix="simulator")
 
 
 # -- what else a computation needs ----------------------------------------------------------------
 
 
 def computes_bfloat16(device: torch.device) -> bool:
-    """Whether the device computes in bfloat16; other processors emulate it, ten times as slow."""
+    """Whether the device computes in bfloat16 instead of emulating it, ten times as slow."""
     return device.type != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
@@ -242,12 +230,8 @@ def check_bfloat16(device: torch.device) -> None:
 def progress_bar(title: str, total: int, *, done: int = 0) -> Iterator[Callable[[], None]]:
     """A bar on standard error during work that the user did not ask for, wiped out at the end.
 
-    Nothing is shown where that is no terminal, or belongs to a bar of the program's own.
-
-    Args:
-        title: What is done.
-        total: Number of steps; 0 for no bar.
-        done: Steps done before.
+    Nothing is shown where that is no terminal, or belongs to a bar of the program's own, or where
+    `total` is 0; `done` steps were done before.
 
     Yields:
         A function that counts a step; several threads may call it.

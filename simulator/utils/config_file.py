@@ -44,8 +44,8 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
     """The configuration in a YAML file.
 
     Raises:
-        ValueError: If the file is missing, unreadable or not YAML, or an entry is unknown, given
-            twice or out of range; the message names the file and the entry.
+        ValueError: As `read_yaml`, or if an entry is unknown or out of range; the message names the
+            file and the entry.
     """
     name, content = f"`config` (={str(path)!r})", read_yaml(path)
     if not isinstance(content, dict):
@@ -59,14 +59,9 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
 
 
 def read_yaml(path: str | Path, *, name: str = "config") -> Any:
-    """The values in a YAML file from anybody: no tags that run code.
+    """The values in a YAML file from anybody; None for an empty file.
 
-    Args:
-        path: The file; ``~`` is the home folder.
-        name: Argument that gave the path, for error messages.
-
-    Returns:
-        Mappings, lists, numbers, text; None for an empty file.
+    No tag runs code; `name` is the argument that gave the path, for error messages.
 
     Raises:
         ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or not YAML, or
@@ -108,10 +103,8 @@ class _Loader(yaml.SafeLoader):
 def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
     """All of pydantic's complaints in one line, each with the entry that it is about.
 
-    Args:
-        error: The error that pydantic raised.
-        prefix: Put before the name of every entry.
-        model: The validated model; for an unknown entry its nearest name is proposed.
+    `prefix` stands before the name of every entry; of `model` the name nearest to an unknown one is
+    proposed.
     """
     parts = []
     for item in error.errors():

@@ -47,9 +47,8 @@ _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image"
 def data_folder() -> Path | None:
     """The folder of real files for tests and measurements.
 
-    Returns:
-        The folder that ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data``
-        beside the checkout, or None if that is not there.
+    It is what ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data`` beside the
+    checkout, or None if that is not there.
 
     Raises:
         FileNotFoundError: If the folder that is named is not there.
@@ -63,27 +62,16 @@ def data_folder() -> Path | None:
 
 
 def as_path(path: object) -> Path:
-    """`path` as a `Path`.
-
-    Raises:
-        ValueError: If it is neither text nor a path.
-    """
+    """`path` as a `Path`; a `ValueError` if it is neither text nor a path."""
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise ValueError(f"`path` (={path!r}) must be a file's name: a str or a pathlib.Path")
     return Path(path)
 
 
 def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
-    """Why a picture must not be decoded: it claims far more pixels than its file can hold.
+    """Why a picture must not be decoded: it claims far more pixels than `size` bytes can hold.
 
-    Args:
-        height: Rows that the file claims.
-        width: Columns that it claims.
-        size: Length of the file [byte].
-        per_byte: Most pixels that each byte of the file may stand for.
-
-    Returns:
-        The reason, for an error message; empty where the picture may be decoded.
+    Empty where it may be decoded; each byte of the file may stand for `per_byte` pixels at most.
 
     >>> refuse_bomb(60_000, 60_000, 4096)
     'claims 60000 x 60000 pixels, where at most 268435456 are read'
@@ -102,14 +90,8 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
 def write_atomically(
     path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
 ) -> Path:
-    """Write `content` under a temporary name beside `path`, then rename it; makes the folder.
-
-    Args:
-        path: File to write or replace.
-        content: Bytes, text that is encoded as UTF-8, or pieces of bytes, written as they come.
-
-    Returns:
-        `path`.
+    """Write bytes, text (as UTF-8), or pieces of bytes under a temporary name beside `path`, then
+    rename it; makes the folder, and returns `path`.
 
     Raises:
         ValueError: If `path` is not a file's name.
@@ -156,16 +138,12 @@ def sibling(path: str | Path, suffix: str) -> Path:
 
 
 def result_meta(command: str, seed: int | None) -> dict[str, Any]:
-    """Where a measurement comes from: the ``meta`` of every result file.
+    """Where a measurement comes from: the ``meta`` of every result file, JSON-ready.
 
-    Args:
-        command: The command line that writes the file again.
-        seed: Seed of the run; None where nothing is random.
-
-    Returns:
-        A JSON-ready dict with the keys ``command``, ``commit`` (hash of the checkout, ending in
-        ``+changes`` where files differ from it; None outside a checkout), ``seed``, ``date`` (UTC,
-        ISO 8601), ``machine`` (``cpu``, ``cores``, ``threads``, ``gpu``) and ``versions``.
+    Its keys are ``command`` (the command line that writes the file again), ``commit`` (hash of the
+    checkout, ending in ``+changes`` where files differ from it; None outside a checkout), ``seed``,
+    ``date`` (UTC, ISO 8601), ``machine`` (``cpu``, ``cores``, ``threads``, ``gpu``) and
+    ``versions``.
     """
     return {
         "command": command,
@@ -178,20 +156,12 @@ def result_meta(command: str, seed: int | None) -> dict[str, Any]:
 
 
 def write_results(
-    path: str | os.PathLike[str],
-    rows: Iterable[Mapping[str, Any]],
-    meta: Mapping[str, Any],
+    path: str | os.PathLike[str], rows: Iterable[Mapping[str, Any]], meta: Mapping[str, Any]
 ) -> Path:
     """Write ``{"meta": meta, "rows": rows}`` as JSON, whole or not at all.
 
-    Args:
-        path: File to write; its folder is made where missing.
-        rows: One mapping per row, JSON-ready; scalars and arrays of numpy and torch become numbers
-            and lists.
-        meta: As `result_meta` returns it, plus whatever describes this measurement.
-
-    Returns:
-        The path written.
+    Scalars and arrays of numpy and torch become numbers and lists. `meta` is that of `result_meta`,
+    and whatever else describes the measurement.
 
     Raises:
         ValueError: If a value is NaN or infinite (JSON has no such number; write None) or of a
@@ -251,11 +221,8 @@ def _commit() -> str | None:
     # An installed copy may lie inside somebody else's repository.
     if top is None or Path(top).resolve() != root:
         return None
-    commit = _git(root, "rev-parse", "--verify", "--quiet", "HEAD")
-    if commit is None:
-        return None
-    changed = _git(root, "status", "--porcelain", "--untracked-files=no")
-    return f"{commit}+changes" if changed else commit
+    wanted = ("--always", "--abbrev=40", "--exclude=*", "--dirty=+changes")
+    return _git(root, "describe", *wanted)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

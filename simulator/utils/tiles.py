@@ -7,7 +7,7 @@ and again, and a half without such a pixel costs nothing.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import EllipsisType
 
 import numpy as np
@@ -28,12 +28,8 @@ class Tile:
     """A rectangle of a frame, and the halo that a network must see around it [pixel].
 
     Args:
-        top: First row.
-        bottom: Row after the last.
-        left: First column.
-        right: Column after the last.
-        height: Rows of the frame.
-        width: Columns of the frame.
+        top, bottom, left, right: First row and column, and those after the last.
+        height, width: Of the frame.
         halo: Pixels on each side, as far as the frame reaches.
     """
 
@@ -46,47 +42,47 @@ class Tile:
     halo: int
 
     @property
+    def _sides(self) -> tuple[tuple[int, int, int], ...]:
+        return (self.top, self.bottom, self.height), (self.left, self.right, self.width)
+
+    @property
     def inner(self) -> _Index:
         """Index of the rectangle in the frame."""
-        return ..., slice(self.top, self.bottom), slice(self.left, self.right)
+        rows, columns = (slice(first, last) for first, last, _ in self._sides)
+        return ..., rows, columns
 
     @property
     def outer(self) -> _Index:
         """Index of the rectangle and its halo in the frame."""
-        first_row, first_column = self._corner
-        rows = slice(first_row, min(self.bottom + self.halo, self.height))
-        return ..., rows, slice(first_column, min(self.right + self.halo, self.width))
+        rows, columns = (
+            slice(max(first - self.halo, 0), min(last + self.halo, size))
+            for first, last, size in self._sides
+        )
+        return ..., rows, columns
 
     @property
     def core(self) -> _Index:
         """Index of the rectangle in the part that `outer` cuts out."""
-        row, column = self._corner
-        rows = slice(self.top - row, self.bottom - row)
-        return ..., rows, slice(self.left - column, self.right - column)
+        rows, columns = (
+            slice(min(first, self.halo), min(first, self.halo) + last - first)
+            for first, last, _ in self._sides
+        )
+        return ..., rows, columns
 
     @property
     def area(self) -> int:
         """Pixels including the halo: the cost of the tile."""
-        rows = min(self.bottom + self.halo, self.height) - max(self.top - self.halo, 0)
-        return rows * (min(self.right + self.halo, self.width) - max(self.left - self.halo, 0))
-
-    @property
-    def _corner(self) -> tuple[int, int]:
-        return max(self.top - self.halo, 0), max(self.left - self.halo, 0)
+        _, rows, columns = self.outer
+        return int((rows.stop - rows.start) * (columns.stop - columns.start))
 
 
 def make_tiles(
     height: int, width: int, *, halo: int, tile: int = TILE, needed: Tensor | None = None
 ) -> list[Tile]:
-    """Tiles that cover a frame, or its needed pixels, at little cost.
+    """Tiles that cover a frame, or its `needed` pixels (H, W), at little cost.
 
-    Args:
-        height: Rows of the frame.
-        width: Columns of the frame.
-        halo: Multiple of 4 [pixel].
-        tile: Largest side of a tile, a multiple of 4 [pixel]; a frame that is no larger than one
-            tile and a halo is one tile.
-        needed: (H, W) bool, the pixels to cover; by default all.
+    `halo` and `tile`, the largest side, are multiples of 4 [pixel]; a frame that is no larger than
+    one tile and a halo is one tile.
     """
     if height <= tile + halo and width <= tile + halo:
         tile = 4 * ((max(height, width) + 3) // 4)
@@ -105,14 +101,12 @@ def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
     cells = F.max_pool2d(part, _CELL, ceil_mode=True)[0].bool().cpu().numpy()
 
     def made(rows: tuple[int, int], columns: tuple[int, int]) -> Tile:
-        return Tile(
-            tile.top + _CELL * rows[0],
-            min(tile.top + _CELL * rows[1], tile.bottom),
-            tile.left + _CELL * columns[0],
-            min(tile.left + _CELL * columns[1], tile.right),
-            tile.height,
-            tile.width,
-            tile.halo,
+        return replace(
+            tile,
+            top=tile.top + _CELL * rows[0],
+            bottom=min(tile.top + _CELL * rows[1], tile.bottom),
+            left=tile.left + _CELL * columns[0],
+            right=min(tile.left + _CELL * columns[1], tile.right),
         )
 
     def cover(row: int, column: int, cells: np.ndarray) -> list[Tile]:
@@ -135,14 +129,10 @@ def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
 
 
 def varying(image: Tensor, margin: int = 0) -> Tensor:
-    """Mask of where a picture is not constant; constant parts carry neither noise nor detail.
+    """(H, W) bool: where `image` (C, H, W) is not constant, in cells of 16 x 16 pixels.
 
-    Args:
-        image: (C, H, W).
-        margin: Pixels around varying cells that also count as varying, a multiple of 16.
-
-    Returns:
-        (H, W) bool, in cells of 16 x 16 pixels.
+    Constant parts carry neither noise nor detail. `margin`, a multiple of 16, is how many pixels
+    around varying cells also count.
     """
     height, width = image.shape[-2:]
     high = F.max_pool2d(image, _CELL, ceil_mode=True)
@@ -174,9 +164,6 @@ def in_tiles(
         tile: Side of a tile, a multiple of 4 [pixel].
         needed: (H, W) bool, the pixels that need the function; by default all.
         fallback: Values of all other pixels, of the result's shape; given with `needed`.
-
-    Returns:
-        The result of `function` on the whole images; `fallback` where it is not needed.
     """
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)

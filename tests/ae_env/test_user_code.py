@@ -101,11 +101,6 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: s
     assert str(caught.value).startswith(ARGUMENT)
     left = [name for name in set(sys.modules) - before if name.startswith("ae_env_user_")]
     assert len(left) == ("class" in message)  # what failed to load is not kept
-
-
-def test_no_file_and_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=rf"there is no file 'mine.py' in {tmp_path}"):
-        load_from_file("mine.py", "Mine", ARGUMENT)
-    with pytest.raises(ValueError, match=r"must name a class of the file: 'mine.py:MyScore'"):
-        load_from_file("mine.py", "", ARGUMENT, example="MyScore")
+    for path, name in ((tmp_path / "none.py", "Mine"), (file, "")):
+        with pytest.raises(ValueError, match=r"`thing` \(='mine.py:Mine'\)"):
+            load_from_file(str(path), name, ARGUMENT)

@@ -112,10 +112,13 @@ def test_a_meter_with_foresight_is_ahead_of_a_ramp(context, photograph, name):
         assert off > 2.0
 
 
-def test_foresight_is_checked(context):
-    with pytest.raises(ValueError, match=r"`foresight` \(='trends'\) must be one of.*'trend'\?"):
-        make_policy("average:P?foresight=trends", context)
-    with pytest.raises(ValueError, match="needs the scores that a tuned program predicts"):
-        make_policy("average:P?foresight=model", context)
-    with pytest.raises(ValueError, match=r"`damping` \(=0.5\) must be 0 with `foresight`"):
-        make_policy("average:P?foresight=trend&damping=0.5", context)
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        *(("foresight=trends", "foresight"), ("foresight=model", "foresight")),
+        ("foresight=trend&damping=0.5", "damping"),
+    ],
+)
+def test_foresight_is_checked(context, options, name):
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        make_policy(f"average:P?{options}", context)

@@ -23,7 +23,6 @@ from ae_env.scenes.load import _LOADED
 from ae_env.scenes.measured_depth import depth_scenes
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
-from simulator.radiance import depth
 from simulator.radiance.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
@@ -97,22 +96,6 @@ def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> No
     assert max(np.abs(e).max() for e in errors.values()) < 5.0
 
 
-def test_hard_kinds_are_what_they_say(unseen: list[Scene]) -> None:
-    for scene in unseen:
-        reflectance = scene.light[1] / WHITE
-        if scene.kind == "snow":
-            assert 0.7 <= reflectance.median() <= 0.95
-            assert 0.6 <= reflectance.mean() <= 0.95
-        if scene.kind == "night":
-            assert 1 <= (scene.illuminance or 0.0) <= 50
-            assert reflectance.max() > 5
-            assert (scene.light.amax(dim=0) > 1).float().mean() < 0.08
-        if scene.kind == "back_light":
-            assert 0.1 < (reflectance > 1.0).float().mean() < 0.75
-        if scene.kind == "spot_light":
-            assert reflectance.median() < 0.02
-
-
 def test_a_scene_is_the_same_wherever_it_is_asked_for(unseen: list[Scene]) -> None:
     small = load_scenes("bundled:small", "all", camera=CAMERA)
     assert len({s.group for s in small}) == 2 * 2 * 8
@@ -124,21 +107,13 @@ def test_a_scene_is_the_same_wherever_it_is_asked_for(unseen: list[Scene]) -> No
         assert scene.reference == by_id[scene.scene_id].reference
 
 
-def test_drawing_depends_on_the_generator_alone() -> None:
-    for kind in list_kinds():
-        first, second, other = (draw(kind, np.random.default_rng(i), 64) for i in (5, 5, 6))
-        assert np.array_equal(first.light, second.light)
-        assert first.illuminance == second.illuminance
-        assert not np.array_equal(first.light, other.light)
-        assert first.light.dtype == np.float32
+def test_unknown_kinds_and_sizes_are_named() -> None:
     rng = np.random.default_rng(0)
-    for call, arguments, message in (
-        (draw, ("nights",), "did you mean 'night'"),
-        (draw_depth, (32, "fron"), r"`focus`.*did you mean 'front'"),
-        (draw_depth, (8,), "`size`"),
-    ):
+    with pytest.raises(ValueError, match="did you mean 'night'"):
+        draw("nights", rng)
+    for arguments, message in (((32, "fron"), "`focus`"), ((8,), "`size`")):
         with pytest.raises(ValueError, match=message):
-            call(*([*arguments, rng] if call is draw else [rng, *arguments]))
+            draw_depth(rng, *arguments)
 
 
 def test_unprocess_inverts_tone_and_gamma() -> None:
@@ -153,8 +128,6 @@ def test_unprocess_inverts_tone_and_gamma() -> None:
     gamma = np.where(flat <= 0.0031308, 12.92 * flat, 1.055 * flat ** (1 / 2.4) - 0.055)
     again = 3 * gamma**2 - 2 * gamma**3  # the smooth step of Brooks et al. 2019
     assert np.abs(again * 255 - shown).max() <= 0.51
-    with pytest.raises(ValueError, match="`image`"):
-        unprocess(np.zeros((4, 4)), rng)
 
 
 def test_cached_scenes_equal_fresh_ones(
@@ -196,20 +169,6 @@ PITCH = 11.88e-6  # packed pixels of the Nikon Z6
 
 def drawn_depth(seed: int, size: int = 48, focus: str = "middle") -> DepthDrawing:
     return draw_depth(np.random.default_rng(seed), size, focus)
-
-
-def test_a_thing_hides_what_is_farther_and_nothing_else() -> None:
-    ramp = np.repeat(np.linspace(-4.0, 4.0, 48, dtype=np.float32)[None], 48, axis=0)
-    visible = 0
-    for seed in range(12):
-        blur, surface = ramp.copy(), np.zeros((48, 48), int)
-        depth._put_thing(np.random.default_rng(seed), blur, surface, 1, 0.0)
-        seen = surface == 1
-        assert (blur[seen] < ramp[seen]).all()  # larger is farther
-        np.testing.assert_array_equal(blur[~seen], ramp[~seen])
-        assert not seen[ramp < -2.0].any()  # no thing is slanted by more than 1.8 pixels
-        visible += seen.any()
-    assert visible >= 6
 
 
 def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:

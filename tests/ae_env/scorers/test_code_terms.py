@@ -14,7 +14,7 @@ from ae_env.scorers.captures import prepare_scene, source_noises
 from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.term_scores import TermScores
 from ae_env.scorers.terms import Highlights, Noise, Shadows
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import clip_and_quantise
 from simulator.optics.motion import Movement
 from tests.ae_env.environments import make_env

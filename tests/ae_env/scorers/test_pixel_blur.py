@@ -14,7 +14,7 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures, prepare_scene
 from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.terms import Sharpness
-from simulator.capture.layout import Layout
+from simulator.capture.prepared_scene import Layout
 from simulator.optics.motion import Movement
 from tests.ae_env.scorer_images import CAMERA, make_scene
 

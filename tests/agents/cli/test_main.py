@@ -14,7 +14,7 @@ import simulator
 from ae_env.scorers import list_scorers
 from agents.cli import console
 from agents.cli import main as cli
-from simulator.capture.plan import DEFAULT_TOLERANCE
+from simulator.capture.exposure import DEFAULT_TOLERANCE
 from tests.simulator.training.captures import write_dataset
 
 COMMANDS = (

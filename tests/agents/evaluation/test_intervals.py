@@ -59,17 +59,18 @@ def _gains(seed: int = 0, **means: float) -> dict[str, np.ndarray]:
 
 def test_differences_far_beyond_the_noise_make_tiers():
     found = rank(_gains(low=0.3, best=0.8, alike=0.799), SPAN, resamples=4000)
-    assert [one.policy for one in found] == ["best", "alike", "low"]
-    assert [one.tier for one in found] == [1, 1, 2]
-    best, alike, low = found
+    assert found.policy.tolist() == ["best", "alike", "low"]
+    assert found.tier.tolist() == [1, 1, 2]
+    best, alike, low = found.itertuples()
     assert best.to_best is None
     assert low.to_next is None
-    assert not best.to_next.significant
-    assert low.to_best.significant
-    assert alike.to_next.significant
+    assert not best.to_next["significant"]
+    assert low.to_best["significant"]
+    assert alike.to_next["significant"]
     # Every policy's own interval is wide: the groups differ by 0.2.
-    assert best.score.high - best.score.low > 0.08
-    assert low.to_best.high - low.to_best.low < 0.04
+    assert np.ptp(best.ci95) > 0.08
+    assert np.ptp(low.to_best["simultaneous_ci95"]) < 0.04
+    assert np.mean(low.to_best["simultaneous_ci95"]) == pytest.approx(low.to_best["difference"])
 
 
 def test_more_policies_widen_the_intervals_as_tukeys_range_does():
@@ -77,10 +78,10 @@ def test_more_policies_widen_the_intervals_as_tukeys_range_does():
     rng = np.random.default_rng(1)
     gains = {f"p{i}": rng.normal(0.5, 0.1, (1, 400)) for i in range(6)}
     found = rank(gains, np.ones(400), resamples=20_000)
-    change = gains[found[-1].policy] - gains[found[0].policy]
+    best, last = found.policy.iloc[0], found.policy.iloc[-1]
     factor = scipy.stats.studentized_range.ppf(0.95, 6, np.inf) / np.sqrt(2)
-    error = change.std() / np.sqrt(400)
-    half = (found[-1].to_best.high - found[-1].to_best.low) / 2
+    error = (gains[last] - gains[best]).std() / np.sqrt(400)
+    half = np.ptp(found.to_best.iloc[-1]["simultaneous_ci95"]) / 2
     assert half == pytest.approx(factor * error, rel=0.06)
 
 
@@ -90,6 +91,6 @@ def test_below_fifteen_groups_there_is_an_order_but_no_interval():
     assert score_interval(*_data(MIN_GROUPS)).pair is not None
     gains = {"a": np.full((1, MIN_GROUPS - 1), 0.9), "b": np.zeros((1, MIN_GROUPS - 1))}
     found = rank(gains, np.ones(MIN_GROUPS - 1))
-    assert [(one.policy, one.tier) for one in found] == [("a", None), ("b", None)]
-    assert not found[1].to_best.significant
-    assert found[1].to_best.value == pytest.approx(-0.9)
+    assert (found.policy.tolist(), found.tier.tolist()) == (["a", "b"], [None, None])
+    assert not found.to_best[1]["significant"]
+    assert found.to_best[1]["difference"] == pytest.approx(-0.9)

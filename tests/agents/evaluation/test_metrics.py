@@ -67,28 +67,25 @@ def test_frames_to_converge(errors, frames, converged):
 )
 def test_overshoot_and_reversals(evs, over, turns):
     evs = np.array([evs], float)
-    np.testing.assert_allclose(metrics.overshoot(evs), [over], atol=1e-12)
-    assert metrics.reversals(evs).tolist() == [turns]
-    seeds = np.stack([evs, evs])  # (K, E, T)
-    np.testing.assert_allclose(metrics.overshoot(seeds), [[over]] * 2, atol=1e-12)
-    assert metrics.reversals(seeds).tolist() == [[turns]] * 2
+    for own in (evs, np.stack([evs, evs])):  # (E, T), (K, E, T)
+        np.testing.assert_allclose(metrics.overshoot(own), np.full(own.shape[:-1], over), atol=1e-9)
+        np.testing.assert_array_equal(metrics.reversals(own), np.full(own.shape[:-1], turns))
 
 
 def test_convergence_after_a_step_counts_from_the_step():
     # The light steps in frame 4 (index 3), which is the first that shows it: the answer to it is
     # frame 5. It is right for good from frame 7 on: the third frame that knows.
     light = np.array([[0, 0, 0, 1, 1, 1, 1, 1, 1, 1]], float)[..., None]
-    errors = np.array([[2, 0, 0, 4, 2, 1, 0, 0, 0, 0]], float)
     since = metrics.settling(light)
     assert since.tolist() == [4]
-    frames, converged = metrics.frames_to_converge(errors, since=since)
-    assert (frames.tolist(), converged.tolist()) == ([3], [True])
-    at_once = np.where(np.arange(10) == 3, 4.0, 0.0)[None]
-    for errors in (at_once, np.zeros((1, 10))):
-        assert metrics.frames_to_converge(errors, since=since)[0].tolist() == [1]
-    # Never: as many frames as there are after the step, not T.
-    frames, converged = metrics.frames_to_converge(np.ones((1, 10)), since=since)
-    assert (frames.tolist(), converged.tolist()) == ([6], [False])
+    for errors, frames, known in (
+        ([2, 0, 0, 4, 2, 1, 0, 0, 0, 0], 3, True),
+        ([0, 0, 0, 4, 0, 0, 0, 0, 0, 0], 1, True),
+        ([0] * 10, 1, True),
+        ([1] * 10, 6, False),  # never: as many frames as there are after the step, not T
+    ):
+        found, converged = metrics.frames_to_converge(np.array([errors], float), since=since)
+        assert (found.tolist(), converged.tolist()) == ([frames], [known])
 
 
 @pytest.mark.parametrize(

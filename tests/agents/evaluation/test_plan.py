@@ -33,25 +33,21 @@ def test_delays_multiply_the_conditions_that_have_none_of_their_own():
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ({"starts": ["drak"]}, r"`starts` \(='drak'\).*did you mean 'dark'"),
-        ({"starts": []}, "`starts`"),
+        ({"starts": ["drak"]}, r"`starts` \(='drak'\)"),
+        ({"starts": []}, "starts\n"),
         ({"seeds": [0, 0]}, "seeds\n"),
-        ({"seeds": [-1]}, r"`seeds` \(=-1\)"),
-        ({"frames": 0}, "frames\n"),
-        ({"conditions": {"hard": {}}}, "none of"),
+        ({"seeds": [-1]}, r"seeds\.0\n"),
+        ({"conditions": {"hard": {}}}, "`conditions`"),
+        ({"conditions": {"a": {"budget": 1.0}}}, "`conditions`"),
         ({"conditions": {"a": {"lighting": "disco"}}}, "condition 'a': `lighting`"),
-        ({"conditions": {"a": {"delay": 99}}}, r"`delay` \(=99\) must be an integer in \[0, 16\]"),
-        ({"environment": {"lighting": "sine"}}, "must not have `lighting`"),
-        ({"environment": {"scorrer": "noise"}}, "did you mean `scorer`"),
-        ({"polices": ["random"]}, "polices\n"),
-        ({"budgets": []}, "budgets\n"),
+        ({"conditions": {"a": {"delay": 99}}}, r"`delay` \(=99\)"),
+        ({"conditions": {"a": {"delay": 3}}, "frames": 3}, r"`delay` \(=3\)"),
+        ({"environment": {"lighting": "sine"}}, "`environment` .* `lighting`"),
         ({"budgets": [0.1, 0.1]}, "budgets\n"),
-        ({"budgets": [0.0]}, r"`budgets` \(=0.0\)"),
-        ({"budgets": [0.1], "environment": {"budget": 1}}, "must not have `budget`"),
-        ({"budgets": [0.1], "environment": {"scene": "bundled"}}, "scene"),
+        ({"budgets": [0.0]}, r"budgets\.0\n"),
+        ({"budgets": [0.1], "environment": {"budget": 1}}, "`environment` .* `budget`"),
         ({"budgets": [0.1], "frames": 3}, "`frames`"),
         ({"max_frames": 2}, "`max_frames`"),
-        ({"conditions": {"a": {"budget": 1.0}}}, "`budget`"),
     ],
 )
 def test_mistakes_in_a_plan_are_told(entries, message):
@@ -66,15 +62,6 @@ def test_presets_are_valid():
     assert [plan.measure for plan in plans.values()] == ["score", "score", "quality"]
 
 
-def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
-    first = PLAN.model_dump(mode="json")
-    turned = dict(reversed([*first.items()]))
-    again = EvaluationPlan.model_validate({**turned, "policies": ["spot:P"], "hash": "x"})
-    assert digest(again.protocol()) == digest(PLAN.protocol())
-    assert digest(PLAN.changed(frames=9).protocol()) != digest(PLAN.protocol())
-    assert digest(1, "a") != digest("1a")
-
-
 #: Of the plans as they were when they were published: their digests must not move.
 PUBLISHED = {
     "ae_bench_v1": "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd",
@@ -84,8 +71,12 @@ PUBLISHED = {
 }
 
 
-def test_published_plans_keep_their_digest():
+def test_digests_are_of_the_episodes_and_do_not_move():
     assert {name: digest(load_plan(name).protocol()) for name in PUBLISHED} == PUBLISHED
+    turned = dict(reversed([*PLAN.model_dump(mode="json").items()]))
+    again = EvaluationPlan.model_validate({**turned, "policies": ["spot:P"], "hash": "x"})
+    assert digest(again.protocol()) == digest(PLAN.protocol())
+    assert digest(PLAN.changed(frames=9).protocol()) != digest(PLAN.protocol())
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +87,7 @@ def scenes():
 def test_objects_of_a_callers_own_are_described_but_are_no_protocol(scenes):
     plan = PLAN.changed(environment={**PLAN.environment, "scenes": scenes[:1]})
     assert "dead_leaves" in str(plan.describe()["environment"]["scenes"])
-    with pytest.raises(ValueError, match="must be a JSON value, not"):
+    with pytest.raises(ValueError, match="JSON value"):
         plan.protocol()
 
 

@@ -17,7 +17,7 @@ from agents.learning.regression import (
     Replay,
     train_regression,
 )
-from agents.learning.weights import describe_agent, save_agent
+from agents.learning.weights import save_agent
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 
@@ -38,12 +38,13 @@ def test_it_learns(make_tiny_envs) -> None:
     assert rewards[-1] > rewards[15] + 0.1
 
 
-def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path) -> None:
-    envs = make_tiny_envs(num_envs=6)
+@pytest.mark.parametrize("observation", ["uint8", "statistics"])
+def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path, observation: str) -> None:
+    envs = make_tiny_envs(num_envs=6, observation=observation)
     context = PolicyContext.from_envs(envs)
     training = TRAINING.model_copy(update={"total_timesteps": 24, "batch_size": 12})
     network = train_ppo(envs, training)
-    save_agent(tmp_path / "ppo", "ppo", network, describe_agent(network.width, context, {}))
+    save_agent(tmp_path / "ppo", "ppo", network, network.width, context, {})
     loaded = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
     assert isinstance(loaded, PPOPolicy)
     ours = PPOPolicy(context, network=network)
@@ -65,6 +66,9 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path) -> None:
         allowed = loaded.act(observations, masks)
         assert masks[np.arange(6), allowed].all()
         observations, *_ = envs.step(chosen)
+    if observation == "statistics":
+        with pytest.raises(ValueError, match=r"resolution = \[4, 12, 16\]"):
+            make_policy(f"ppo:{tmp_path / 'ppo'}", PolicyContext.from_envs(make_tiny_envs()))
 
 
 def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
@@ -91,20 +95,6 @@ def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
     end, weights = torch.load(path, weights_only=True)["state"], network.state_dict()
     assert all(torch.equal(end["policy"][k], v) for k, v in weights.items())
     assert any(not torch.equal(half["policy"][k], v) for k, v in weights.items())
-
-
-def test_it_learns_from_statistics_and_says_so(make_tiny_envs, tmp_path: Path) -> None:
-    envs = make_tiny_envs(num_envs=6, observation="statistics")
-    context = PolicyContext.from_envs(envs)
-    training = TRAINING.model_copy(update={"total_timesteps": 24, "batch_size": 12})
-    network = train_ppo(envs, training)
-    save_agent(tmp_path / "ppo", "ppo", network, describe_agent(network.width, context, {}))
-    policy = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
-    policy.reset(6)
-    observations, _ = envs.reset(seed=9)
-    assert envs.action_space.contains(policy.act(observations))
-    with pytest.raises(ValueError, match=r"resolution = \[4, 12, 16\]"):
-        make_policy(f"ppo:{tmp_path / 'ppo'}", PolicyContext.from_envs(make_tiny_envs()))
 
 
 class Stub(nn.Module):

@@ -25,8 +25,8 @@ def make_network(context: PolicyContext) -> ScoreRegressor:
 @pytest.fixture
 def agent(context: PolicyContext, tmp_path: Path) -> Path:
     path = tmp_path / "regression-0.5"
-    description = agent_weights.describe_agent(8, context, {"agent": "regression"})
-    agent_weights.save_agent(path, "regression", make_network(context), description)
+    training = {"agent": "regression"}
+    agent_weights.save_agent(path, "regression", make_network(context), 8, context, training)
     return path
 
 
@@ -41,13 +41,16 @@ def test_round_trip(agent: Path, context: PolicyContext) -> None:
         parameter.data.zero_()
     agent_weights.load_into(network, tensors, agent)
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
+    next(network.parameters()).data.fill_(float("nan"))
+    with pytest.raises(ValueError, match="must be finite"):
+        agent_weights.save_agent(agent, "regression", network, 8, context, {})
+    assert load_file(sibling(agent, ".safetensors")).keys() == on_disk.keys()
 
 
 def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
     module["again"] = module["a"]
-    description = {"width": 2, "context": {}, "training": {}}
-    agent_weights.save_agent(tmp_path / "m", "ppo", module, description)
+    agent_weights.save_agent(tmp_path / "m", "ppo", module, 2, None, {})
     assert len(load_file(tmp_path / "m.safetensors")) == 4
     tensors, _ = agent_weights.load_agent(tmp_path / "m", "ppo")
     assert set(tensors) == set(module.state_dict())
@@ -57,61 +60,36 @@ def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("suffix", "content", "message"),
     [
-        (".json", None, "there is no regression-0.5.json.*ae-env"),
-        (".safetensors", None, "there is no regression-0.5.safetensors.*ae-env"),
-        (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
+        (".json", None, "there is no regression-0.5.json"),
+        (".safetensors", None, "there is no regression-0.5.safetensors"),
+        (".safetensors", b"", "the hash of regression-0.5.safetensors"),
         (".json", b"{", "regression-0.5.json is damaged"),
-        (".json", b"[1]", "must hold a JSON object"),
         (".json", b'{"kind": "regression", "format": 1}', "width: Field required; context: Field"),
-        (".json", b'{"kind": "regression", "format": 2}', "format 1, got 'regression' of format 2"),
+        (".json", b'{"kind": "regression", "format": 2}', "of format 2"),
+        (".json", {"aliases": 3}, r"aliases \(=3\): must be a mapping"),
+        (".json", {"width": True}, r"width \(=True\)"),
+        (".json", {"width": 10**9}, r"width \(=1000000000\)"),
+        (".json", {"width": 9}, r"do not fit the network: [^\n]*weight[^\n]*\Z"),
+        (".json", {"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
+        (".json", {"context": {"observation": "uint8", "resolution": [4]}}, "resolution = "),
+        (".json", {"kind": "ppo"}, "must be a regression agent of format 1, got 'ppo'"),
     ],
 )
-def test_damaged_file(agent: Path, suffix: str, content: bytes | None, message: str) -> None:
-    sibling(agent, suffix).unlink()
-    if content is not None:
-        sibling(agent, suffix).write_bytes(content)
-    with pytest.raises(FileNotFoundError if content is None else ValueError, match=message):
-        agent_weights.load_agent(agent, "regression")
-
-
-@pytest.mark.parametrize(
-    ("entries", "message"),
-    [
-        ({"aliases": 3}, r"regression-0.5.json: aliases \(=3\): must be a mapping"),
-        ({"width": True}, r"width \(=True\): .* valid integer"),
-        ({"width": 10**9}, r"width \(=1000000000\): .* less than or equal to 65536"),
-        ({"width": 9}, r"do not fit the network: [^\n]*weight[^\n]*\Z"),
-        ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
-        (
-            {"context": {"observation": "uint8", "resolution": [4]}},
-            r"trained with resolution = \[4\]",
-        ),
-        ({"context": {"resolution": [4]}}, "trained with observation = None"),
-        ({"kind": "ppo"}, "must be a regression agent of format 1, got 'ppo'"),
-    ],
-)
-def test_wrong_types_in_the_card(
-    agent: Path, context: PolicyContext, entries: dict[str, Any], message: str
+def test_damaged_and_wrong_files(
+    agent: Path, context: PolicyContext, suffix: str, content: Any, message: str
 ) -> None:
-    file = sibling(agent, ".json")
-    card = json.loads(file.read_text())
-    del card["sha256"]  # a card of an earlier version, which is fine
-    file.write_text(json.dumps(card))
-    assert make_policy(f"regression:{agent}", context).name == "regression"
-    file.write_text(json.dumps(card | entries))
-    with pytest.raises(ValueError, match=message):
+    file = sibling(agent, suffix)
+    if isinstance(content, dict):
+        card = json.loads(file.read_text())
+        del card["sha256"]  # a card of an earlier version, which is fine
+        file.write_text(json.dumps(card))
+        assert make_policy(f"regression:{agent}", context).name == "regression"
+        content = json.dumps(card | content).encode()
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(FileNotFoundError if content is None else ValueError, match=message):
         make_policy(f"regression:{agent}", context)
-
-
-def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> None:
-    before = sibling(agent, ".safetensors").read_bytes()
-    network = make_network(context)
-    next(network.parameters()).data.fill_(float("nan"))
-    with pytest.raises(ValueError, match="must be finite: their training has failed"):
-        agent_weights.save_agent(
-            agent, "regression", network, agent_weights.describe_agent(8, context, {})
-        )
-    assert sibling(agent, ".safetensors").read_bytes() == before
 
 
 def test_another_grid_or_observation_than_the_trained(agent: Path, context: PolicyContext) -> None:

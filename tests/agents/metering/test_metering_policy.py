@@ -11,7 +11,7 @@ from ae_env.grid import ExposureGrid
 from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.tuned import ScoreRegression
 from agents.policy import PolicyContext
-from agents.policy_names import MANUAL_PROGRAMS, METERS, make_policy
+from agents.policy_names import METERS, make_policy
 from agents.rollouts import make_envs
 
 CONTROLLERS = (*METERS, "rpi_agc")
@@ -60,26 +60,12 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
     policy = make_policy("average:tuned?shutter_cap=1/100", context, weights=weights)
     path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
     assert all(context.grid[s].exposure_time <= 1 / 100 for s in path)
-
-
-def test_tuned_needs_a_fit_and_the_same_readings(context, photograph, tmp_path):
     with pytest.raises(ValueError, match="call fit"):
         _run(make_policy("average:tuned", context), photograph, 8.0)
     with pytest.raises(ValueError, match="nothing to save"):
         make_policy("average:tuned", context).save(tmp_path / "x.safetensors")
-    _fitted(context).save(tmp_path / "three.safetensors")
-    blind = make_policy("average:tuned_blind", context, weights=tmp_path / "three.safetensors")
-    with pytest.raises(ValueError, match="agree on `sensors`"):
-        _run(blind, photograph, 8.0)
-
-
-def test_a_fit_that_fails_leaves_the_policy_as_it_was(make_tiny_envs, monkeypatch):
-    envs = make_tiny_envs(mode="DISABLED")
-    policy = make_policy("average:tuned?foresight=model", PolicyContext.from_envs(envs))
-    monkeypatch.setattr(envs, "step", lambda actions: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        policy.fit(envs)
-    assert (policy.program, policy.foresight, policy.regression) == ("tuned", "model", None)
+    with pytest.raises(ValueError, match="`sensors`"):
+        _run(make_policy("average:tuned_blind", context, weights=weights), photograph, 8.0)
 
 
 def test_sensors_are_averaged_over_the_frames(context, photograph):
@@ -123,9 +109,12 @@ def _loop(name: str, frames: int, start: int | None = None, step: float | None =
 
 
 @pytest.mark.parametrize(
-    ("program", "start"), [*((p, None) for p in MANUAL_PROGRAMS), ("P", 3), ("P", 60)]
+    ("name", "program", "start"),
+    [
+        *((name, "P", start) for name in CONTROLLERS for start in (None, 3, 60)),
+        *((name, program, None) for name in ("matrix", "rpi_agc") for program in "ASM"),
+    ],
 )
-@pytest.mark.parametrize("name", CONTROLLERS)
 def test_comes_to_rest_in_steady_light(name, program, start):
     """From a start of the environment's, from the darkest state (3) and from the brightest (60)."""
     _, _, ev, light = _loop(f"{name}:{program}", 24, start)

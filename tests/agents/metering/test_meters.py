@@ -6,6 +6,15 @@ import pytest
 from ae_env.observation import decode_observation
 from agents.metering import search_meters
 from agents.metering.meters import make_meter, weight_map
+from agents.metering.reading import (
+    EVTracker,
+    Reading,
+    ReferenceFrames,
+    ZoneMatcher,
+    frame_ev100,
+    light_change,
+    zone_signals,
+)
 from agents.policy_names import METERS, make_policy
 
 GREY = np.ones((64, 64))
@@ -28,12 +37,9 @@ def test_weighted_mean_matches_a_direct_sum(context, photograph):
     mean = 0.75 * light[inside].mean() + 0.25 * light[~inside].mean()
     reading = make_meter("centre_weighted", context.camera)(frame)
     assert reading.ev100[0] == pytest.approx(9.0 + math.log2(mean), abs=0.02)
-
-
-def test_weights_sum_to_one_and_spot_covers_four_percent():
-    for name in ("average", "centre_weighted", "spot"):
-        assert weight_map(name, 48, 64).sum() == pytest.approx(1.0, abs=1e-5)
     assert (weight_map("spot", 128, 128) > 0).mean() == pytest.approx(0.04, abs=0.002)
+    with pytest.raises(ValueError, match="`meter`"):
+        make_meter("matric", context.camera)
 
 
 def test_matrix_is_the_weighted_mean_of_the_zones_logarithms(context, photograph):
@@ -98,51 +104,12 @@ def test_every_kind_of_observation_reads_the_same(context, photograph, name):
     np.testing.assert_allclose(found, found[0], atol=0.03)
 
 
-def test_unknown_meter_names_the_nearest():
-    with pytest.raises(ValueError, match=r"`meter` \(='matric'\).*did you mean 'matrix'"):
-        make_meter("matric", None)
-
-
 def _srgb(x):
     return 12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055
 
 
 def _linear(z):
     return z / 12.92 if z <= 0.04045 else ((z + 0.055) / 1.055) ** 2.4
-
-
-def test_highlights_are_exposed_to_nine_tenths_of_white(context, photograph):
-    light = GREY.copy()
-    light.flat[: int(0.02 * light.size)] = 4.0  # 2 % of the pixels are highlights
-    light.flat[int(0.02 * light.size) + 1] = 30.0  # and one a lamp, which does not count
-    state = context.grid.nearest(9.0)
-    reading = make_meter("highlight_weighted", context.camera)(photograph(light, 9.0, state))
-    # 0.12 * 4 at EV 9; 0.9 at 9 + log2(0.48 / 0.9).
-    assert reading.ev100[0] == pytest.approx(9.0 + math.log2(0.48 / 0.9), abs=0.03)
-    assert reading.saturated[0] == 0.0
-
-
-def test_the_brightest_plane_of_each_pixel_counts_in_every_frame(context, photograph):
-    light = np.ones((4, 64, 64))
-    light[3, :8] = 5.0  # blue, an eighth of the frame
-    state = context.grid.nearest(9.0)
-    frame = photograph(light, 9.0, [state, state])
-    reading = make_meter("highlight_weighted", context.camera)(frame)
-    np.testing.assert_allclose(reading.ev100, [9.0 + math.log2(0.6 / 0.9)] * 2, atol=0.03)
-    assert reading.black.tolist() == [False, False]
-    dark = photograph(GREY, -6.0, context.grid.nearest(17.0))
-    assert make_meter("highlight_weighted", context.camera)(dark).black.tolist() == [True]
-
-
-def test_blown_highlights_read_brighter_than_they_show(context, photograph):
-    light = GREY.copy()
-    light[:4] = 100.0
-    state = context.grid.nearest(9.0)
-    reading = make_meter("highlight_weighted", context.camera)(photograph(light, 9.0, state))
-    share = 4 / 64
-    step = 3.0 * (0.51 + 0.49 * share)
-    ev = context.grid.ev100[state]
-    assert reading.ev100[0] == pytest.approx(ev + math.log2(1.0 / 0.9) + step, abs=0.02)
 
 
 def test_skewness_balances_two_levels_about_mid_grey(context, photograph):
@@ -165,31 +132,6 @@ def test_entropy_finds_the_exposure_of_the_highest_entropy(context, photograph):
     reading = make_meter("entropy", context.camera)(photograph(light, 9.0, state))
     # The frame has its top at 0.35 at EV 9, so at 1 at 9 - log2(1 / 0.35).
     assert reading.ev100[0] == pytest.approx(9.0 + math.log2(top), abs=0.15)
-
-
-def test_simulated_histogram_is_that_of_the_exposed_frame():
-    """A uniform density of the signal is uniform in linear light at every exposure."""
-    codes = np.arange(256)
-    edges = (np.clip(codes[:, None] + [-0.5, 0.5], 0, 255) / 255.0) ** 2 * (1 + 1 / 1024) - 1 / 1024
-    shares = np.diff(np.clip(edges, 0.0, 1.0), axis=1)[:, 0]
-    exposed = search_meters._exposed(shares[None], np.array([-1.0, 0.0, 1.0]))[0]
-    assert exposed.shape == (3, 256)
-    assert exposed.sum(axis=1) == pytest.approx(1.0)
-    share = exposed[:, 128:].sum(axis=1)  # above half of the code: signal above 0.214
-    border = _linear(0.5)
-    assert share[1] == pytest.approx(1.0 - border, abs=5e-4)
-    assert share[2] == pytest.approx(1.0 - border / 2, abs=5e-4)
-    assert share[0] == pytest.approx(1.0 - border * 2, abs=1e-3)  # white lies at 0.5 there
-
-
-def test_saturated_pixels_add_to_what_a_search_finds():
-    shares = np.zeros((2, 256))
-    shares[0, [100, 255]] = 0.75, 0.25
-    shares[1, 0] = 1.0
-    found = search_meters._search_reading(shares, np.array([8.0, 8.0]), np.array([-1.0, 2.0]))
-    assert found.ev100.tolist() == [9.0 + 0.25 * 3.0, 6.0]
-    assert found.saturated.tolist() == [0.25, 0.0]
-    assert found.black.tolist() == [False, True]
 
 
 def test_peak_is_the_top_of_a_parabola():
@@ -229,3 +171,114 @@ def test_the_dark_is_left(context, photograph, name):
             assert context.grid.ev100[state[0]] < 9.0 + 1.6
         state = policy.act(photograph(light, 35.0 if frame in (13, 14) else 9.0, state))
     assert context.grid.ev100[state[0]] < 9.0 + 1.6
+
+
+def test_highlights_are_exposed_to_nine_tenths_of_white(context, photograph):
+    """The 99th percentile of the brightest plane of each pixel; where it is white, by a bound."""
+    state, meter = context.grid.nearest(9.0), make_meter("highlight_weighted", context.camera)
+    light = np.ones((4, 64, 64))
+    light[3, :2] = 4.0  # 3 % of the pixels are blue highlights
+    light[:, 2, 0] = 30.0  # and one a lamp, which does not count
+    reading = meter(photograph(light, 9.0, [state, state]))
+    # 0.12 * 4 at EV 9; 0.9 at 9 + log2(0.48 / 0.9).
+    np.testing.assert_allclose(reading.ev100, [9.0 + math.log2(0.48 / 0.9)] * 2, atol=0.03)
+    assert reading.saturated.tolist() == [0.0, 0.0]
+    assert reading.black.tolist() == [False, False]
+    light[:, :4] = 100.0  # a sixteenth is blown
+    blown = meter(photograph(light, 9.0, state))
+    step = 3.0 * (0.51 + 0.49 * 4 / 64)
+    end = context.grid.ev100[state] + math.log2(1.0 / 0.9) + step
+    assert blown.ev100[0] == pytest.approx(end, abs=0.02)
+    dark = photograph(GREY, -6.0, context.grid.nearest(17.0))
+    assert meter(dark).black.tolist() == [True]
+
+
+#: Stripes from 5 stops below to 2 stops above a grey card, and a flat one.
+STRIPES = np.repeat(2.0 ** np.linspace(-5.0, 2.0, 16), 4)[None, :] * np.ones((64, 1))
+RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
+
+
+def _reading(ev, saturated=0.0, black=False):
+    return Reading(np.array([ev]), np.array([saturated]), np.array([black]))
+
+
+def _match(matcher, reading, frame, camera):
+    return matcher.match(reading, zone_signals(frame["raw"], camera), frame_ev100(frame))
+
+
+def test_tracker_jumps_far_averages_near_and_respects_bounds():
+    tracker = EVTracker(1, (-1.0, 17.0))
+    assert tracker.update(_reading(8.0))[0] == 8.0
+    assert tracker.update(_reading(8.5))[0] == 8.25
+    assert tracker.update(_reading(12.0))[0] == 12.0
+    assert tracker.update(_reading(9.0, saturated=0.8))[0] == 12.0  # 12 is above the bound
+    assert tracker.update(_reading(13.0, black=True))[0] == 12.0  # and below this one
+    assert tracker.update(_reading(16.0, saturated=0.8))[0] == 16.0  # 12 is below 16 - 2.4
+    assert tracker.update(_reading(5.0, black=True))[0] == 2.0  # half of the way to -1
+    white = EVTracker(1, (-1.0, 17.0)).update(_reading(9.0, saturated=1.0))
+    assert white[0] == 0.5 * (9.0 - 3.0 + 17.0)
+
+
+def test_damping_keeps_its_share_of_the_distance_in_ev():
+    tracker = EVTracker(1, (-1.0, 17.0), damping=0.75)
+    assert tracker.update(_reading(4.0))[0] == 4.0  # nothing to keep yet
+    found = [tracker.update(_reading(12.0))[0] for _ in range(6)]
+    np.testing.assert_allclose(found, [12.0 - 8.0 * 0.75**n for n in range(1, 7)])
+
+
+def _kept(reference, observations):
+    return frame_ev100(reference.update(observations))[0]
+
+
+def test_the_brightest_frame_that_hides_nothing_is_kept(context, photograph):
+    grid = context.grid
+    dark, fair, bright = (grid.nearest(ev) for ev in (13.0, 10.0, 6.0))
+    reference = ReferenceFrames(context.camera)
+    for state, best in ((dark, dark), (fair, fair), (bright, fair), (dark, fair), (fair, fair)):
+        found = _kept(reference, photograph(RAMP, 9.0, state))
+        assert abs(found - grid.ev100[best]) < 0.05
+
+
+def test_another_light_is_noticed_at_once(context, photograph):
+    grid = context.grid
+    for change in (-6.0, -4.0, -1.0, 1.0, 4.0):
+        reference = ReferenceFrames(context.camera)
+        _kept(reference, photograph(RAMP, 9.0, grid.nearest(9.0)))
+        later = photograph(RAMP, 9.0 + change, grid.nearest(11.0))
+        assert abs(_kept(reference, later) - grid.ev100[grid.nearest(11.0)]) < 0.05
+
+
+@pytest.mark.parametrize("stops", [4.0, 3.0, -2.0])
+def test_a_jump_is_read_from_the_shadows(context, photograph, stops):
+    """The light is known: 9 EV before, and so much more in two frames after, as the first's."""
+    meter, state = make_meter("average", context.camera), context.grid.nearest(9.0)
+    matched = ZoneMatcher()
+    before = photograph(STRIPES, 9.0, state)
+    first = _match(matched, meter(before), before, context.camera)
+    for late in (state, context.grid.nearest(11.0), context.grid.nearest(9.0 + stops)):
+        after = photograph(STRIPES, 9.0 + stops, late)
+        reading = _match(matched, meter(after), after, context.camera)
+        assert reading.ev100 - first.ev100 == pytest.approx(stops, abs=0.1)
+        assert reading.saturated[0] <= 0.02
+
+
+def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
+    meter, state = make_meter("average", context.camera), context.grid.nearest(9.0)
+    matched = ZoneMatcher()
+    for light in (9.0, 15.0):
+        frame = photograph(np.ones((64, 64)), light, state)
+        plain, reading = meter(frame), _match(matched, meter(frame), frame, context.camera)
+        np.testing.assert_array_equal(reading.ev100, plain.ev100)
+        np.testing.assert_array_equal(reading.saturated, plain.saturated)
+    assert reading.saturated[0] == 1.0
+
+
+def test_only_zones_that_both_show_are_compared():
+    before = np.array([0.02, 0.1, 0.3, np.nan, 0.5])
+    now = np.array([0.08, 0.4, np.nan, 0.9, np.nan])
+    stops, enough = light_change(before, now)
+    assert stops == pytest.approx(2.0)
+    assert enough
+    for dark in (np.full(5, 1e-4), np.full(5, np.nan)):
+        stops, enough = light_change(dark, now)
+        assert (stops, enough) == (0.0, False)

@@ -32,11 +32,11 @@ def test_other_conditions_have_one_row_of_their_own_name():
     own = rows[rows.policy == "ppo"]
     assert own.condition.tolist() == ["all", "hard", "rest", "sine"]
     assert own.regret_given_ev.iloc[0] == own.regret_given_ev.iloc[3]
-    ranking = made.ranking_rows(made.overall_ranking(results, resamples=100))
-    assert [row["policy"] for row in ranking] == ["spot:P", "matrix:P", "ppo"]  # oracle is told
-    assert [row["place"] for row in ranking] == [1, 2, 3]
-    assert (ranking[1]["to_best"]["other"], ranking[2]["to_next"]) == ("spot:P", None)
-    assert ranking[1]["to_best"]["difference"] < 0
+    ranking = made.overall_ranking(results, resamples=100)
+    assert ranking.policy.tolist() == ["spot:P", "matrix:P", "ppo"]  # oracle is told
+    assert ranking.place.tolist() == [1, 2, 3]
+    assert (ranking.to_best[1]["other"], ranking.to_next[2]) == ("spot:P", None)
+    assert ranking.to_best[1]["difference"] < 0
 
 
 def test_scenes_have_means_of_their_episodes():
@@ -75,10 +75,7 @@ def test_best_meter_differences_and_histogram():
     share = np.mean([result.grid[s].iso == 400 for s in result.oracle_states])
     assert histogram["iso"]["400"] == pytest.approx(share)
     kinds = made.scores_by_kind(result)
-    assert [(kind, own["groups"]) for kind, own in kinds.items()] == [
-        ("snow", 10),
-        ("photograph", 10),
-    ]
+    assert {kind: own["groups"] for kind, own in kinds.items()} == {"snow": 10, "photograph": 10}
     assert kinds["snow"]["oracle"] == pytest.approx(1.0)
 
 
@@ -90,8 +87,8 @@ def test_brackets_by_hand():
         for k, budget in enumerate((0.1, 0.2))
     }
     ranking = made.overall_ranking(results)
-    assert [(one.policy, one.tier) for one in ranking] == [("high", 1), ("low", 2)]
-    assert ranking[1].score.value == pytest.approx(0.7)
+    assert (ranking.policy.tolist(), ranking.tier.tolist()) == (["high", "low"], [1, 2])
+    assert ranking.normalised_score[1] == pytest.approx(0.7)
     rows = made.bracket_rows(results, ranking).set_index(["budget", "policy"])
     low = rows.loc[0.2, "low"]
     assert (low.quality, low.unseen, low.num_groups) == (pytest.approx(0.75), 0.5, 16)

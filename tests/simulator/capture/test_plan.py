@@ -12,19 +12,19 @@ from scipy.integrate import quad
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
-from simulator.capture.blurred_light import MapApertureBlur
-from simulator.capture.exposure import HIDDEN_LIGHT, Exposure, Step, TransitionInputs, decide
-from simulator.capture.layout import Layout
+from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
+from simulator.capture.exposure import DEFAULT_TOLERANCE, Exposure, Step, Target, check_tolerance
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
-from simulator.capture.plan import _BOUND, _LEAST_BOUND, DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import (
     DenoisedLight,
     LightStatistics,
     Residual,
     ResidualStatistics,
 )
-from simulator.optics.motion import Path
+from simulator.optics.motion import Movement
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)
@@ -179,17 +179,66 @@ UNIT = NoiseLevelFunction((0.0,) * 4, (1.0,) * 4)
 FLAT = ResidualStatistics(torch.ones(4, 16, 16), UNIT)
 
 
-def steps(
-    tolerance: float, found: Statistics, networks: tuple[DenoisedLight, ...] = (), **given: object
-) -> list[Step]:
+class Opening(ApertureBlur):
+    """An aperture that opens by a blur of `extent`."""
+
+    def __init__(self, extent: float, *, needs_denoised: bool = False) -> None:
+        super().__init__(16.0)
+        self._extent, self.needs_denoised = extent, needs_denoised  # type: ignore[misc]
+
+    def remaining_variance(self, f_number: float) -> None:
+        """None: no noise is left out of account here."""
+
+    def _largest(self, f_number: float) -> float:
+        return self._extent
+
+    def _open(self, f_number: float, denoised: DenoisedLight | None) -> torch.Tensor:
+        return LIGHT
+
+
+def decided(
+    tolerance: float,
+    found: Statistics,
+    networks: tuple[DenoisedLight, ...] = (),
+    *,
+    opened_px: float | None = None,
+    noise: bool = True,
+    nlf: tuple[NoiseLevelFunction, NoiseLevelFunction] = (UNIT, UNIT),
+    **given: object,
+) -> Exposure:
     """What is decided where the noise's variance is 1; by default with a network without error."""
     exact = DenoisedLight(LIGHT)
     exact.statistics = found  # type: ignore[misc]
-    inputs = TransitionInputs(1.0, UNIT, UNIT, tolerance, True, found, FLAT, networks or (exact,))
-    return list(decide(inputs._replace(**given)).steps)  # type: ignore[arg-type]
+    if opened_px is not None:
+        given["aperture_blur"] = Opening(opened_px)
+    scene = PreparedScene(
+        LIGHT,
+        SOURCE,
+        Z6,
+        nlf[0],
+        denoised_lights=networks or (exact,),
+        tolerance=tolerance,
+        **given,
+    )  # type: ignore[arg-type]
+    scene.blurred_light.statistics, scene.blurred_light.residuals = found, FLAT
+    scene.targets[SOURCE] = Target(1.0, nlf[1])
+    return scene.exposure(SOURCE, noise=noise)
 
 
-def left_out(made: list[Step]) -> list[str]:
+def steps(*given: object, **options: object) -> tuple[Step, ...]:
+    return decided(*given, **options).steps  # type: ignore[arg-type]
+
+
+#: A disc, and a streak along the rows, of so many pixels at `SOURCE`.
+def disc(extent: float) -> dict[str, float]:
+    return {"defocus": 2.0 * extent}
+
+
+def streak(extent: float) -> dict[str, float]:
+    return {"image_speed": 4.0 * extent}
+
+
+def left_out(made: tuple[Step, ...]) -> list[str]:
     return [step.name for step in made if not step.runs and step.error]
 
 
@@ -236,39 +285,38 @@ def test_a_larger_network_or_any_may_be_the_worse_one() -> None:
 def test_noise_and_blur_add_as_squares() -> None:
     """3, 4, 5: a blur of 0.4 fits beside noise of 0.3 within 0.5, and nothing more does."""
     found = Statistics(0.3, disc=0.4, streak=1e-3)
-    assert left_out(steps(0.5, found, defocus_px=1.0)) == ["noise_reduction", "defocus"]
-    made = steps(0.5, found, defocus_px=1.0, motion_px=1.0)
+    assert left_out(steps(0.5, found, **disc(1.0))) == ["noise_reduction", "defocus"]
+    made = steps(0.5, found, **disc(1.0), **streak(1.0))
     assert [step.runs for step in made] == [False, False, False, True]
-    assert left_out(steps(0.29, found, defocus_px=1.0)) == []
+    assert left_out(steps(0.29, found, **disc(1.0))) == []
     assert left_out(steps(0.4999, Statistics(0.5))) == []
-    for disc, runs in ((0.41, True), (0.39, False)):  # beside a network that errs by 0.3
+    for error, runs in ((0.41, True), (0.39, False)):  # beside a network that errs by 0.3
         own = network("nano", 0.3)
-        own.statistics = Statistics(disc=disc)  # type: ignore[misc]
-        made = steps(0.5, Statistics(0.9), (own,), defocus_px=1.0)
+        own.statistics = Statistics(disc=error)  # type: ignore[misc]
+        made = steps(0.5, Statistics(0.9), (own,), **disc(1.0))
         assert [made[0].runs, made[2].runs] == [True, runs]
 
 
 def test_missing_blurs_add_up_in_the_mean() -> None:
     """0.3 and 0.4 shift a pixel by up to 0.7; the second adds sqrt(0.49 - 0.09) to the square."""
     found = Statistics(disc=0.1, streak=0.4)
-    made = steps(0.7, found, aperture_px=3**0.5, opens=True, motion_px=1.0)
+    made = steps(0.7, found, opened_px=3**0.5, **streak(1.0))
     assert left_out(made) == ["aperture", "motion_blur"]
     assert made[3].error == pytest.approx(math.sqrt(0.4))
     assert math.hypot(*(step.error for step in made)) == pytest.approx(0.7)
     # Errors go with the square of the extent: 0.9 does not fit.
-    assert left_out(steps(0.7, found, aperture_px=3.0, opens=True)) == []
+    assert left_out(steps(0.7, found, opened_px=3.0)) == []
 
 
 def test_a_blur_that_runs_takes_nothing_of_the_tolerance() -> None:
-    made = steps(0.2, Statistics(disc=0.05, streak=0.2), aperture_px=10, defocus_px=2, opens=True)
+    made = steps(0.2, Statistics(disc=0.05, streak=0.2), opened_px=10, **disc(2))
     assert left_out(made) == ["defocus"]
     assert [step.error for step in made] == [0.0, pytest.approx(5.0), pytest.approx(0.2), 0.0]
     assert [step.extent for step in made] == [0.0, 10, 2, 0.0]
 
 
 def test_tolerance_0_leaves_nothing_out() -> None:
-    blurs = {"aperture_px": 1.0, "opens": True, "defocus_px": 1e-200, "motion_px": 1.0}
-    made = steps(0.0, Statistics(1e-9), **blurs)
+    made = steps(0.0, Statistics(1e-9), opened_px=1.0, **disc(1e-200), **streak(1.0))
     assert all(step.runs for step in made)
     assert [step.error for step in made] == [1e-9] + [math.inf] * 3
     assert not steps(0.0, Statistics(0.0))[0].runs  # a noisier target: topping up is exact
@@ -278,17 +326,16 @@ def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
     """The paper's aperture module needs the denoised light; its own blur is not known before."""
     nlf, found = (Z6.nlf(6400), Z6.nlf(100)), Statistics(5.0, disc=0.01)
     lazy = DenoisedLight(lambda: pytest.fail("it ran"))
-    inputs = TransitionInputs(1.0, *nlf, 0.1, True, found, FLAT, (lazy,))
-    opens = inputs._replace(aperture_px=math.inf, opens=True, opens_denoised=True)
-    made = decide(opens).steps
+    opens = {"aperture_blur": Opening(math.inf, needs_denoised=True), "nlf": nlf}
+    made = steps(0.1, found, (lazy,), **opens)
     assert [step.runs for step in made] == [True, True, False, False]
     assert "works on the noise-reduced light only" in made[0].reason
     assert made[1].reason == "the aperture opens and adds blur"
     assert made[1].error == math.inf
-    assert decide(inputs).steps[0].runs
+    assert steps(0.1, found, (lazy,), nlf=nlf)[0].runs
     lazy.statistics = Statistics(disc=0.02)  # type: ignore[misc]
-    blurred = opens._replace(defocus_px=2.0)
-    assert decide(blurred).steps[2].error == pytest.approx(0.08)  # of the light that is blurred
+    blurred = steps(0.1, found, (lazy,), **opens, **disc(2.0))
+    assert blurred[2].error == pytest.approx(0.08)  # of the light that is blurred
 
 
 def test_tolerances() -> None:
@@ -303,21 +350,23 @@ def test_tolerances() -> None:
 
 def test_the_exposure_has_what_runs() -> None:
     """Of blur that is left out, neither extent nor path nor layout stays."""
-    where, layout = {"path": Path(3.0, 0.5), "subject_path": Path(4.0)}, Layout(torch.zeros(16, 16))
-    blurs = {"defocus_px": 2.0, "motion_px": 4.0, "layout": layout, **where}
-    inputs = TransitionInputs(2.0, UNIT, UNIT, 0.1, True, Statistics(), FLAT, (network("a", 0.0),))
-    for disc, streak in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0)):
-        found = Statistics(disc=disc, streak=3 / 4 * streak)  # a path's bound is that of a disc
-        made = decide(inputs._replace(statistics=found, **blurs))
-        moves = disc > 0.0
-        assert (made.defocus_px, made.motion_px) == (2.0 * (disc > 0.0), 4.0 * moves)
-        assert (made.path, made.subject_path) == ((*where.values(),) if moves else (None, None))
+    subject = torch.arange(20).expand(16, 20) > 9
+    layout, movement = Layout(torch.ones(16, 20), subject), Movement(0.5, 0.0, 4.0)
+    blurs = {**disc(2.0), **streak(4.0), "layout": layout, "movement": movement}
+    own = movement.subject_path(16.0, 1 / 64, 16)
+    paths = movement.path(16.0, 1 / 64, 16), own
+    for point, row in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0)):
+        found = Statistics(disc=point, streak=3 / 4 * row)  # a path's bound is that of a disc
+        made = decided(0.1, found, (network("a", 0.0),), **blurs)
+        moves = point > 0.0
+        assert (made.defocus_px, made.motion_px) == (2.0 * moves, own.length * moves)
+        assert (made.path, made.subject_path) == (paths if moves else (None, None))
         assert made.layout is (layout if moves else None)
-        assert (made.ratio, made.source, made.denoised, made.opened_to) == (2.0, UNIT, None, None)
-    opened = inputs._replace(aperture_px=9.0, opens=True, f_number=2.8, statistics=Statistics(9, 9))
-    made = decide(opened)
-    assert (made.opened_to, made.source.is_zero) == (2.8, True)
-    assert made.denoised is inputs.networks[0]
+        assert (made.ratio, made.source, made.denoised, made.opened_to) == (1.0, UNIT, None, None)
+    exact = network("a", 0.0)
+    exact.statistics = Statistics(9, 9)  # type: ignore[misc]
+    made = decided(0.1, Statistics(9, 9), (exact,), opened_px=9.0)
+    assert (made.opened_to, made.source.is_zero, made.denoised) == (8.0, True, exact)
     assert made.left_out == 0.0
     assert Exposure(1.0, UNIT, UNIT).left_out == 0.0
 

@@ -71,7 +71,7 @@ def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path, depth: Any) ->
 
 
 def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
-    with pytest.raises(ValueError, match=r"`cache` \(='ram'\) must be None or one of"):
+    with pytest.raises(ValueError, match=r"`cache` \(='ram'\) must be one of None"):
         _simulator(cache="ram")
     _denoised(_simulator(), _raw())  # in memory only
     simulator = _simulator(cache=None)

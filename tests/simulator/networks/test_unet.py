@@ -216,13 +216,3 @@ def test_batch_of_different_f_numbers_equals_single_runs() -> None:
     for i in range(3):
         alone = net(images[i : i + 1], f_numbers[i : i + 1])
         torch.testing.assert_close(together[i : i + 1], alone)
-
-
-def test_bad_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"`f_numbers` \(of shape \(2,\)\) must have shape \(1, 2"):
-        AttentionUNet(widths=(4, 6))(normal(1, 4, 4, 4), PAIR[0])
-    for kind, widths in [(UNet, w) for w in ((), (8,), (8, 0), (8, 4.0))] + [
-        (AttentionUNet, (32,))
-    ]:
-        with pytest.raises(ValueError, match="`widths`"):
-            kind(widths=widths)

@@ -18,19 +18,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from simulator.noise.generator import (
-    BLOCK,
+from simulator.capture.sensor import (
     Noise,
-    bank_normals,
-    drawn_normals,
     frame_normals,
     noise_bank,
-    noise_generator,
     noise_keys,
-    philox,
     single_normals,
     sweep_keys,
 )
+from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, philox
 from simulator.settings import CameraSettings
 
 SHAPE = (4, 128, 128)
@@ -144,7 +140,7 @@ def test_the_bank_is_every_quantile_once_in_a_fixed_order() -> None:
 def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, int]) -> None:
     key, bank = key_of(5, 2.0), noise_bank()
     size, turn = shape[1] * shape[2], 0
-    for plane in bank_normals(key, shape).reshape(shape[0], size):
+    for plane in frame_normals(key, shape, "bank").reshape(shape[0], size):
         for start in range(0, size, 256):
             turn += 1
             word = mixed(key + turn * STEP & MASK)

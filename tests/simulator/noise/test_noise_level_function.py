@@ -14,15 +14,14 @@ from scipy.stats import norm
 
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
+from simulator.capture.exposure import Exposure
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, record
+from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
 from simulator.noise.noise_level_function import (
     NoiseLevelFunction,
     ReadNoise,
     averaged_shape,
-    missing_variance,
     noise_variance,
-    top_up_table,
     tukey_lambda,
 )
 from simulator.reference.camera import ReferenceCamera
@@ -84,7 +83,7 @@ def test_what_is_missing_is_the_difference_of_the_two_noises(
 ) -> None:
     """A quarter of the source's variance is left of the second pixels: the rest is missing, too."""
     levels, share = signal(-0.05, 0.0, 0.2, 0.9, 0.5), torch.tensor([[1.0, 0.25, 1.0, 0.25, 0.0]])
-    (table,) = top_up_table([source], [target])
+    table = exposure_table([Exposure(1.0, source, target)])[0, 1:]
     given, wanted = (noise_variance(levels, nlf).double() for nlf in (source, target))
     plain, blurred = missing_variance(levels, table), missing_variance(levels, table, share)
     np.testing.assert_allclose(plain, wanted - given, rtol=1e-5, atol=1e-12)
@@ -95,14 +94,15 @@ def test_what_is_missing_is_the_difference_of_the_two_noises(
 
 
 def test_the_table_has_the_differences_in_float64() -> None:
+    first = NoiseLevelFunction((1e-4,) * 4, CLEAN.read)
     nearly = NoiseLevelFunction((1e-4 * (1 + 1e-12),) * 4, CLEAN.read)
-    table = top_up_table([NoiseLevelFunction((1e-4,) * 4, CLEAN.read), CLEAN], [nearly, NOISY])
-    assert table.shape == (2, 4, 4)
-    assert table[0, 0] == pytest.approx(1e-16, rel=1e-3)
-    assert table[0, 1].tolist() == [0.0] * 4
-    np.testing.assert_allclose(table[1, 0], np.subtract(NOISY.shot, CLEAN.shot))
-    assert table[1, 2:].tolist() == [list(CLEAN.shot), list(CLEAN.read)]
-    assert top_up_table([], []).shape == (0, 4, 4)
+    table = exposure_table([Exposure(1.0, first, nearly), Exposure(1.0, CLEAN, NOISY)])
+    assert table.shape == (2, 5, 4)
+    assert table[0, 1] == pytest.approx(1e-16, rel=1e-3)
+    assert table[0, 2].tolist() == [0.0] * 4
+    np.testing.assert_allclose(table[1, 1], np.subtract(NOISY.shot, CLEAN.shot), rtol=1e-6)
+    np.testing.assert_allclose(table[1, 3:], [CLEAN.shot, CLEAN.read], rtol=1e-6)
+    assert exposure_table([]).shape == (0, 5, 4)
 
 
 # -- rows and tails of read noise -------------------------------------------------------------

@@ -23,7 +23,6 @@ from simulator import (
 from simulator.camera import BayerPattern, CameraProfile
 from simulator.raw.develop import (
     apply_tone,
-    demosaic_half,
     demosaic_malvar,
     develop_inverse,
     neutral_highlights,
@@ -143,24 +142,17 @@ def test_render_sizes(size):
         (render_srgb, {"exposure_ev": math.nan}, "exposure_ev"),
         (render_srgb, {"raw": object()}, "raw"),
         (develop, {"images": torch.zeros(4, 8, 8)}, "images"),
-        (develop, {"images": torch.zeros(1, 3, 8, 8)}, "images"),
-        (develop, {"images": torch.full((1, 4, 2, 2), math.nan)}, "images"),
-        (develop, {"images": torch.zeros(1, 4, 2, 2, dtype=torch.uint8)}, "images"),
         (develop, {"white_balance": (1.0, 1.0)}, "white_balance"),
-        (develop, {"white_balance": torch.ones(3, 3)}, "white_balance"),
-        (develop, {"white_balance": (1.0, 0.0, 1.0)}, "white_balance"),
         (develop, {"white_balance": (1.0, math.nan, 1.0)}, "white_balance"),
         (develop, {"colour_matrix": torch.eye(4)}, "colour_matrix"),
-        (develop, {"colour_matrix": torch.full((3, 3), math.inf)}, "colour_matrix"),
         (develop, {"colour_matrix": torch.ones(3, 3)}, "colour_matrix"),
         (develop, {"colour_matrix": -torch.eye(3)}, "colour_matrix"),
-        (develop, {"tone": "photografic"}, "did you mean 'photographic'"),
     ],
 )
 def test_bad_arguments(function, arguments, message):
     raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
     usual = {"images": torch.zeros(2, 4, 2, 2)} if function is develop else {"raw": raw}
-    with pytest.raises(ValueError, match=message if " " in message else f"`{message}`"):
+    with pytest.raises(ValueError, match=f"`{message}`"):
         function(**(usual | arguments))
 
 
@@ -226,12 +218,6 @@ def test_malvar_border_is_that_of_a_mirrored_mosaic(pattern, size):
     mirrored = np.pad(mosaic, 4, mode="reflect")
     theirs = demosaicing_CFA_Bayer_Malvar2004(mirrored, pattern)[4:-4, 4:-4]
     np.testing.assert_allclose(ours, theirs, atol=1e-14)
-
-
-def test_half_is_one_pixel_per_tile():
-    rgb = demosaic_half(torch.arange(2 * 4 * 2 * 3.0).reshape(2, 4, 2, 3))
-    assert rgb.shape == (2, 3, 2, 3)
-    assert rgb[1, :, 0, 2].tolist() == [26.0, 35.0, 44.0]  # of 26, 32, 38, 44
 
 
 @pytest.mark.gpu

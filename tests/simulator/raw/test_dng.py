@@ -1,5 +1,3 @@
-import errno
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,7 @@ from simulator import (
     write_dng,
 )
 from simulator.camera import BayerPattern
-from simulator.raw import dng as dng_module
-from simulator.raw.dng import DEFAULT_COLOUR_MATRIX, as_rational
+from simulator.raw.dng import DEFAULT_COLOUR_MATRIX
 from tests.strategies import cameras, log_uniform, mosaics, settings_within
 
 NLF = NoiseLevelFunction((1.5e-4, 2e-4, 2e-4, 2.5e-4), (1e-6, 2e-6, 2e-6, 3e-6))
@@ -198,33 +195,11 @@ def test_any_size_and_order_of_memory(path):
         np.testing.assert_array_equal(tifffile.imread(path), mosaic)
 
 
-def test_rationals():
-    for value in (1 / 60, 0.0001, 2.8, 1 / 3, 2**0.5, 30.0, 1e-6, 4e9):
-        numerator, denominator = as_rational(value)
-        assert max(numerator, denominator) < 2**32
-        assert numerator / denominator == pytest.approx(value, rel=1e-9)
-    for far in (-1.0, 1e12):
-        with pytest.raises(ValueError, match="32-bit rational"):
-            as_rational(far)
-
-
-def test_bad_arguments_and_a_full_disk_leave_nothing_and_keep_the_old(tmp_path, path, monkeypatch):
-    with pytest.raises(ValueError, match=r"`path`.*'\.dng'"):
-        write_dng(tmp_path / "a.tif", make_raw())
-    with pytest.raises(ValueError, match="`raw`"):
-        write_dng(path, make_raw().data)  # type: ignore[arg-type]
+def test_bad_arguments_leave_what_is_there(tmp_path, path):
     write_dng(path, make_raw())
     before = path.read_bytes()
-
-    def full_disk(*_: Any) -> Iterator[bytes]:
-        yield b"half of it"
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(dng_module, "_strip", full_disk)
-    for target in (path, tmp_path / "new" / "b.dng"):
-        with pytest.raises(OSError, match="cannot be written: No space left") as caught:
-            write_dng(target, make_raw())
-        assert caught.value.errno == errno.ENOSPC
-        assert str(target) in str(caught.value)
+    for target, raw, name in ((tmp_path / "a.tif", make_raw(), "path"), (path, None, "raw")):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            write_dng(target, raw)  # type: ignore[arg-type]
     assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["a.dng"]
+    assert [p.name for p in tmp_path.iterdir()] == ["a.dng"]

@@ -7,12 +7,10 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-import torch
 from numba.core import caching
 
-from simulator import CameraSimulator
 from simulator.utils import compute as jit
-from simulator.utils.compute import computes_bfloat16, kernel, parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 
 def add(a: int, b: int) -> int:
@@ -121,15 +119,3 @@ def test_child_processes_make_threads_of_their_own():
     child.start()
     assert queue.get(timeout=60) == [1.0, 2.0]
     child.join(timeout=60)
-
-
-def test_emulated_bfloat16_is_said(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    known = "simulator.utils.compute.computes_bfloat16"
-    for computed in (True, False):
-        monkeypatch.setattr(known, lambda device, computed=computed: computed)
-        with caplog.at_level(logging.WARNING):
-            CameraSimulator(device="cpu", precision="bfloat16")
-        assert ("ten times as slow" in caplog.text) is not computed
-    assert computes_bfloat16(torch.device("cuda"))
