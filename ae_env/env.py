@@ -10,14 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from ae_env.episodes.core import (
-    EpisodeCore,
-    FindTransitions,
-    Frames,
-    MakeTask,
-    Task,
-    check_actions,
-)
+from ae_env.episodes.core import EpisodeCore, FindTransitions, Frames, MakeTask, Task, check_actions
 from ae_env.episodes.lookup import RECORDED
 from ae_env.episodes.state import Episode, Episodes, check_options
 from ae_env.grid import ExposureGrid

@@ -365,13 +365,8 @@ def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
     """Corners of a five-pointed star."""
     angles = np.arange(10) * np.pi / 5
     radii = np.where(np.arange(10) % 2, 0.4 * radius, radius)
-    return list(
-        zip(
-            (x + radii * np.sin(angles)).tolist(),
-            (y - radii * np.cos(angles)).tolist(),
-            strict=True,
-        )
-    )
+    corners = np.stack([x + radii * np.sin(angles), y - radii * np.cos(angles)], axis=1)
+    return [(column, row) for column, row in corners.tolist()]
 
 
 def _fitting_font(draw: ImageDraw.ImageDraw, line: str, size: int, width: int) -> Any:

@@ -16,7 +16,7 @@ allowed positions may still be a forbidden state; the environment photographs it
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -39,102 +39,137 @@ __all__ = [
 _DISTANCE_DECIMALS = 9
 
 
-# -- from actions (..., 3) to states, and from allowed states to masks ----------------------------
+class _GridActions(RecordConstructorArgs):
+    """What the wrappers of one and of many environments have in common; actions are (..., 3)."""
 
+    _shape: tuple[int, ...] = (3,)
+    _states_name: ClassVar[str] = "state"
 
-def _check_steps(actions: Any, sizes: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    """`actions` as int64 of `shape` with column i in [0, sizes[i])."""
-    values = check_actions("action", actions, shape)
-    if bool(((values < 0) | (values >= np.array(sizes))).any()):
-        raise ValueError(f"`action` (={values.tolist()}) must be in [0, {list(sizes)}) by column")
-    return values.astype(np.int64)
-
-
-def _states_of_controls(grid: ExposureGrid, controls: np.ndarray) -> np.ndarray:
-    """States at the positions `controls` in the grid's three lists."""
-    states = np.ravel_multi_index(tuple(np.moveaxis(controls, -1, 0)), grid.shape)
-    return np.asarray(states, np.int64)
-
-
-def _states_of_steps(grid: ExposureGrid, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """States that `steps` (0 down, 1 stay, 2 up) lead to from `states`."""
-    last = np.array(grid.shape) - 1
-    return _states_of_controls(grid, np.clip(grid.controls(states) + steps - 1, 0, last))
-
-
-def _check_apex(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """`actions` as float64 of `shape`, clipped to [-1, 1]."""
-    try:
-        values = np.asarray(actions)
-    except ValueError:  # rows of different lengths
-        values = np.empty(0, object)
-    numbers = values.shape == shape and values.dtype.kind in "iuf"
-    values = values.astype(np.float64) if numbers else values
-    if not numbers or not np.isfinite(values).all():
-        raise ValueError(f"`action` (={actions!r}) must be finite numbers of shape {shape}")
-    clipped: np.ndarray = np.clip(values, -1.0, 1.0)
-    return clipped
-
-
-def _apex_of(grid: ExposureGrid) -> np.ndarray:
-    """(S, 3) Av, Tv, Sv of every state."""
-    return np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid.states])
-
-
-def _states_of_apex(apex: np.ndarray, actions: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """Nearest allowed state of each action, ties to the lower index; allowed (..., S)."""
-    low, high = apex.min(axis=0), apex.max(axis=0)
-    wanted = low + 0.5 * (actions + 1.0) * (high - low)
-    distance = ((wanted[..., None, :] - apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
-    nearest: np.ndarray = np.argmin(np.where(allowed, distance, np.inf), axis=-1)
-    return nearest.astype(np.int64)
-
-
-def _control_masks(grid: ExposureGrid, allowed: np.ndarray) -> np.ndarray:
-    """(..., I + T + N): positions of each control that some allowed state (..., S) has."""
-    cube = allowed.reshape(*allowed.shape[:-1], *grid.shape)
-    return np.concatenate(
-        [cube.any(axis=(-2, -1)), cube.any(axis=(-3, -1)), cube.any(axis=(-3, -2))], axis=-1
-    )
-
-
-def _step_masks(grid: ExposureGrid, states: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """(..., 9): steps of each control that lead to a position which some allowed state has."""
-    by_value = np.split(_control_masks(grid, allowed), np.cumsum(grid.shape)[:-1], axis=-1)
-    controls = grid.controls(states)
-    masks = []
-    for i, mask in enumerate(by_value):
-        targets = np.clip(controls[..., i, None] + np.array([-1, 0, 1]), 0, grid.shape[i] - 1)
-        masks.append(np.take_along_axis(mask, targets, axis=-1))
-    return np.concatenate(masks, axis=-1)
-
-
-def _checked_grid(env: Any) -> ExposureGrid:
-    """The grid of an environment whose actions are its states; raises a `ValueError` for others."""
-    for name in ("grid", "action_masks"):
-        if not hasattr(env.unwrapped, name):
-            raise ValueError(
-                f"`env` (={env}) must be an ae_env/AutoExposure-v0 whose actions are grid states; "
-                f"it has no `{name}` (for many environments use gymnasium.make_vec)"
-            )
-    if not isinstance(getattr(env, "single_action_space", env.action_space), gym.spaces.Discrete):
-        raise ValueError(f"`env` (={env}) must have Discrete actions: it is wrapped already")
-    grid: ExposureGrid = env.unwrapped.grid
-    return grid
-
-
-# -- one environment ------------------------------------------------------------------------------
-
-
-class _GridActions(gym.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def _set_up(self, env: Any) -> None:
         RecordConstructorArgs.__init__(self)
-        gym.ActionWrapper.__init__(self, env)
+        for name in ("grid", "action_masks"):
+            if not hasattr(env.unwrapped, name):
+                raise ValueError(
+                    f"`env` (={env}) must be an ae_env/AutoExposure-v0 whose actions are grid "
+                    f"states; it has no `{name}` (for many environments use gymnasium.make_vec)"
+                )
+        space = getattr(env, "single_action_space", env.action_space)
+        if not isinstance(space, gym.spaces.Discrete):
+            raise ValueError(f"`env` (={env}) must have Discrete actions: it is wrapped already")
         self._inner: Any = env.unwrapped
-        self._grid = _checked_grid(env)
+        self._grid: ExposureGrid = env.unwrapped.grid
+
+    def _space(self) -> gym.Space[Any]:
+        """Space of one environment's actions."""
+        raise NotImplementedError
+
+    def _states_of(self, actions: Any) -> np.ndarray:
+        """States (...) int64 that `actions` choose."""
+        raise NotImplementedError
+
+    def _now(self) -> np.ndarray:
+        """The current states."""
+        return np.asarray(getattr(self._inner, self._states_name))
+
+    def _checked(self, actions: Any, sizes: tuple[int, ...]) -> np.ndarray:
+        """`actions` as int64 with column i in [0, sizes[i])."""
+        values = check_actions("action", actions, self._shape)
+        if bool(((values < 0) | (values >= np.array(sizes))).any()):
+            raise ValueError(
+                f"`action` (={values.tolist()}) must be in [0, {list(sizes)}) by column"
+            )
+        return values.astype(np.int64)
+
+    def _states_at(self, controls: np.ndarray) -> np.ndarray:
+        states = np.ravel_multi_index(tuple(np.moveaxis(controls, -1, 0)), self._grid.shape)
+        return np.asarray(states, np.int64)
+
+    def _control_masks(self) -> list[np.ndarray]:
+        """(..., I), (..., T), (..., N): positions of each control that some allowed state has."""
+        allowed = self._inner.action_masks()
+        cube = allowed.reshape(*allowed.shape[:-1], *self._grid.shape)
+        return [cube.any(axis=axes) for axes in ((-2, -1), (-3, -1), (-3, -2))]
 
 
-class ControlActions(_GridActions):
+class _One(_GridActions, gym.ActionWrapper[Any, Any, Any]):
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        gym.ActionWrapper.__init__(self, env)
+        self._set_up(env)
+        self.action_space = self._space()
+
+    def action(self, action: Any) -> np.int64:
+        """The state that `action` (3,) chooses."""
+        return np.int64(self._states_of(action))
+
+
+class _Many(_GridActions, gym.vector.VectorActionWrapper):
+    _states_name = "states"
+
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
+        gym.vector.VectorActionWrapper.__init__(self, env)
+        self._set_up(env)
+        self._shape = (env.num_envs, 3)
+        self.single_action_space = self._space()
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
+
+    def actions(self, actions: Any) -> np.ndarray:
+        """(N,) int64: states that `actions` (N, 3) choose."""
+        return self._states_of(actions)
+
+
+class _Controls(_GridActions):
+    def _space(self) -> gym.Space[Any]:
+        return gym.spaces.MultiDiscrete(list(self._grid.shape))
+
+    def _states_of(self, actions: Any) -> np.ndarray:
+        return self._states_at(self._checked(actions, self._grid.shape))
+
+    def action_masks(self) -> np.ndarray:
+        """(..., I + T + N) bool: positions of each control that some allowed state has."""
+        return np.concatenate(self._control_masks(), axis=-1)
+
+
+class _Steps(_GridActions):
+    def _space(self) -> gym.Space[Any]:
+        return gym.spaces.MultiDiscrete([3, 3, 3])
+
+    def _states_of(self, actions: Any) -> np.ndarray:
+        steps, last = self._checked(actions, (3, 3, 3)) - 1, np.array(self._grid.shape) - 1
+        return self._states_at(np.clip(self._grid.controls(self._now()) + steps, 0, last))
+
+    def action_masks(self) -> np.ndarray:
+        """(..., 9) bool: steps of each control to a position that some allowed state has."""
+        controls, masks = self._grid.controls(self._now()), []
+        for i, mask in enumerate(self._control_masks()):
+            targets = controls[..., i, None] + np.array([-1, 0, 1])
+            targets = np.clip(targets, 0, self._grid.shape[i] - 1)
+            masks.append(np.take_along_axis(mask, targets, axis=-1))
+        return np.concatenate(masks, axis=-1)
+
+
+class _Apex(_GridActions):
+    def _space(self) -> gym.Space[Any]:
+        return gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+    def _states_of(self, actions: Any) -> np.ndarray:
+        try:
+            values = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            values = np.empty(0, object)
+        numbers = values.shape == self._shape and values.dtype.kind in "iuf"
+        if not numbers or not np.isfinite(values).all():
+            raise ValueError(
+                f"`action` (={actions!r}) must be finite numbers of shape {self._shape}"
+            )
+        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self._grid])
+        low, high = apex.min(axis=0), apex.max(axis=0)
+        wanted = low + 0.5 * (np.clip(values.astype(np.float64), -1.0, 1.0) + 1.0) * (high - low)
+        distance = ((wanted[..., None, :] - apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
+        distance = np.where(self._inner.action_masks(), distance, np.inf)
+        return np.argmin(distance, axis=-1).astype(np.int64)
+
+
+class ControlActions(_Controls, _One):
     """Actions `MultiDiscrete([I, T, N])`: positions of ISO, exposure time and f-number.
 
     Args:
@@ -149,21 +184,8 @@ class ControlActions(_GridActions):
     (MultiDiscrete([4 4 4]), 'ISO 400, 1/15 s, f/11')
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.MultiDiscrete(list(self._grid.shape))
 
-    def action(self, action: Any) -> np.int64:
-        """State of the three positions `action` (3,)."""
-        controls = _check_steps(action, self._grid.shape, (3,))
-        return np.int64(_states_of_controls(self._grid, controls))
-
-    def action_masks(self) -> np.ndarray:
-        """(I + T + N,) bool: positions of each control that some allowed state has."""
-        return _control_masks(self._grid, self._inner.action_masks())
-
-
-class RelativeActions(_GridActions):
+class RelativeActions(_Steps, _One):
     """Actions `MultiDiscrete([3, 3, 3])`: 0 one step down, 1 stay, 2 one step up.
 
     For ISO, exposure time and f-number at once, because a single control cannot trade shutter for
@@ -177,21 +199,8 @@ class RelativeActions(_GridActions):
         ValueError: If `env` has no grid.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.MultiDiscrete([3, 3, 3])
 
-    def action(self, action: Any) -> np.int64:
-        """State that the three steps `action` (3,) lead to."""
-        steps = _check_steps(action, (3, 3, 3), (3,))
-        return np.int64(_states_of_steps(self._grid, np.asarray(self._inner.state), steps))
-
-    def action_masks(self) -> np.ndarray:
-        """(9,) bool: steps of each control to a position that some allowed state has."""
-        return _step_masks(self._grid, np.asarray(self._inner.state), self._inner.action_masks())
-
-
-class ContinuousActions(_GridActions):
+class ContinuousActions(_Apex, _One):
     """Actions `Box(-1, 1, (3,))`: Av, Tv and Sv from the grid's least to its greatest.
 
     The allowed state at the least distance in stops is taken; ties go to the lower ISO. Values
@@ -204,87 +213,14 @@ class ContinuousActions(_GridActions):
         ValueError: If `env` has no grid.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
-        self._apex = _apex_of(self._grid)
 
-    def action(self, action: Any) -> np.int64:
-        """State nearest to the APEX values `action` (3,)."""
-        allowed = self._inner.action_masks()
-        return np.int64(_states_of_apex(self._apex, _check_apex(action, (3,)), allowed))
+class VectorControlActions(_Controls, _Many):
+    """`ControlActions` for a vector environment from `gymnasium.make_vec`; actions (N, 3)."""
 
 
-# -- many environments ----------------------------------------------------------------------------
+class VectorRelativeActions(_Steps, _Many):
+    """`RelativeActions` for a vector environment from `gymnasium.make_vec`; actions (N, 3)."""
 
 
-class _VectorGridActions(gym.vector.VectorActionWrapper, RecordConstructorArgs):
-    def __init__(
-        self, env: gym.vector.VectorEnv[Any, Any, Any], single_action_space: gym.Space[Any]
-    ) -> None:
-        RecordConstructorArgs.__init__(self)
-        gym.vector.VectorActionWrapper.__init__(self, env)
-        self.single_action_space = single_action_space
-        self.action_space = batch_space(single_action_space, env.num_envs)
-        self._inner: Any = env.unwrapped
-        self._grid = _checked_grid(env)
-
-
-class VectorControlActions(_VectorGridActions):
-    """`ControlActions` for a vector environment; actions (N, 3).
-
-    Args:
-        env: An `ae_env/AutoExposure-v0` from `gymnasium.make_vec`, wrapped or not.
-    """
-
-    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        grid = _checked_grid(env)
-        super().__init__(env, gym.spaces.MultiDiscrete(list(grid.shape)))
-
-    def actions(self, actions: Any) -> np.ndarray:
-        """(N,) int64: states of the positions `actions` (N, 3)."""
-        controls = _check_steps(actions, self._grid.shape, (self.num_envs, 3))
-        return _states_of_controls(self._grid, controls)
-
-    def action_masks(self) -> np.ndarray:
-        """(N, I + T + N) bool: positions of each control that some allowed state has."""
-        return _control_masks(self._grid, self._inner.action_masks())
-
-
-class VectorRelativeActions(_VectorGridActions):
-    """`RelativeActions` for a vector environment; actions (N, 3).
-
-    Args:
-        env: An `ae_env/AutoExposure-v0` from `gymnasium.make_vec`, wrapped or not.
-    """
-
-    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        _checked_grid(env)
-        super().__init__(env, gym.spaces.MultiDiscrete([3, 3, 3]))
-
-    def actions(self, actions: Any) -> np.ndarray:
-        """(N,) int64: states that the steps `actions` (N, 3) lead to."""
-        steps = _check_steps(actions, (3, 3, 3), (self.num_envs, 3))
-        return _states_of_steps(self._grid, self._inner.states, steps)
-
-    def action_masks(self) -> np.ndarray:
-        """(N, 9) bool: steps of each control to a position that some allowed state has."""
-        return _step_masks(self._grid, self._inner.states, self._inner.action_masks())
-
-
-class VectorContinuousActions(_VectorGridActions):
-    """`ContinuousActions` for a vector environment; actions (N, 3).
-
-    Args:
-        env: An `ae_env/AutoExposure-v0` from `gymnasium.make_vec`, wrapped or not.
-    """
-
-    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        _checked_grid(env)
-        super().__init__(env, gym.spaces.Box(-1.0, 1.0, (3,), np.float32))
-        self._apex = _apex_of(self._grid)
-
-    def actions(self, actions: Any) -> np.ndarray:
-        """(N,) int64: states nearest to the APEX values `actions` (N, 3)."""
-        allowed = self._inner.action_masks()
-        return _states_of_apex(self._apex, _check_apex(actions, (self.num_envs, 3)), allowed)
+class VectorContinuousActions(_Apex, _Many):
+    """`ContinuousActions` for a vector environment from `gymnasium.make_vec`; actions (N, 3)."""

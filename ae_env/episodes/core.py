@@ -8,7 +8,6 @@ are the functions of a `Task`.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -41,14 +40,6 @@ CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
 LIGHT_CACHE_BYTES = 256 * 2**20
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
-#: How the noise is made, by the environment's argument.
-_NOISES: dict[bool | str, Noise | None] = {
-    False: None,
-    True: "bank",
-    "bank": "bank",
-    "exact": "exact",
-    "sensor": "sensor",
-}
 #: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
 _DTYPES = {"codes": np.uint8, "signals": np.float32, "numbers": np.uint16}
 _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": "numbers"}
@@ -165,7 +156,7 @@ class Task:
         raise NotImplementedError
 
 
-#: Light and exposures behind the frames of scenes (B,) at states (B,): `CaptureBatch.transitions`.
+#: `CaptureBatch.transitions`: light and exposures behind the frames of scenes (B,) at states (B,).
 FindTransitions = Callable[[np.ndarray, np.ndarray], Transitions]
 #: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
 #: and exposures behind frames where rewards are expectations.
@@ -209,34 +200,30 @@ class EpisodeCore:
         if options.recorded is not None:  # a recorded capture is its own expectation
             self._captures = LookupBatch(self.scenes, self._prepared, self.camera)
         else:
-            frame_bytes = 16 * options.resolution**2
+            noise: Noise | None = "bank" if options.noise is True else options.noise or None
+            light_bytes = num_envs * self._cached_frames() * 16 * options.resolution**2
             batch = self._captures = CaptureBatch(
                 self._prepared,
                 len(self.scenes) + num_envs,
                 states,
                 self.camera,
-                noise=_NOISES[options.noise],
-                cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
+                noise=noise,
+                cache_light=light_bytes <= LIGHT_CACHE_BYTES,
             )
             transitions = batch.transitions if options.reward == "expected" else None
         self.task = make_task(episodes, self._captures, scorer, transitions)
         self.num_actions = self.task.num_actions
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._arguments(), *self._progress())
+        return _restored, self._restorable(None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeCore:
-        progress = copy.deepcopy(self._progress(), memo)
-        return _restored({**self._arguments(), "scenes": self.scenes}, *progress)
+        return _restored(*self._restorable(self.scenes))
 
-    def _arguments(self) -> dict[str, Any]:
-        """Arguments of the constructor."""
-        count = len(self.episodes.begun)
-        return {"options": self.options, "num_envs": count, "make_task": self._make_task}
-
-    def _progress(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Where the episodes are."""
-        return self.episodes.columns(), self.task.columns()
+    def _restorable(self, scenes: Sequence[Scene] | None) -> tuple[Any, ...]:
+        """Arguments of `_restored`, which copies the columns."""
+        arguments = self.options, len(self.episodes.begun), self._make_task, scenes
+        return arguments, self.episodes.columns(), self.task.columns()
 
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
@@ -284,13 +271,7 @@ class EpisodeCore:
         rngs: Sequence[np.random.Generator],
         options: Sequence[Mapping[str, Any]] | None = None,
     ) -> None:
-        """Draws new episodes for `env_indices` (K,); those that ran there end.
-
-        Args:
-            env_indices: The environments.
-            rngs: K generators.
-            options: See `Episodes.draw`.
-        """
+        """Draws new episodes for `env_indices` (K,), as `Episodes.draw`; those there end."""
         drawn = self.episodes.draw(rngs, options)
         self._forget(env_indices)
         self.episodes.begin(env_indices, drawn)
@@ -404,22 +385,20 @@ class EpisodeCore:
         env_index = light_index - len(self.scenes)
         if env_index < 0:
             return self._prepared_at_rest(light_index)
-        episode = self.episodes[env_index]
-        displaced = self.task.displaced(env_index)
+        episode, displaced = self.episodes[env_index], self.task.displaced(env_index)
         if displaced is None:
             return in_episode(self._prepared_at_rest(episode.scene), **episode.moves)
-        return self._with_tolerance(prepare_scene(displaced, self.camera, **episode.moves))
+        prepared = prepare_scene(displaced, self.camera, **episode.moves)
+        return prepared.changed(tolerance=self.options.tolerance)
 
     def _prepared_at_rest(self, scene: int) -> PreparedScene:
         prepared = self._at_rest.get(scene)
         if prepared is None:
-            prepared = self._with_tolerance(prepare_scene(self.scenes[scene], self.camera))
+            prepared = prepare_scene(self.scenes[scene], self.camera)
+            prepared = prepared.changed(tolerance=self.options.tolerance)
             if prepared.aperture_blur is None:  # which caches too much light to stay for long
                 self._at_rest[scene] = prepared
         return prepared
-
-    def _with_tolerance(self, prepared: PreparedScene) -> PreparedScene:
-        return prepared.changed(tolerance=self.options.tolerance)
 
     # -- what is known of an episode ----------------------------------------------------------
 
@@ -462,9 +441,9 @@ def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _restored(
-    arguments: dict[str, Any], episodes: dict[str, np.ndarray], task: dict[str, np.ndarray]
+    arguments: tuple[Any, ...], episodes: dict[str, np.ndarray], task: dict[str, np.ndarray]
 ) -> EpisodeCore:
-    core = EpisodeCore(**arguments)
+    core = EpisodeCore(*arguments)
     core.episodes.resume(episodes)
     for name, values in core.task.columns().items():
         values[:] = task[name]

@@ -213,7 +213,8 @@ class Episodes:
         """
         chosen = [self._chosen(one) for one in options or ()]  # errors come before any draw
         uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
-        which, start, moving, speed, defocus, phase, seed, *motion = uniforms
+        which, start, moving, speed, defocus, phase, seed, direction, turn, *own = uniforms
+        apart, subject_speed, subject_direction = own
         place = (which * len(self._firsts)).astype(np.int64)
         frame = np.zeros(len(rngs), np.int64)
         for i, one in enumerate(chosen):
@@ -227,43 +228,27 @@ class Episodes:
         discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
         discs = _fixed_or_drawn(self.options.depth, discs)
         own_blur = self._own_blur[scene] * 64.0 / self.options.resolution
-        return {
-            "scene": self._shown_at(scene, frame),
-            "state": state,
-            **self._draw_motion(scene, moving, speed, *motion),
-            "defocus": discs,
-            "focus_drive": np.hypot(discs, own_blur),
-            "phase": phase,
-            "noise_seed": (seed * _VALUES).astype(np.int64),
-            "frame": frame,
-        }
-
-    def _draw_motion(
-        self,
-        scene: np.ndarray,
-        moving: np.ndarray,
-        speed: np.ndarray,
-        direction: np.ndarray,
-        turn: np.ndarray,
-        apart: np.ndarray,
-        subject_speed: np.ndarray,
-        subject_direction: np.ndarray,
-    ) -> dict[str, np.ndarray]:
-        """Columns of the motion in `scene` (K,), from K uniform numbers each."""
-        speeds = self._median_speed[scene]
-        shake, own = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
         # Either may rest where both could move: a camera on a tripod, a subject that waits.
         moves = moving >= STATIC_SHARE
         subject_moves = moves & self._has_subject[scene] & (apart < SUBJECT_SHARE)
         shakes = moves & ~(subject_moves & (apart < ALONE_SHARE))
         if self.options.motion != "random":  # one speed of the whole image
             subject_moves = np.zeros(len(scene), bool)
+        median = self._median_speed[scene]
+        shake, subject = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
         return {
-            "speed": _fixed_or_drawn(self.options.motion, shakes * shake * speeds),
+            "scene": self._shown_at(scene, frame),
+            "state": state,
+            "speed": _fixed_or_drawn(self.options.motion, shakes * shake * median),
             "direction": 2.0 * math.pi * direction,
             "turn": TURN_SIGMA * ndtri(turn),
-            "subject_speed": subject_moves * own * speeds,
+            "subject_speed": subject_moves * subject * median,
             "subject_direction": 2.0 * math.pi * subject_direction,
+            "defocus": discs,
+            "focus_drive": np.hypot(discs, own_blur),
+            "phase": phase,
+            "noise_seed": (seed * _VALUES).astype(np.int64),
+            "frame": frame,
         }
 
     def _chosen(self, options: Mapping[str, Any]) -> dict[str, int]:
@@ -358,15 +343,10 @@ class Episodes:
     # -- the light of the current frames ------------------------------------------------------
 
     def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure in the current frame of an episode, relative to its scene's own.
-
-        Args:
-            env_index: Which episode.
-            exposure_time: Time the shutter is open [s].
+        """Light of an exposure [s] in the current frame of an episode, relative to its scene's own.
 
         Returns:
-            That of the frame, and (R,) that of each row relative to it; None where all rows have
-            the same.
+            That of the frame, and (R,) that of each row relative to it, or None (`Lighting.rows`).
         """
         frame, phase = self.frame.item(env_index), self.phase.item(env_index)
         if not self.lighting.within_frame:
@@ -378,11 +358,7 @@ class Episodes:
     def gains(
         self, env_indices: np.ndarray, exposure_times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """`gain` of one exposure of each of `env_indices` (B,).
-
-        Returns:
-            (B,) and (B, R); None where all rows of all frames are alike.
-        """
+        """`gain` of one exposure of each of `env_indices` (B,): (B,), and (B, R) or None."""
         pairs = zip(env_indices.tolist(), exposure_times.tolist(), strict=True)
         return _stacked([self.gain(env_index, time) for env_index, time in pairs])
 
@@ -394,11 +370,7 @@ class Episodes:
 
 
 def check_options(options: Any, *more: str) -> dict[str, Any]:
-    """The options of a reset as a dictionary of its own.
-
-    Args:
-        options: The options of `reset`: None or a mapping.
-        more: Names that are allowed beside those of `OPTIONS`.
+    """The options of a reset, None or a mapping of names in `OPTIONS` and `more`, as a dictionary.
 
     Raises:
         ValueError: If there is another name, or it is no mapping.

@@ -7,6 +7,7 @@ it changes within a frame (`FlickerLighting`), one for each row.
 from ae_env.lighting.base import (
     KINDS,
     MAX_STOPS,
+    FlickerLighting,
     LensCapLighting,
     Lighting,
     RampLighting,
@@ -17,7 +18,6 @@ from ae_env.lighting.base import (
     TunnelLighting,
     make_lighting,
 )
-from ae_env.lighting.flicker import FlickerLighting
 from ae_env.lighting.moving import MovingLighting
 
 __all__ = [

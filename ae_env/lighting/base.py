@@ -1,4 +1,8 @@
-"""`Lighting`, the changes of light from frame to frame, and `make_lighting`, which finds one."""
+"""`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list.
+
+Flickering light (mains, dimmed LEDs, screens) changes within a frame, too: a rolling shutter makes
+bands of it.
+"""
 
 from __future__ import annotations
 
@@ -6,26 +10,33 @@ import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 from simulator.utils.checks import check_integer, check_number, check_word
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
 #: Most frames of a schedule.
 MAX_FRAMES = 2**20
+#: Depth of a lamp on the mains, where none is given.
+MAINS_DEPTH = 0.8
+#: Precision of the light of a row, relative to the lamp's long-term mean: smaller differences are
+#: rounding errors of float64.
+_RESOLUTION = 1e-12
+#: Least light of a row: its logarithm must be finite.
+_DARKEST = 2.0**-MAX_STOPS
+#: The lamp's clock restarts after this time [s]: beyond it, float64 does not resolve a period.
+_CLOCK = 1e8
 
 
 def _check_frame(name: str, value: Any, low: int, high: int) -> int:
     """`value` as an int; a whole float, as some JSON writers give it, is one too."""
-    number = isinstance(value, Real) and not isinstance(value, Integral)
-    if number and low <= value <= high and value % 1 == 0:
-        value = int(value)
-    return check_integer(name, value, low, high)
+    whole = isinstance(value, float | np.floating) and float(value).is_integer()
+    return check_integer(name, int(value) if whole else value, low, high)
 
 
 #: Least and greatest value of each option, and what checks it.
@@ -35,6 +46,10 @@ _RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
     "stops_per_frame": (0, MAX_STOPS, check_number),
     "period": (1e-3, 2**31, check_number),
     "edge": (0, 2**31, _check_frame),
+    "frequency": (1e-3, 1e6, check_number),
+    "depth": (0.0, 1.0, check_number),
+    "duty": (1e-6, 1.0, check_number),
+    "frame_rate": (1e-3, 1e6, check_number),
     **dict.fromkeys(("at", "enter", "leave", "on", "off"), _FRAME),
 }
 
@@ -68,16 +83,27 @@ class Lighting:
     name: ClassVar[str] = "static"
     #: Whether light also changes within a frame, so that it depends on the exposure time.
     within_frame: ClassVar[bool] = False
+    #: Options that are frames, the second not before the first.
+    ordered: ClassVar[tuple[str, str] | None] = None
 
     def __init_subclass__(cls) -> None:
         KINDS.setdefault(cls.name, cls)
 
     def __post_init__(self) -> None:
         for option in fields(self):
-            if option.name in _RANGES:
+            value = getattr(self, option.name)
+            if option.name in _RANGES and (value is not None or option.default is not None):
                 low, high, check = _RANGES[option.name]
-                value = check(f"lighting[{option.name!r}]", getattr(self, option.name), low, high)
+                value = check(f"lighting[{option.name!r}]", value, low, high)
                 object.__setattr__(self, option.name, value)
+        if self.ordered is not None:
+            first, last = self.ordered
+            begin, end = getattr(self, first), getattr(self, last)
+            if end < begin:
+                raise ValueError(
+                    f"`lighting[{last!r}]` (={end!r}) must not be before `lighting[{first!r}]` "
+                    f"(={begin!r})"
+                )
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """Mean relative light of an exposure.
@@ -190,14 +216,11 @@ class TunnelLighting(Lighting):
     """
 
     name: ClassVar[str] = "tunnel"
+    ordered: ClassVar[tuple[str, str] | None] = ("enter", "leave")
     stops: float = -6.0
     enter: int = 3
     leave: int = 10
     edge: int = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "enter", "leave")
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
@@ -216,25 +239,14 @@ class LensCapLighting(Lighting):
     """The lens is covered (`stops` darker) from frame `on` to before frame `off`."""
 
     name: ClassVar[str] = "lens_cap"
+    ordered: ClassVar[tuple[str, str] | None] = ("on", "off")
     stops: float = -20.0
     on: int = 2
     off: int = 5
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "on", "off")
-
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
         return 2.0**self.stops if self.on <= frame < self.off else 1.0
-
-
-def _check_order(lighting: Lighting, first: str, last: str) -> None:
-    begin, end = getattr(lighting, first), getattr(lighting, last)
-    if end < begin:
-        raise ValueError(
-            f"`lighting[{last!r}]` (={end!r}) must not be before `lighting[{first!r}]` (={begin!r})"
-        )
 
 
 # -- by a list of the user's -----------------------------------------------------------------------
@@ -319,3 +331,69 @@ def _read(file: Any) -> list[float]:
         if not math.isfinite(values[-1]):
             raise ValueError(f"{rule}, row {number} (={cell!r}), must be a number of stops")
     return values
+
+
+# -- faster than frames ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FlickerLighting(Lighting):
+    """Light that flickers much faster than frames follow each other, around the scene's own.
+
+    It is integrated in closed form over the exposure time of each row
+    (`simulator.optics.flicker_integral`). Rows begin one after the other, so unless the
+    exposure lasts whole periods, the frame has bands.
+
+    Args:
+        frequency: Of the light [Hz]: twice that of the mains, or of the pulses. 0.001 to 1e6.
+        depth: Share of the light that flickers, 0 to 1; the rest is steady. `MAINS_DEPTH` by
+            default, 1 where `duty` is given.
+        duty: Share of a period that a pulsed lamp is on, 1e-6 to 1; None for a lamp on the mains,
+            ``1 + depth cos(2 pi (frequency t + phase))``.
+        frame_rate: Frames per second, 0.001 to 1e6: frame n begins at n / frame_rate, at the
+            episode's own phase of the lamp.
+
+    >>> FlickerLighting(frequency=100.0).gain(3, 1 / 50, 0.3)
+    1.0
+    """
+
+    name: ClassVar[str] = "flicker"
+    within_frame: ClassVar[bool] = True
+    frequency: float = 100.0
+    depth: float | None = None
+    duty: float | None = None
+    frame_rate: float = 30.0
+
+    def lamp(self, phase: float) -> Lamp:
+        """The part of the light that flickers, with `phase` as of `gain`."""
+        if self.duty is None:
+            return MainsLamp(frequency=self.frequency, phase=phase)
+        return PulsedLamp(frequency=self.frequency, duty=self.duty, phase=phase)
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """Mean relative light of an exposure that begins with the frame; see `Lighting.gain`."""
+        light = self.lamp(phase).mean_light(self._start(frame), exposure_time)
+        return float(self._with_steady_light(light))
+
+    def rows(
+        self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
+    ) -> tuple[float, np.ndarray | None]:
+        """See `Lighting.rows`."""
+        light = self.lamp(phase).row_light(
+            self._start(frame), exposure_time, shutter.rows, shutter.row_time, shutter.sensor_rows
+        )
+        light = self._with_steady_light(light)
+        mean = float(light.mean())
+        if np.ptp(light) <= 8.0 * _RESOLUTION:
+            return float(light[0]), None
+        return mean, light / mean
+
+    def _start(self, frame: int) -> float:
+        return math.fmod(frame / self.frame_rate, _CLOCK)
+
+    def _with_steady_light(self, light: np.ndarray) -> np.ndarray:
+        depth = self.depth
+        if depth is None:
+            depth = MAINS_DEPTH if self.duty is None else 1.0
+        light = (1.0 - depth) + depth * light
+        return np.maximum(np.round(light / _RESOLUTION) * _RESOLUTION, _DARKEST)

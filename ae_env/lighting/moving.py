@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ae_env.lighting.base import Lighting, RollingShutter
-from ae_env.lighting.flicker import FlickerLighting
+from ae_env.lighting.base import FlickerLighting, Lighting, RollingShutter
 from simulator.utils.checks import check_word
 
 #: Mean light that a camera sees as it turns, in 72 directions [EV], 5 degrees apart: a line for
@@ -155,15 +154,12 @@ class MovingLighting(Lighting):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.kinds, str) and self.kinds not in MOVES:
-            check_word("lighting['kinds']", self.kinds, (*KIND_SETS, "all", *MOVES))
         kinds = (self.kinds,) if isinstance(self.kinds, str) else tuple(self.kinds)
         if not kinds:
             raise ValueError(f"`lighting['kinds']` (={self.kinds!r}) must name one kind or more")
         for kind in kinds:
             check_word("lighting['kinds']", kind, (*KIND_SETS, "all", *MOVES))
         object.__setattr__(self, "kinds", kinds)
-        FlickerLighting(frame_rate=self.frame_rate)  # checks it
 
     @functools.cached_property
     def drawn_from(self) -> tuple[str, ...]:

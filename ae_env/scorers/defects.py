@@ -278,6 +278,12 @@ class AnalyticBlur(_Analytic):
     defect = "blur"
 
 
+#: The measures of single defects, by the names that they are registered under.
+ANALYTIC: dict[str, type[_Analytic]] = {
+    f"analytic_{kind.defect}": kind for kind in _Analytic.__subclasses__()
+}
+
+
 class Defects(CompositeScorer):
     """A picture is nearly as bad as its worst defect: the six `analytic_*` measures together.
 
@@ -288,15 +294,7 @@ class Defects(CompositeScorer):
     worst_share = 0.75
 
     def __init__(self) -> None:
-        parts: dict[str, Any] = {
-            "analytic_exposure": AnalyticExposure(),
-            "analytic_noise": AnalyticNoise(),
-            "analytic_white_balance": AnalyticWhiteBalance(),
-            "analytic_saturation": AnalyticSaturation(),
-            "analytic_haze": AnalyticHaze(),
-            "analytic_blur": AnalyticBlur(),
-        }
-        super().__init__(parts)
+        super().__init__({name: measure() for name, measure in ANALYTIC.items()})
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total score from the parts' scores: tensors or arrays of any one shape."""

@@ -28,23 +28,14 @@ def find_model_file(
     scorer: str,
     given: str | os.PathLike[str] | None,
     variable: str,
-    names: tuple[str, ...],
+    name: str,
     *,
     how: str,
 ) -> Path:
-    """The model file of a scorer.
-
-    It is `given`, or else the one that the environment variable names, or else in the cache folder.
-
-    Args:
-        scorer: Name of the scorer, for errors.
-        given: A file, or None.
-        variable: Environment variable that may name one.
-        names: File names in the cache folder; the first that exists is taken.
-        how: How to get the file: the end of the message where there is none.
+    """The model file of a scorer: `given`, else what `variable` names, else `name` in the cache.
 
     Raises:
-        ValueError: If there is none; the message says where to put it.
+        ValueError: If there is none; the message says where to put it, and `how` to get it.
     """
     named = os.environ.get(variable) if given is None else os.fspath(given)
     if named:
@@ -53,13 +44,12 @@ def find_model_file(
             return file
         source = f"`{variable}`" if given is None else "`file`"
         raise ValueError(f"{source} (={named!r}) must be the model file of {scorer!r}; {how}")
-    folder = cache_dir()
-    for name in names:
-        if (folder / name).is_file():
-            return folder / name
+    file = cache_dir() / name
+    if file.is_file():
+        return file
     raise ValueError(
         f"scorer {scorer!r} needs a model file, which does not come with ae-env: set "
-        f"{variable}=FILE, or put it at {folder / names[0]}; {how}"
+        f"{variable}=FILE, or put it at {file}; {how}"
     )
 
 
@@ -80,13 +70,6 @@ class ConvNormReLU6(nn.Sequential):
     """Convolution without bias, batch normalisation and ReLU6, padded as Keras' MobileNet is.
 
     With stride 2 only the right and the lower edge are padded, by one pixel.
-
-    Args:
-        inputs: Channels.
-        outputs: Channels.
-        kernel: 1 or 3.
-        stride: 1 or 2.
-        groups: Of the convolution; `inputs` makes it depthwise.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1):
@@ -239,7 +222,7 @@ class Nima:
             self.name,
             file,
             f"AE_ENV_{self.name.upper()}",
-            (f"{self.name}.safetensors",),
+            f"{self.name}.safetensors",
             how=(
                 "examples/convert_nima.py makes it from the published Keras weights, whose git "
                 f"blob id is {PUBLISHED[self.name]} (docs/scorers.md)"
@@ -328,9 +311,15 @@ class Classifier:
     ) -> None:
         if size is not None:
             check_integer("size", size, 1, 4096)
-        self.mean, self.std = _triple("mean", mean), _triple("std", std)
-        if min(self.std) <= 0.0:
-            raise ValueError(f"`std` (={std!r}) must be > 0")
+        for name, values, low in (("mean", mean, -math.inf), ("std", std, 0.0)):
+            try:
+                red, green, blue = (float(value) for value in values)
+            except (TypeError, ValueError):
+                red = green = blue = math.nan
+            if not min(red, green, blue) > low:
+                rule = "three numbers, for R, G and B" + (", > 0" if name == "std" else "")
+                raise ValueError(f"`{name}` (={values!r}) must be {rule}")
+        self.mean, self.std = tuple(map(float, mean)), tuple(map(float, std))
         self.batch: int | None = None  # of a network that takes no other number of pictures
         if callable(model):
             if getattr(model, "training", False):
@@ -344,7 +333,7 @@ class Classifier:
             "classifier",
             model,
             VARIABLE,
-            ("classifier.onnx",),
+            "classifier.onnx",
             how="an ONNX file of one input (B, 3, S, S) and an output (B, classes)",
         ).resolve()
         # SHA-256 of the file: another network under the same name gives other scores.
@@ -387,14 +376,6 @@ class Classifier:
             pictures = torch.cat([pictures, pictures[-1:].expand(missing, -1, -1, -1)])
         outputs = session.run(None, {session.get_inputs()[0].name: pictures.numpy()})[0]
         return outputs[: len(outputs) - missing]
-
-
-def _triple(name: str, values: Sequence[float]) -> tuple[float, float, float]:
-    try:
-        red, green, blue = (float(value) for value in values)
-    except (TypeError, ValueError):
-        raise ValueError(f"`{name}` (={values!r}) must be three numbers, for R, G and B") from None
-    return red, green, blue
 
 
 def _confidence(outputs: Any, count: int) -> Tensor:

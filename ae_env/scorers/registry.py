@@ -22,39 +22,9 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
+from ae_env.scorers import composite, defects, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
-from ae_env.scorers.composite import Balanced, CompositeScorer
-from ae_env.scorers.defects import (
-    AnalyticBlur,
-    AnalyticExposure,
-    AnalyticHaze,
-    AnalyticNoise,
-    AnalyticSaturation,
-    AnalyticWhiteBalance,
-    Defects,
-)
-from ae_env.scorers.fidelity import Fidelity, Keypoints, Matches
-from ae_env.scorers.learnt import Classifier, NimaAesthetic, NimaTechnical, PyiqaMetric
-from ae_env.scorers.measures import (
-    BlindNoise,
-    Clipping,
-    DynamicRange,
-    Entropy,
-    MidGrey,
-    Shim,
-    Shin,
-    SignalToNoise,
-    WellExposedness,
-    Zhang,
-)
-from ae_env.scorers.terms import (
-    Banding,
-    Brightness,
-    Highlights,
-    Noise,
-    Shadows,
-    Sharpness,
-)
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
@@ -64,36 +34,31 @@ PYIQA = "pyiqa"
 Factory = TypeVar("Factory", bound=Callable[[], Any])
 
 _REGISTRY: dict[str, Callable[[], Any]] = {
-    "balanced": Balanced,
-    "brightness": Brightness,
-    "highlights": Highlights,
-    "shadows": Shadows,
-    "noise": Noise,
-    "sharpness": Sharpness,
-    "banding": Banding,
-    "classifier": Classifier,
-    "keypoints": Keypoints,
-    "matches": Matches,
-    "nima_aesthetic": NimaAesthetic,
-    "nima_technical": NimaTechnical,
-    "mid_grey": MidGrey,
-    "clipping": Clipping,
-    "dynamic_range": DynamicRange,
-    "well_exposedness": WellExposedness,
-    "entropy": Entropy,
-    "shim": Shim,
-    "zhang": Zhang,
-    "shin": Shin,
-    "snr": SignalToNoise,
-    "blind_noise": BlindNoise,
-    "defects": Defects,
-    "fidelity": Fidelity,
-    "analytic_exposure": AnalyticExposure,
-    "analytic_noise": AnalyticNoise,
-    "analytic_white_balance": AnalyticWhiteBalance,
-    "analytic_saturation": AnalyticSaturation,
-    "analytic_haze": AnalyticHaze,
-    "analytic_blur": AnalyticBlur,
+    "balanced": composite.Balanced,
+    "brightness": terms.Brightness,
+    "highlights": terms.Highlights,
+    "shadows": terms.Shadows,
+    "noise": terms.Noise,
+    "sharpness": terms.Sharpness,
+    "banding": terms.Banding,
+    "classifier": learnt.Classifier,
+    "keypoints": fidelity.Keypoints,
+    "matches": fidelity.Matches,
+    "nima_aesthetic": learnt.NimaAesthetic,
+    "nima_technical": learnt.NimaTechnical,
+    "mid_grey": measures.MidGrey,
+    "clipping": measures.Clipping,
+    "dynamic_range": measures.DynamicRange,
+    "well_exposedness": measures.WellExposedness,
+    "entropy": measures.Entropy,
+    "shim": measures.Shim,
+    "zhang": measures.Zhang,
+    "shin": measures.Shin,
+    "snr": measures.SignalToNoise,
+    "blind_noise": measures.BlindNoise,
+    "defects": defects.Defects,
+    "fidelity": fidelity.Fidelity,
+    **defects.ANALYTIC,
 }
 
 
@@ -164,7 +129,7 @@ def _find_scorer(name: str) -> Any:
         return _instantiate(name, load_from_file(*in_file, rule, example="MyScore"))
     module_name, _, attribute = name.partition(":")
     if attribute and module_name == PYIQA:
-        return PyiqaMetric(attribute)
+        return learnt.PyiqaMetric(attribute)
     if attribute:
         return _instantiate(name, load_attribute(name, rule))
     known = list_scorers()

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Option
 
 from agents.cli import console
 from agents.cli.console import check_outputs, print_files, print_line, progress_bars
@@ -25,9 +25,9 @@ _SHEET_SIZE = 128
 
 def simulate(
     raw: console.Raw,
-    iso: Annotated[float, typer.Option(help="Target ISO speed.")],
-    shutter: Annotated[str, typer.Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
-    aperture: Annotated[str, typer.Option(help="Target f-number, such as 4 or f/4.")],
+    iso: Annotated[float, Option(help="Target ISO speed.")],
+    shutter: Annotated[str, Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
+    aperture: Annotated[str, Option(help="Target f-number, such as 4 or f/4.")],
     out: console.OutDng = Path("out.dng"),
     png: console.Png = None,
     source_iso: console.SourceIso = None,
@@ -41,7 +41,7 @@ def simulate(
     device: console.Device = "auto",
     cache: console.Cache = True,
     details: Annotated[
-        bool, typer.Option("--details", help="Also print why each step runs or is left out.")
+        bool, Option("--details", help="Also print why each step runs or is left out.")
     ] = False,
 ) -> None:
     """Simulate one raw at other settings and write it as a DNG; prints the plan.
@@ -92,8 +92,8 @@ def _remarks(source: RawImage, result: RawImage, *, details: bool) -> Iterator[s
 
 def sweep(
     raw: console.Raw,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("sweep"),
-    dngs: Annotated[bool, typer.Option(help="Also write the 64 DNGs, full size.")] = False,
+    out: console.Folder = Path("sweep"),
+    dngs: Annotated[bool, Option(help="Also write the 64 DNGs, full size.")] = False,
     source_iso: console.SourceIso = None,
     source_shutter: console.SourceShutter = None,
     source_aperture: console.SourceAperture = None,
@@ -101,7 +101,7 @@ def sweep(
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
     tolerance: Annotated[
-        float, typer.Option(help="Of the DNGs: error to accept for speed, see simulate.")
+        float, Option(help="Of the DNGs: error to accept for speed, see simulate.")
     ] = console.TOLERANCE,
     device: console.Device = "auto",
     cache: console.Cache = True,
@@ -150,38 +150,38 @@ def sweep(
 
 DepthMap = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Depth map of the developed picture, upright, or half its size: PNG, EXR or .npy; "
         "by default the blur is estimated."
     ),
 ]
 DepthKindName = Annotated[
     str | None,
-    typer.Option(help="distance (default), or disparity: larger numbers are nearer."),
+    Option(help="distance (default), or disparity: larger numbers are nearer."),
 ]
 DepthScale = Annotated[
     float | None,
-    typer.Option(
+    Option(
         help="Metres for each unit (by default 0.001 in a PNG, else 1), or 1 / metres for "
         "each unit of disparity."
     ),
 ]
 Focus = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Where the lens is focused: a distance such as 2.5 [m], or a pixel of the depth "
         "map such as 640,480; by default its middle."
     ),
 ]
-FocalLength = Annotated[float | None, typer.Option(help="Of the lens [mm]; by default the file's.")]
+FocalLength = Annotated[float | None, Option(help="Of the lens [mm]; by default the file's.")]
 PixelPitch = Annotated[
-    float | None, typer.Option(help="Of the sensor [um]; by default the camera's, if known.")
+    float | None, Option(help="Of the sensor [um]; by default the camera's, if known.")
 ]
 
 
 def refocus(
     raw: console.Raw,
-    aperture: Annotated[str, typer.Option(help="Wider f-number, such as 1.4 or f/1.4.")],
+    aperture: Annotated[str, Option(help="Wider f-number, such as 1.4 or f/1.4.")],
     out: console.OutDng = Path("out.dng"),
     png: console.Png = None,
     depth: DepthMap = None,
@@ -281,13 +281,11 @@ def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
 def hdr(
     raw: console.Raw,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="EXR to write: linear light, 1 at the raw's white.")
+        Path, Option("--out", "-o", help="EXR to write: linear light, 1 at the raw's white.")
     ] = Path("out.exr"),
-    png: Annotated[Path | None, typer.Option(help="Also write the fused picture here.")] = None,
-    stops: Annotated[
-        float, typer.Option(help="The bracket reaches this far down and up [EV].")
-    ] = 4.0,
-    step: Annotated[float, typer.Option(help="Between its pictures [EV].")] = 0.5,
+    png: Annotated[Path | None, Option(help="Also write the fused picture here.")] = None,
+    stops: Annotated[float, Option(help="The bracket reaches this far down and up [EV].")] = 4.0,
+    step: Annotated[float, Option(help="Between its pictures [EV].")] = 0.5,
     source_iso: console.SourceIso = None,
     source_shutter: console.SourceShutter = None,
     source_aperture: console.SourceAperture = None,

@@ -86,11 +86,7 @@ class ApertureModule(nn.Module):
         return usable_defocus(self.estimate_defocus(image, deviation), image)
 
     def estimate_defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """The network's map (B, H, W) [pixel]; each pixel depends on its neighbourhood alone.
-
-        Raises:
-            ValueError: If the preset has no such map.
-        """
+        """The network's map (B, H, W) [pixel]; each pixel depends on its neighbourhood alone."""
         if not isinstance(self.network, DefocusMap):
             raise ValueError(f"`preset` (={self.preset!r}) must be 'compact' to have a defocus map")
         return to_diameter(self.network(image, deviation))

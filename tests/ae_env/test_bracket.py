@@ -1,9 +1,6 @@
 """`ExposureBracket-v0`: its rules, its merged picture, and both environments of it."""
 
-import copy
 import math
-import pickle
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -19,7 +16,7 @@ from ae_env.tasks import displaced
 from simulator.camera import get_camera
 from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import WHITE_SIGNAL, reference_settings
-from tests.ae_env.environments import SMALL, assert_equal, check_parity, make_env, make_envs
+from tests.ae_env.environments import check_parity, make_env
 
 ID = "ae_env/ExposureBracket-v0"
 GRID = ExposureGrid.bracket()
@@ -238,24 +235,3 @@ def test_bad_arguments_are_refused() -> None:
         env.unwrapped.step(np.int64(25))
     with pytest.raises(ValueError, match="no score table"):
         env.unwrapped.expected_scores()
-
-
-def test_statistics_are_those_of_the_frame() -> None:
-    envs = make_envs(2, ID, observation="statistics")
-    observation, _ = envs.reset(seed=4)
-    frames, _ = make_envs(2, ID).reset(seed=4)
-    assert observation["raw"].shape == (2, 4, 12, 16)
-    assert envs.observation_space.contains(observation)
-    white = (frames["raw"] == 255).mean(axis=(1, 2, 3))
-    np.testing.assert_allclose(observation["clipped"][:, 0], white, atol=1e-7)
-    assert SMALL["resolution"] == frames["raw"].shape[-1]
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
-def test_a_copy_of_a_begun_bracket_goes_on_like_the_original(copied: Callable[[Any], Any]) -> None:
-    envs = make_envs(3, ID).unwrapped
-    envs.reset(seed=0)
-    envs.step(np.array([0, 1, 6]))
-    other = copied(envs)
-    for actions in (np.array([2, 3, 4]), np.array([7, 1, 2])):
-        assert_equal(envs.step(actions), other.step(actions))

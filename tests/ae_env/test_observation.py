@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from ae_env.observation import (
     PEDESTAL,
     SENSOR_RANGES,
-    SETTINGS_RANGES,
     decode_observation,
     decode_sensors,
     decode_settings,
@@ -56,14 +55,6 @@ def test_observations_are_monotone_and_within_half_a_code(light: torch.Tensor) -
     every = np.arange(256, dtype=np.uint8)
     again = encode_observation(torch.from_numpy(decode_observation(every)))
     np.testing.assert_array_equal(again.numpy(), every)
-
-
-@given(st.tuples(*(st.floats(low, high) for low, high in SETTINGS_RANGES)))
-def test_settings_are_decoded_as_they_were(apex: tuple[float, float, float]) -> None:
-    encoded = encode_settings(np.array(apex))
-    assert encoded.dtype == np.float32
-    assert np.abs(encoded).max() <= 1.0
-    np.testing.assert_allclose(np.stack(decode_settings(encoded)), apex, atol=10 * 2.0**-24)
 
 
 @given(st.floats(0.0, 1e300), log_uniform(1e-3, 1e3), st.floats(-10, 10), st.floats(-10, 10))

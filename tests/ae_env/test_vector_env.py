@@ -37,12 +37,7 @@ def test_modes_have_the_names_and_values_of_gymnasiums_enum(mode: AutoresetMode)
 
 LIGHTINGS: list[Any] = [
     "static",
-    {"kind": "step", "stops": 2, "at": 1},
-    {"kind": "ramp", "stops_per_frame": 1},
     "sine",
-    {"kind": "tunnel", "enter": 0, "leave": 2},
-    {"kind": "lens_cap", "on": 1, "off": 2},
-    "flicker",
     {"kind": "flicker", "frequency": 500, "duty": 0.2},
     {"kind": "schedule", "ev": [0, 1, -1]},
 ]

@@ -66,20 +66,6 @@ def test_each_control_has_its_own_delay():
         assert (info["iso"][0], info["exposure_time"][0]) == (state.iso, state.exposure_time)
 
 
-@pytest.mark.parametrize(
-    ("delay", "message"),
-    [
-        ({"shutter": 1}, r"`delay` \(='shutter'\) must be one of 'iso', 'exposure_time'"),
-        ({"iso": 17}, r"`delay\['iso'\]` \(=17\) must be an integer in \[0, 16\] frames"),
-        ({"iso": True}, r"`delay\['iso'\]` \(=True\)"),
-        ("late", r"`delay` \(='late'\) must be an integer in \[0, 16\] frames, or a mapping"),
-    ],
-)
-def test_delays_are_checked(delay: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        gym.make(ID, delay=delay, **SMALL)
-
-
 def test_equal_delays_of_all_controls_are_one_number():
     same = dict.fromkeys(("iso", "exposure_time", "f_number"), 2)
     assert make_envs(1, delay=same).unwrapped.core.options.delay == 2
