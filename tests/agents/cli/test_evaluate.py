@@ -79,7 +79,7 @@ def test_an_environment_is_the_base(tmp_path):
         (("--preset", "broken.yaml"), "starts"),
         (("--policy", "random", "--author", "me"), "give --append too"),
         (("--preset", "ae_bench_v2_still", "--append", "none/x.csv"), "there is no folder none"),
-        (("--policy", "random", "--delay", "8"), "`delay` (=8) must be below `frames` (=8)"),
+        (("--policy", "random", "--delay", "8"), "condition 'static': `delay` (=8)"),
         (("--policy", "random", "--on-error", "skip"), "give that, too"),
         (("--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop' for recorded grids"),
         (("--preset", "ae_bench_v1", "--append", "."), "must be a file, but it is a folder"),
