@@ -170,21 +170,16 @@ class ExposureAugmentation:
         source = NoiseLevelFunction.zero() if nlf is None else nlf
         out = torch.empty(images.shape, device=images.device)
         for image, seed, frame in zip(images.detach(), words, out, strict=True):
-            frame.copy_(self._photographed(image, seed, source))
+            drawn = self.draw(seed)
+            if len(image) == 4:
+                frame.copy_(self._raw(image.float(), seed, drawn, source))
+                continue
+            light = _in_pieces(lambda piece: develop_inverse(piece[None])[0], image)
+            if "exposure" in self.modules:
+                light = light * _raised(image, drawn.highlights)
+            raw = self._raw(light, seed, drawn, source)
+            frame.copy_(_in_pieces(lambda piece: develop(piece[None])[0], raw))
         return out
-
-    def _photographed(
-        self, image: torch.Tensor, seed: int, source: NoiseLevelFunction
-    ) -> torch.Tensor:
-        """One picture."""
-        drawn = self.draw(seed)
-        if image.shape[0] == 4:
-            return self._raw(image.float(), seed, drawn, source)
-        light = _in_pieces(lambda piece: develop_inverse(piece[None])[0], image)
-        if "exposure" in self.modules:
-            light = light * _raised(image, drawn.highlights)
-        raw = self._raw(light, seed, drawn, source)
-        return _in_pieces(lambda piece: develop(piece[None])[0], raw)
 
     def _raw(
         self, light: torch.Tensor, seed: int, drawn: DrawnSettings, source: NoiseLevelFunction
@@ -245,15 +240,9 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
     given = indices.tolist() if isinstance(indices, torch.Tensor) else indices
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ValueError(f"`indices` (={indices!r}) must be integers, one for each sample")
-    found = []
-    for index in given:
-        words = [
-            _check_seed("seed", seed),
-            _check_seed("epoch", epoch),
-        ]
-        sequence = np.random.SeedSequence([*words, _check_seed("indices", index)])
-        found.append(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-    return found
+    words = _check_seed("seed", seed), _check_seed("epoch", epoch)
+    sequences = [np.random.SeedSequence([*words, _check_seed("indices", i)]) for i in given]
+    return [int(s.generate_state(1, np.uint64)[0] >> np.uint64(1)) for s in sequences]
 
 
 class AugmentedDataset(Dataset[Any]):
