@@ -1,21 +1,28 @@
-"""The harness of the benchmarks: tables, rounding, runs that continue where they were stopped."""
+"""Benchmarks: the harness, measures against closed forms, whole runs on small data."""
 
 import importlib
 import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from agents.cli.main import BENCHMARKS
-from benchmarks import harness
+from benchmarks import harness, paper, recorded
 from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.harness import Benchmark, FinishedParts, Part, Report, cell, pivot, rounded, table
 from benchmarks.throughput import full_frame
 from benchmarks.work_precision.plans import _Draws
 from benchmarks.work_precision.precision import pareto_front
-from simulator import NoiseLevelFunction
+from simulator import CameraSimulator, NoiseLevelFunction, exposure_ratio
+from simulator.networks.weights import build_modules, save_modules
+from simulator.training.paper_dataset import split_dataset
+from tests.ae_env.recorded_files import GRID, capture, write_raws
+from tests.simulator.training.captures import write_dataset
+from tests.simulator.training.scenes import scene as photographed
 
 
 def test_cells_of_missing_values_are_empty_and_pipes_escaped() -> None:
@@ -127,3 +134,113 @@ def test_the_inverse_anscombe_transform_is_unbiased() -> None:
     stable = anscombe(samples.double(), nlf).mean(dim=(1, 2), keepdim=True)
     found = 1000.0 * inverse_anscombe(stable, nlf).flatten()
     assert found.tolist() == pytest.approx(electrons.tolist(), rel=0.02)
+
+
+# -- the paper's table, on a small dataset in the paper's layout ----------------------------------
+
+
+@pytest.fixture
+def here(benchmarks_here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Parts run in this process, and nothing is written elsewhere."""
+    monkeypatch.setattr(paper, "WEIGHTS", tmp_path / "runs" / "paper")
+    write_dataset(tmp_path / "data")
+    return tmp_path
+
+
+def test_train_measure_table_in_one_command(ae_env, here: Path) -> None:
+    code, _, error = ae_env("bench", "paper", "data", "--quick", "--out", "results")
+    assert (code, error) == (0, "")
+    result = json.loads((here / "results" / "paper.json").read_text())
+    assert result["meta"]["command"] == "ae-env bench paper data --quick"
+    rows = result["rows"]
+    means = {(r["group"], r["preset"], r["method"]): r for r in rows if "group" in r}
+    networks = [("paper", m) for m in ("EXP", "NS", "Full")] + [("pc", "PC"), ("dl", "DL")]
+    networks += [("compact", m) for m in ("EXP", "NS", "Full")]
+    assert {key[1:] for key in means if key[0] == "all"} == set(networks)
+    for key in networks:
+        parts = [m["pairs"] for k, m in means.items() if k[1:] == key and k[0] != "all"]
+        assert sum(parts) == means["all", *key]["pairs"] == 6
+    page = (here / "results" / "paper.md").read_text()
+    assert "|EXP`paper`|" in page.replace(" ", "")
+    assert "36.10 / 0.923" in page  # what the paper publishes
+    with Image.open(here / "results" / "paper.png") as picture:
+        assert picture.width > 300
+    # The exposure of w = 1, b = 0 by hand, on the pairs that were measured.
+    _, held_out = split_dataset(here / "data")
+    captures = {str(c.settings): c for c in held_out[0].captures}
+    for row in (r for r in rows if (r["preset"], r["method"]) == ("compact", "EXP")):
+        if "source" not in row:
+            continue
+        source, target = captures[row["source"]], captures[row["target"]]
+        scale = 2.0 ** (target.settings.log2_exposure - source.settings.log2_exposure)
+        pictures = [np.load(c.file).astype(float) for c in (source, target)]
+        error = np.minimum(pictures[0] * scale, 1.0) - np.minimum(pictures[1], 1.0)
+        decibels = -10.0 * np.log10((error**2).mean())
+        assert row["psnr_db"] == pytest.approx(decibels, abs=0.02)
+
+
+def test_given_weights_are_measured_and_nothing_is_trained(ae_env, here: Path) -> None:
+    torch.manual_seed(0)
+    save_modules(here / "mine", build_modules("paper"), "paper", {})
+    assert CameraSimulator.from_pretrained(here / "mine", device="cpu").noise is not None
+    options = ("--quick", "--out", "results", "--weights", "mine.safetensors")
+    code, _, error = ae_env("bench", "paper", "data", *options)
+    assert (code, error) == (0, "")
+    rows = json.loads((here / "results" / "paper.json").read_text())["rows"]
+    assert {row["preset"] for row in rows} == {"paper", "compact"}
+    assert not (here / "runs" / "paper").exists()
+
+
+# -- simulated states against the captures of a small recorded grid -------------------------------
+
+
+def test_a_grid_of_ones_own(ae_env, benchmarks_here: Path) -> None:
+    write_raws(benchmarks_here / "grid" / "a")
+    write_raws(benchmarks_here / "grid" / "b", tuple(GRID)[:-1], seed=1)
+    code, _, error = ae_env("bench", "recorded", "grid", "--quick")  # into ./results
+    assert (code, error.partition("WARNING")[0]) == (0, "")
+    result = json.loads((benchmarks_here / "results" / "recorded.json").read_text())
+    assert result["meta"]["command"] == "ae-env bench recorded grid --quick"
+    rows = {(row["scene"], row["method"]): row for row in result["rows"]}
+    assert set(rows) == {(s, m) for s in "ab" for m in ("simulated", "scaled")}
+    assert [rows[s, "scaled"]["states"] for s in "ab"] == [8, 7]
+    # Scaled by hand: the source is the state whose green is nearest to a mean of 0.12.
+    frames = torch.stack([capture(s).data for s in GRID]).double()
+    source = int((frames[:, 1:3].mean(dim=(1, 2, 3)) - 0.12).abs().argmin())
+    assert rows["a", "scaled"]["source_state"] == str(GRID[source])
+    assert float(frames[source].max()) < 0.8  # so that all of it is known, and compared
+    errors = []
+    for state, settings in enumerate(GRID):
+        if state != source:
+            scaled = (frames[source] * exposure_ratio(GRID[source], settings)).clamp(max=1.0)
+            errors.append(-10.0 * np.log10(float((scaled - frames[state]).square().mean())))
+    row = rows["a", "scaled"]
+    assert row["known_share"] == 1.0
+    assert row["psnr_db"] == pytest.approx(np.median(errors), abs=0.3)  # the pedestal clips
+    assert row["psnr_all_db"] == row["psnr_db"] == row["psnr_expected_db"]
+    # The simulated frames have the noise of real ones, at the cost of PSNR against noisy ones.
+    simulated = rows["a", "simulated"]
+    assert simulated["noise_error_stops"] < row["noise_error_stops"]
+    assert simulated["psnr_expected_db"] > simulated["psnr_db"]
+    for own in rows.values():
+        assert 0.0 <= own["oracle_regret"] < 0.2
+    page = (benchmarks_here / "results" / "recorded.md").read_text()
+    assert "|grid|tworealcaptures|" in page.replace(" ", "")
+    assert "boreal" not in page
+
+
+def test_the_noise_of_two_real_captures_is_told(tmp_path: Path) -> None:
+    """The ceiling, worked out from the calibration, against two captures of one light."""
+    write_raws(tmp_path / "a")
+    (scene,) = recorded._of_folder(str(tmp_path))
+    everywhere = torch.ones(scene.light.shape[1:], dtype=torch.bool)
+    for state, settings in enumerate(GRID):
+        other = capture(settings, 0).data
+        again = (
+            recorded.ReferenceCamera(scene.camera)
+            .capture(photographed("s0", size=40, seed=0), settings, seed=99)
+            .sample
+        )
+        error = -10.0 * np.log10(float((again - other).double().square().mean()))
+        ceiling = recorded._ceiling(scene, GRID, state, everywhere)
+        assert ceiling == pytest.approx(error, abs=0.3)
