@@ -43,23 +43,14 @@ _F_NUMBER, _TIME = 4.0, 1.0
 
 
 class DrawnSettings(NamedTuple):
-    """What an `ExposureAugmentation` draws for one picture.
+    """What an `ExposureAugmentation` draws for one picture."""
 
-    Args:
-        stops: Exposure relative to the picture's [EV].
-        iso: ISO speed, whose noise the new picture has.
-        defocus: Diameter of the defocus disc [pixel].
-        motion: Length of the motion blur [pixel].
-        direction: Of the motion [rad]; 0 is along the rows.
-        highlights: By how much light that was clipped is raised above white [EV].
-    """
-
-    stops: float
-    iso: float
-    defocus: float
-    motion: float
-    direction: float
-    highlights: float
+    stops: float  # exposure relative to the picture's [EV]
+    iso: float  # speed, whose noise the new picture has
+    defocus: float  # diameter of the disc [pixel]
+    motion: float  # length of the blur [pixel]
+    direction: float  # of the motion [rad]; 0 is along the rows
+    highlights: float  # by how much light that was clipped is raised above white [EV]
 
 
 @dataclass(frozen=True)
@@ -170,21 +161,16 @@ class ExposureAugmentation:
         source = NoiseLevelFunction.zero() if nlf is None else nlf
         out = torch.empty(images.shape, device=images.device)
         for image, seed, frame in zip(images.detach(), words, out, strict=True):
-            frame.copy_(self._photographed(image, seed, source))
+            drawn = self.draw(seed)
+            if len(image) == 4:
+                frame.copy_(self._raw(image.float(), seed, drawn, source))
+                continue
+            light = _in_pieces(lambda piece: develop_inverse(piece[None])[0], image)
+            if "exposure" in self.modules:
+                light = light * _raised(image, drawn.highlights)
+            raw = self._raw(light, seed, drawn, source)
+            frame.copy_(_in_pieces(lambda piece: develop(piece[None])[0], raw))
         return out
-
-    def _photographed(
-        self, image: torch.Tensor, seed: int, source: NoiseLevelFunction
-    ) -> torch.Tensor:
-        """One picture."""
-        drawn = self.draw(seed)
-        if image.shape[0] == 4:
-            return self._raw(image.float(), seed, drawn, source)
-        light = _in_pieces(lambda piece: develop_inverse(piece[None])[0], image)
-        if "exposure" in self.modules:
-            light = light * _raised(image, drawn.highlights)
-        raw = self._raw(light, seed, drawn, source)
-        return _in_pieces(lambda piece: develop(piece[None])[0], raw)
 
     def _raw(
         self, light: torch.Tensor, seed: int, drawn: DrawnSettings, source: NoiseLevelFunction
@@ -229,15 +215,9 @@ def _in_pieces(
 
 
 def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -> list[int]:
-    """Seeds of the samples of an epoch, for a batch that is augmented after it was collated.
+    """Seeds of the samples `indices` of an epoch, for a batch that is augmented once collated.
 
-    Args:
-        seed: Of the training, >= 0.
-        epoch: Number of the epoch, >= 0: each has pictures of its own.
-        indices: Of the samples in the data set, >= 0.
-
-    Returns:
-        An integer for each index, a function of it, of `seed` and of `epoch`.
+    Each is a function of its index, of the training's `seed` and of the `epoch`, all >= 0.
 
     >>> sample_seeds(0, 1, [5, 7]) == sample_seeds(0, 1, [5]) + sample_seeds(0, 1, [7])
     True
@@ -245,22 +225,15 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
     given = indices.tolist() if isinstance(indices, torch.Tensor) else indices
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ValueError(f"`indices` (={indices!r}) must be integers, one for each sample")
-    found = []
-    for index in given:
-        words = [
-            _check_seed("seed", seed),
-            _check_seed("epoch", epoch),
-        ]
-        sequence = np.random.SeedSequence([*words, _check_seed("indices", index)])
-        found.append(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-    return found
+    words = _check_seed("seed", seed), _check_seed("epoch", epoch)
+    sequences = [np.random.SeedSequence([*words, _check_seed("indices", i)]) for i in given]
+    return [int(s.generate_state(1, np.uint64)[0] >> np.uint64(1)) for s in sequences]
 
 
 class AugmentedDataset(Dataset[Any]):
     """A data set whose pictures are augmented where they are loaded, in the workers.
 
-    The seed of a sample comes from `seed`, the epoch and its index: the order of the samples and
-    the number of workers do not matter.
+    Neither the order of the samples nor the number of workers matters.
 
     Args:
         dataset: Map-style data set of pictures (C, H, W), or of tuples and lists that begin with

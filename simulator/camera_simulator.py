@@ -1,8 +1,7 @@
 """The camera simulator: plans which steps a change of settings needs, and runs those.
 
 A raw or a scene is prepared once (`CameraSimulator.prepare`): everything that does not depend on
-the target settings, the networks included, is in the `PreparedScene`. Exposing it at any settings
-is then a few element-wise steps.
+the target settings, the networks included. Exposing it at any settings is a few element-wise steps.
 """
 
 from __future__ import annotations
@@ -99,7 +98,18 @@ def prepared_of(source: Source, device: torch.device) -> PreparedScene:
         ValueError: If `source` is neither a raw nor a prepared scene nor a scene.
     """
     if isinstance(source, RawImage):
-        return _recorded(source, device)
+        marks, camera = source.saturated, source.camera
+        if source.nlf is not None and not camera.nlf_by_iso:
+            camera = camera.with_nlf(source.settings.iso, source.nlf)
+        return PreparedScene(
+            light=neutral_highlights(source, marks).to(device),
+            reference=source.settings,
+            camera=camera,
+            nlf=source.noise,
+            saturated=marks.to(device) if marks.count_nonzero() else None,
+            white_balance=source.white_balance,
+            box_factor=source.box_factor,
+        )
     if isinstance(source, PreparedScene):
         if source.light.device == device:
             return source
@@ -111,21 +121,6 @@ def prepared_of(source: Source, device: torch.device) -> PreparedScene:
         return prepared_of(source.prepared, device)
     raise ValueError(
         f"`source` (={type(source).__name__}) must be a RawImage, a PreparedScene or a scene"
-    )
-
-
-def _recorded(raw: RawImage, device: torch.device) -> PreparedScene:
-    saturated, camera = raw.saturated, raw.camera
-    if raw.nlf is not None and not camera.nlf_by_iso:
-        camera = camera.with_nlf(raw.settings.iso, raw.nlf)
-    return PreparedScene(
-        light=neutral_highlights(raw, saturated).to(device),
-        reference=raw.settings,
-        camera=camera,
-        nlf=raw.noise,
-        saturated=saturated.to(device) if saturated.count_nonzero() else None,
-        white_balance=raw.white_balance,
-        box_factor=raw.box_factor,
     )
 
 
@@ -212,9 +207,7 @@ class CameraSimulator:
                 one up to it does, `tolerance` decides. Or the path of weights that
                 `ae-env train-simulator` wrote, or of the authors' (docs/networks.md), whose noise
                 module is the only one then.
-            device: See `CameraSimulator`.
-            precision: See `CameraSimulator`.
-            cache: See `CameraSimulator`.
+            device, precision, cache: See `CameraSimulator`.
             body_correction: Whether to apply the exposure module's w and b. They make up for the
                 errors of the one body that was trained on and are wrong for any other.
 
@@ -312,14 +305,10 @@ class CameraSimulator:
 
     @torch.no_grad()
     def denoise(self, prepared: PreparedScene, noise: NoiseModule | None = None) -> torch.Tensor:
-        """The prepared scene's light (4, H, W) with little noise.
+        """The prepared scene's light (4, H, W) with little noise, by `noise` or the best module.
 
         The result serves every exposure: the family commutes with exposure. Those of the paper
         and of its authors' code do not; they are run at the exposure of the source.
-
-        Args:
-            prepared: The scene.
-            noise: The noise module; by default the best.
 
         Raises:
             ValueError: If this simulator has no noise module.
@@ -372,17 +361,15 @@ class CameraSimulator:
         return usable_defocus(diameter, image)[0]
 
     def _aperture_blur(self, prepared: PreparedScene) -> ApertureBlur:
-        assert self.aperture is not None
-        f_number = prepared.reference.effective_f_number
-        if not self.aperture.has_map:
-            denoised = (
-                prepared.denoised_lights[-1]
-                if prepared.denoised_lights
-                else DenoisedLight(prepared.light)
-            )
-            opened = partial(self._results.called, "opened", self.aperture)
-            return NetworkApertureBlur(denoised, opened, f_number)
-        estimate, everywhere = partial(self._defocus_map, prepared), prepared.tolerance == 0.0
+        aperture, f_number = self.aperture, prepared.reference.effective_f_number
+        assert aperture is not None
+        if not aperture.has_map:
+            lights = prepared.denoised_lights or (DenoisedLight(prepared.light),)
+            opened = partial(self._results.called, "opened", aperture)
+            return NetworkApertureBlur(lights[-1], opened, f_number)
+        make, shape = partial(self.estimate_defocus, prepared), prepared.light.shape[-2:]
+        estimate = partial(self._cached, "defocus_maps", aperture, prepared, make, shape)
+        everywhere = prepared.tolerance == 0.0
         return MapApertureBlur(prepared.light, estimate, f_number, everywhere=everywhere)
 
     def _denoised(self, noise: NoiseModule, prepared: PreparedScene) -> DenoisedLight:
@@ -411,13 +398,6 @@ class CameraSimulator:
                 times.append(time.perf_counter() - start)
             self._seconds[noise.preset] = min(times) / _TIMED**2
         return self._seconds[noise.preset]
-
-    def _defocus_map(self, prepared: PreparedScene) -> torch.Tensor:
-        """`estimate_defocus`, cached."""
-        assert self.aperture is not None
-        estimate = partial(self.estimate_defocus, prepared)
-        shape = prepared.light.shape[-2:]
-        return self._cached("defocus_maps", self.aperture, prepared, estimate, shape)
 
     def _cached(
         self,
@@ -464,8 +444,7 @@ class CameraSimulator:
             source: A raw, a prepared scene, or a scene.
             settings: Target settings.
             noise: False plans the light on the sensor alone (`PreparedScene.expected`).
-            tolerance: See `prepare`.
-            scene: `image_speed`, `defocus` and `depth`, see `prepare`.
+            tolerance, scene: See `prepare`.
         """
         return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 
@@ -487,8 +466,7 @@ class CameraSimulator:
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-            scene: `image_speed`, `defocus` and `depth`, see `prepare`; by default the depth is
-                unknown.
+            scene: See `prepare`; by default the depth is unknown.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.
@@ -562,7 +540,7 @@ class CameraSimulator:
                 row noise and tails (see `PreparedScene.capture`); the full run knows ``"exact"``.
             tolerance: See `prepare`; None runs every module for this very transition (`stages`),
                 and shares and leaves out nothing.
-            scene: `image_speed`, `defocus` and `depth`, see `prepare`.
+            scene: See `prepare`.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
@@ -576,9 +554,8 @@ class CameraSimulator:
             stages = self.stages(source, settings, seed=seed, **scene)
             data, excess_noise = stages.capture, 0.0
             prepared = prepared_of(source, self.device)
-            clean = replace(
-                prepared, nlf=prepared.nlf.zero(), denoised_lights=(), aperture_blur=None
-            )
+            zero = NoiseLevelFunction.zero()
+            clean = replace(prepared, nlf=zero, denoised_lights=(), aperture_blur=None)
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
             exact = 0.0 if tolerance is None else tolerance

@@ -117,16 +117,15 @@ NOTHING_KNOWN = FolderOptions()
 def folder_scenes(
     spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
-    """The scenes of a split among the user's files.
+    """The scenes of a split among the user's files; each is resized before the next file is read.
 
     Args:
         spec: See `find_files`.
-        request: Split, camera and size. Each scene is resized before the next file is read.
+        request: Split, camera and size.
         options: Facts about the files that the caller knows.
 
     Raises:
-        ValueError: If a file cannot be read (with ``on_error="skip"`` only if no file can), or
-            there are too few groups to train on.
+        ValueError: If a file cannot be read, or there are too few groups to train on.
     """
     base, files = find_files(spec)
     named = _named_groups(sorted({base, *(p.parent for p in files)}))

@@ -78,13 +78,11 @@ class Asset(Configuration):
     """A panorama.
 
     Args:
-        name: Public name.
+        name, bytes, sha256: Public name of its file, the file's length and hash.
         kind: Kind of light.
         split: ``"train"`` or ``"test"``.
         group: Source group: the place; by default the asset itself.
         file: Where it lies in a folder of real files.
-        bytes: Length of the file.
-        sha256: Of the file.
     """
 
     name: str = Field(pattern=r"[a-z0-9_]+")
@@ -225,10 +223,9 @@ def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
     against the view. A white diffuse surface there has a luminance of it over pi.
 
     Args:
-        panorama: (3, H, W) linear sRGB; columns are longitudes from -180 degrees, rows latitudes
-            from +90 degrees.
-        azimuth: Longitude that the surface faces [degrees].
-        pitch: Latitude that it faces [degrees]; 90 is level ground.
+        panorama: See `simulator.radiance.maps.perspective`.
+        azimuth, pitch: Longitude and latitude that the surface faces [degrees]; a pitch of 90 is
+            level ground.
     """
     height, width = panorama.shape[1:]
     longitude = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * math.pi

@@ -75,14 +75,7 @@ _FRAME = re.compile(r"frame[_-]?(\d+)", re.I)
 
 @dataclass(frozen=True)
 class RecordedOptions:
-    """A folder of recorded grids.
-
-    Args:
-        folder: The folder.
-        iso: ISO of files that do not state it.
-        exposure_time: Exposure time [s] of files that do not state it.
-        f_number: F-number of files that do not state it.
-    """
+    """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs."""
 
     folder: Path
     iso: float | None = None
@@ -160,11 +153,8 @@ def recorded_scenes(
 ) -> list[Scene]:
     """The recorded scenes of a split, frames of one video after the other.
 
-    Args:
-        options: The folder.
-        request: Split, camera and size. Each capture is resized before the next is read.
-        grid: The states; captures at other settings are left out, states without a capture are
-            forbidden (`Scene.allowed`).
+    Each capture is resized before the next is read. Captures at settings that are not in `grid` are
+    left out, states without a capture are forbidden (`Scene.allowed`).
 
     Raises:
         ValueError: If a capture cannot be read, or a scene's captures are no grid of one size.
@@ -337,9 +327,7 @@ class RecordedFile:
 def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
     """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
-    Args:
-        folder: Searched with its sub-folders.
-        known: Settings by name that the files do not state; those that they do come first.
+    `known` are settings by name that the files do not state; those that they do come first.
 
     Raises:
         ValueError: If there is no capture, one does not state its settings, or a table is wrong.

@@ -151,13 +151,10 @@ class Scene:
         return LightStatistics(self.light)  # computes each value when it is first asked for
 
     def own_blur(self, f_number: float) -> float:
-        """Root mean square of the scene's own circle of confusion at `f_number` [pixel].
+        """Root mean square of the scene's own circle of confusion at an effective f-number [px].
 
         It grows as the aperture opens; a smaller aperture than the reference's leaves its blur. 0
         without a `defocus_map`.
-
-        Args:
-            f_number: Effective f-number.
         """
         return self._blur_at_reference * max(1.0, self.reference.effective_f_number / f_number)
 
@@ -420,15 +417,9 @@ def _checked(scene: Scene) -> Scene:
 class SceneSet(Sequence[Scene]):
     """Scenes in a fixed order; bundled ones are drawn when they are needed.
 
-    All names are known at once. `load` the scenes that are about to be used, several at a time;
-    indexing and iterating load what they need. All scenes of a set that draws are alike: those that
-    are `loaded` tell whether any has a layout.
-
-    Args:
-        scenes: All of them, in order.
-
-    Attributes:
-        scene_ids: Their names.
+    All `scene_ids` are known at once. `load` the scenes that are about to be used, several at a
+    time; indexing and iterating load what they need. All scenes of a set that draws are alike:
+    those that are `loaded` tell whether any has a layout.
     """
 
     def __init__(self, scenes: Iterable[Scene]) -> None:

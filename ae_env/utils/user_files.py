@@ -174,11 +174,11 @@ def list_presets(kind: str = "env") -> list[str]:
 
 
 def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
-    """The YAML file of a preset.
+    """The YAML file of a preset of one `kind`, a folder of ``configs/``.
 
     Args:
         name: Name of a preset, or the path of a ``.yaml`` file.
-        kind: Folder of ``configs/``, such as ``"env"``.
+        kind: Such as ``"env"``.
 
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.

@@ -8,6 +8,7 @@ Laplacian pyramid as by T. Mertens, J. Kautz and F. Van Reeth, "Exposure fusion"
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import tempfile
@@ -24,6 +25,7 @@ from torch import Tensor
 
 from simulator import CameraSimulator, RawImage, render_srgb
 from simulator.raw.develop import quarter_turns, srgb_from_camera
+from simulator.utils.checks import check_number
 from simulator.utils.files import write_atomically
 
 #: Ends and step of the bracket [EV].
@@ -69,8 +71,8 @@ def hdr_picture(
 
     Args:
         raw: The photograph.
-        stops: The bracket reaches from -`stops` to +`stops` [EV], in (0, 10].
-        step: Between its pictures [EV], in (0, `stops`].
+        stops: The bracket reaches from -`stops` to +`stops` [EV], in [0.05, 10].
+        step: Between its pictures [EV], in [0.05, `stops`].
         simulator: What reduces noise; by default ``CameraSimulator.from_pretrained()``.
 
     Raises:
@@ -93,10 +95,8 @@ def bracket_exposures(stops: float = STOPS, step: float = STEP) -> tuple[float, 
     >>> bracket_exposures(1.0, 0.5)
     (-1.0, -0.5, 0.0, 0.5, 1.0)
     """
-    if not 0.0 < stops <= 10.0:
-        raise ValueError(f"`stops` (={stops!r}) must be in (0, 10]")
-    if not 0.05 <= step <= stops:
-        raise ValueError(f"`step` (={step!r}) must be in [0.05, {stops:g}], at most `stops`")
+    check_number("stops", stops, 0.05, 10.0)
+    check_number("step", step, 0.05, stops, more=", at most `stops`")
     count = math.floor(stops / step + 1e-9)
     return tuple(step * i for i in range(-count, count + 1))
 
@@ -131,26 +131,17 @@ def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> Path:
-    """Writes linear light (H, W, 3) as an EXR of 32-bit floats.
-
-    Raises:
-        ImportError: If OpenEXR is not installed.
-    """
+    """Writes linear light (H, W, 3) as an EXR of 32-bit floats, for which OpenEXR is needed."""
     openexr = import_openexr()
-    path = Path(path)
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     with tempfile.TemporaryDirectory() as folder:  # OpenEXR writes to a path only
         file = Path(folder, "image.exr")
         openexr.File(header, {"RGB": np.ascontiguousarray(image)}).write(str(file))
-        return write_atomically(path, file.read_bytes())
+        return write_atomically(Path(path), file.read_bytes())
 
 
 def import_openexr() -> Any:
-    """The module OpenEXR.
-
-    Raises:
-        ImportError: If it is not installed; names the extra.
-    """
+    """The module OpenEXR, or an `ImportError` that names the extra."""
     try:
         import OpenEXR
     except ImportError:
@@ -185,16 +176,20 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
     means = torch.tensor([float(_luma(picture).mean()) for picture in every()])
     if len(means) < 2:
         raise ValueError(f"`pictures` (={len(means)}) must be at least 2")
-    widths = _spacing(means)
-    total: Tensor | None = None
-    for picture, mean, width in zip(every(), means, widths, strict=True):
-        weight = _weight(_luma(picture), float(mean), float(width))
-        total = weight if total is None else total + weight
-    assert total is not None
+    # Standard deviation of the first weight: `ALPHA` times the distance between both neighbours.
+    order = means.argsort()
+    widths = torch.empty_like(means)
+    widths[order] = ALPHA * 2.0 * torch.gradient(means[order])[0]
+    widths = widths.clamp(min=1.0 / _BINS)  # pictures that are alike
+
+    def weighted() -> Iterator[tuple[Tensor, Tensor]]:
+        for picture, mean, width in zip(every(), means, widths, strict=True):
+            yield picture, _weight(_luma(picture), float(mean), float(width))
+
+    total = functools.reduce(torch.add, (weight for _, weight in weighted()))
     fused: list[Tensor] = []
-    for picture, mean, width in zip(every(), means, widths, strict=True):
-        weight = _smoothed(_weight(_luma(picture), float(mean), float(width)) / total)
-        weights = _gaussian_pyramid(weight[None])
+    for picture, weight in weighted():
+        weights = _gaussian_pyramid(_smoothed(weight / total)[None])
         details = _laplacian_pyramid(picture)
         blended = [w * d for w, d in zip(weights, details, strict=True)]
         fused = blended if not fused else [f.add_(b) for f, b in zip(fused, blended, strict=True)]
@@ -202,19 +197,6 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
     for detail in reversed(fused[:-1]):
         result = detail + _expand(result, detail.shape[-2:])
     return result.clamp(0.0, 1.0)
-
-
-def _spacing(means: Tensor) -> Tensor:
-    """Standard deviation of the first weight of each picture."""
-    order = means.argsort()
-    ascending = means[order]
-    between = torch.empty_like(ascending)
-    between[1:-1] = ascending[2:] - ascending[:-2]
-    between[0] = 2.0 * (ascending[1] - ascending[0])
-    between[-1] = 2.0 * (ascending[-1] - ascending[-2])
-    widths = torch.empty_like(between)
-    widths[order] = ALPHA * between
-    return widths.clamp(min=1.0 / _BINS)  # pictures that are alike
 
 
 def _weight(luma: Tensor, mean: float, width: float) -> Tensor:
@@ -275,25 +257,20 @@ def _padded(image: Tensor, axis: int, margin: int) -> Tensor:
     return F.pad(image, margins, mode="replicate")
 
 
-def _depth(image: Tensor) -> int:
-    """Levels such that the coarsest has 4 to 8 pixels along its shorter side, at least `LEVELS`.
+def _gaussian_pyramid(image: Tensor) -> list[Tensor]:
+    """Levels down to 4 to 8 pixels along the shorter side, at least `LEVELS` of them.
 
     What is larger than a pixel of the coarsest level is weighted as a whole: with 7 levels, a flat
     patch of a photograph of some megapixels fades from its edges to its middle.
     """
-    return max(LEVELS, min(image.shape[-2:]).bit_length() - 2)
-
-
-def _gaussian_pyramid(image: Tensor) -> list[Tensor]:
     levels = [image]
-    while len(levels) < _depth(image) and min(levels[-1].shape[-2:]) > 1:
+    depth = max(LEVELS, min(image.shape[-2:]).bit_length() - 2)
+    while len(levels) < depth and min(levels[-1].shape[-2:]) > 1:
         levels.append(_reduce(levels[-1]))
     return levels
 
 
 def _laplacian_pyramid(image: Tensor) -> list[Tensor]:
     levels = _gaussian_pyramid(image)
-    details = [
-        fine - _expand(coarse, fine.shape[-2:]) for fine, coarse in itertools.pairwise(levels)
-    ]
-    return [*details, levels[-1]]
+    pairs = itertools.pairwise(levels)
+    return [*(fine - _expand(coarse, fine.shape[-2:]) for fine, coarse in pairs), levels[-1]]

@@ -69,12 +69,21 @@ def refocus(
             fit `raw`, if the camera's pixel pitch is needed and not known, or if neither depth nor
             networks are there; before any work.
     """
-    _check(raw, f_number, depth, lens, simulator)
-    simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
+    if target.effective_f_number > source.effective_f_number:
+        raise ValueError(
+            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:.3g}: "
+            "closing the aperture would have to sharpen"
+        )
+    known = _known_blur(raw, depth, lens)
+    if known is None and simulator is not None and simulator.aperture is None:
+        raise ValueError(
+            "`depth` (=None) must be given to a `simulator` without networks: they estimate the "
+            "blur, see CameraSimulator.from_pretrained"
+        )
+    simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
     opened = source.effective_f_number / target.effective_f_number
-    known = None if depth is None or lens is None else _known_blur(raw, depth, lens)
     prepared = simulator.prepare(raw, tolerance=0.0)
     clean = prepared.denoised_lights[-1].light if prepared.denoised_lights else prepared.light
     diameter = simulator.estimate_defocus(prepared) if known is None else known
@@ -88,36 +97,15 @@ def refocus(
     frame, _ = scene.capture(settings, seed)
     kept = (added.abs().to(clean.device) <= SHARP) & (blurred == clean).all(dim=0)
     data = torch.where(kept, raw.data.to(frame), frame)
-    metadata = {
-        **raw.metadata,
-        "depth": "estimated" if known is None else "given",
-        "largest_disc_px": float(added.abs().max()),
-    }
-    return replace(raw, data=data, settings=settings, metadata=metadata)
+    how = "estimated" if known is None else "given"
+    facts = {"depth": how, "largest_disc_px": float(added.abs().max())}
+    return replace(raw, data=data, settings=settings, metadata={**raw.metadata, **facts})
 
 
-def _check(
-    raw: RawImage,
-    f_number: float,
-    depth: np.ndarray | None,
-    lens: Lens | None,
-    simulator: CameraSimulator | None,
-) -> None:
-    """Raises the `ValueError` of `refocus` about these arguments."""
-    source = raw.settings
-    target = CameraSettings(source.iso, source.exposure_time, f_number)
-    if target.effective_f_number > source.effective_f_number:
-        raise ValueError(
-            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:.3g}: "
-            "closing the aperture would have to sharpen"
-        )
+def _known_blur(raw: RawImage, depth: np.ndarray | None, lens: Lens | None) -> torch.Tensor | None:
+    """Signed circle of confusion (H, W) at the raw's own aperture [packed pixel]; checks it all."""
     if depth is None and lens is None:
-        if simulator is not None and simulator.aperture is None:
-            raise ValueError(
-                "`depth` (=None) must be given to a `simulator` without networks: they estimate "
-                "the blur, see CameraSimulator.from_pretrained"
-            )
-        return
+        return None
     if depth is None or lens is None:
         given = "lens" if depth is None else "depth"
         raise ValueError(f"`{given}` must come with both of `depth` and `lens`")
@@ -139,11 +127,6 @@ def _check(
             f"`raw`: the pixel pitch of {raw.camera.name!r} is not known; give it, with "
             "`--pixel-pitch` or dataclasses.replace(camera, pixel_pitch_um=...)"
         )
-
-
-def _known_blur(raw: RawImage, depth: np.ndarray, lens: Lens) -> torch.Tensor:
-    """Signed circle of confusion (H, W) at the raw's own aperture [packed pixel]."""
-    assert raw.camera.pixel_pitch_um is not None
     pitch = 2e-6 * raw.camera.pixel_pitch_um * raw.box_factor
     metres = torch.from_numpy(np.ascontiguousarray(depth, np.float64))
     blur = lens.circle_of_confusion(metres, raw.settings.effective_f_number) / pitch
@@ -177,10 +160,6 @@ def read_depth(
         raise ValueError(f"`scale` (={scale!r}) must be finite and > 0")
     if scale is None and kind == "disparity":
         raise ValueError("`scale` (=None) must be given for a disparity: 1 / metres for each unit")
-    if path.suffix.lower() not in (".png", ".exr", ".npy"):
-        raise ValueError(f"`depth` (={str(path)!r}) must end in .png, .exr or .npy")
-    if not path.is_file():
-        raise ValueError(f"`depth` (={str(path)!r}): there is no such file")
     values = _read_map(path)
     if values.ndim != 2 or not values.size:
         raise ValueError(f"`depth` (={str(path)!r}, shape {values.shape}) must be one map (H, W)")
@@ -198,6 +177,8 @@ def read_depth(
 
 def _read_map(path: Path) -> np.ndarray:
     """The numbers of a file, float64."""
+    if path.suffix.lower() not in (".png", ".exr", ".npy"):
+        raise ValueError(f"`depth` (={str(path)!r}) must end in .png, .exr or .npy")
     try:
         match path.suffix.lower():
             case ".png":

@@ -169,14 +169,7 @@ BLUR_ERRORS = np.array(
 
 
 class Bracketing(Policy):
-    """Base of the policies: keeps the frames of each camera, and what they show together.
-
-    Args:
-        context: The camera, with the limits of a bracket.
-
-    Raises:
-        ValueError: If the context is not that of `ExposureBracket-v0`.
-    """
+    """Base of the policies: keeps the frames of each camera, and what they show together."""
 
     def __init__(self, context: PolicyContext) -> None:
         super().__init__(context)

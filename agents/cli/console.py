@@ -14,55 +14,52 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from rich.console import Console
+from typer import Argument, Option
 
 terminal = Console()
 
 # -- options of several commands ------------------------------------------------------------------
 
 MAX_SEED = 2**63 - 1
-Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
+Seed = Annotated[int, Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
 OwnSeed = Annotated[
-    int | None, typer.Option(help="Seed instead of the one in the YAML.", min=0, max=MAX_SEED)
+    int | None, Option(help="Seed instead of the one in the YAML.", min=0, max=MAX_SEED)
 ]
 OnError = Annotated[
-    str, typer.Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
+    str, Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
 ]
-Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
-Policies = Annotated[
-    list[str] | None, typer.Option(help="A policy; give the option several times.")
-]
-Raw = Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")]
-OutDng = Annotated[Path, typer.Option("--out", "-o", help="DNG to write.")]
-Png = Annotated[Path | None, typer.Option(help="Also write the developed picture here.")]
-SourceIso = Annotated[
-    float | None, typer.Option(help="ISO speed of RAW, instead of what the file says.")
-]
-SourceShutter = Annotated[str | None, typer.Option(help="Exposure time of RAW [s].")]
-SourceAperture = Annotated[str | None, typer.Option(help="F-number of RAW.")]
+Device = Annotated[str, Option(help="Torch device: auto, cpu, cuda.")]
+Policies = Annotated[list[str] | None, Option(help="A policy; give the option several times.")]
+Raw = Annotated[Path, Argument(help="Any Bayer raw that LibRaw reads.")]
+Folder = Annotated[Path, Option(help="Folder for the results.")]
+OutDng = Annotated[Path, Option("--out", "-o", help="DNG to write.")]
+Png = Annotated[Path | None, Option(help="Also write the developed picture here.")]
+SourceIso = Annotated[float | None, Option(help="ISO speed of RAW, instead of what the file says.")]
+SourceShutter = Annotated[str | None, Option(help="Exposure time of RAW [s].")]
+SourceAperture = Annotated[str | None, Option(help="F-number of RAW.")]
 Weights = Annotated[
     str,
-    typer.Option(
+    Option(
         help="Largest network that may run: nano, compact, large; a file of weights; or none to "
         "only add noise."
     ),
 ]
 Depth = Annotated[
     str,
-    typer.Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens."),
+    Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens."),
 ]
-Cache = Annotated[bool, typer.Option(help="Cache the outputs of the networks between runs.")]
+Cache = Annotated[bool, Option(help="Cache the outputs of the networks between runs.")]
 Tolerance = Annotated[
     float,
-    typer.Option(
+    Option(
         help="Error that a capture may have, in units of the target's noise: the cheapest way "
         "within it is taken, or else the best; 0 for the best."
     ),
 ]
 Noise = Annotated[
     str,
-    typer.Option(
+    Option(
         help="exact: drawn; bank: looked up in a bank of normals, faster; or sensor: drawn with "
         "the row noise and the tails of a calibrated camera's read noise."
     ),

@@ -10,6 +10,7 @@ from time import perf_counter
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from agents.cli import console
 from agents.cli.console import print_files, print_line, progress_bars
@@ -40,7 +41,7 @@ def _scenes() -> None:
 @scenes.command()
 def download(
     url: Annotated[
-        str | None, typer.Option(help="Another server's folder that holds NAME_1k.hdr.")
+        str | None, Option(help="Another server's folder that holds NAME_1k.hdr.")
     ] = None,
 ) -> None:
     """Fetch Poly Haven's panoramas (CC0) for `--scenes polyhaven`; a second run resumes the first.
@@ -61,17 +62,15 @@ def download(
 
 
 def record(
-    policy: Annotated[str, typer.Option(help="The policy that acts.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Name, such as ae_env/matrix-v0.")],
+    policy: Annotated[str, Option(help="The policy that acts.")],
+    out: Annotated[str, Option("--out", "-o", help="Name, such as ae_env/matrix-v0.")],
     task: Annotated[
-        str, typer.Option(help="AutoExposure-v0 or AutoExposureVideo-v0.")
+        str, Option(help="AutoExposure-v0 or AutoExposureVideo-v0.")
     ] = "AutoExposure-v0",
-    env: Annotated[
-        str | None, typer.Option(help="Preset of the environment, or a YAML file.")
-    ] = None,
-    scenes: Annotated[str | None, typer.Option(help="Scenes to draw from.")] = None,
-    split: Annotated[str | None, typer.Option(help="train (default), test or all.")] = None,
-    episodes: Annotated[int, typer.Option(help="How many.", min=1, max=1_000_000)] = 200,
+    env: Annotated[str | None, Option(help="Preset of the environment, or a YAML file.")] = None,
+    scenes: Annotated[str | None, Option(help="Scenes to draw from.")] = None,
+    split: Annotated[str | None, Option(help="train (default), test or all.")] = None,
+    episodes: Annotated[int, Option(help="How many.", min=1, max=1_000_000)] = 200,
     seed: console.Seed = 0,
 ) -> None:
     """Record episodes of a policy as a Minari dataset.
@@ -115,34 +114,34 @@ def record(
 
 Engine = Annotated[
     str,
-    typer.Option(
+    Option(
         help="local: this process; ray: a Ray on this machine; or a cluster's address, such as "
         "ray://head:10001 or auto."
     ),
 ]
 TakesNoiseOut = Annotated[
-    str, typer.Option(help="Networks that take the noise out of raws; none for none.")
+    str, Option(help="Networks that take the noise out of raws; none for none.")
 ]
 
 
 def score_tables(
     what: Annotated[
-        str, typer.Argument(help="A folder or glob of raws and radiance maps, or one of them.")
+        str, Argument(help="A folder or glob of raws and radiance maps, or one of them.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the shards.")] = Path(
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the shards.")] = Path(
         "score_tables"
     ),
     on: Engine = "local",
-    workers: Annotated[int, typer.Option(help="Processes on Ray.", min=1)] = 2,
-    per_shard: Annotated[int, typer.Option(help="Files of a shard.", min=1)] = 16,
-    resolution: Annotated[int, typer.Option(help="Packed pixels a side.", min=1)] = 64,
+    workers: Annotated[int, Option(help="Processes on Ray.", min=1)] = 2,
+    per_shard: Annotated[int, Option(help="Files of a shard.", min=1)] = 16,
+    resolution: Annotated[int, Option(help="Packed pixels a side.", min=1)] = 64,
     grid: Annotated[
-        str, typer.Option(help="Exposure grid: default, third_stop, video, bracket.")
+        str, Option(help="Exposure grid: default, third_stop, video, bracket.")
     ] = "default",
-    scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
-    camera: Annotated[str, typer.Option(help="Camera for radiance maps.")] = "nikon_z6",
+    scorer: Annotated[str, Option(help="Scorer, as for `evaluate`.")] = "balanced",
+    camera: Annotated[str, Option(help="Camera for radiance maps.")] = "nikon_z6",
     weights: TakesNoiseOut = "compact",
-    captures: Annotated[bool, typer.Option(help="Also write the captures.")] = False,
+    captures: Annotated[bool, Option(help="Also write the captures.")] = False,
     seed: console.Seed = 0,
 ) -> None:
     """Score every exposure state of many raws or radiance maps; writes Parquet, shard by shard.
@@ -188,7 +187,7 @@ def score_tables(
 
 
 def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all of it.")] = False,
+    clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = False,
 ) -> None:
     """Show what is cached between runs (scenes, networks' outputs), or clear it.
 

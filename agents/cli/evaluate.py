@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from agents.cli import console
 
@@ -28,42 +29,42 @@ _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 
 Preset = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="quick, standard, video, bracket, ae_bench_v2_still (_video, _bracket), or a .yaml "
         "file of one's own."
     ),
 ]
 Environment = Annotated[
-    str | None, typer.Option(help="Environment: a preset of configs/env, or a .yaml file.")
+    str | None, Option(help="Environment: a preset of configs/env, or a .yaml file.")
 ]
 Scenes = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="'bundled', 'polyhaven', 'mixed', a folder or file of raws or radiance maps, or "
         "'recorded:FOLDER' (with what its files do not say: 'recorded:FOLDER?iso=100')."
     ),
 ]
-Split = Annotated[str | None, typer.Option(help="train, test (default) or all.")]
-Grid = Annotated[str | None, typer.Option(help="default, third_stop, video or bracket.")]
-Scorer = Annotated[str | None, typer.Option(help="The scorer of the states: balanced...")]
-Lighting = Annotated[str | None, typer.Option(help="static (default), step, ramp, sine, tunnel...")]
+Split = Annotated[str | None, Option(help="train, test (default) or all.")]
+Grid = Annotated[str | None, Option(help="default, third_stop, video or bracket.")]
+Scorer = Annotated[str | None, Option(help="The scorer of the states: balanced...")]
+Lighting = Annotated[str | None, Option(help="static (default), step, ramp, sine, tunnel...")]
 Delay = Annotated[
-    int | None, typer.Option(help="Frames from a decision to its frame; 0 by default.", min=0)
+    int | None, Option(help="Frames from a decision to its frame; 0 by default.", min=0)
 ]
-Observation = Annotated[str | None, typer.Option(help="uint8 (default), statistics...")]
-Sensors = Annotated[bool | None, typer.Option(help="Whether speed and defocus are observed (yes).")]
-Resolution = Annotated[int | None, typer.Option(help="Packed pixels a side; 64 by default.")]
+Observation = Annotated[str | None, Option(help="uint8 (default), statistics...")]
+Sensors = Annotated[bool | None, Option(help="Whether speed and defocus are observed (yes).")]
+Resolution = Annotated[int | None, Option(help="Packed pixels a side; 64 by default.")]
 EpisodeCount = Annotated[
-    int | None, typer.Option(help="Episodes per scene and start: so many seeds.", min=1)
+    int | None, Option(help="Episodes per scene and start: so many seeds.", min=1)
 ]
-Frames = Annotated[int | None, typer.Option(help="Frames per episode.", min=1)]
-Append = Annotated[Path | None, typer.Option(help="Benchmark table (CSV) to add the results to.")]
-Author = Annotated[str, typer.Option(help="For --append: who made the policy.")]
+Frames = Annotated[int | None, Option(help="Frames per episode.", min=1)]
+Append = Annotated[Path | None, Option(help="Benchmark table (CSV) to add the results to.")]
+Author = Annotated[str, Option(help="For --append: who made the policy.")]
 FirstSeed = Annotated[
-    int | None, typer.Option(help="Seed of everything random.", min=0, max=console.MAX_SEED)
+    int | None, Option(help="Seed of everything random.", min=0, max=console.MAX_SEED)
 ]
 Workers = Annotated[
-    int | None, typer.Option(help="Processes; by default one per core if it pays.", min=1)
+    int | None, Option(help="Processes; by default one per core if it pays.", min=1)
 ]
 
 
@@ -84,7 +85,7 @@ def evaluate(
     resolution: Resolution = None,
     episodes: EpisodeCount = None,
     frames: Frames = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("evaluation"),
+    out: console.Folder = Path("evaluation"),
     append: Append = None,
     author: Author = "",
     seed: FirstSeed = None,

@@ -18,6 +18,7 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
+from typer import Argument, Option
 
 from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
@@ -40,36 +41,36 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def bench(
-    name: Annotated[str, typer.Argument(help=", ".join(BENCHMARKS))],
+    name: Annotated[str, Argument(help=", ".join(BENCHMARKS))],
     folder: Annotated[
         Path | None,
-        typer.Argument(
+        Argument(
             help="Of paper, required: sequences of captures (docs/dataset.md). Of recorded, "
             "optional: recorded grids; by default those of the page."
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Folder for the results; by default the checkout's docs/results, of a FOLDER "
             "of your own ./results."
         ),
     ] = None,
     seed: console.Seed = 0,
-    quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
+    quick: Annotated[bool, Option(help="A short version, to try it out.")] = False,
     against: Annotated[
         Path | None,
-        typer.Option(help="Of throughput: another checkout or commit, timed in turns with this."),
+        Option(help="Of throughput: another checkout or commit, timed in turns with this."),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Of paper: measure these weights, and train nothing; of features: ALIKED's "
             "(aliked-n16.pth), judged beside."
         ),
     ] = None,
     part: Annotated[
-        str | None, typer.Option(help="Of transfer: agents or tables; by default both.")
+        str | None, Option(help="Of transfer: agents or tables; by default both.")
     ] = None,
 ) -> None:
     """Run one of the measurements whose results are in docs/results.
@@ -204,9 +205,9 @@ def _version(asked: bool) -> None:
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`."
 )
 def _options(
-    debug: Annotated[bool, typer.Option(help="Show the traceback of an error.")] = False,
+    debug: Annotated[bool, Option(help="Show the traceback of an error.")] = False,
     version: Annotated[
-        bool, typer.Option("--version", help="Show the version.", callback=_version, is_eager=True)
+        bool, Option("--version", help="Show the version.", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
     # `main` looks for the option itself: it must know before the arguments are parsed.

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from agents.cli import console
 from agents.cli.console import print_line
@@ -28,13 +28,13 @@ PPO_FRAMES = 55_000
 EPISODES = 2
 
 Scenes = Annotated[
-    str, typer.Option(help="'bundled', 'polyhaven', or a folder or file of raws or .hdr/.exr maps.")
+    str, Option(help="'bundled', 'polyhaven', or a folder or file of raws or .hdr/.exr maps.")
 ]
 
 
 def quickstart(
     scenes: Scenes = "bundled",
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("quickstart"),
+    out: console.Folder = Path("quickstart"),
     on_error: console.OnError = "stop",
     seed: console.Seed = 0,
     device: console.Device = "cpu",

@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from agents.cli import console
 from agents.cli.console import print_files, print_line, progress_bars
@@ -21,17 +21,17 @@ POLICIES = ("average:tuned", "average:tuned?foresight=model", "regression:video?
 def view(
     what: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="[RAW|FOLDER|SCENE]",
             help="A raw or radiance map, a folder of them, scenes such as bundled or polyhaven, or "
             "the id of a bundled scene.",
         ),
     ] = DEFAULT_SCENES,
-    port: Annotated[int, typer.Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
+    port: Annotated[int, Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
     open_browser: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")
+        bool, Option("--open/--no-open", help="Open the page in the default browser.")
     ] = True,
-    scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
+    scorer: Annotated[str, Option(help="Scorer, as for `evaluate`.")] = "balanced",
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
     tolerance: console.Tolerance = console.TOLERANCE,
@@ -76,13 +76,13 @@ def view(
 def film(
     policy: console.Policies = None,
     light: Annotated[
-        str, typer.Option(help="Kind of moving light: tunnels, sines, shadows, clouds, pans...")
+        str, Option(help="Kind of moving light: tunnels, sines, shadows, clouds, pans...")
     ] = "tunnels",
-    scenes: Annotated[str, typer.Option(help="Scenes to draw from.")] = "bundled",
-    scene: Annotated[str | None, typer.Option(help="Id of the scene; drawn by default.")] = None,
-    frames: Annotated[int, typer.Option(help="Actions of the episode.", min=1)] = 64,
+    scenes: Annotated[str, Option(help="Scenes to draw from.")] = "bundled",
+    scene: Annotated[str | None, Option(help="Id of the scene; drawn by default.")] = None,
+    frames: Annotated[int, Option(help="Actions of the episode.", min=1)] = 64,
     seed: console.Seed = 0,
-    out: Annotated[Path, typer.Option(help="The animated GIF.")] = Path("film.gif"),
+    out: Annotated[Path, Option(help="The animated GIF.")] = Path("film.gif"),
 ) -> None:
     """Film one episode of AutoExposureVideo-v0: policies side by side, in the same moving light.
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Option
 
 from agents.cli import console
 from agents.cli.console import check_outputs, print_files, print_line, progress_bars
@@ -25,9 +25,9 @@ _SHEET_SIZE = 128
 
 def simulate(
     raw: console.Raw,
-    iso: Annotated[float, typer.Option(help="Target ISO speed.")],
-    shutter: Annotated[str, typer.Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
-    aperture: Annotated[str, typer.Option(help="Target f-number, such as 4 or f/4.")],
+    iso: Annotated[float, Option(help="Target ISO speed.")],
+    shutter: Annotated[str, Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
+    aperture: Annotated[str, Option(help="Target f-number, such as 4 or f/4.")],
     out: console.OutDng = Path("out.dng"),
     png: console.Png = None,
     source_iso: console.SourceIso = None,
@@ -41,7 +41,7 @@ def simulate(
     device: console.Device = "auto",
     cache: console.Cache = True,
     details: Annotated[
-        bool, typer.Option("--details", help="Also print why each step runs or is left out.")
+        bool, Option("--details", help="Also print why each step runs or is left out.")
     ] = False,
 ) -> None:
     """Simulate one raw at other settings and write it as a DNG; prints the plan.
@@ -92,8 +92,8 @@ def _remarks(source: RawImage, result: RawImage, *, details: bool) -> Iterator[s
 
 def sweep(
     raw: console.Raw,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("sweep"),
-    dngs: Annotated[bool, typer.Option(help="Also write the 64 DNGs, full size.")] = False,
+    out: console.Folder = Path("sweep"),
+    dngs: Annotated[bool, Option(help="Also write the 64 DNGs, full size.")] = False,
     source_iso: console.SourceIso = None,
     source_shutter: console.SourceShutter = None,
     source_aperture: console.SourceAperture = None,
@@ -101,7 +101,7 @@ def sweep(
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
     tolerance: Annotated[
-        float, typer.Option(help="Of the DNGs: error to accept for speed, see simulate.")
+        float, Option(help="Of the DNGs: error to accept for speed, see simulate.")
     ] = console.TOLERANCE,
     device: console.Device = "auto",
     cache: console.Cache = True,
@@ -150,38 +150,38 @@ def sweep(
 
 DepthMap = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Depth map of the developed picture, upright, or half its size: PNG, EXR or .npy; "
         "by default the blur is estimated."
     ),
 ]
 DepthKindName = Annotated[
     str | None,
-    typer.Option(help="distance (default), or disparity: larger numbers are nearer."),
+    Option(help="distance (default), or disparity: larger numbers are nearer."),
 ]
 DepthScale = Annotated[
     float | None,
-    typer.Option(
+    Option(
         help="Metres for each unit (by default 0.001 in a PNG, else 1), or 1 / metres for "
         "each unit of disparity."
     ),
 ]
 Focus = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Where the lens is focused: a distance such as 2.5 [m], or a pixel of the depth "
         "map such as 640,480; by default its middle."
     ),
 ]
-FocalLength = Annotated[float | None, typer.Option(help="Of the lens [mm]; by default the file's.")]
+FocalLength = Annotated[float | None, Option(help="Of the lens [mm]; by default the file's.")]
 PixelPitch = Annotated[
-    float | None, typer.Option(help="Of the sensor [um]; by default the camera's, if known.")
+    float | None, Option(help="Of the sensor [um]; by default the camera's, if known.")
 ]
 
 
 def refocus(
     raw: console.Raw,
-    aperture: Annotated[str, typer.Option(help="Wider f-number, such as 1.4 or f/1.4.")],
+    aperture: Annotated[str, Option(help="Wider f-number, such as 1.4 or f/1.4.")],
     out: console.OutDng = Path("out.dng"),
     png: console.Png = None,
     depth: DepthMap = None,
@@ -206,6 +206,7 @@ def refocus(
 
     from agents.applications import refocus as applied
     from simulator.raw.develop import quarter_turns
+    from simulator.utils.checks import check_number
 
     f_number = console.parse_f_number(aperture)
     for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale, "focus": focus}
@@ -213,8 +214,8 @@ def refocus(
     for name, value in for_depth.items():
         if depth is None and value is not None:
             raise ValueError(f"`{name}` (={value}) is an option of a known `--depth`")
-    if pixel_pitch is not None and not 0.1 <= pixel_pitch <= 100.0:
-        raise ValueError(f"`pixel-pitch` (={pixel_pitch:g}) must be in [0.1, 100] micrometres")
+    if pixel_pitch is not None:
+        check_number("pixel-pitch", pixel_pitch, 0.1, 100.0, more=" micrometres")
     check_outputs(raw, depth, out=(out, ".dng"), png=(png, ".png"))
     source = _read(raw, source_iso, source_shutter, source_aperture)
     metres, lens = None, None
@@ -246,14 +247,14 @@ def _lens(
 ) -> Lens:
     """The lens that the options and the file describe."""
     from simulator import Lens
+    from simulator.utils.checks import check_number
 
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length
     if millimetres is None:
         raise ValueError("`focal-length` (=None) must be given: the file does not say it")
-    if not float(millimetres) > 0.0:
-        raise ValueError(f"`focal-length` (={millimetres:g}) must be above 0 mm")
+    millimetres = check_number("focal-length", float(millimetres), 1e-3, 1e6, more=" mm")
     with console.option_names(focus_distance="focus", focal_length="focal-length"):
-        return Lens(float(millimetres) / 1000.0, _focus_distance(focus, metres))
+        return Lens(millimetres / 1000.0, _focus_distance(focus, metres))
 
 
 def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
@@ -281,13 +282,11 @@ def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
 def hdr(
     raw: console.Raw,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="EXR to write: linear light, 1 at the raw's white.")
+        Path, Option("--out", "-o", help="EXR to write: linear light, 1 at the raw's white.")
     ] = Path("out.exr"),
-    png: Annotated[Path | None, typer.Option(help="Also write the fused picture here.")] = None,
-    stops: Annotated[
-        float, typer.Option(help="The bracket reaches this far down and up [EV].")
-    ] = 4.0,
-    step: Annotated[float, typer.Option(help="Between its pictures [EV].")] = 0.5,
+    png: Annotated[Path | None, Option(help="Also write the fused picture here.")] = None,
+    stops: Annotated[float, Option(help="The bracket reaches this far down and up [EV].")] = 4.0,
+    step: Annotated[float, Option(help="Between its pictures [EV].")] = 0.5,
     source_iso: console.SourceIso = None,
     source_shutter: console.SourceShutter = None,
     source_aperture: console.SourceAperture = None,

@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from agents.cli import console
 from agents.cli.console import print_files, print_line, progress_bars
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 def train(
-    config: Annotated[Path, typer.Argument(help="YAML such as configs/regression.yaml.")],
-    out: Annotated[Path, typer.Option(help="File name of the agent, without suffix.")] = Path(
+    config: Annotated[Path, Argument(help="YAML such as configs/regression.yaml.")],
+    out: Annotated[Path, Option(help="File name of the agent, without suffix.")] = Path(
         "runs/agent"
     ),
     seed: console.OwnSeed = None,
     device: console.Device = "cpu",
-    tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
+    tensorboard: Annotated[Path | None, Option(help="Folder for a TensorBoard log.")] = None,
 ) -> None:
     """Train an agent; a second run resumes the first.
 
@@ -67,13 +67,13 @@ def _evaluation(agent: AgentConfig, out: Path) -> list[str]:
 
 
 def train_simulator(
-    config: Annotated[Path, typer.Argument(help="YAML such as configs/simulator/compact.yaml.")],
+    config: Annotated[Path, Argument(help="YAML such as configs/simulator/compact.yaml.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder; by default runs/simulator/NAME-OF-THE-CONFIG.")
+        Path | None, Option(help="Folder; by default runs/simulator/NAME-OF-THE-CONFIG.")
     ] = None,
     seed: console.OwnSeed = None,
     device: console.Device = "auto",
-    tensorboard: Annotated[bool, typer.Option(help="Log to OUT/tensorboard.")] = True,
+    tensorboard: Annotated[bool, Option(help="Log to OUT/tensorboard.")] = True,
 ) -> None:
     """Train the simulator's modules stage by stage; a second run resumes the first.
 
@@ -116,9 +116,9 @@ def train_simulator(
 
 def export(
     policy: Annotated[
-        str, typer.Argument(help="regression, ppo, regression:video, regression:PATH or ppo:PATH.")
+        str, Argument(help="regression, ppo, regression:video, regression:PATH or ppo:PATH.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .onnx file.")] = Path("policy.onnx"),
+    out: Annotated[Path, Option("--out", "-o", help="The .onnx file.")] = Path("policy.onnx"),
 ) -> None:
     """Export a trained agent to ONNX, to run it without torch (`agents.onboard.Controller`).
 

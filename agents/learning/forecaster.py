@@ -59,9 +59,6 @@ class ForecasterTraining(Configuration):
         bent: Share of the light that is cut at a level above or below, as light is that comes
             through gaps; likewise the share whose pace varies, and the share that is smoothed.
         seed: Seed of light, frames and weights.
-
-    Raises:
-        ValueError: If a value is out of range or an entry is unknown; the message names it.
     """
 
     steps: int = Field(default=10_000, ge=2, le=10**9)
@@ -110,10 +107,7 @@ class LightForecaster(nn.Module):
 def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np.float32]:
     """What the network sees of a frame, (..., 4): changes and exposure in stops, clipping.
 
-    Args:
-        reading: Of the frame.
-        before: Metered EV100 of the frame before it.
-        exposed_at: EV100 that the frame was taken at.
+    `before` is the metered EV100 of the frame before, `exposed_at` that of the settings.
     """
     change, exposure = (reading.ev100 - before) / 2.0, (reading.ev100 - exposed_at) / 4.0
     parts = [change, exposure, reading.saturated, reading.black]

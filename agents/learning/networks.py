@@ -141,8 +141,7 @@ class ExposureFeatures(nn.Module):
         """Histograms of the frame's luminance, ``(B, LIGHT_NUMBERS)``, for a `StateHead`.
 
         Args:
-            codes: As for `forward`.
-            settings: As for `forward`.
+            codes, settings: As for `forward`.
             histogram: (B, 128) shares of all samples by code, where statistics are observed; the
                 brightest of each pixel is then that of each zone.
         """
@@ -336,13 +335,10 @@ def with_history(space: gym.spaces.Dict, frames: int) -> gym.spaces.Dict:
 
 
 def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Frames shifted by up to an eighth, all alike, and mirrored half of the time.
+    """Frames (N, 4, H, W) shifted by up to an eighth, all alike, and mirrored half of the time.
 
-    Their light, and so the scores of all states, stay nearly what they were.
-
-    Args:
-        raw: (N, 4, H, W) uint8. Shifted frames continue their border.
-        rng: Draws the shift.
+    Their light, and so the scores of all states, stay nearly what they were: shifted frames
+    continue their border.
     """
     for axis in (2, 3):
         size = raw.shape[axis]

@@ -44,10 +44,6 @@ class ExposureExtractor(BaseFeaturesExtractor):
     """`ExposureFeatures` as SB3 wants it, followed by what the `StateHead` needs beside it.
 
     That is the light's histograms and the sensors. SB3 has divided the raw by 255 already.
-
-    Args:
-        observation_space: Observation of a single environment.
-        width: Features without these.
     """
 
     def __init__(self, observation_space: gym.spaces.Dict, width: int = 256) -> None:
@@ -88,9 +84,7 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
     """SB3's actor and critic on the exposure features, with a `StateHead` for the logits.
 
     Args:
-        observation_space: Observation of a single environment.
-        action_space: `Discrete`, one per state.
-        lr_schedule: As SB3 calls it.
+        observation_space, action_space, lr_schedule: As SB3 calls it, for a single environment.
         grid: The exposure states.
         width: Features that describe a frame.
         trained_on: See `StateHead`.
@@ -152,9 +146,6 @@ class PPOTraining(Configuration):
         history: Frames of which the network sees what a light meter read and what was asked for
             (`MeterHistory`); 0 for none.
         seed: Seed of scenes, noise, weights and actions.
-
-    Raises:
-        ValueError: If a value is out of range or an entry is unknown; the message names it.
     """
 
     total_timesteps: int = Field(default=200_000, ge=1, le=10**12)

@@ -61,11 +61,10 @@ class ScoreRegressor(nn.Module):
 
     Args:
         observation_space: Observation of a single environment.
-        grid: The exposure states.
+        grid, trained_on: See `StateHead`.
         width: Features that describe a frame.
         dropout: Share of the features that a training step leaves out; of the CNN's channels it
             leaves out 0.4 times as many.
-        trained_on: See `StateHead`.
     """
 
     def __init__(
@@ -268,9 +267,6 @@ class RegressionTraining(Configuration):
         width: Hidden features of the network.
         dropout: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
         seed: Seed of scenes, noise and weights.
-
-    Raises:
-        ValueError: If a value is out of range or an entry is unknown; the message names it.
     """
 
     frames: int = Field(default=100_000, ge=1, le=10**12)
@@ -314,11 +310,7 @@ def train_regression(
 class Rollout:
     """Frames and the scores of all states, from episodes that the policy itself drives.
 
-    Args:
-        envs: Vector environments.
-        policy: Chooses the actions that are not random.
-        training: Hyperparameters.
-        first_step: Optimiser steps that an earlier run has taken; every start draws other episodes.
+    `first_step` are the steps that an earlier run has taken; every start draws other episodes.
     """
 
     def __init__(

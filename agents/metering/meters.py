@@ -68,8 +68,7 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
         name: ``"average"``; ``"centre_weighted"``: 75 % of the weight in the central circle of half
             the frame's height (the classic 12 mm circle of 35 mm cameras), the rest around it;
             ``"spot"``: a central circle of 4 % of the area.
-        height: Rows.
-        width: Columns.
+        height, width: Rows and columns.
 
     >>> round(float(weight_map("centre_weighted", 64, 64)[16:48, 16:48].sum()), 2)
     0.77

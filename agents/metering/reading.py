@@ -252,10 +252,7 @@ class ZoneMatcher:
     def match(self, reading: Reading, zones: Floats, exposed_at: Floats) -> Reading:
         """Take in one frame of each camera; what it reads, unsaturated where it was matched.
 
-        Args:
-            reading: What a meter reads in the frames, ``(N,)``.
-            zones: See `zone_signals`.
-            exposed_at: EV100 that they were taken at, ``(N,)``.
+        `zones` are `zone_signals`, `exposed_at` is the EV100 of the frames' settings, ``(N,)``.
         """
         light, saturated = reading.ev100, reading.saturated
         if self._zones is not None:

@@ -128,11 +128,8 @@ def entropy_reading(
 def peak(values: Floats, positions: Floats, best: NDArray[np.intp] | None = None) -> Floats:
     """Where each row of `values` (N, K) is highest: the top of the parabola through its best three.
 
-    Args:
-        values: ``(N, K)``.
-        positions: ``(K,)``, ascending.
-        best: Index of the highest value of each row, ``(N,)``; by default of equal ones that at the
-            position nearest to 0.
+    `positions` (K,) ascend. `best` (N,) are the indices of the highest values; by default, of equal
+    ones, that at the position nearest to 0.
     """
     if best is None:
         best = np.argmax(values.round(9) - 1e-9 * np.abs(positions), axis=1)

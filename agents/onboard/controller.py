@@ -51,12 +51,9 @@ class Controller:
         try:
             import onnxruntime
         except ImportError as error:
-            raise ImportError(
-                "a Controller needs ONNX Runtime: pip install onnxruntime, or the extra "
-                "'ae-env[onnx]'"
-            ) from error
-        if not Path(path).is_file():
-            raise ValueError(f"`path` (={str(path)!r}): there is no such file")
+            how = "pip install onnxruntime, or the extra 'ae-env[onnx]'"
+            raise ImportError(f"a Controller needs ONNX Runtime: {how}") from error
+        given = f"`path` (={str(path)!r})"
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # the network is small: threads cost more than they bring
         try:
@@ -65,14 +62,12 @@ class Controller:
             )
             found = self._session.get_modelmeta().custom_metadata_map[METADATA]
         except KeyError:
-            raise ValueError(f"`path` (={str(path)!r}) is no export of `ae-env export`") from None
+            raise ValueError(f"{given} is no export of `ae-env export`") from None
         except Exception as error:  # ONNX Runtime has errors of its own
-            raise ValueError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
+            raise ValueError(f"{given} cannot be read: {error}") from error
         self.card: dict[str, Any] = json.loads(found)
         if self.card.get("format") != FORMAT:
-            raise ValueError(
-                f"`path` (={str(path)!r}) is of format {self.card.get('format')}, not {FORMAT}"
-            )
+            raise ValueError(f"{given} is of format {self.card.get('format')}, not {FORMAT}")
         self.states = [ExposureState(*state) for state in self.card["states"]]
         self.reset(num_cameras)
 
@@ -104,10 +99,8 @@ class Controller:
         Raises:
             ValueError: If an array has the wrong shape.
         """
-        shown: dict[str, NDArray[Any]] = {
-            "raw": np.asarray(raw, np.uint8),
-            "settings": np.asarray(settings, np.float32),
-        }
+        shown: dict[str, NDArray[Any]] = {"raw": np.asarray(raw, np.uint8)}
+        shown["settings"] = np.asarray(settings, np.float32)
         if sensors is not None:
             shown["sensors"] = np.asarray(sensors, np.float32)
         self._check(shown)
@@ -115,8 +108,7 @@ class Controller:
         utility = found[0] if self.card["kind"] == "ppo" else self._accumulated(*found)
         if action_masks is not None:
             utility = np.where(action_masks, utility, -np.inf)
-        chosen: NDArray[np.int64] = np.argmax(utility, axis=1).astype(np.int64)
-        return chosen
+        return np.argmax(utility, axis=1).astype(np.int64)
 
     def decide(
         self,
@@ -159,29 +151,20 @@ class Controller:
         averaged = _averaged(_averaged(np.asarray(planes, np.float64), height, 1), width, 2)
         pedestal = self.card["pedestal"]
         shown = np.clip(averaged, -pedestal, 1.0)
-        codes: NDArray[np.uint8] = np.rint(
-            255.0 * np.sqrt((shown + pedestal) / (1.0 + pedestal))
-        ).astype(np.uint8)
-        return codes
+        root = np.sqrt((shown + pedestal) / (1.0 + pedestal))
+        return np.rint(255.0 * root).astype(np.uint8)
 
     def encode_settings(self, state: ExposureState) -> NDArray[np.float32]:
         """The observed settings (3,) of a state: Av, Tv and Sv in [-1, 1]."""
-        apex = (
-            2 * np.log2(state.f_number),
-            -np.log2(state.exposure_time),
-            np.log2(state.iso / 3.125),
-        )
-        return self._unit(np.array(apex), "settings")
+        aperture, time = 2 * np.log2(state.f_number), -np.log2(state.exposure_time)
+        return self._unit(np.array([aperture, time, np.log2(state.iso / 3.125)]), "settings")
 
     def _unit(self, values: NDArray[np.float64], name: str) -> NDArray[np.float32]:
         low, high = np.array(self.card["ranges"][name]).T
         return np.clip(2.0 * (values - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
     def _accumulated(
-        self,
-        scores: NDArray[np.float32],
-        precision: NDArray[np.float32],
-        ev100: NDArray[np.float32],
+        self, scores: NDArray[Any], precision: NDArray[Any], ev100: NDArray[Any]
     ) -> NDArray[np.float64]:
         other = (self._frames > 0) & (np.abs(ev100 - self._light) > self.card["same_light_ev"])
         for sums in (self._weighted, self._precision, self._light, self._frames):
@@ -190,19 +173,16 @@ class Controller:
         self._light += (ev100 - self._light) / self._frames
         self._weighted += precision.astype(np.float64) * scores
         self._precision += precision
-        utility: NDArray[np.float64] = self._weighted / self._precision
-        return utility
+        return self._weighted / self._precision
 
     def _check(self, shown: dict[str, NDArray[Any]]) -> None:
         shapes = {"raw": self.frame_shape, "settings": (3,)}
         if self.card["sensors"]:
             shapes["sensors"] = (2,)
         for name in shapes.keys() | shown.keys():
-            if name not in shapes:
-                raise ValueError(f"`{name}`: the agent was trained without it")
-            wanted = (len(self._light), *shapes[name])
-            if name not in shown or shown[name].shape != wanted:
-                given = shown[name].shape if name in shown else None
+            wanted = (len(self._light), *shapes[name]) if name in shapes else None
+            given = shown[name].shape if name in shown else None
+            if given != wanted:
                 raise ValueError(f"`{name}` (shape {given}) must be {wanted}")
 
 

@@ -85,21 +85,24 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
     if file.suffix != ".onnx":
         raise ValueError(f"`out` (={str(path)!r}) must end in .onnx")
     graph = _graph(policy)
-    onnx = _onnx()
+    try:
+        import onnx
+        import onnxscript  # noqa: F401  (torch's exporter needs it)
+    except ImportError as error:
+        raise ImportError(
+            "the export needs ONNX: install the extra with pip install 'ae-env[onnx]'"
+        ) from error
     context = policy.context
     shape = context.observation_space["raw"].shape or ()
-    arguments = [torch.zeros(2, *shape, dtype=torch.uint8), torch.zeros(2, 3)]
-    names = ["raw", "settings"]
+    arguments = {"raw": torch.zeros(2, *shape, dtype=torch.uint8), "settings": torch.zeros(2, 3)}
     if context.has_sensors:
-        arguments.append(torch.zeros(2, 2))
-        names.append("sensors")
-    outputs = ["logits"] if isinstance(policy, PPOPolicy) else ["scores", "precision", "ev100"]
-    batch = torch.export.Dim("batch", min=1)
-    program = _exported(graph.eval(), tuple(arguments), names, outputs, batch)
-    model = program.model_proto
+        arguments["sensors"] = torch.zeros(2, 2)
+    ppo = isinstance(policy, PPOPolicy)
+    outputs = ["logits"] if ppo else ["scores", "precision", "ev100"]
+    model = _exported(graph.eval(), arguments, outputs).model_proto
     card = {
         "format": FORMAT,
-        "kind": "ppo" if isinstance(policy, PPOPolicy) else "regression",
+        "kind": "ppo" if ppo else "regression",
         "states": [[s.iso, s.exposure_time, s.f_number] for s in context.grid],
         "frame_shape": list(shape),
         "sensors": context.has_sensors,
@@ -129,9 +132,9 @@ def _graph(policy: Policy) -> nn.Module:
     raise ValueError(f"`policy` (={policy.name!r}) must be a regression or a PPO agent")
 
 
-def _exported(
-    graph: nn.Module, arguments: tuple[Any, ...], names: list[str], outputs: list[str], batch: Any
-) -> Any:
+def _exported(graph: nn.Module, arguments: dict[str, torch.Tensor], outputs: list[str]) -> Any:
+    """The program, for any batch; the exporter's own output says nothing to a user."""
+    batch = torch.export.Dim("batch", min=1)
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
     quiet.setLevel(logging.ERROR)
@@ -140,8 +143,8 @@ def _exported(
             warnings.simplefilter("ignore")
             return torch.onnx.export(
                 graph,
-                arguments,
-                input_names=names,
+                tuple(arguments.values()),
+                input_names=list(arguments),
                 output_names=outputs,
                 dynamic_shapes=tuple({0: batch} for _ in arguments),
                 dynamo=True,
@@ -149,14 +152,3 @@ def _exported(
             )
     finally:
         quiet.setLevel(level)
-
-
-def _onnx() -> Any:
-    try:
-        import onnx
-        import onnxscript  # noqa: F401  (torch's exporter needs it)
-    except ImportError as error:
-        raise ImportError(
-            "the export needs ONNX: install the extra with pip install 'ae-env[onnx]'"
-        ) from error
-    return onnx

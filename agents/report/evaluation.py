@@ -403,10 +403,7 @@ class _Report:
             *self._conditions(),
             *self._cost(),
             *self._clipping(),
-            *self._kinds(),
-            *self._other_scorers(),
-            *self._paths(),
-            *self._differences(),
+            *self._details(),
             "## What the oracle chooses",
             "Share of the episodes; where one value dominated, the control would not matter.",
             _histogram_table(self.meta["oracle_histogram"]),
@@ -523,53 +520,48 @@ class _Report:
             ]
         return ["## Clipping", "Share of the pixels at white and at black.", _wide(table, "")]
 
-    def _kinds(self) -> list[str]:
-        kinds = self.meta["by_kind"]
-        if len(kinds) < 2:
-            return []
-        table = pd.DataFrame(kinds).drop(index="groups").rename_axis("policy")
-        table.columns = [f"{kind} ({values['groups']})" for kind, values in kinds.items()]
-        text = f"Normalised score ({self.static}); in brackets the source groups of each kind."
-        return ["## By kind of scene", text, _wide(table, ".3f")]
-
-    def _other_scorers(self) -> list[str]:
-        scores, plan = self.meta["other_scorers"], self.result.plan
-        if not scores or plan is None:
-            return []
-        table = pd.DataFrame(scores, index=pd.Index(self.result.tracks, name="policy"))
-        count = min(plan.other_scorer_scenes, self.meta["scenes"])
-        text = (
-            f"Mean expected score of the chosen states of {count} scenes under scorers that "
-            "nothing was trained on. Scorers that read noise as detail rise with gain: see "
-            "`docs/scorers.md`."
-        )
-        return ["## Under other scorers", text, _wide(table, ".3f")]
-
-    def _paths(self) -> list[str]:
+    def _details(self) -> list[str]:
+        """What only some evaluations have: kinds, other scorers, paths, differences to a meter."""
+        meta, plan, parts = self.meta, self.result.plan, []
+        if len(meta["by_kind"]) > 1:
+            table = pd.DataFrame(meta["by_kind"]).drop(index="groups").rename_axis("policy")
+            groups = {kind: f"{kind} ({own['groups']})" for kind, own in meta["by_kind"].items()}
+            parts += [
+                "## By kind of scene",
+                f"Normalised score ({self.static}); in brackets the source groups of each kind.",
+                _wide(table.rename(columns=groups), ".3f"),
+            ]
+        if meta["other_scorers"] and plan is not None:
+            count = min(plan.other_scorer_scenes, meta["scenes"])
+            policies = pd.Index(self.result.tracks, name="policy")
+            parts += [
+                "## Under other scorers",
+                f"Mean expected score of the chosen states of {count} scenes under scorers that "
+                "nothing was trained on. Scorers that read noise as detail rise with gain: see "
+                "`docs/scorers.md`.",
+                _wide(pd.DataFrame(meta["other_scorers"], index=policies), ".3f"),
+            ]
         sheets = [name for name in self.pictures if name.startswith("contact_sheet")]
-        if not sheets or self.result.plan is None:
-            return []
-        text = (
-            "The states of one scene, the oracle's starred, with those that each policy chose from "
-            f"the start '{self.result.plan.starts[0]}', frame by frame."
-        )
-        return ["## Paths", text, *(f"![States and paths]({name})" for name in sheets)]
-
-    def _differences(self) -> list[str]:
-        found = self.meta["differences_to_best_meter"]
-        if not found:
-            return []
-        columns = {
-            "policy": "{policy}",
-            "scenes": "{condition}",
-            "difference": "{difference:+.3f}",
-            "95 % interval": "{ci95:+.3f}",
-        }
-        return [
-            f"## Difference to the best meter, {code(self.meta['best_meter'])} ({self.static})",
-            "Paired on the same episodes; intervals of single differences, not simultaneous.",
-            to_markdown(found, columns),
-        ]
+        if sheets and plan is not None:
+            parts += [
+                "## Paths",
+                "The states of one scene, the oracle's starred, with those that each policy chose "
+                f"from the start '{plan.starts[0]}', frame by frame.",
+                *(f"![States and paths]({name})" for name in sheets),
+            ]
+        if meta["differences_to_best_meter"]:
+            columns = {
+                "policy": "{policy}",
+                "scenes": "{condition}",
+                "difference": "{difference:+.3f}",
+                "95 % interval": "{ci95:+.3f}",
+            }
+            parts += [
+                f"## Difference to the best meter, {code(meta['best_meter'])} ({self.static})",
+                "Paired on the same episodes; intervals of single differences, not simultaneous.",
+                to_markdown(meta["differences_to_best_meter"], columns),
+            ]
+        return parts
 
 
 def _change(change: Mapping[str, Any] | None) -> str | None:
@@ -588,11 +580,10 @@ def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
         "exposure_time": format_exposure_time,
         "f_number": "f/{:g}".format,
     }
-    shares = {
-        name.replace("_", " "): [f"{labels[name](float(v))}: {own:.0%}" for v, own in found.items()]
-        for name, found in histogram.items()
-    }
-    rows = [{"control": name, "share": ", ".join(own)} for name, own in shares.items()]
+    rows = []
+    for name, own in histogram.items():
+        shares = [f"{labels[name](float(value))}: {share:.0%}" for value, share in own.items()]
+        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
     return to_markdown(rows, {"control": "{control}", "share": "{share}"})
 
 

@@ -67,7 +67,17 @@ class ExposurePage(Tab):
                     "frame 64 pixels high."
                 ).classes("note")
             with ui.element("div").classes("column"):
-                self._build_readouts()
+                self._histogram = ui.html(sanitize=False)
+                self._histogram.props('role=img aria-label="histogram of the raw planes"')
+                ui.label(
+                    "Raw histogram of R, G1, G2 and B, black to white level (height: square root "
+                    "of the pixel share)."
+                ).classes("note")
+                with ui.element("div").classes("facts"):
+                    for name in ("Score", "Noise", "Blur", "Clipped", "Time"):
+                        ui.label(name).classes("name")
+                        self._facts[name] = ui.label()
+                self._plan = ui.label().classes("plan")
         ui.keyboard(on_key=self._on_key)
 
     def _build_picture(self) -> None:
@@ -89,19 +99,6 @@ class ExposurePage(Tab):
         self._down = self._slider("Down", 1.0, 0.01, "{:.0%}".format, self._move)
         self._pinned = ui.label().classes("note")
         self._show_window()
-
-    def _build_readouts(self) -> None:
-        self._histogram = ui.html(sanitize=False)
-        self._histogram.props('role=img aria-label="histogram of the raw planes"')
-        ui.label(
-            "Raw histogram of R, G1, G2 and B, black to white level (height: square root of the "
-            "pixel share)."
-        ).classes("note")
-        with ui.element("div").classes("facts"):
-            for name in ("Score", "Noise", "Blur", "Clipped", "Time"):
-                ui.label(name).classes("name")
-                self._facts[name] = ui.label()
-        self._plan = ui.label().classes("plan")
 
     def _stops(self, name: str, values: Sequence[float], text: Callable[[float], str]) -> ui.slider:
         return self._slider(name, len(values) - 1, 1, lambda i: text(values[int(i)]))

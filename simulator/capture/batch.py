@@ -1,9 +1,8 @@
 """Many scenes side by side, photographed in batches: what the environment runs on.
 
-A capture here is cheap because nothing is worked out twice. All that a frame depends on, except for
-its noise, is planned when a state is first used, and cached as a row of columns. Blurred light is
-cached as long as its scene is shown. A batch of frames is then one call of
-`simulator.capture.sensor.record`.
+Nothing is worked out twice: all that a frame depends on, except for its noise, is planned when a
+state is first used, and cached as a row of columns; blurred light, as long as its scene is shown. A
+batch of frames is then one call of `simulator.capture.sensor.record`.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -128,8 +128,7 @@ class CaptureBatch:
     A pickled copy works everything out again.
 
     Args:
-        prepared: Function that returns the scene of an index, in its own light; called when the
-            scene is first photographed.
+        prepared: Returns the scene of an index, in its own light, when it is first photographed.
         num_scenes: Number of scenes, n.
         states: The settings of the S states.
         camera: The body.
@@ -150,28 +149,36 @@ class CaptureBatch:
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
         self.camera, self.noise, self._cache_light = camera, noise, cache_light
-        self._forget_all()
-
-    def _forget_all(self) -> None:
-        self._table = FrameTable(self.num_scenes * len(self.states))
         self._scenes: dict[int, PreparedScene] = {}
-        self._pool = Pool(self._cache_light)
+        self._pool = Pool(cache_light)
         # Row of the blurred light that each scene has at present.
-        self._blurred_row = np.full(self.num_scenes, -1)
+        self._blurred_row = np.full(num_scenes, -1)
+        # Planned captures as columns, by scene and state: all that a frame depends on, except for
+        # its noise. A row takes some 40 bytes, the rest of its memory when it is used.
+        count = num_scenes * len(states)
+        self._gain = np.full(count, np.nan)  # light that it was planned for; NaN where it was not
+        self._table = np.zeros((count, 5, 4), np.float32)  # of `exposure_table`
+        # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
+        self._excess_variance, self._predicted_error = np.zeros((2, count))
+        self._modules = np.zeros(count, np.int64)
+        # Whether the light must be blurred, else it is the scene's own; and whether any ever was.
+        self._blurs, self._any_blurs = np.zeros(count, bool), False
+        # Light (4, H, W), of a blur until its scene blurs another; `Exposure.remaining_variance` of
+        # it; and the exposure, where it must be blurred.
+        self._light, self._remaining_variance, self._exposure = np.empty((3, count), object)
 
-    def __getstate__(self) -> dict[str, Any]:
-        cached = ("_table", "_scenes", "_pool", "_blurred_row")
-        return {name: value for name, value in vars(self).items() if name not in cached}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._forget_all()
+    def __reduce__(self) -> tuple[Any, ...]:
+        made = partial(CaptureBatch, noise=self.noise, cache_light=self._cache_light)
+        return made, (self._prepared, self.num_scenes, self.states, self.camera)
 
     def forget(self, indices: np.ndarray) -> None:
         """See `FrameSource`; the memory is used again."""
-        count = len(self.states)
+        count, objects = len(self.states), (self._light, self._remaining_variance, self._exposure)
         for index in indices.tolist():
-            self._table.forget(slice(index * count, (index + 1) * count))
+            rows = slice(index * count, (index + 1) * count)
+            self._gain[rows] = np.nan
+            for column in objects:
+                column[rows] = None
             scene = self._scenes.pop(index, None)
             if scene is not None:
                 scene.blurred_light.release()
@@ -180,20 +187,20 @@ class CaptureBatch:
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
-        stale = self._table.gain[rows] != gains
+        stale = self._gain[rows] != gains
         if stale.any():
             self._plan(indices[stale], rows[stale], gains[stale])
-        if self._table.any_blurs:
-            missing = self._table.blurs[rows] & (self._blurred_row[indices] != rows)
+        if self._any_blurs:
+            missing = self._blurs[rows] & (self._blurred_row[indices] != rows)
             if missing.any():
                 self._blur(indices[missing], rows[missing])
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
         rows, remaining = indices * len(self.states) + states, None
-        if self._table.any_blurs:  # else all of the source's variance remains
-            remaining = self._table.remaining_variance[rows]
-        return Transitions(self._table.light[rows], self._table.table[rows], remaining)
+        if self._any_blurs:  # else all of the source's variance remains
+            remaining = self._remaining_variance[rows]
+        return Transitions(self._light[rows], self._table[rows], remaining)
 
     def record(
         self,
@@ -208,7 +215,7 @@ class CaptureBatch:
         signals: np.ndarray | None = None,
     ) -> FrameStatistics:
         """See `FrameSource`."""
-        rows, columns = indices * len(self.states) + states, self._table
+        rows = indices * len(self.states) + states
         keys, transitions = noise_keys(seeds, frames), self.transitions(indices, states)
         read_noise = None
         if self.noise == "sensor":
@@ -230,9 +237,9 @@ class CaptureBatch:
         return FrameStatistics(
             clipped_low=counts[:, 0] / samples,
             clipped_high=counts[:, 1] / samples,
-            excess_variance=columns.excess_variance[rows],
-            predicted_error=columns.predicted_error[rows],
-            modules=columns.modules[rows],
+            excess_variance=self._excess_variance[rows],
+            predicted_error=self._predicted_error[rows],
+            modules=self._modules[rows],
             source_noise=transitions.averaged_table()[:, 3:],
             keys=keys,
         )
@@ -254,36 +261,37 @@ class CaptureBatch:
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
         """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
-        columns, noisy, exposures = self._table, self.noise is not None, []
+        noisy, exposures = self.noise is not None, []
         for index, row, gain in zip(indices.tolist(), rows.tolist(), gains.tolist(), strict=True):
             scene, settings = self.prepared_scene(index), self.states[row % len(self.states)]
             exposure = decide(scene, settings, gain=gain)
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
-            columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
-            columns.remaining_variance[row] = None  # `_begin_blur` knows it
-            columns.any_blurs |= bool(blurs)
+            self._blurs[row], self._exposure[row] = blurs, exposure if blurs else None
+            self._remaining_variance[row] = None  # `_begin_blur` knows it
+            self._any_blurs |= bool(blurs)
             if not blurs:
-                columns.light[row] = scene.blurred_light.source(exposure).contiguous()
+                self._light[row] = scene.blurred_light.source(exposure).contiguous()
             excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
-            columns.excess_variance[row] = excess
+            self._excess_variance[row] = excess
             error = exposure.left_out
             if not scene.nlf.is_zero:
                 shown = exposure if noisy else decide(scene, settings, noise=False, gain=gain)
                 error = math.hypot(*predict_errors(scene, settings, shown).values())
-            columns.predicted_error[row] = error
-            columns.modules[row] = _modules(exposure, noisy)
+            self._predicted_error[row] = error
+            found = noisy * _NOISE_BIT
+            for step in exposure.steps:
+                found |= step.runs << _STEPS.index(step.name)
+            self._modules[row] = found
             exposures.append(exposure)
-        columns.table[rows] = exposure_table(exposures)
-        columns.gain[rows] = gains  # last: what is interrupted stays unknown
+        self._table[rows] = exposure_table(exposures)
+        self._gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
 
     def _blur(self, indices: np.ndarray, rows: np.ndarray) -> None:
         """Makes the light of `rows`, on as many threads as torch may use."""
         planned = list(zip(indices.tolist(), rows.tolist(), strict=True))
-        exposures = self._table.exposure
         try:
-            opened = [pair for pair in planned if exposures[pair[1]].opened_to is not None]
-            _each(self._open, opened)
+            _each(self._open, planned)
             begun = [self._begin_blur(index, row) for index, row in planned]
             blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
             _each(lambda task: task(), [(task,) for task in begun if callable(task)])
@@ -294,26 +302,27 @@ class CaptureBatch:
         self._blurred_row[indices] = rows
 
     def _open(self, index: int, row: int) -> None:
-        """Opens the aperture, which caches its result."""
-        self._scenes[index].blurred_light.source(self._table.exposure[row])
+        """Opens the aperture where that is needed; the scene caches its result."""
+        if self._exposure[row].opened_to is not None:
+            self._scenes[index].blurred_light.source(self._exposure[row])
 
     def _begin_blur(self, index: int, row: int) -> Blur | Callable[[], None] | None:
-        columns, exposure = self._table, self._table.exposure[row]
-        columns.light[row], blur = self._scenes[index].blurred_light.begin(exposure)
+        exposure = self._exposure[row]
+        self._light[row], blur = self._scenes[index].blurred_light.begin(exposure)
         remaining = exposure.remaining_variance
         if remaining is not None:
             remaining = remaining.float().contiguous()
-        columns.remaining_variance[row] = remaining
+        self._remaining_variance[row] = remaining
         return blur
 
     def _balance(self, index: int, row: int) -> None:
         """Computes the excess variance where it depends on the pixels."""
-        columns = self._table
-        if np.isnan(columns.excess_variance[row]):
-            balance = noise_balance(columns.light[row], columns.exposure[row])
-            columns.excess_variance[row] = balance.relative_excess_variance
-        if columns.exposure[row].opened_to is not None and not self._cache_light:
-            self._scenes[index].blurred_light.forget_opened()
+        exposure = self._exposure[row]
+        if np.isnan(self._excess_variance[row]):
+            balance = noise_balance(self._light[row], exposure)
+            self._excess_variance[row] = balance.relative_excess_variance
+        if exposure.opened_to is not None and not self._cache_light:
+            self._scenes[index].aperture_blur.forget()
 
 
 def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
@@ -332,45 +341,3 @@ def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
     if exposure.remaining_variance is not None:
         return math.nan
     return statistics.relative_excess_variance(exposure.ratio, source, target)
-
-
-def _modules(exposure: Exposure, noise: bool) -> int:
-    """Index into `MODULES`."""
-    found = noise * _NOISE_BIT
-    for step in exposure.steps:
-        found |= step.runs << _STEPS.index(step.name)
-    return found
-
-
-class FrameTable:
-    """Planned captures: all that a frame depends on except for its noise, as columns.
-
-    A row takes some 40 bytes from the start, the rest of its memory when it is used.
-
-    Attributes:
-        gain: Light that the row was planned for; NaN where it was not planned.
-        table: (5, 4) float32 each, of `exposure_table`.
-        excess_variance: As in `FrameStatistics`; NaN where it depends on blurred light that is not
-            made yet.
-        predicted_error: As in `FrameStatistics`.
-        modules: As in `FrameStatistics`.
-        light: (4, H, W) that is exposed; where it is blurred, until its scene blurs another.
-        remaining_variance: `Exposure.remaining_variance` of that light; None for all.
-        blurs: Whether the light must be blurred; else it is the scene's own.
-        any_blurs: Whether that was ever so in any row.
-        exposure: `Exposure` of light that must be blurred; else None.
-    """
-
-    def __init__(self, count: int) -> None:
-        self.gain, self.excess_variance = np.full(count, np.nan), np.zeros(count)
-        self.predicted_error = np.zeros(count)
-        self.modules = np.zeros(count, np.int64)
-        self.table, self.blurs = np.zeros((count, 5, 4), np.float32), np.zeros(count, bool)
-        self.any_blurs = False
-        objects = np.empty((3, count), object)
-        self.light, self.remaining_variance, self.exposure = objects
-
-    def forget(self, rows: slice) -> None:
-        """Makes `rows` unknown."""
-        self.gain[rows] = np.nan
-        self.light[rows] = self.remaining_variance[rows] = self.exposure[rows] = None

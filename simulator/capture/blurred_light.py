@@ -105,8 +105,7 @@ class MapApertureBlur(ApertureBlur):
         light: (4, H, W) as recorded.
         diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or a function that
             estimates it, called when an aperture first opens.
-        f_number: See `ApertureBlur`.
-        everywhere: See `ApertureBlur`.
+        f_number, everywhere: See `ApertureBlur`.
     """
 
     def __init__(
@@ -124,6 +123,7 @@ class MapApertureBlur(ApertureBlur):
         """Drops what is cached; the map stays."""
         super().forget()
         self._banks: dict[tuple[Tile, DenoisedLight | None], DiscBank] = {}
+        self._left: dict[float, Tensor] = {}
 
     @functools.cached_property
     def diameter(self) -> Tensor:
@@ -132,7 +132,9 @@ class MapApertureBlur(ApertureBlur):
 
     def remaining_variance(self, f_number: float) -> Tensor:
         """See `ApertureBlur`."""
-        return discs.remaining_variance(self._added(self.diameter, f_number))
+        if f_number not in self._left:
+            self._left[f_number] = discs.remaining_variance(self._added(self.diameter, f_number))
+        return self._left[f_number]
 
     @functools.cached_property
     def mean_square_diameter(self) -> float:
@@ -208,8 +210,7 @@ class Pool:
     """Memory for the light of a batch's scenes: new memory costs more than what is written to it.
 
     Args:
-        keeps: Whether the defocused light of every f-number is kept until its scene is forgotten;
-            else only that of the latest.
+        keeps: See `cache_light` of `simulator.capture.batch.CaptureBatch`.
     """
 
     def __init__(self, keeps: bool) -> None:
@@ -250,34 +251,27 @@ class BlurredLight:
         self.aperture_blur = aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
-        self._cache: LruCache[Tensor] = LruCache(cache_bytes)
+        self._cache_bytes = cache_bytes
         self._banks: dict[object, DiscBank] = {}
         self._pool = Pool(keeps=True) if pool is None else pool
         self._defocused: dict[tuple[object, ...], Tensor] = {}  # by `Exposure.lens_blur`
         self._streak: Tensor | None = None
         self._latest: tuple[tuple[object, ...], Tensor] | None = None  # by `Exposure.blur`
 
+    @property
+    def known(self) -> tuple[Any, ...]:
+        """All that is known of the light: the arguments between it and the statistics."""
+        return self.denoised_lights, self.residuals.nlf, self.aperture_blur
+
     def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
-        known = self.denoised_lights, self.residuals.nlf, self.aperture_blur, self.statistics
-        copied = BlurredLight(self.light, *known, cache_bytes, pool)
+        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes, pool)
         copied.residuals = self.residuals
         return copied
 
-    def is_of(
-        self,
-        light: Tensor,
-        denoised_lights: tuple[DenoisedLight, ...],
-        nlf: NoiseLevelFunction,
-        aperture_blur: ApertureBlur | None,
-    ) -> bool:
-        """Whether it was made for exactly these objects."""
-        return (
-            self.light is light
-            and self.denoised_lights == denoised_lights
-            and self.residuals.nlf == nlf
-            and self.aperture_blur is aperture_blur
-        )
+    @functools.cached_property
+    def _cache(self) -> LruCache[Tensor]:
+        return LruCache(self._cache_bytes)  # of a sweep: a batch takes none of it
 
     def source(self, exposure: Exposure) -> Tensor:
         """The light (4, H, W) that `exposure` starts from: as recorded, denoised or opened."""
@@ -291,7 +285,7 @@ class BlurredLight:
             return self._behind_lens(exposure) if exposure.defocus_px else self.source(exposure)
         light = self._cache.get(exposure.blur)
         if light is None:
-            light = motion_blurred(self._behind_lens(exposure), exposure)
+            light = _motion_blurred(self._behind_lens(exposure), exposure)
             self._cache.put(exposure.blur, light, light.nbytes)
         return light
 
@@ -356,7 +350,7 @@ class BlurredLight:
             if not self._pool.keeps:
                 self._banks.clear()
         if streak is not None:
-            motion_blurred(source, exposure, streak)
+            _motion_blurred(source, exposure, streak)
 
     def release(self) -> None:
         """Puts all memory back into the pool; the light of `begin` must not be used afterwards."""
@@ -370,53 +364,33 @@ class BlurredLight:
         self._defocused.clear()
         self._banks.clear()
 
-    def forget_opened(self) -> None:
-        """Drops the light of every opened aperture, but not that of `begin`."""
-        self._cache = LruCache(self._cache.max_bytes)
-        if self.aperture_blur is not None:
-            self.aperture_blur.forget()
-
     # -- noise of the source ------------------------------------------------------------------
 
     def with_remaining_noise(self, exposure: Exposure) -> Exposure:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
         left: Tensor | None = None
+        path, layout, defocus_px = exposure.path, exposure.layout, exposure.defocus_px
+        if path is None and exposure.motion_px:
+            path = Path(exposure.motion_px)
         if exposure.is_uniform:
-            energy = kernel_energy(exposure.motion_px, exposure.defocus_px)
+            energy = kernel_energy(exposure.motion_px, defocus_px)
+        elif layout is None:
+            energy = _uniform_energy(path, defocus_px, *self.light.shape[-2:])
         else:
-            energy, left = _remaining_noise(exposure, *self.light.shape[-2:])
-            left = None if left is None else left.to(self.light.device)
-        if exposure.opened_to is not None:
-            # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
-            # it further. Both together leave about what the larger leaves alone.
-            opened = self._left_by_aperture(exposure.opened_to, energy)
-            if left is None or opened is None:
-                left = opened if left is None else left
-            else:
-                left = torch.minimum(left, opened)
+            energy, left = 1.0, _noise_map(layout, path, exposure.subject_path, defocus_px)
+            left = left.to(self.light.device)
+        if exposure.opened_to is not None and self.aperture_blur is not None:
+            share = self.aperture_blur.remaining_variance(exposure.opened_to)
+            if share is not None:
+                # Noise that one blur has smeared is correlated: a second, smaller one hardly
+                # averages it further. Both together leave about what the larger leaves alone.
+                opened = (share / energy).clamp(max=1.0)
+                left = opened if left is None else torch.minimum(left, opened)
         return replace(exposure, energy=energy, remaining_variance=left)
 
-    def _left_by_aperture(self, f_number: float, energy: float) -> Tensor | None:
-        """(H, W) `Exposure.remaining_variance` where other blurs left a share `energy`."""
-        key = ("remaining_variance", f_number, energy)
-        left = self._cache.get(key)
-        if left is None and self.aperture_blur is not None:
-            share = self.aperture_blur.remaining_variance(f_number)
-            if share is None:
-                return None
-            left = (share / energy).clamp(max=1.0)
-            self._cache.put(key, left, left.nbytes)
-        return left
 
-
-def motion_blurred(light: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
-    """`light` (4, H, W), behind the lens already, as it moves in `exposure`.
-
-    Args:
-        light: Light; limited to `LIGHT_LIMIT`.
-        exposure: The exposure; without a path, the motion is along the rows.
-        out: Contiguous tensor to write to, instead of a new one, where `light` is on the CPU.
-    """
+def _motion_blurred(light: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
+    """`light` (4, H, W), behind the lens already, as it moves in `exposure`."""
     if exposure.path is None:
         return motion_blur(light, exposure.motion_px, out, limit=LIGHT_LIMIT)
     height, width = light.shape[-2:]
@@ -434,22 +408,9 @@ def _bank(banks: dict[Any, DiscBank], key: object, light: Tensor) -> DiscBank:
     return banks[key]
 
 
-def _remaining_noise(exposure: Exposure, height: int, width: int) -> tuple[float, Tensor | None]:
-    """Share of a source's noise variance that a blur with a path or a layout leaves.
-
-    Returns:
-        That of the whole frame, and (H, W) that of each pixel relative to it; None for 1.
-    """
-    path = exposure.path
-    if path is None and exposure.motion_px:
-        path = Path(exposure.motion_px)
-    if exposure.layout is None:
-        return _uniform_energy(path, exposure.defocus_px, height, width), None
-    return 1.0, _noise_map(exposure.layout, path, exposure.subject_path, exposure.defocus_px)
-
-
 @functools.lru_cache(maxsize=2)  # a plan needs the same again
 def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: float) -> Tensor:
+    """Share of a source's noise variance that blurs leave of each pixel (H, W)."""
     height, width = layout.defocus.shape
     diameter = layout.defocus * defocus_px
     if path is None:

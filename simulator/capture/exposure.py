@@ -1,7 +1,7 @@
 """Exposure of one capture: the steps from a scene's light to the sensor, and why they are taken.
 
-`decide` looks at numbers only, and says for each step whether it runs and why. Captures follow the
-`Exposure` that it returns, and `simulator.capture.plan.SimulationPlan` shows it.
+`decide` looks at numbers only. Captures follow the `Exposure` that it returns, and
+`simulator.capture.plan.SimulationPlan` shows it.
 """
 
 from __future__ import annotations
@@ -96,6 +96,8 @@ class Step(NamedTuple):
         extent: Extent of its blur [pixel], where it is one.
         residual: Error that it makes itself where it runs, as far as that is known.
         network: The network that it runs, if any.
+        operations: Arithmetic operations that it takes, all pixels together, in a plan; those of a
+            network once for all settings.
     """
 
     name: str
@@ -105,6 +107,7 @@ class Step(NamedTuple):
     extent: float = 0.0
     residual: float = 0.0
     network: DenoisedLight | None = None
+    operations: int = 0
 
 
 @dataclass(frozen=True)
@@ -155,10 +158,10 @@ class Exposure:
         """Noise of the source on the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
-        known, blurs = self.energy, (self.motion_px, self.defocus_px)
-        return self.source.exposed(self.ratio).scaled(
-            kernel_energy(*blurs) if known is None else known
-        )
+        energy = self.energy
+        if energy is None:
+            energy = kernel_energy(self.motion_px, self.defocus_px)
+        return self.source.exposed(self.ratio).scaled(energy)
 
     @property
     def is_uniform(self) -> bool:

@@ -15,11 +15,7 @@ import torch
 from simulator.camera import get_camera
 from simulator.capture.exposure import SIGNAL_LIMIT, Exposure, Step
 from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
-from simulator.noise.noise_level_function import (
-    VARIANCE_LIMIT,
-    NoiseLevelFunction,
-    noise_variance,
-)
+from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction, noise_variance
 from simulator.raw.develop import ABOVE_WHITE
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
@@ -40,13 +36,7 @@ _BOUND = {
 #: clipped or rounded in the source.
 _LEAST_BOUND = 0.05
 #: Arithmetic operations per sample of the steps whose cost does not depend on anything.
-_OPERATIONS = {
-    "exposure": 2,
-    "aperture": 4,
-    "motion_blur": 6,
-    "noise": 14,
-    "clip_and_quantise": 6,
-}
+_OPERATIONS = {"exposure": 2, "aperture": 4, "motion_blur": 6, "noise": 14, "clip_and_quantise": 6}
 #: Rounding error of float32 in a transition, as a share of the light.
 ROUNDING = 2.0**-20
 #: Root mean square light hidden by white, over what a density that falls with the square of the
@@ -65,26 +55,6 @@ _BALANCED = 2**15
 #: Reasons why no noise is added.
 _ONLY_LIGHT = "only the light is wanted"
 _ENOUGH_NOISE = "no pixel lacks noise: the source has the target's already, or more"
-
-
-@dataclass(frozen=True)
-class PlannedStep:
-    """One step of a transition.
-
-    Args:
-        name: Its name in `SimulationPlan.modules`.
-        runs: Whether it runs.
-        reason: Why it does, or does not.
-        error: Error of leaving it out, in units of the target's noise; 0 if it runs.
-        operations: Arithmetic operations that it takes, all pixels together; those of a network
-            once for all settings.
-    """
-
-    name: str
-    runs: bool
-    reason: str
-    error: float
-    operations: int
 
 
 @dataclass(frozen=True)
@@ -117,7 +87,7 @@ class SimulationPlan:
     samples: int
 
     @functools.cached_property
-    def steps(self) -> tuple[PlannedStep, ...]:
+    def steps(self) -> tuple[Step, ...]:
         """Every step in order, with the reason why it runs or not."""
         wanted, lacks, reason = self.exposure.noise, self.balance.lacks_noise, _ONLY_LIGHT
         if wanted:
@@ -212,8 +182,7 @@ class SimulationPlan:
             f"{_short(self.error_bound)}{': ' * bool(parts)}{', '.join(parts)} "
             f"(tolerance {self.tolerance:g}: {within})\n"
             f"cost {_counted(self.operations)} operations, about {_short(max(capture, 0.01))} ms a "
-            "capture"
-            f"{once}"
+            f"capture{once}"
         )
 
     def details(self) -> str:
@@ -222,9 +191,8 @@ class SimulationPlan:
         for step in self.steps:
             if step.reason:
                 error = f" (error {_short(step.error)})" if step.error else ""
-                lines.append(
-                    f"{'runs' if step.runs else 'left out'} {step.name}: {step.reason}{error}"
-                )
+                verb = "runs" if step.runs else "left out"
+                lines.append(f"{verb} {step.name}: {step.reason}{error}")
         if self.excess_noise:
             lines.append(
                 f"noise variance {1.0 + self.excess_noise:.4g} times the target's, white included"
@@ -256,9 +224,8 @@ def _counted(number: int) -> str:
 def seconds_per_operation() -> float:
     """Time of one of the operations that `SimulationPlan` counts, measured on this machine [s]."""
     light = torch.zeros(4, 128, 128)
-    exposure = Exposure(
-        1.0, NoiseLevelFunction.zero(), NoiseLevelFunction((1e-4,) * 4, (1e-7,) * 4)
-    )
+    noises = NoiseLevelFunction.zero(), NoiseLevelFunction((1e-4,) * 4, (1e-7,) * 4)
+    exposure = Exposure(1.0, *noises)
     transition, camera = Transitions.of([light], [exposure]), get_camera("nikon_z6")
     signals, keys, times = torch.empty(1, 4, 128, 128), np.ones(1, np.uint64), []
     for _ in range(5):
@@ -269,14 +236,17 @@ def seconds_per_operation() -> float:
     return min(times) / (each * light.numel())
 
 
-def _planned(step: Step, samples: int) -> PlannedStep:
+def _planned(step: Step, samples: int) -> Step:
+    """`step` as a plan shows it; what runs leaves no error."""
     reason = step.reason.format(extent=step.extent, error=step.error)
     if not step.runs:
-        return PlannedStep(step.name, False, reason, step.error, 0)
+        return step._replace(reason=reason)
     if step.network is not None:
-        return PlannedStep(step.name, True, reason, 0.0, step.network.operations)
-    per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
-    return PlannedStep(step.name, True, reason, 0.0, per_sample * samples)
+        operations = step.network.operations
+    else:  # else of the taps of a disc
+        per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)
+        operations = per_sample * samples
+    return step._replace(reason=reason, error=0.0, operations=operations)
 
 
 # -- predicted errors -------------------------------------------------------------------------

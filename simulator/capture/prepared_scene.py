@@ -39,7 +39,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_number, check_type
 
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
@@ -82,9 +82,8 @@ class Layout:
 
     def __post_init__(self) -> None:
         found, mask = self.defocus, self.subject
-        for name, value in (("defocus", found), ("subject", mask)):
-            if not isinstance(value, torch.Tensor) and (name == "defocus" or value is not None):
-                raise ValueError(f"`{name}` (={type(value).__name__}) must be a torch tensor")
+        check_type("defocus", found, torch.Tensor)
+        check_type("subject", mask, torch.Tensor, None)
         if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
             raise ValueError(f"`defocus` (shape {tuple(found.shape)}) must be (H, W) in [0, 1]")
         object.__setattr__(self, "defocus", found.detach().float().cpu().contiguous())
@@ -226,14 +225,12 @@ class PreparedScene:
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
         known = self.denoised_lights, self.nlf, self.aperture_blur
-        if cached is None or not cached.is_of(self.light, *known):
-            same_light = cached is not None and cached.light is self.light
+        same_light = cached is not None and cached.light is self.light
+        if cached is None or not same_light or cached.known != known:
             if not same_light:  # a copy's light was checked before
                 object.__setattr__(self, "light", check_packed("light", self.light))
             for denoised in self.denoised_lights:
-                if not isinstance(denoised, DenoisedLight):
-                    found = type(denoised).__name__
-                    raise ValueError(f"`denoised_lights` (={found}) must be DenoisedLight")
+                check_type("denoised_lights", denoised, DenoisedLight)
                 if denoised.shape not in (None, self.light.shape):
                     raise ValueError(
                         f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
@@ -293,8 +290,7 @@ class PreparedScene:
                 part of the target's.
             gain: Light relative to this scene's.
         """
-        if not isinstance(settings, CameraSettings):
-            raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
+        check_type("settings", settings, CameraSettings)
         return decide(self, settings, noise=noise, gain=gain)
 
     def plan(
@@ -302,10 +298,7 @@ class PreparedScene:
     ) -> SimulationPlan:
         """Steps, reasons, predicted error and cost of a capture at `settings`.
 
-        Args:
-            settings: Settings to simulate.
-            noise: False plans `expected`, the light without noise, instead of a capture.
-            gain: Light relative to this scene's.
+        Without `noise`, of `expected`; the arguments are those of `exposure`.
         """
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
@@ -323,8 +316,7 @@ class PreparedScene:
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
 
-        Shot and read noise are compared apart, so that a mixed case is stated too high rather than
-        too low.
+        Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
         exposure = self.exposure(settings)
         source = exposure.source_noise.scaled(float(self.box_factor**2))
@@ -343,9 +335,7 @@ class PreparedScene:
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
         """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped.
 
-        Args:
-            settings: Settings to simulate.
-            gain: Light relative to this scene's.
+        The light is `gain` times this scene's.
         """
         exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
@@ -405,8 +395,7 @@ class PreparedScene:
 
         Args:
             states: Settings to simulate.
-            seed: See `capture`.
-            noise: See `capture`.
+            seed, noise: See `capture`.
             gain: (S,) light of each state relative to this scene's, where it depends on the
                 exposure time, as flickering light does; None for the same.
             row_gain: (S, H) light of each row relative to that; None where all rows have the same.
@@ -467,8 +456,7 @@ class PreparedScene:
 
         Args:
             states: Settings to simulate.
-            seed: See `capture`.
-            noise: See `capture`.
+            seed, noise: See `capture`.
 
         Yields:
             One capture (4, H, W) per state.

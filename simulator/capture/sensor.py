@@ -1,9 +1,8 @@
 """The sensor: from linear light to the numbers that the camera records.
 
-The order is physical, and it matters: exposed light, not clipped -> motion and defocus blur of
-that unclipped light -> the light of each row, where it flickers -> noise of that signal -> clip ->
-quantise, each of the last two once. (Exposure and blur are linear and change places here: one blur
-then serves many exposures.)
+The order is physical, and it matters: exposed light, not clipped -> motion and defocus blur of that
+light -> the light of each row, where it flickers -> noise of that signal -> clip -> quantise, each
+of the last two once. (Exposure and blur are linear: one blur here serves many exposures.)
 
 *The missing variance*: a pixel of signal x whose source has the noise (shot1, read1) carries
 ``a shot1 x + a^2 read1`` after the exposure ratio a (`NoiseLevelFunction.exposed`). To carry the
@@ -233,12 +232,11 @@ class Transitions:
     def in_bands(self, row_gain: np.ndarray) -> Transitions:
         """The same where rows have light of their own: the bands of flickering light.
 
-        The light of each row multiplies the blurred light before there is noise, so that the noise
-        is that of the banded signal: exact for motion along the rows; other motion blurs across
-        rows that do not share their light. The source's own noise is multiplied with
-        its light: its variance by the square of the row's gain, r^2. What the top-up takes away for
-        it has the variance times r: exact for shot noise, whose variance is worked out from the
-        banded signal, and off by r (1 - r) of the source's read noise.
+        The light of each row multiplies the blurred light before there is noise: exact for motion
+        along the rows; other motion blurs across rows that do not share their light. The source's
+        own noise is multiplied with its light, its variance by the square of the row's gain, r^2.
+        What the top-up takes away for it has the variance times r: exact for shot noise, and off by
+        r (1 - r) of the source's read noise.
 
         Args:
             row_gain: (B, H) light of each row relative to the frame's.
@@ -387,11 +385,7 @@ def record(
 
 def exposed_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     """Light on the sensor, (4, H, W), of `light` that has the blur of `exposure` already."""
-    return _limited(light * exposure.ratio)
-
-
-def _limited(signal: torch.Tensor) -> torch.Tensor:
-    return signal.clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
+    return (light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
 
 def record_stepwise(
@@ -404,7 +398,7 @@ def record_stepwise(
 ) -> None:
     """`record` on any device: the reference of the fused kernel. Fills `signals`."""
     for i, (light, table) in enumerate(zip(transitions.light, transitions.table, strict=True)):
-        signal = _limited(light * table[0, 0].item())
+        signal = (light * table[0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
         if keys is not None:
             missing = missing_variance(signal, table[1:], transitions.shares()[i])
             normals = frame_normals(int(keys[i]), tuple(light.shape), noise)
@@ -551,15 +545,7 @@ def _in_bank(key, block):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _record(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    samples,
-    light,
-    remaining_variance,
-    exposure,
-    noise_source,
-    sensor,
-    outputs,
+    first, last, samples, light, remaining_variance, exposure, noise_source, sensor, outputs
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order."""
     (keys, drawn, bank), (codes, numbers, signals, counts) = noise_source, outputs
@@ -631,24 +617,20 @@ def _record_fused(
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
-    empty, flat = (0, 4, 0), (frames, 4, samples)
+    keys = np.zeros(frames, np.uint64) if keys is None else keys
+    given = ((codes, np.uint8), (numbers, np.uint16), (signals, np.float32))
+    outputs = [
+        np.empty((0, 4, 0), dtype) if out is None else out.reshape(frames, 4, samples)
+        for out, dtype in given
+    ]
     fixed = (
         samples,
         addresses(light),
         np.zeros(frames, np.uintp) if remaining is None else addresses(remaining),
         transitions.table,
-        (
-            np.zeros(frames, np.uint64) if keys is None else keys,
-            drawn,
-            noise_bank() if drawn == _BANK else _NO_BANK,
-        ),
+        (keys, drawn, noise_bank() if drawn == _BANK else _NO_BANK),
         camera.digits,
-        (
-            np.empty(empty, np.uint8) if codes is None else codes.reshape(flat),
-            np.empty(empty, np.uint16) if numbers is None else numbers.reshape(flat),
-            np.empty(empty, np.float32) if signals is None else signals.reshape(flat),
-            counts,
-        ),
+        (*outputs, counts),
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     parallel_ranges(lambda first, last: _record(first, last, *fixed), units, least=least)

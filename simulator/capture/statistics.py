@@ -1,14 +1,11 @@
 """Statistics of a light, from which the errors of a capture are predicted.
 
-Errors are in units of the target's noise: the root mean square over the pixels of
-``sqrt(dm^2 + ds^2) / s``, where dm and ds are what a pixel's mean and standard deviation move by
-and s is the standard deviation that it should have.
-
-`LightStatistics` predicts the errors of steps that are left out. `ResidualStatistics` predicts
-those of a denoising network: the noise that it leaves, and the detail that it takes for noise. Both
-are, in units of the noise, functions of how well noise and detail can be told apart: of the error
-that the best linear filter would make. They are measured once for each network, on pictures that it
-was not trained on, and are part of its weights' card.
+Errors are those of `simulator.capture.plan.SimulationPlan`. `LightStatistics` predicts what steps
+that are left out make, `ResidualStatistics` what a denoising network makes: the noise that it
+leaves, and the detail that it takes for noise. Both are, in units of the noise, functions of how
+well noise and detail can be told apart: of the error that the best linear filter would make. They
+are measured once for each network, on pictures that it was not trained on, and are part of its
+weights' card.
 """
 
 from __future__ import annotations
@@ -174,7 +171,9 @@ class _Bins(NamedTuple):
 class LightStatistics:
     """Noise and curvature of a light, by its levels; each value is computed when first needed.
 
-    The first answer takes a pass over the pixels, the others a few microseconds each.
+    The first answer takes a pass over the pixels, the others a few microseconds each. Where its
+    methods say nothing else, they take the exposure `ratio` from the light to the target, the noise
+    `source` of the light at its own exposure, and the noise `target` that the capture should have.
 
     Args:
         light: (4, H, W) linear light at the reference exposure.
@@ -189,13 +188,7 @@ class LightStatistics:
     def excess_error(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
-        """Error of leaving a source's noise where it exceeds the target's, rather too high.
-
-        Args:
-            ratio: Exposure ratio from the light to the target.
-            source: Noise of the light, at its own exposure.
-            target: Noise that the capture should have.
-        """
+        """Error of leaving a source's noise where it exceeds the target's, rather too high."""
         if source.is_zero:
             return 0.0
         bins = self._bins
@@ -209,10 +202,6 @@ class LightStatistics:
         Others go with the square of their extent. A symmetric kernel with second moment m per axis
         moves the light by at most m / 2 times its discrete Laplacian, in the root mean square:
         ``1 - cos(k t) <= k^2 (1 - cos t)``.
-
-        Args:
-            ratio: Exposure ratio from the light to the target.
-            target: Noise that the capture should have.
         """
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
@@ -231,11 +220,7 @@ class LightStatistics:
         """What a disc of one pixel changes, in units of the target's noise; other than in
         `curvature` estimated, not bounded: the noise of the light itself is taken out.
 
-        Args:
-            ratio: Exposure ratio from the light to the target.
-            source: Noise of the light, at its own exposure.
-            target: Noise that the capture should have.
-            noise: Whether a capture is wanted, in which what is surely white shows no change.
+        With `noise` a capture is wanted, in which what is surely white shows no change.
         """
         bins = self._bins
         own = _variance(bins.light, source)
@@ -260,10 +245,9 @@ class LightStatistics:
     def relative_excess_variance(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
-        """Mean over the pixels of the variance of `source` beyond the target's.
+        """Mean over the pixels of the variance of `source` beyond the target's, relative to it.
 
-        Relative to the target's. Other than in `excess_error`, `source` is on the target's scale,
-        averaged by what blur there is.
+        Here `source` is on the target's scale, averaged by what blur there is.
         """
         signal, wanted = self._signal(ratio, target)
         beyond = np.maximum(_variance(signal, source) / wanted - 1.0, 0.0)
@@ -381,11 +365,6 @@ def _laplacian(light: torch.Tensor) -> torch.Tensor:
     return around.sub_(light, alpha=4.0)
 
 
-def _blocks(image: torch.Tensor) -> torch.Tensor:
-    """Means of a picture (C, H, W) over blocks."""
-    return F.avg_pool2d(image, tuple(min(BLOCK, n) for n in image.shape[-2:]))
-
-
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Error of one network in units of the standard deviation of the noise that it removes.
@@ -472,21 +451,12 @@ class ResidualStatistics:
         return ResidualStatistics, (self.light, self.nlf)
 
     def error(
-        self,
-        residual: Residual,
-        ratio: float,
-        target: NoiseLevelFunction,
-        *,
-        noise: bool = True,
+        self, residual: Residual, ratio: float, target: NoiseLevelFunction, *, noise: bool = True
     ) -> float:
-        """Error of a capture that starts from the light which a network has denoised.
+        """Error of a capture that starts from the light denoised by the network of `residual`.
 
-        Args:
-            residual: Of the network.
-            ratio: Exposure ratio to the target.
-            target: Noise that the capture should have.
-            noise: Whether a capture is wanted; else the light alone, in which noise that is left
-                is an error in full.
+        Without `noise` the light alone is wanted, in which noise that is left is an error in full;
+        the other arguments are those of `LightStatistics`.
         """
         level, share = self._levels
         noises = noise_numbers(self.nlf), noise_numbers(target)
@@ -517,7 +487,9 @@ class ResidualStatistics:
         rows = _some_rows(self.light)
         parts = [self.light[:, top:bottom] for top, bottom in rows]
         error = torch.cat([wiener_error(part, self.nlf).flatten() for part in parts])
-        light = torch.cat([_blocks(part).flatten(1) for part in parts], dim=1).clamp_(min=0.0)
+        block = tuple(min(BLOCK, n) for n in parts[0].shape[-2:])
+        means = [F.avg_pool2d(part, block).flatten(1) for part in parts]
+        light = torch.cat(means, dim=1).clamp_(min=0.0)
         values = light.double().cpu().numpy()
         order = np.argsort(np.argsort(values, axis=1), axis=1)
         place = order * _LEVELS // values.shape[1]

@@ -23,12 +23,7 @@ class ExposureModule(nn.Module):
         self.b = nn.Parameter(torch.zeros(4))
 
     def forward(self, raw: Tensor, ratio: Tensor | float) -> Tensor:
-        """The raw at another exposure, not clipped.
-
-        Args:
-            raw: (B, 4, H, W) or (4, H, W).
-            ratio: Exposure ratio, one number or (B,).
-        """
+        """The raw ((B,) 4, H, W) at another exposure, one `ratio` or (B,), not clipped."""
         scale = self.w * torch.as_tensor(ratio, dtype=raw.dtype, device=raw.device)
         if scale.ndim:
             scale = scale[:, None, None, None]

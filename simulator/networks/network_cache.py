@@ -20,9 +20,7 @@ MEMORY_BYTES = 2**28
 class NetworkCache:
     """Results by the content of everything that they depend on: inputs, numbers and weights.
 
-    Args:
-        where: Where results are cached; None caches nothing.
-        max_bytes: Most bytes in memory.
+    With `where` None nothing is cached; `max_bytes` bounds those in memory.
     """
 
     def __init__(self, where: Where | None, *, max_bytes: int = MEMORY_BYTES) -> None:
@@ -44,7 +42,7 @@ class NetworkCache:
     ) -> Tensor:
         """The result of `make`, or an earlier one of the same inputs: the same values, bit by bit.
 
-        A stored result that is not finite, or of another shape, is made again.
+        A stored result that is not finite, or not of `shape`, is made again.
 
         Args:
             kind: Of the result, part of its key.

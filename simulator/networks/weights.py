@@ -19,7 +19,7 @@ from simulator.capture.statistics import Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule
-from simulator.utils.checks import check_word, did_you_mean
+from simulator.utils.checks import check_type, check_word, did_you_mean
 from simulator.utils.files import sibling, write_atomically
 
 
@@ -63,11 +63,8 @@ def list_pretrained() -> list[str]:
 def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, Any]) -> None:
     """Writes ``path.safetensors`` and ``path.json``, the card with the hash of the weights.
 
-    Args:
-        path: File name, with or without one of the two endings.
-        modules: What `build_modules` makes of `preset`.
-        preset: Its name.
-        card: JSON values: how they were trained and what they score.
+    The `modules` are what `build_modules` makes of `preset`; the entries of `card`, JSON values,
+    say how they were trained and what they score.
 
     Raises:
         ValueError: If the weights are not finite; nothing is written then.
@@ -84,10 +81,9 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
 
 
 def write_pair(path: Path, content: bytes, card: dict[str, Any]) -> None:
-    """Writes the card, then the weights whose hash it holds.
+    """Writes the card, then the weights whose hash it holds; `read_pair` reads them in reverse.
 
-    `read_pair` reads them the other way round: whatever other processes write in between, weights
-    never come with a card that is older than they are.
+    Whatever other processes write in between, weights never come with an older card.
     """
     write_atomically(sibling(path, ".json"), json.dumps(card, indent=1) + "\n")
     write_atomically(sibling(path, ".safetensors"), content)
@@ -133,24 +129,20 @@ def check_finite(tensors: Mapping[str, Tensor], path: str | Path) -> None:
     """Raises a `ValueError` that names the first of `tensors` that holds a NaN or an infinity."""
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise ValueError(
-                f"`weights` (={str(path)!r}) must be finite: their training has failed ({name}); "
-                "train again with a lower learning_rate"
-            )
+            rule = f"must be finite ({name} is not): train again with a lower learning_rate"
+            raise ValueError(f"`weights` (={str(path)!r}) {rule}")
 
 
 def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     """Trained modules, in evaluation mode, and their model card.
 
-    Args:
-        name: One of `list_pretrained()`, or the path of a ``.safetensors`` file with its ``.json``.
+    `name` is one of `list_pretrained()`, or the path of a ``.safetensors`` file with its ``.json``.
 
     Raises:
         ValueError: If there is no such file, its hash is not the card's, or its tensors are not
             those of the preset's networks.
     """
-    if not isinstance(name, str | Path) or not str(name):
-        raise ValueError(f"`weights` (={name!r}) must be a name or a path")
+    check_type("weights", name, str, Path)
     known = list_pretrained()
     path: Any = name
     if str(name) in known:
@@ -194,8 +186,9 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
     elif "sha256" not in card:
         rule = "the .json must hold the hash, `sha256`"
     elif card.get("preset") not in list(BUILDERS):
-        found = card.get("preset")
-        rule = f"unknown preset {found!r} in the .json, the presets are {list(BUILDERS)}"
+        rule = (
+            f"unknown preset {card.get('preset')!r} in the .json, the presets are {list(BUILDERS)}"
+        )
     if rule is not None:
         raise ValueError(f"`weights` (={str(name)!r}): {rule}")
 

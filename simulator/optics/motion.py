@@ -536,8 +536,7 @@ def path_blur_apart(
         behind: (H, W) int64, which pixel (counted row by row) B shows in place of each.
         taps: Of the background's path, K_b.
         own: Of the subject's, K_s.
-        out: See `path_blur`.
-        limit: See `path_blur`.
+        out, limit: See `path_blur`.
     """
     out = torch.empty(light.shape) if out is None else out
     planes, result = light.cpu().contiguous().numpy(), out.numpy()

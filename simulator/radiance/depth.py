@@ -76,9 +76,6 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
         rng: Source of all randomness; the same state gives the same picture.
         size: Height and width [packed pixels], at least 16.
         focus: One of `FOCUSES`.
-
-    Raises:
-        ValueError: If an argument is invalid; the message proposes the nearest name.
     """
     check_word("focus", focus, FOCUSES)
     check_integer("size", size, 16, more=" packed pixels")
@@ -103,14 +100,10 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
 
 
 def draw_layout(name: str, height: int, width: int) -> Layout:
-    """The layout of a picture without depth, as if it lay over procedural depth.
+    """The layout of a picture of so many packed pixels, as if it lay over procedural depth.
 
-    The subject is the nearest thing. Focus is on it in eight of ten layouts, in the others on
-    something behind it.
-
-    Args:
-        name: Decides the layout.
-        height, width: Of the picture [packed pixels].
+    `name` decides it. The subject is the nearest thing. Focus is on it in eight of ten layouts, in
+    the others on something behind it.
     """
     rng = np.random.default_rng([zlib.crc32(f"layout {name}".encode()), 0])
     focus = str(rng.choice(_LAYOUT_FOCUSES, p=_LAYOUT_SHARES))

@@ -75,13 +75,7 @@ def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np
 
 
 def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = None) -> np.ndarray:
-    """Reflectance of a dead-leaves picture, (3, size, size) float32 linear sRGB in [0.005, 0.97].
-
-    Args:
-        rng: Source of all randomness.
-        size: Height and width [pixels].
-        style: Appearance of the leaves.
-    """
+    """Reflectance of dead leaves, (3, size, size) float32 linear sRGB in [0.005, 0.97]."""
     style = LeafStyle() if style is None else style
     leaves = _draw_leaves(rng, size, style)
     label = paint_leaves(size, *leaves)
@@ -235,16 +229,13 @@ class Drawing:
 def draw(
     kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE, *, lens: bool = True
 ) -> Drawing:
-    """A picture of `kind`.
+    """A picture of `kind`, one of `list_kinds()`.
 
     Args:
-        kind: One of `list_kinds()`.
+        kind: Its kind.
         rng: Source of all randomness; the same state gives the same picture.
         size: Height and width [pixels].
         lens: Whether it has the softness of a lens; without, it is for a camera that has its own.
-
-    Raises:
-        ValueError: If there is no such kind; the message proposes the nearest name.
     """
     check_word("kind", kind, tuple(_KINDS))
     drawing = _KINDS[kind](rng, size)

@@ -131,15 +131,11 @@ def render_srgb(
 
 
 def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
-    """Packed raws that `develop` turns into these pictures, without balance or colour matrix.
+    """Packed raws (B, 4, H, W) that `develop` turns into these pictures, without balance or matrix.
 
-    What a camera's own processing did besides (its tone curve, sharpening, compression) stays in.
-
-    Args:
-        pictures: (B, 3, H, W) sRGB, uint8 or floating point in [0, 1].
-
-    Returns:
-        (B, 4, H, W) float32 in [0, 1]: each pixel becomes a packed one, its planes at one place.
+    Each pixel becomes a packed one, its planes at one place. What a camera's own processing did
+    besides (its tone curve, sharpening, compression) stays in. `pictures` are (B, 3, H, W) sRGB,
+    uint8 or floating point in [0, 1].
 
     >>> picture = torch.tensor([0, 17, 118, 255], dtype=torch.uint8).expand(1, 3, 1, 4)
     >>> develop(develop_inverse(picture)).mul(255.0).round()[0, 0, 0]
@@ -282,19 +278,17 @@ def demosaic_half(packed: torch.Tensor) -> torch.Tensor:
 
 
 def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tensor:
-    """RGB at the sensor's resolution with the linear 5 x 5 filters of Malvar, He and Cutler.
+    """RGB (B, 3, 2H, 2W) with the linear 5 x 5 filters of Malvar, He and Cutler.
+
+    A missing colour is its bilinear estimate plus a share of the Laplacian of the colour that is
+    there: 1/2 for green, 5/8 at greens, 3/4 for red at blue and blue at red. The border is
+    mirrored about its last pixel, so every colour stays on its own rows and columns. The result may
+    overshoot the input's range at edges.
 
     Args:
         packed: (B, 4, H, W), planes R, G1, G2, B, H, W >= 2, floating point, any range. White
             balance it first: the filters take the planes' detail to be alike.
         cfa: Where in the 2 x 2 tile each plane lies.
-
-    Returns:
-        (B, 3, 2H, 2W), dtype and device of `packed`; it may overshoot the input's range at edges.
-
-    A missing colour is its bilinear estimate plus a share of the Laplacian of the colour that is
-    there: 1/2 for green, 5/8 at greens, 3/4 for red at blue and blue at red. The border is
-    mirrored about its last pixel, so every colour stays on its own rows and columns.
 
     Source: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
     Bayer-patterned color images", ICASSP 2004, figure 2.

@@ -256,7 +256,7 @@ def normalised_model(make: str, model: str) -> str:
 # -- the meaning of DNG tags that LibRaw does not pass on -----------------------------------------
 
 #: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
-_LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
+LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
 _EXPOSURE = {
     "iso": "RecommendedExposureIndex",
     "exposure_time": "ExposureTime",
@@ -293,12 +293,6 @@ def read_own_record(directories: Sequence[Directory]) -> OwnRecord | None:
     return OwnRecord(settings, min(max(1, box_factor), _MAX_BOX_FACTOR), source)
 
 
-def read_long_iso(directories: Sequence[Directory]) -> float | None:
-    """The ISO speed that does not fit EXIF's 16 bits, None where the file has none."""
-    values = (first_numbers(directories, name) for name in _LONG_ISO)
-    return next((float(v[0]) for v in values if v and v[0] > 0), None)
-
-
 def read_colour_matrix(
     directories: Sequence[Directory],
 ) -> tuple[tuple[float, float, float], ...] | None:
@@ -326,12 +320,11 @@ def read_colour_matrix(
 
 
 def read_noise_profile(directories: Sequence[Directory]) -> NoiseLevelFunction | None:
-    """The noise level function of a DNG's NoiseProfile, None if it has none.
+    """The noise level function of a DNG's NoiseProfile, None if it has none that can be one.
 
     The tag holds pairs (S, O), one for all colour planes or one per plane in the order of
     CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
-    (DNG specification 1.4). Values that cannot be a noise profile are ignored: negative slopes, and
-    variances that no capture has.
+    (DNG specification 1.4).
     """
     values = first_numbers(directories, "NoiseProfile")
     colours = first_numbers(directories, "CFAPlaneColor") or (0, 1, 2)

@@ -19,6 +19,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.dng import ORIENTATIONS, OwnRecord
 from simulator.raw.image import RawImage, pack_mosaic
 from simulator.raw.metadata import (
+    LONG_ISO,
     Directory,
     camera_identity,
     first,
@@ -30,7 +31,6 @@ from simulator.raw.metadata import (
     read_black_level,
     read_colour_matrix,
     read_directories,
-    read_long_iso,
     read_noise_profile,
     read_own_record,
 )
@@ -122,11 +122,9 @@ def read_raw(
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Settings that a raw file states, without reading its pixels.
+    """``iso``, ``exposure_time`` [s] and ``f_number`` that a raw file states, where it does.
 
-    Returns:
-        ``iso``, ``exposure_time`` [s] and ``f_number``, of which those are missing that the file
-        does not state; the exposure time is the exact stop that the recorded one stands for.
+    No pixel is read; the exposure time is the exact stop that the recorded one stands for.
 
     Raises:
         RawFileError: (a `ValueError`) If the file is no raw that can be read.
@@ -171,11 +169,9 @@ def _read(
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
     if float(packed.max()) > _WHITE_TOLERANCE:
-        times, level = f"{float(packed.max()):.3g}", f"{profile.white_level:g}"
-        logger.warning(
-            f"{path.name}: its digital numbers reach {times} times white; its white level "
-            f"(={level}) is wrong: give `camera` with the right one"
-        )
+        text = "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: "
+        text += "give `camera` with the right one"
+        logger.warning(text, path.name, float(packed.max()), profile.white_level)
     box_factor = own.box_factor if own is not None else 1
     noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
@@ -208,26 +204,18 @@ def _check_structure(directories: Sequence[Directory], known_kind: bool, size: i
         )
     lost = missing_bytes(directories, size)
     if lost:
-        raise RawFileError(
-            f"must be a whole file, but its directory names {lost} bytes beyond its end: it is "
-            "truncated"
-        )
+        raise RawFileError(f"must be whole, but names {lost} bytes beyond its end: truncated")
     kinds = [tags.get("PhotometricInterpretation") for tags in directories]
     if (LINEAR_RAW,) in kinds and (COLOUR_FILTER_ARRAY,) not in kinds:
-        raise RawFileError(
-            "must be a Bayer raw, but is a linear DNG: already demosaicked, its noise is no longer "
-            "per pixel"
-        )
+        raise RawFileError("must be a Bayer raw, but is a linear DNG: demosaicked already")
     for tags, kind in zip(directories, kinds, strict=True):
         if kind != (COLOUR_FILTER_ARRAY,):
             continue
         height, width = ((numbers(tags, n) or (0,))[0] for n in ("ImageLength", "ImageWidth"))
         pixels = numbers(tags, "StripOffsets") or numbers(tags, "TileOffsets")
         if min(height, width) < 1 or not pixels:
-            raise RawFileError(
-                f"must hold an image, but its directory names {height:g} x {width:g} pixels at "
-                f"{tags.get('StripOffsets', 'no position')}: it is damaged"
-            )
+            found = f"{height:g} x {width:g} pixels at {tags.get('StripOffsets', 'no position')}"
+            raise RawFileError(f"must hold an image, but names {found}: it is damaged")
 
 
 def _settings(path: Path, exposure: Sequence[float], own: OwnRecord | None) -> CameraSettings:
@@ -528,9 +516,11 @@ def _colour_matrix(
 
 
 def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory]) -> tuple[float, float, float]:
-    other = raw.other
-    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
-    return iso, other.shutter_speed, other.aperture
+    iso = raw.other.iso_speed
+    if iso == 65535:  # it does not fit EXIF's 16 bits
+        stated = (first_numbers(directories, name) for name in LONG_ISO)
+        iso = next((float(v[0]) for v in stated if v and v[0] > 0), iso)
+    return iso, raw.other.shutter_speed, raw.other.aperture
 
 
 def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileError:
@@ -545,10 +535,8 @@ def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileEr
         )
     reason = error.args[0] if error.args else error
     reason = reason.decode() if isinstance(reason, bytes) else reason
-    return RawFileError(
-        f"must be a whole camera raw, but LibRaw cannot read it ({reason}): it is a file of "
-        "another kind, truncated or damaged"
-    )
+    rule = "it is a file of another kind, truncated or damaged"
+    return RawFileError(f"must be a camera raw, but LibRaw cannot read it ({reason}): {rule}")
 
 
 def _extra(

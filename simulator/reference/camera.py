@@ -1,13 +1,10 @@
 """The reference camera: the ground truth that the simulator's error is measured against.
 
 From noise-free light and depth to digital numbers, each step as the physics has it: thin-lens
-defocus with occlusion, the softness of a lens in focus, the colour filter array, the light of the
-true exposure time and aperture, motion blur, photon noise in electrons, full well, read noise,
-black level, clip, whole digital numbers, and only then an average of neighbours. Each body has a
-small hidden error of shutter, aperture and black level, as real ones do.
-
-A sensor sees each colour at its own place: light is blurred by the lens (about a pixel), each
-photosite takes the colour of its filter, and only then may neighbours of one plane be averaged.
+defocus with occlusion, the softness of a lens in focus (about a pixel), the colour filter array,
+the light of the true exposure time and aperture, motion blur, photon noise in electrons, full well,
+read noise, black level, clip, whole digital numbers, and only then an average of neighbours. Each
+body has a small hidden error of shutter, aperture and black level, as real ones do.
 """
 
 from __future__ import annotations
@@ -198,20 +195,11 @@ class BodyError:
     black_offset: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod
-    def none(cls) -> BodyError:
-        """A body without errors."""
-        return cls()
-
-    @classmethod
     def draw(cls, camera: CameraProfile, seed: int) -> BodyError:
-        """Draw a body of `camera` as it might leave the factory.
+        """Draw a body of `camera` as it might leave the factory; the same `seed` gives the same.
 
         Shutter: 15 us (standard deviation, at most 60 us, so that 1/8000 s stays open) and 1 %.
         Light of each aperture stop: 2 %, at most 6 %. Black: up to 2 digital numbers per plane.
-
-        Args:
-            camera: Gives the size of a digital number.
-            seed: Integer >= 0; the same seed gives the same body.
         """
         rng = np.random.default_rng([seed, 0xB0D1])
         errors = np.clip(rng.normal(0.0, 0.02, len(_STOPS)), -0.06, 0.06)
@@ -285,7 +273,7 @@ class ReferenceCamera:
         if not camera.nlf_by_iso:
             raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
         self.camera = camera
-        self.body = BodyError.none() if body is None else body
+        self.body = BodyError() if body is None else body
         self.box_factor = check_integer("box_factor", box_factor, 1)
         self.sensor_noise = sensor_noise
         if sensor_noise:
@@ -297,11 +285,11 @@ class ReferenceCamera:
         Where depth is finer than that it is the root of the mean square, as second moments add.
 
         Args:
-            scene: The scene to photograph.
+            scene: The scene to photograph, of H x W packed pixels.
             f_number: As marked on the lens; the blur is that of the stop that it stands for.
 
         Returns:
-            (H // k, W // k) for a scene of H x W packed pixels and `box_factor` k.
+            (H // k, W // k), k the `box_factor`.
         """
         diameter, pixels = self._signed_diameter(scene, f_number), scene.pitch * self.box_factor
         if pixels == 1:
@@ -322,9 +310,7 @@ class ReferenceCamera:
     def blurred_light(self, scene: ReferenceScene, f_number: float) -> Tensor:
         """Light on the photosites behind the aperture `f_number`, (4, H, W).
 
-        Defocus at the pitch of ``scene.light``; light at the pitch of the photosites then goes
-        through a lens that is sharp to about a pixel and through the colour filter array. It is
-        still at the exposure of ``scene.reference``, unclipped, without noise and not averaged: one
+        It is at the exposure of ``scene.reference``, unclipped, without noise and not averaged: one
         result serves every ISO and exposure time.
         """
         light = scene.light
@@ -367,11 +353,10 @@ class ReferenceCamera:
         return torch.tensor(self.body.black_offset).to(signal)[:, None, None]
 
     def record(self, signal: Tensor, iso: float, generator: torch.Generator) -> Tensor:
-        """Digital numbers of `signal`, on the scale where sensor white is 1.
+        """Digital numbers of `signal`, on the scale where sensor white is 1; averaged after that.
 
         The variance of a sample is that of the camera's noise level function: the noise of the
         rounding to whole numbers is part of the calibrated read noise, and is not counted twice.
-        `box_factor` squared samples are averaged after that.
 
         Args:
             signal: (..., 4, H, W), from `expose`.
@@ -409,9 +394,7 @@ class ReferenceCamera:
         return torch.tensor(wells).to(signal)[:, None, None]
 
     def clip(self, signal: Tensor, iso: float) -> Tensor:
-        """The mean of a capture of `signal` (..., 4, H, W) at `iso`: clipped to [-pedestal, 1],
-        then averaged as `record` does.
-        """
+        """The mean of a capture of `signal` (..., 4, H, W): clipped to [-pedestal, 1], averaged."""
         black = self._black_offset(signal)
         held = torch.minimum(signal, self._well(signal, iso) + black)
         pedestal = torch.tensor(self.camera.pedestal).to(signal)[:, None, None]
@@ -435,8 +418,7 @@ class ReferenceCamera:
             seed: Seed of the noise, >= 0; the noise is a function of it and of the settings.
             light: Result of ``blurred_light(scene, settings.f_number)`` if known: it serves every
                 capture at that f-number.
-            lamp: As in `expose`.
-            start: As in `expose`.
+            lamp, start: As in `expose`.
         """
         if light is None:
             light = self.blurred_light(scene, settings.f_number)

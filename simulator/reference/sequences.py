@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol, get_args
@@ -60,12 +59,7 @@ _GREY = 0.18
 
 @dataclass(frozen=True)
 class Sequence:
-    """One scene and the settings it is captured with.
-
-    Args:
-        scene: The scene.
-        settings: The settings of each capture, at least two.
-    """
+    """One scene and the settings of each of its captures, at least two."""
 
     scene: ReferenceScene
     settings: tuple[CameraSettings, ...]
@@ -86,13 +80,7 @@ class HasSettings(Protocol):
 
 @dataclass(frozen=True, order=True)
 class Pair:
-    """Two captures of one sequence: the input of a module and its target.
-
-    Args:
-        sequence: Index of the sequence.
-        source: Index of the input among the sequence's settings.
-        target: Index of the output among them.
-    """
+    """Two captures of one sequence, the input of a module and its target, by their indices."""
 
     sequence: int
     source: int
@@ -102,9 +90,8 @@ class Pair:
 def exposure_error(illuminance: float, settings: CameraSettings) -> float:
     """Exposure error of `settings` against an incident-light meter [EV], > 0 if too bright.
 
-    Args:
-        illuminance: Light on the scene [lux].
-        settings: The settings; the f-number counts as the exact stop that it stands for.
+    The light on the scene is `illuminance` [lux]; f-numbers count as the exact stops that they
+    stand for.
 
     >>> exposure_error(2.5 * 2**13, CameraSettings(iso=100, exposure_time=1 / 64, f_number=8))
     1.0
@@ -173,19 +160,14 @@ def _candidates(lowest_iso: float, highest_iso: float) -> tuple[list[CameraSetti
 
 def _weights(stops: np.ndarray, light: float) -> np.ndarray:
     """How likely each candidate is drawn, up to a factor, in a scene of EV100 `light`."""
-    low, high = (incident_ev100(e) for e in ILLUMINANCE)
-    brightness = min(max((light - low) / (high - low), 0.0), 1.0)
-    error = light + stops[:, 0]
-    iso = stops[:, 1] - _between(_ISO_CENTRES, brightness)
-    aperture = stops[:, 2] - _between(_APERTURE_CENTRES, brightness)
+    darkest, brightest = (incident_ev100(e) for e in ILLUMINANCE)
+    brightness = min(max((light - darkest) / (brightest - darkest), 0.0), 1.0)
+    centres = [low + (high - low) * brightness for low, high in (_ISO_CENTRES, _APERTURE_CENTRES)]
+    error, iso, aperture = light + stops[:, 0], *(stops[:, 1:] - centres).T
     distance = (
         (error / _ERROR_SPREAD) ** 2 + (iso / _ISO_SPREAD) ** 2 + (aperture / _APERTURE_SPREAD) ** 2
     )
     return np.where(np.abs(error) <= _LARGEST_ERROR, np.exp(-0.5 * distance), 0.0)
-
-
-def _between(ends: tuple[float, float], share: float) -> float:
-    return ends[0] + (ends[1] - ends[0]) * share
 
 
 def select_pairs(
@@ -212,7 +194,7 @@ def select_pairs(
     """
     check_word("stage", stage, get_args(Stage))
     if stage == "noise":
-        return list(_little_noise(sequences, any_pairs(sequences), camera))
+        return [pair for pair in any_pairs(sequences) if _has_little_noise(sequences, pair, camera)]
     return opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
 
 
@@ -237,23 +219,19 @@ def grey_signal(scene: ReferenceScene, settings: CameraSettings) -> float:
     return float(scene.light.median()) * exposure_ratio(scene.reference, settings)
 
 
-def _little_noise(
-    sequences: SequenceOf[Sequence], pairs: list[Pair], camera: CameraProfile
-) -> Iterator[Pair]:
+def _has_little_noise(sequences: SequenceOf[Sequence], pair: Pair, camera: CameraProfile) -> bool:
     # An 18 % card at the exposure that an incident-light meter gives, 0.119 of sensor white.
     right = sensor_signal(_GREY * 2.5 / math.pi, CameraSettings(100, 1.0, 1.0))
-    for pair in pairs:
-        sequence = sequences[pair.sequence]
-        source, target = sequence.settings[pair.source], sequence.settings[pair.target]
-        if source.aperture_stop != target.aperture_stop or target.iso > _LOW_ISO:
-            continue
-        grey = grey_signal(sequence.scene, target)
-        error = math.log2(grey / right) if grey > 0 else -math.inf
-        if not _FAIR_ERROR[0] <= error <= _FAIR_ERROR[1]:
-            continue
-        exposed = camera.nlf(source.iso).exposed(exposure_ratio(source, target))
-        if _variance(camera.nlf(target.iso), grey) <= _LOW_NOISE * _variance(exposed, grey):
-            yield pair
+    sequence = sequences[pair.sequence]
+    source, target = sequence.settings[pair.source], sequence.settings[pair.target]
+    if source.aperture_stop != target.aperture_stop or target.iso > _LOW_ISO:
+        return False
+    grey = grey_signal(sequence.scene, target)
+    error = math.log2(grey / right) if grey > 0 else -math.inf
+    if not _FAIR_ERROR[0] <= error <= _FAIR_ERROR[1]:
+        return False
+    exposed = camera.nlf(source.iso).exposed(exposure_ratio(source, target))
+    return _variance(camera.nlf(target.iso), grey) <= _LOW_NOISE * _variance(exposed, grey)
 
 
 def _variance(nlf: NoiseLevelFunction, signal: float) -> float:

@@ -150,10 +150,8 @@ class ReferencePairs:
         k = self.camera.box_factor
         height, width = (n // k for n in scene.size)
         if crop > min(height, width):
-            raise ValueError(
-                f"`crop` (={crop}) must not exceed the {height} x {width} pixels of scene "
-                f"{scene.scene_id!r}"
-            )
+            most = f"the {height} x {width} pixels of scene {scene.scene_id!r}"
+            raise ValueError(f"`crop` (={crop}) must not exceed {most}")
         top, left = (int(rng.integers(n - crop + 1)) for n in (height, width))
         # The one symmetry of a mosaic: transposed, G1 and G2 change places. Mirrored, its planes
         # would lie where no photosites are.
@@ -246,11 +244,8 @@ class DetailPicture:
 class NoiseBatch(NamedTuple):
     """B crops with and without noise.
 
-    Args:
-        noisy: (B, 4, H, W) as recorded: clipped, whole digital numbers where nothing is averaged.
-        clean: (B, 4, H, W) their light, clipped at white.
-        shot: (B, 4) slope of the noise variance.
-        read: (B, 4) noise variance at zero signal.
+    `noisy` (B, 4, H, W) is as recorded: clipped, whole digital numbers where nothing is averaged.
+    `clean` is its light, clipped at white. The noise variance is ``read + shot * clean``, (B, 4).
     """
 
     noisy: Tensor
@@ -274,8 +269,6 @@ class DetailCrops:
     def __init__(
         self, pictures: Sequence[DetailPicture], cameras: Sequence[CameraProfile], seed: int = 0
     ) -> None:
-        if not pictures or not cameras:
-            raise ValueError("`pictures` and `cameras` must not be empty")
         self.cameras, self.seed = list(cameras), seed
         kinds: dict[str, list[DetailPicture]] = {}
         for picture in pictures:

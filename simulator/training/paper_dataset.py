@@ -17,6 +17,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -66,6 +67,9 @@ _LOW_ISO, _LOW_NOISE, _GREY = 400.0, 0.25, 0.119
 #: Most bytes of captures in memory; one of 4 x 512 x 768 takes 6 million.
 _CACHED = 2**31
 
+#: What the files do not state of a camera.
+_LAYOUT = attrgetter("name", "cfa", "black_level", "white_level")
+
 Balance = tuple[float, float, float]
 
 
@@ -88,12 +92,7 @@ def packed_camera(name: str) -> CameraProfile:
 class PackedCapture:
     """One capture: a row of the table.
 
-    Args:
-        file: Its ``.npy`` file.
-        camera: The body.
-        settings: The exposure settings.
-        white_balance: Gains of R, G, B, green 1; None if not stated.
-        nlf: Noise as the row states it; None if it does not.
+    `white_balance` (gains, green 1) and `nlf` are None where the row does not state them.
     """
 
     file: Path
@@ -189,10 +188,8 @@ def _tables(name: str, folder: str | os.PathLike[str]) -> list[Path]:
 def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[CapturedSequence]:
     rows = _cells(table)
     if not set(COLUMNS) <= set(rows.columns):
-        raise ValueError(
-            f"`{table}` (columns: {', '.join(rows.columns) or 'none'}) must have the columns "
-            f"{', '.join(COLUMNS)}, and may have wb and noiseprofile"
-        )
+        found, needed = (", ".join(names) for names in (rows.columns, COLUMNS))
+        raise ValueError(f"`{table}` (columns: {found}) must have the columns {needed}")
     if camera is None:
         camera = "nikon_z6" if "wb" in rows.columns else "canon_70d"
     profile = packed_camera(camera) if isinstance(camera, str) else camera
@@ -213,10 +210,7 @@ def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[
     if lost:
         logger.warning("%s: %d of %d files are not there, %s", table, len(lost), len(rows), lost[0])
     if not captures:
-        raise ValueError(
-            f"`{table}` ({len(rows)} rows) must list .npy files that are there, as "
-            "SEQUENCE/NAME.npy or NAME.npy beside the table"
-        )
+        raise ValueError(f"`{table}` ({len(rows)} rows) must list .npy files that are there")
     return [CapturedSequence(name, tuple(own)) for name, own in captures.items()]
 
 
@@ -303,8 +297,8 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
     name = raws[0].camera.name
     known, nikon = packed_camera(name), name == "nikon_z6"
     for camera in (raw.camera for raw in raws):
-        if _layout_of(camera) != _layout_of(known):
-            raise ValueError(f"`raws` (one of {_layout_of(camera)}) must all be of {known}")
+        if _LAYOUT(camera) != _LAYOUT(known):
+            raise ValueError(f"`raws` (one of {_LAYOUT(camera)}) must all be of {_LAYOUT(known)}")
     rows: list[list[object]] = [[*COLUMNS, *(["wb"] if nikon else []), "noiseprofile"]]
     for index, raw in enumerate(raws):
         stem = f"capture_{index:03d}"
@@ -317,10 +311,6 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
     text = io.StringIO()
     csv.writer(text).writerows(rows)
     write_atomically(folder / PARAMETERS, text.getvalue())
-
-
-def _layout_of(camera: CameraProfile) -> tuple[Any, ...]:
-    return camera.name, camera.cfa.value, camera.black_level, camera.white_level
 
 
 def _profile_text(nlf: NoiseLevelFunction, *, colours: bool) -> str:
@@ -356,10 +346,8 @@ def split_dataset(
         return named[False], named[True]
     every = sorted(named[False] + named[True], key=lambda sequence: sequence.name)
     if len(every) < 2:
-        raise ValueError(
-            f"`folder` (={str(folder)!r}) must hold two sequences or more, of two captures or "
-            f"more each, to train on one and measure on another; it holds {len(every)}"
-        )
+        rule = f"must hold two sequences of two captures or more; it holds {len(every)}"
+        raise ValueError(f"`folder` (={str(folder)!r}) {rule}")
     count = max(1, round(TEST_SHARE * len(every)))
     held_out = set(np.random.default_rng(seed).permutation(len(every))[:count].tolist())
     train = [sequence for index, sequence in enumerate(every) if index not in held_out]
@@ -379,18 +367,14 @@ def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pa
     """
     pairs = opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
     if stage == "noise":
-        captures = [sequence.captures for sequence in sequences]
-        pairs = [
-            p
-            for p in pairs
-            if _is_cleaner(captures[p.sequence][p.source], captures[p.sequence][p.target])
-        ]
+        pairs = [pair for pair in pairs if _is_cleaner(sequences[pair.sequence], pair)]
     if not pairs:
         raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
     return pairs
 
 
-def _is_cleaner(source: PackedCapture, target: PackedCapture) -> bool:
+def _is_cleaner(sequence: CapturedSequence, pair: Pair) -> bool:
+    source, target = sequence.captures[pair.source], sequence.captures[pair.target]
     if source.settings.aperture_stop != target.settings.aperture_stop:
         return False
     exposed = source.noise.exposed(exposure_ratio(source.settings, target.settings))

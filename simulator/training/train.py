@@ -166,10 +166,8 @@ class SimulatorConfig(Configuration):
                 raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
         for name, stage in self.stages().items():
             if name != "noise" and stage.crop > self.scenes.size:
-                raise ValueError(
-                    f"`{name}.crop` (={stage.crop}) must not exceed `scenes.size` "
-                    f"(={self.scenes.size})"
-                )
+                rule = f"must not exceed `scenes.size` (={self.scenes.size})"
+                raise ValueError(f"`{name}.crop` (={stage.crop}) {rule}")
         return self
 
     def stages(self) -> dict[str, StageConfig]:
@@ -317,10 +315,8 @@ def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any
     except ValueError as error:
         raise ValueError(f"`start` (={config.start!r}): {error}") from None
     if card["preset"] != config.preset:
-        raise ValueError(
-            f"`start` (={config.start!r}) must be weights of preset {config.preset!r}, "
-            f"got {card['preset']!r}"
-        )
+        rule = f"must be weights of preset {config.preset!r}, got {card['preset']!r}"
+        raise ValueError(f"`start` (={config.start!r}) {rule}")
     modules.load_state_dict(started.state_dict())
     return modules, {key: card.get(key) for key in ("sha256", "training", "stages", "start")}
 

@@ -71,11 +71,8 @@ class Checkpoint:
             _LOGGER.warning("checkpoint %s is damaged, training restarts: %s", self.path, reason)
             return None
         if identity != self.identity:
-            _LOGGER.warning(
-                "checkpoint %s is of a training with other settings or of another version: "
-                "training restarts",
-                self.path,
-            )
+            text = "checkpoint %s is of other settings or of another version: training restarts"
+            _LOGGER.warning(text, self.path)
             return None
         return state
 

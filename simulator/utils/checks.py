@@ -12,11 +12,7 @@ from typing import Any
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
     """End of a message that proposes the nearest of `known` to a misspelt `name`; empty if none is.
 
-    Args:
-        name: The unknown name.
-        known: The names there are.
-        mark: Quotation mark around the proposal.
-        cutoff: Similarity from which a name is near, see `difflib.get_close_matches`.
+    `mark` is the quotation mark; for `cutoff` see `difflib.get_close_matches`.
 
     >>> did_you_mean("scorrer", ["scenes", "scorer"])
     "; did you mean 'scorer'?"

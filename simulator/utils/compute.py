@@ -173,10 +173,10 @@ def parallel_ranges(
     """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
 
     The caller's thread takes the first share. A task that calls `parallel_ranges` itself gets one
-    share. Returns when all shares are done.
+    share. Returns when all shares are done; an error in any of them is raised here.
 
     Args:
-        task: Safe to run on several threads at once; an error in any share is raised here.
+        task: Safe to run on several threads at once.
         count: Number of items, >= 0.
         least: Items below which another thread is not worth waking.
         threads: Most threads to use; `thread_count()` by default.
@@ -230,12 +230,8 @@ def check_bfloat16(device: torch.device) -> None:
 def progress_bar(title: str, total: int, *, done: int = 0) -> Iterator[Callable[[], None]]:
     """A bar on standard error during work that the user did not ask for, wiped out at the end.
 
-    Nothing is shown where that is no terminal, or belongs to a bar of the program's own.
-
-    Args:
-        title: What is done.
-        total: Number of steps; 0 for no bar.
-        done: Steps done before.
+    Nothing is shown where that is no terminal, or belongs to a bar of the program's own, or where
+    `total` is 0; `done` steps were done before.
 
     Yields:
         A function that counts a step; several threads may call it.

@@ -69,15 +69,9 @@ def as_path(path: object) -> Path:
 
 
 def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
-    """Why a picture must not be decoded: it claims far more pixels than its file can hold.
+    """Why a picture must not be decoded: it claims far more pixels than `size` bytes can hold.
 
-    Args:
-        height, width: That the file claims.
-        size: Length of the file [byte].
-        per_byte: Most pixels that each byte of the file may stand for.
-
-    Returns:
-        The reason, for an error message; empty where the picture may be decoded.
+    Empty where it may be decoded; each byte of the file may stand for `per_byte` pixels at most.
 
     >>> refuse_bomb(60_000, 60_000, 4096)
     'claims 60000 x 60000 pixels, where at most 268435456 are read'
@@ -96,14 +90,8 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
 def write_atomically(
     path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
 ) -> Path:
-    """Write `content` under a temporary name beside `path`, then rename it; makes the folder.
-
-    Args:
-        path: File to write or replace.
-        content: Bytes, text that is encoded as UTF-8, or pieces of bytes, written as they come.
-
-    Returns:
-        `path`.
+    """Write bytes, text (as UTF-8), or pieces of bytes under a temporary name beside `path`, then
+    rename it; makes the folder, and returns `path`.
 
     Raises:
         ValueError: If `path` is not a file's name.
@@ -172,13 +160,8 @@ def write_results(
 ) -> Path:
     """Write ``{"meta": meta, "rows": rows}`` as JSON, whole or not at all.
 
-    Args:
-        path: File to write; its folder is made where missing.
-        rows: One mapping per row; scalars and arrays of numpy and torch become numbers and lists.
-        meta: As `result_meta` returns it, plus whatever describes this measurement.
-
-    Returns:
-        The path written.
+    Scalars and arrays of numpy and torch become numbers and lists. `meta` is that of `result_meta`,
+    and whatever else describes the measurement.
 
     Raises:
         ValueError: If a value is NaN or infinite (JSON has no such number; write None) or of a

@@ -7,7 +7,7 @@ and again, and a half without such a pixel costs nothing.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import EllipsisType
 
 import numpy as np
@@ -63,10 +63,9 @@ class Tile:
     @property
     def core(self) -> _Index:
         """Index of the rectangle in the part that `outer` cuts out."""
-        befores = (min(first, self.halo) for first, _, _ in self._sides)
         rows, columns = (
-            slice(before, before + last - first)
-            for before, (first, last, _) in zip(befores, self._sides, strict=True)
+            slice(min(first, self.halo), min(first, self.halo) + last - first)
+            for first, last, _ in self._sides
         )
         return ..., rows, columns
 
@@ -102,14 +101,12 @@ def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
     cells = F.max_pool2d(part, _CELL, ceil_mode=True)[0].bool().cpu().numpy()
 
     def made(rows: tuple[int, int], columns: tuple[int, int]) -> Tile:
-        return Tile(
-            tile.top + _CELL * rows[0],
-            min(tile.top + _CELL * rows[1], tile.bottom),
-            tile.left + _CELL * columns[0],
-            min(tile.left + _CELL * columns[1], tile.right),
-            tile.height,
-            tile.width,
-            tile.halo,
+        return replace(
+            tile,
+            top=tile.top + _CELL * rows[0],
+            bottom=min(tile.top + _CELL * rows[1], tile.bottom),
+            left=tile.left + _CELL * columns[0],
+            right=min(tile.left + _CELL * columns[1], tile.right),
         )
 
     def cover(row: int, column: int, cells: np.ndarray) -> list[Tile]:

@@ -197,16 +197,6 @@ def test_bad_scenes_are_named(simulator: CameraSimulator, name: str, value: Any)
         (lambda s, raw: s.simulate(raw, 3), "`settings`"),
         # A disc may be as wide as the frame.
         (lambda s, raw: s.simulate(raw, CameraSettings(100, 1, 1), defocus=200.0), "`defocus`"),
-        (
-            lambda s, raw: PreparedScene(torch.ones(4, 1, 600), BASE, Z6, ZERO, defocus=601.0),
-            "`defocus`",
-        ),
-        (lambda s, raw: PreparedScene(raw.data[:3], BASE, Z6, ZERO), "`light`"),
-        (lambda s, raw: PreparedScene(raw.data * math.nan, BASE, Z6, ZERO), "`light`"),
-        *(
-            (lambda s, raw, gain=gain: PreparedScene(raw.data, BASE, Z6, ZERO, gain=gain), "`gain`")
-            for gain in (-0.1, math.inf, math.nan, None)
-        ),
         (lambda s, raw: s.denoise(s.prepare(raw)), "there is no noise module"),
         (lambda s, raw: s.estimate_defocus(s.prepare(raw)), "there is no aperture module"),
         (lambda s, raw: s.stages(raw, BASE), "there are no modules to run"),
@@ -639,18 +629,6 @@ def test_known_motion_disc_and_gain(compact: CameraSimulator) -> None:
     prepared = compact.prepare(prepared, tolerance=0)
     light = compact.stages(prepared, FULL_SOURCE, depth="far").light
     torch.testing.assert_close(prepared.expected(FULL_SOURCE), light, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("scene", [{}, {"image_speed": 0.4, "defocus": 2}])
-@pytest.mark.parametrize("noise", [True, False])
-def test_without_networks_the_full_run_is_exposure_and_noise(scene: dict, noise: bool) -> None:
-    plain = CameraSimulator(device="cpu")
-    for target in TARGETS:
-        full, exact = (
-            plain.simulate(full_raw(noise), target, seed=5, tolerance=t, **scene) for t in (None, 0)
-        )
-        assert torch.equal(full.data, exact.data)
-        assert full.metadata == exact.metadata
 
 
 def test_the_tolerance_of_a_prepared_scene_is_kept(compact: CameraSimulator) -> None:

@@ -1,3 +1,5 @@
+"""Exposure fusion against its formulas, and a bracket of one raw."""
+
 import itertools
 from dataclasses import replace
 
@@ -5,15 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from agents.applications.hdr import (
-    _weight,
-    bracket_exposures,
-    expose_and_develop,
-    fuse,
-    hdr_picture,
-    linear_rgb,
-    write_exr,
-)
+from agents.applications import hdr
+from agents.applications.hdr import expose_and_develop, fuse, linear_rgb, write_exr
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 
 CAMERA = get_camera("nikon_z6")
@@ -40,7 +35,8 @@ def test_flat_pictures_weigh_as_the_formula_says() -> None:
 def test_rare_brightnesses_weigh_more() -> None:
     luma = torch.full((10, 10), 0.2)
     luma[0, :5] = 0.4
-    weight = _weight(luma, mean=0.7, width=0.5)
+    # Private: nothing shows the weights of a picture alone.
+    weight = hdr._weight(luma, mean=0.7, width=0.5)
     # Both lie as far from 1 - 0.7 as each other; one is 19 times as frequent.
     np.testing.assert_allclose(float(weight[0, 0] / weight[5, 5]), 19.0, rtol=1e-4)
 
@@ -64,18 +60,17 @@ def test_a_large_flat_patch_stays_flat() -> None:
 def test_a_function_that_yields_pictures() -> None:
     pictures = [torch.full((3, 20, 20), value) for value in (0.2, 0.6)]
     assert fuse(lambda: iter(pictures)).equal(fuse(pictures))
-    with pytest.raises(ValueError, match="must be at least 2"):
+    with pytest.raises(ValueError, match="`pictures`"):
         fuse(pictures[:1])
 
 
 def test_bracket_exposures() -> None:
-    assert bracket_exposures()[0] == -4.0
-    assert len(bracket_exposures()) == 17
-    steps = [b - a for a, b in itertools.pairwise(bracket_exposures(1.0, 0.3))]
+    assert len(hdr.bracket_exposures()) == 17
+    steps = [b - a for a, b in itertools.pairwise(hdr.bracket_exposures(1.0, 0.3))]
     np.testing.assert_allclose(steps, 0.3)
     for stops, step in ((0.0, 0.5), (11.0, 0.5), (float("nan"), 0.5), (1.0, 2.0), (1.0, 0.0)):
         with pytest.raises(ValueError, match=r"`(stops|step)`"):
-            bracket_exposures(stops, step)
+            hdr.bracket_exposures(stops, step)
 
 
 def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
@@ -84,7 +79,7 @@ def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
     light[..., :64] = 0.002 + 0.002 * stripes[None, :, None]  # deep shadow
     light[..., 64:] = 0.80 + 0.15 * stripes[None, :, None]
     raw = RawImage(light, SETTINGS, CAMERA)
-    picture = hdr_picture(raw, simulator=CameraSimulator(device="cpu"))
+    picture = hdr.hdr_picture(raw, simulator=CameraSimulator(device="cpu"))
     single = render_srgb(raw).float() / 255.0
     for columns, least in ((slice(40, 88), 1.3), (slice(168, 216), 1.05)):
         contrast = [float(p[1, 20:-20, columns].std()) for p in (single, picture.fused)]
@@ -93,11 +88,11 @@ def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
 
 
 def test_the_sensor_clips_each_picture() -> None:
-    raw = RawImage(torch.full((4, 8, 8), 0.5), SETTINGS, CAMERA)
-    assert expose_and_develop(raw, 2.0).min() == 1.0
-    assert expose_and_develop(raw, -2.0).equal(
-        expose_and_develop(RawImage(torch.full((4, 8, 8), 0.125), SETTINGS, CAMERA))
+    half, eighth = (
+        RawImage(torch.full((4, 8, 8), level), SETTINGS, CAMERA) for level in (0.5, 0.125)
     )
+    assert expose_and_develop(half, 2.0).min() == 1.0
+    assert expose_and_develop(half, -2.0).equal(expose_and_develop(eighth))
 
 
 def test_radiance_as_an_exr(tmp_path) -> None:

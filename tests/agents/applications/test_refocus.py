@@ -1,18 +1,16 @@
+"""Refocusing against a thin lens's geometry; depth maps of all kinds."""
+
+import importlib.util
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from agents.applications.refocus import refocus
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    Lens,
-    NoiseLevelFunction,
-    RawImage,
-    get_camera,
-)
+from agents.applications.refocus import read_depth, refocus
+from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage
+from simulator.camera import get_camera
 
 NO_NOISE = NoiseLevelFunction((1e-12,) * 4, (1e-12,) * 4)
 #: Pixel pitch such that packed pixels are 10 um.
@@ -87,28 +85,19 @@ def test_what_is_before_the_focus_spreads_over_what_is_sharp(simulator) -> None:
 
 def test_the_source_s_own_aperture_changes_nothing(simulator) -> None:
     light = torch.rand(4, 32, 40, generator=torch.Generator().manual_seed(0)) * 0.5
-    out = refocus(
-        make_raw(light), 5.6, depth=np.full((32, 40), 9.0), lens=LENS, simulator=simulator
-    )
+    depth = np.full((32, 40), 9.0)
+    out = refocus(make_raw(light), 5.6, depth=depth, lens=LENS, simulator=simulator)
     assert out.data.equal(light)
     assert out.settings == SETTINGS
 
 
-def test_what_is_blurred_has_the_noise_of_the_sensor() -> None:
-    light = torch.full((4, 128, 128), 0.2)
-    raw = RawImage(light, CameraSettings(6400, 1 / 64, 5.6), CAMERA)
-    out = refocus(
-        raw,
-        1.4,
-        depth=np.full((128, 128), 9.0),
-        lens=LENS,
-        simulator=CameraSimulator(device="cpu"),
-        seed=1,
-    )
+def test_what_is_blurred_has_the_noise_of_the_sensor(simulator) -> None:
+    raw = RawImage(torch.full((4, 128, 128), 0.2), CameraSettings(6400, 1 / 64, 5.6), CAMERA)
+    depth = np.full((128, 128), 9.0)
+    out = refocus(raw, 1.4, depth=depth, lens=LENS, simulator=simulator, seed=1)
     nlf = CAMERA.nlf(6400)
-    for plane in range(4):
-        expected = nlf.shot[plane] * 0.2 + nlf.read[plane]
-        np.testing.assert_allclose(float(out.data[plane].var()), expected, rtol=0.05)
+    expected = np.array(nlf.shot) * 0.2 + nlf.read
+    np.testing.assert_allclose(out.data.var(dim=(1, 2)), expected, rtol=0.05)
 
 
 def test_a_sharp_picture_of_unknown_depth_stays_as_it_is() -> None:
@@ -120,24 +109,69 @@ def test_a_sharp_picture_of_unknown_depth_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "named"),
     [
-        ({"f_number": 8.0}, "`f_number` .=8. must be at most that of the raw, 5.6"),
-        ({"depth": np.ones((32, 40))}, "`depth` must come with both"),
-        ({"lens": LENS}, "`lens` must come with both"),
-        ({"depth": np.ones((40, 32)), "lens": LENS}, r"shape \(40, 32\)\) must be \(32, 40\)"),
-        ({"depth": np.full((32, 40), 0.04), "lens": LENS}, "above the focal length"),
-        ({"depth": np.full((32, 40), np.nan), "lens": LENS}, "above the focal length"),
+        ({"f_number": 8.0}, "f_number"),
+        ({"depth": np.ones((32, 40))}, "depth"),
+        ({"lens": LENS}, "lens"),
+        ({}, "depth"),  # nor are there networks
+        ({"depth": np.ones((40, 32)), "lens": LENS}, "depth"),
+        ({"depth": np.full((32, 40), 0.04), "lens": LENS}, "depth"),
+        ({"depth": np.full((32, 40), np.nan), "lens": LENS}, "depth"),
+        ({"camera": replace(CAMERA, pixel_pitch_um=None)}, "raw"),
     ],
 )
-def test_bad_arguments(simulator, arguments, message: str) -> None:
+def test_bad_arguments(simulator, arguments, named: str) -> None:
     raw = make_raw(torch.full((4, 32, 40), 0.1))
-    with pytest.raises(ValueError, match=message):
+    if "camera" in arguments:
+        raw = replace(raw, camera=arguments["camera"])
+        arguments = {"depth": np.full((32, 40), 9.0), "lens": LENS}
+    with pytest.raises(ValueError, match=f"`{named}`"):
         refocus(raw, **{"f_number": 1.4, "simulator": simulator, **arguments})
 
 
-def test_an_unknown_pixel_pitch(simulator) -> None:
-    camera = replace(CAMERA, pixel_pitch_um=None)
-    raw = replace(make_raw(torch.full((4, 32, 40), 0.1)), camera=camera)
-    with pytest.raises(ValueError, match="pixel pitch"):
-        refocus(raw, 1.4, depth=np.full((32, 40), 9.0), lens=LENS, simulator=simulator)
+# -- depth maps -----------------------------------------------------------------------------------
+
+MAP = np.array([[500, 1000, 0], [2000, 4000, 65535]], np.uint16)
+
+
+def test_millimetres_of_a_png_with_a_hole(tmp_path) -> None:
+    Image.fromarray(MAP).save(tmp_path / "depth.png")
+    depth = read_depth(tmp_path / "depth.png")
+    np.testing.assert_allclose(depth[:, :2], [[0.5, 1.0], [2.0, 4.0]])
+    assert depth[0, 2] in (1.0, 65.535)  # that of a neighbour
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", scale=0.01)[0, 0], 5.0)
+
+
+def test_disparity_is_inverse_distance(tmp_path) -> None:
+    np.save(tmp_path / "disparity.npy", np.array([[0.0, 2.0], [4.0, np.nan]], np.float32))
+    depth = read_depth(tmp_path / "disparity.npy", kind="disparity", scale=0.25)
+    assert depth[0, 0] == np.inf
+    np.testing.assert_allclose([depth[0, 1], depth[1, 0]], [2.0, 1.0])
+    assert depth[1, 1] in (1.0, 2.0)
+
+
+def test_an_exr(tmp_path) -> None:
+    openexr = pytest.importorskip("OpenEXR")
+    values = np.array([[1.5, 2.5]], np.float32)
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    openexr.File(header, {"Z": values}).write(str(tmp_path / "z.exr"))
+    np.testing.assert_array_equal(read_depth(tmp_path / "z.exr"), values)
+
+
+def test_bad_maps(tmp_path) -> None:
+    Image.new("RGB", (4, 4)).save(tmp_path / "colour.png")
+    Image.new("L", (4, 4)).save(tmp_path / "empty.png")
+    Image.new("L", (4, 4), 9).save(tmp_path / "photo.jpg")
+    (tmp_path / "text.npy").write_text("no array")
+    (tmp_path / "text.exr").write_text("no picture")
+    np.save(tmp_path / "pickle.npy", np.array([print], object), allow_pickle=True)
+    np.save(tmp_path / "three.npy", np.ones((2, 2, 2)))
+    names = {"missing.png", *(path.name for path in tmp_path.iterdir())}
+    for name in names if importlib.util.find_spec("OpenEXR") else names - {"text.exr"}:
+        with pytest.raises(ValueError, match=rf"`depth` \(='.*{name}'"):
+            read_depth(tmp_path / name)
+    Image.fromarray(MAP).save(tmp_path / "depth.png")
+    for wrong in ({"kind": "metres"}, {"kind": "disparity"}, {"scale": 0.0}):
+        with pytest.raises(ValueError, match=r"`kind` \(='metres'|`scale` \(=(None|0\.0)\)"):
+            read_depth(tmp_path / "depth.png", **wrong)

@@ -1,9 +1,9 @@
 """The program as a whole: help, errors, exit statuses, and the two commands about itself."""
 
+import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -155,16 +155,19 @@ def test_errors_are_one_line(ae_env, dng: Path, arguments, message) -> None:
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
-def test_policies_that_fail(ae_env, tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(OWN)
-    small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
-    for name, status, message in (
+@pytest.mark.parametrize(
+    ("name", "status", "message"),
+    [
         ("Raises", 1, r"own\.py:.*`act` raised KeyError: 'lost'"),
         ("Counts", 2, r"`captures_per_decision` of policy `own\.py:Counts` \(='two'\)"),
-    ):
-        code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *small)
-        assert (code, error.count("\n")) == (status, 1)
-        assert re.search(message, error)
+    ],
+)
+def test_policies_that_fail(ae_env, tmp_path: Path, name, status, message) -> None:
+    (tmp_path / "own.py").write_text(OWN)
+    small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
+    code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *small)
+    assert (code, error.count("\n")) == (status, 1)
+    assert re.search(message, error)
 
 
 @pytest.mark.parametrize(
@@ -188,54 +191,57 @@ def test_failures_while_running(ae_env, dng, monkeypatch, raised, status, messag
 
 # -- bench and cache ------------------------------------------------------------------------------
 
-OURS = """
-def run(out, *, seed, quick):
-    out.mkdir()
-    (out / 'ours').write_text(f'{seed} {quick}')
+_BENCH = """
+import sys
+from pathlib import Path
+from agents.cli import main
+main.CHECKOUT = Path("../checkout").resolve()
+sys.argv = ["ae-env", "bench", "convergence", "--quick", "--seed", "3", "--out", "here"]
+main.main()
 """
 
 
-@pytest.fixture
-def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    for folder, code in (("checkout", OURS), ("mine", "raise RuntimeError('not ours')")):
+def test_the_working_folder_does_not_matter(tmp_path: Path) -> None:
+    ours = "def run(out, *, seed, quick): print('ours', out, seed, quick)"
+    for folder, code in (("checkout", ours), ("mine", "raise RuntimeError('not ours')")):
         (tmp_path / folder / "benchmarks").mkdir(parents=True)
         (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")
         (tmp_path / folder / "benchmarks" / "convergence.py").write_text(code)
-    loaded = {name: sys.modules.pop(name) for name in list(sys.modules) if "benchmarks" in name}
-    monkeypatch.syspath_prepend(tmp_path / "mine")  # takes back what is added to the path, too
-    monkeypatch.setattr(cli, "CHECKOUT", tmp_path / "checkout")
-    yield
-    for name in [name for name in sys.modules if "benchmarks" in name]:
-        del sys.modules[name]
-    sys.modules.update(loaded)
+    command, packages = [sys.executable, "-c", _BENCH], str(Path(cli.__file__).parents[2])
+    env = os.environ | {"PYTHONPATH": packages}
+    printed = subprocess.check_output(command, cwd=tmp_path / "mine", env=env, text=True)
+    assert printed == "ours here 3 True\n"
 
 
-def test_the_working_folder_does_not_matter(ae_env, folders, tmp_path):
-    code, _, _ = ae_env("bench", "convergence", "--quick", "--seed", 3, "--out", "here")
-    assert code == 0
-    assert (tmp_path / "here" / "ours").read_text() == "3 True"
-
-
-def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, monkeypatch):
+def test_an_installed_package_says_that_it_has_none(ae_env, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "CHECKOUT", tmp_path / "site-packages")
     code, _, error = ae_env("bench", "throughput")
     assert code == 2
-    assert "the benchmarks are not part of the installed package" in error
     assert "pip install -e ." in error
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [("recorded", "nope"), ("paper", "nope"), ("paper", "data", "--weights", "nope")],
-    ids=" ".join,
+    ("arguments", "message"),
+    [
+        (("paper",), "ae-env bench paper FOLDER"),
+        (("paper", "nope"), "`folder` (='nope') must be an existing folder"),
+        (("paper", "empty"), "`folder` (='empty') must hold a camera_params.csv"),
+        (("paper", "data", "--weights", "nope.safetensors"), "there is no nope.json"),
+        (("recorded", "nope"), "`scenes` (='recorded:"),
+        (("recorded", "empty"), "must hold captures"),
+        (("recorded", "empty", "--weights", "a"), "`weights` (='a')"),
+        (("convergence", "data"), "`folder` (='data')"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_what_is_refused_leaves_no_folder(ae_env, arguments, tmp_path):
+def test_what_is_refused_leaves_no_folder(ae_env, arguments, message, tmp_path):
     write_dataset(tmp_path / "data")
+    (tmp_path / "empty").mkdir()
     for out in ((), ("--out", "here")):
         code, _, error = ae_env("bench", *arguments, *out)
-        assert code == 2, error
-        assert "nope" in error
-    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+        assert (code, error.strip().count("\n")) == (2, 0), error
+        assert message in error
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "empty"}
 
 
 def test_all_scorers_are_listed(ae_env) -> None:
@@ -249,17 +255,15 @@ def test_all_scorers_are_listed(ae_env) -> None:
 def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:
     folder = tmp_path / "kept [1]"
     monkeypatch.setenv("AE_ENV_CACHE", str(folder))
-    (folder / "scenes").mkdir(parents=True)
-    for i in range(2):
-        (folder / "scenes" / f"bundled-train-64-{i:024d}.safetensors").write_bytes(b"x" * 1000)
-    (folder / "denoised").mkdir()
-    (folder / "denoised" / f"{5:024d}.safetensors").write_bytes(b"x" * 123)
-    (folder / "denoised" / "mine.safetensors").write_bytes(b"x")
-    expected = {"scenes": ["2", "2,000"], "denoised": ["1", "123"]}
+    sizes = {f"scenes/bundled-train-64-{i:024d}": 1000 for i in range(2)}
+    for name, size in {**sizes, f"denoised/{5:024d}": 123, "denoised/mine": 1}.items():
+        path = folder / f"{name}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x" * size)
     for arguments in ((), ("--clear",)):
         code, out, _ = ae_env("cache", *arguments)
         assert code == 0
-        for kind, numbers in expected.items():
+        for kind, numbers in {"scenes": ["2", "2,000"], "denoised": ["1", "123"]}.items():
             (line,) = (text for text in out.splitlines() if f" {kind} " in text)
             assert re.findall(r"[\d,]+", line) == numbers
         assert str(folder) in out.replace("\n", "")

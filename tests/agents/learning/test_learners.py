@@ -71,30 +71,41 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path, observati
             make_policy(f"ppo:{tmp_path / 'ppo'}", PolicyContext.from_envs(make_tiny_envs()))
 
 
-def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
-    path = tmp_path / "ppo.checkpoint"
+REGRESSION = RegressionTraining(frames=160, width=16, seed=5)
+
+
+@pytest.mark.parametrize(
+    ("train", "training", "stopped_at", "done"),
+    [(train_ppo, TRAINING, 56, 48), (train_regression, REGRESSION, 100, 100)],
+)
+def test_a_stopped_training_goes_on(
+    train: Any, training: Any, stopped_at: int, done: int, make_tiny_envs, tmp_path: Path
+) -> None:
+    """PPO from its last complete update of 4 x 4 frames."""
+    path, seen = tmp_path / "agent.checkpoint", []
 
     def stop(done: int, total: int, values: dict[str, float]) -> None:
-        if done == 56:
+        if done == stopped_at:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_ppo(make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=stop))
+        train(make_tiny_envs(), training, Session(checkpoint=path, progress=stop))
     half = torch.load(path, weights_only=True)["state"]
-    assert half["timesteps"] == 48  # the last complete update of 4 x 4 frames before frame 56
-    seen: list[int] = []
-    network = train_ppo(
-        make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=lambda *a: seen.append(a[0]))
-    )
-    assert seen == list(range(52, 97, 4))
-    # The learning rate falls over the whole training, it does not start at its top again.
-    optimizer = network.optimizer
-    assert optimizer.param_groups[0]["lr"] < 0.3 * TRAINING.learning_rate
-    # 6 updates of 2 epochs of 2 batches: Adam goes on counting, so its moments were restored.
-    assert {float(s["step"]) for s in optimizer.state_dict()["state"].values()} == {24.0}
-    end, weights = torch.load(path, weights_only=True)["state"], network.state_dict()
-    assert all(torch.equal(end["policy"][k], v) for k, v in weights.items())
-    assert any(not torch.equal(half["policy"][k], v) for k, v in weights.items())
+    session = Session(checkpoint=path, progress=lambda *a: seen.append(a[0]))
+    network = train(make_tiny_envs(), training, session)
+    assert seen == list(range(done + 4, 97 if train is train_ppo else 161, 4))
+    end = torch.load(path, weights_only=True)["state"]
+    name, steps = ("policy", 24) if train is train_ppo else ("network", 40)
+    assert all(torch.equal(v, end[name][key]) for key, v in network.state_dict().items())
+    assert any(not torch.equal(v, end[name][key]) for key, v in half[name].items())
+    # Adam goes on counting, so its moments were restored.
+    assert {float(s["step"]) for s in end["optimizer"]["state"].values()} == {steps}
+    if train is train_ppo:  # the learning rate falls over the whole training
+        assert half["timesteps"] == done
+        assert network.optimizer.param_groups[0]["lr"] < 0.3 * TRAINING.learning_rate
+    else:
+        assert half["step"] == done // 4
+        assert end["schedule"]["last_epoch"] == end["step"] == steps
 
 
 class Stub(nn.Module):
@@ -164,9 +175,6 @@ def test_frames_of_other_light_are_forgotten(context: PolicyContext, photograph)
     assert policy.act(frames).tolist() == [9, 3]
 
 
-REGRESSION = RegressionTraining(frames=160, width=16, seed=5)
-
-
 def test_training_lowers_the_loss(make_tiny_envs) -> None:
     losses = []
     train_regression(
@@ -208,30 +216,6 @@ def test_the_seed_alone_decides_and_progress_is_complete(
     assert any(not torch.equal(first[name], other[name]) for name in first)
     assert [(done, total) for done, total, _ in seen] == [(n, 32) for n in range(4, 33, 4)] * 3
     assert all(0.0 <= values.get("reward", 0.0) <= 1.0 for _, _, values in seen)
-
-
-def test_a_stopped_regression_goes_on(make_tiny_envs, tmp_path: Path) -> None:
-    path = tmp_path / "regression.checkpoint"
-
-    def stop(done: int, total: int, values: dict[str, float]) -> None:
-        if done == 100:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_regression(make_tiny_envs(), REGRESSION, Session(checkpoint=path, progress=stop))
-    half = torch.load(path, weights_only=True)["state"]
-    assert half["step"] == 25
-    seen: list[int] = []
-    network = train_regression(
-        make_tiny_envs(),
-        REGRESSION,
-        Session(checkpoint=path, progress=lambda *a: seen.append(a[0])),
-    )
-    assert seen == list(range(104, 161, 4))
-    end = torch.load(path, weights_only=True)["state"]
-    assert end["schedule"]["last_epoch"] == end["step"] == 40
-    assert all(float(s["step"]) == 40 for s in end["optimizer"]["state"].values())
-    assert all(torch.equal(v, end["network"][name]) for name, v in network.state_dict().items())
 
 
 @pytest.mark.parametrize("memory", [1, 4, 10])

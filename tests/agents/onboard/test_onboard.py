@@ -1,10 +1,10 @@
 """Exported agents against those in torch, and a camera that is driven by one."""
 
-import importlib.util
+import runpy
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -26,15 +26,6 @@ ROOT = Path(__file__).parents[3]
 def make_envs(num_envs: int, **arguments: Any) -> gym.vector.VectorEnv:
     given = {"scenes": "bundled:small", "split": "test", "max_episode_steps": None, **arguments}
     return gym.make_vec("ae_env:ae_env/AutoExposure-v0", num_envs=num_envs, **given)
-
-
-def load_example(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +105,10 @@ def test_frames_and_settings_are_encoded_as_the_environment_does(exported: Any) 
 
 def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> None:
     """After each jump of 5 EV it settles, at the aperture that it has, where little is clipped."""
-    loop, simulated = load_example("picamera2_ae"), load_example("simulated_camera")
+    loop, simulated = (
+        SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / f"{name}.py")))
+        for name in ("picamera2_ae", "simulated_camera")
+    )
     body = get_camera("nikon_z6")
     scenes = load_scenes("bundled:small", "test", camera=body, resolution=64)
     scene = next(scene for scene in scenes if scene.kind == "indoor")
@@ -146,27 +140,25 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> No
 
 def test_what_cannot_be_exported_is_named(context: PolicyContext, tmp_path: Path) -> None:
     file = tmp_path / "x.onnx"
-    with pytest.raises(ValueError, match=r"must be a regression or a PPO agent"):
-        export_agent(make_policy("matrix:P", context), file)
-    with pytest.raises(ValueError, match=r"export it without `foresight`"):
-        export_agent(make_policy("regression?foresight=trend", context), file)
-    with pytest.raises(ValueError, match=r"must end in .onnx"):
+    for name in ("matrix:P", "regression?foresight=trend"):
+        with pytest.raises(ValueError, match="`policy`"):
+            export_agent(make_policy(name, context), file)
+    with pytest.raises(ValueError, match="`out`"):
         export_agent(make_policy("ppo", context), tmp_path / "x")
     assert not file.exists()
 
 
 def test_a_controller_names_what_is_wrong(exported: Any, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="there is no such file"):
-        Controller(tmp_path / "none.onnx")
     broken = tmp_path / "broken.onnx"
     broken.write_bytes(b"no model")
-    with pytest.raises(ValueError, match="cannot be read"):
-        Controller(broken)
+    for file in (broken, tmp_path / "none.onnx"):
+        with pytest.raises(ValueError, match="`path`"):
+            Controller(file)
     controller = Controller(exported[1])
     frame = np.zeros((1, 4, 64, 64), np.uint8)
-    with pytest.raises(ValueError, match=r"`sensors` \(shape None\) must be \(1, 2\)"):
+    with pytest.raises(ValueError, match="`sensors`"):
         controller.act(frame, np.zeros((1, 3)))
-    with pytest.raises(ValueError, match=r"`raw` \(shape \(2, 4, 64, 64\)\) must be"):
+    with pytest.raises(ValueError, match="`raw`"):
         controller.act(np.zeros((2, 4, 64, 64)), np.zeros((1, 3)), np.zeros((1, 2)))
-    with pytest.raises(ValueError, match=r"`planes` \(shape \(4, 8, 8\)\) must be \(4, H, W\)"):
+    with pytest.raises(ValueError, match="`planes`"):
         controller.decide(np.zeros((4, 8, 8)), controller.states[0])

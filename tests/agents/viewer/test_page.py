@@ -27,6 +27,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 #: Time within which the program or page does what it is asked, on a busy machine [s].
 PATIENCE = 300
+CAMERA = get_camera("nikon_z6")
 
 
 @contextmanager
@@ -62,16 +63,18 @@ def address(tmp_path_factory):
         yield found
 
 
-@pytest.fixture(scope="module")
-def address_of_soft_raw(tmp_path_factory):
-    """Address of a page that shows one raw at f/5.6, sharp on the left, soft on the right."""
-    folder = tmp_path_factory.mktemp("soft")
+def soft_raw():
+    """A raw at f/5.6, sharp on the left, soft on the right."""
     tiles = torch.rand(1, 24, 36, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.05
     light = tiles.repeat_interleave(4, 1).repeat_interleave(4, 2).expand(4, 96, 144).clone()
     light[..., 72:] = disc_blur(light, 6.0)[..., 72:]
-    camera = get_camera("nikon_z6")
-    raw = RawImage(light, CameraSettings(100, 1 / 64, 5.6), camera, nlf=camera.nlf(100))
-    write_dng(folder / "soft.dng", raw)
+    return RawImage(light, CameraSettings(100, 1 / 64, 5.6), CAMERA, nlf=CAMERA.nlf(100))
+
+
+@pytest.fixture(scope="module")
+def address_of_soft_raw(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("soft")
+    write_dng(folder / "soft.dng", soft_raw())
     with served(folder / "log.txt", folder / "soft.dng", "--depth", "unknown") as found:
         yield found
 
@@ -139,22 +142,10 @@ def slider(page, name):
     return page.locator(f"[aria-label='{name}'] [tabindex='0']")
 
 
-def test_slides_by_keyboard_and_shows_another_picture(page):
-    before = picture(page)
-    slider(page, "ISO").focus()
-    page.keyboard.press("ArrowRight")
-    assert_another_picture(page, before)
-    expect(page.get_by_text("ISO 125,")).to_be_visible()  # in the plan
-
-
 def assert_shows_the_clicked_state(page):
     page.locator("button[aria-label^='ISO 6400, 1/2 s, f/4']").click()
     expect(page.locator("button.shown[aria-label^='ISO 6400, 1/2 s, f/4']")).to_be_visible()
     expect(page.get_by_text(re.compile(r"^\d+\.\d+% at white"))).to_be_visible()
-
-
-def test_shows_the_state_that_is_clicked(page):
-    assert_shows_the_clicked_state(page)
 
 
 def test_starts_at_the_best_state(page):
@@ -192,6 +183,7 @@ def test_compares_two_states_with_a_divider(page):
     slider(page, "Shutter").focus()
     page.keyboard.press("ArrowRight")
     assert_another_picture(page, before)
+    expect(page.locator(".plan")).to_contain_text(re.compile(r"ISO \d+, "))
     assert over.get_attribute("src") == pinned
     page.locator("input.divider").focus()
     page.keyboard.press("Home")
@@ -229,9 +221,8 @@ def test_a_bad_file_is_refused_and_the_page_lives(page, tmp_path):
 
 
 def test_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
-    camera = get_camera("nikon_z6")
     light = torch.linspace(0.02, 0.6, 96).repeat(4, 64, 1)
-    raw = RawImage(light, CameraSettings(100, 1 / 64, 4), camera, nlf=camera.nlf(100))
+    raw = RawImage(light, CameraSettings(100, 1 / 64, 4), CAMERA, nlf=CAMERA.nlf(100))
     write_dng(tmp_path / "ramp.dng", raw)
     page.locator("input[type=file]").set_input_files(tmp_path / "ramp.dng")
     page.get_by_text("ramp.dng", exact=True).first.wait_for()
@@ -260,38 +251,24 @@ def saved(page, ending, folder):
 def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
     page = soft_page
     expect(page.get_by_role("button", name="save DNG")).to_be_disabled()
+    page.get_by_text("f/1.4", exact=True).wait_for()  # the widest
     slider(page, "Wider aperture").focus()
-    thirds = (1.4, 1.6, 1.8, 2.0, 2.2, 2.5, 2.8, 3.2, 3.5)
-    for f_number in thirds:
-        page.get_by_text(f"f/{f_number:g}", exact=True).wait_for()
-        page.keyboard.press("ArrowLeft")
-    page.get_by_text("f/4", exact=True).wait_for()
-    page.keyboard.press("ArrowRight")
-    page.get_by_text("f/3.5", exact=True).wait_for()
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("f/1.6", exact=True).wait_for()
     page.get_by_role("button", name="Open the aperture").focus()
     page.keyboard.press("Enter")
     over = page.locator(".stage .over[src]")
     over.wait_for()
-    expect(
-        page.get_by_text(re.compile(r"^right: f/3.5, blur estimated: the widest disc has"))
-    ).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^right: f/1.6, blur estimated: the w"))).to_be_visible()
     expect(over).not_to_have_attribute("src", picture(page))
     back = read_raw(saved(page, "dng", tmp_path))
-    assert back.settings.f_number == 3.5
+    assert back.settings.f_number == 1.6
     assert back.data.shape == (4, 96, 144)
     # Blur takes the contrast of the soft half; the sharp one is as it was recorded.
-    first = page.locator(".stage .over").get_attribute("src")
-    slider(page, "Wider aperture").focus()
-    for f_number in thirds[::-1][1:]:
-        page.keyboard.press("ArrowRight")
-        page.get_by_text(f"f/{f_number:g}", exact=True).wait_for()
-    page.get_by_role("button", name="Open the aperture").click()
-    expect(page.get_by_text(re.compile(r"^right: f/1.4, blur"))).to_be_visible()
-    expect(over).not_to_have_attribute("src", first)
-    wider = read_raw(saved(page, "dng", tmp_path))
-    assert wider.settings.f_number == 1.4
-    assert wider.data[:, 8:-8, :60].equal(back.data[:, 8:-8, :60])
-    assert wider.data[1, :, 84:].std() < 0.8 * back.data[1, :, 84:].std()
+    write_dng(tmp_path / "soft.dng", soft_raw())
+    raw = read_raw(tmp_path / "soft.dng")
+    assert back.data[:, 8:-8, :60].equal(raw.data[:, 8:-8, :60])
+    assert back.data[1, :, 84:].std() < 0.8 * raw.data[1, :, 84:].std()
 
 
 def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
@@ -317,8 +294,7 @@ def test_the_page_lives_while_the_aperture_opens(soft_page):
 
 
 def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
-    camera = get_camera("nikon_z6")
-    raw = RawImage(torch.full((4, 32, 48), 0.2), CameraSettings(100, 1 / 64, 4), camera)
+    raw = RawImage(torch.full((4, 32, 48), 0.2), CameraSettings(100, 1 / 64, 4), CAMERA)
     page.get_by_role("tab", name="Refocus, HDR").click()
     expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
     for name in ("Open the aperture", "Fuse a bracket"):
@@ -346,15 +322,13 @@ def test_two_tabs_show_different_scenes(page, address):
     expect(page.locator(".title").first).not_to_have_text(name)
 
 
-@pytest.mark.parametrize("width", [390, 1280])
-@pytest.mark.parametrize(
-    ("tab", "there"), [("Exposure", ".state.shown"), ("Refocus, HDR", "text=Fuse a bracket")]
-)
-def test_fits_the_width(page, width, tab, there):
-    page.set_viewport_size({"width": width, "height": 844})
-    page.get_by_role("tab", name=tab).click()
-    page.locator(there).wait_for()
-    page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
+def test_fits_the_width(page):
+    for width in (390, 1280):
+        page.set_viewport_size({"width": width, "height": 844})
+        for tab, there in (("Refocus, HDR", "text=Fuse a bracket"), ("Exposure", ".state.shown")):
+            page.get_by_role("tab", name=tab).click()
+            page.locator(there).wait_for()
+            page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
 
 
 @pytest.mark.parametrize(

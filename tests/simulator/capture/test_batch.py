@@ -133,7 +133,7 @@ def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -
     np.testing.assert_array_equal(after, first)
 
 
-@pytest.mark.parametrize("stage", ["blur_many", "_modules"])
+@pytest.mark.parametrize("stage", ["blur_many", "decide"])
 def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
     """While the light is blurred, or while the plan of a later frame is made."""
     batch, calls = made(), []
@@ -142,7 +142,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
 
     def fail(*args: Any, **kwargs: Any) -> Any:
         calls.append(args)
-        if stage == "_modules" and len(calls) < 4:
+        if stage == "decide" and len(calls) < 4:
             return original(*args, **kwargs)
         raise KeyboardInterrupt
 

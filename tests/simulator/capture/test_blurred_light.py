@@ -189,20 +189,6 @@ def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
     ]
 
 
-def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(
-    made: list[tuple[str, float]],
-) -> None:
-    blurred_light = BlurredLight(LIGHT, (), ZERO, None, cache_bytes=2 * LIGHT.nbytes)
-    for disc in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0):
-        found = blurred_light.blurred(replace(STILL, defocus_px=disc))
-        assert torch.equal(found, disc_blur(LIGHT, disc))
-    assert [d for _, d in made] == [1.0, 2.0, 3.0, 2.0]
-    none = BlurredLight(LIGHT, (), ZERO, None, cache_bytes=0)
-    for _ in range(2):
-        none.blurred(replace(STILL, defocus_px=7.0))
-    assert [d for _, d in made][-2:] == [7.0, 7.0]
-
-
 def test_the_opened_aperture_comes_first() -> None:
     aperture = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
     blurred_light = BlurredLight(LIGHT, (CLEAN,), ZERO, aperture)

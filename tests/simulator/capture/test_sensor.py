@@ -156,19 +156,6 @@ def test_limits_of_light_and_signal() -> None:
     assert prepared.exposure(CameraSettings(100, 1, 4)).ratio == 2.0**107
 
 
-def test_motion_blur_comes_before_the_clip() -> None:
-    """A lamp ten times above white, smeared over five pixels, is still at white along the streak:
-    10 / 5 = 2. Clipped first it would come out at 0.2."""
-    light = torch.zeros(4, 5, 31)
-    light[:, 2, 15] = 10.0
-    exposure = Exposure(1.0, ZERO, ZERO, motion_px=5.0)
-    smeared = sensor_light(light, exposure)
-    np.testing.assert_allclose(smeared[:, 2, 14:17].numpy(), 2.0, rtol=0.05)
-    recorded = clip_and_quantise(smeared, Z6)
-    assert torch.all(recorded[:, 2, 14:17] == 1.0)
-    assert float(recorded[:, 2, [10, 20]].abs().max()) < 1 / SPAN
-
-
 def test_blur_averages_the_noise_of_the_source() -> None:
     """Noise already in the light is blurred with it; the top-up makes up for what the blur took."""
     noise = NoiseLevelFunction((0.0,) * 4, (1e-4,) * 4)
@@ -401,15 +388,6 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(
             clipped = [(alone <= 2.0**-10).sum(), (alone >= 1.0 - 1e-6).sum()]
             assert counts[i].tolist() == [int(number) for number in clipped]
     assert counts[1:, 1].min() > 10_000
-
-
-def test_tables_hold_what_is_missing() -> None:
-    source, target = Z6.nlf(800), Z6.nlf(1600)
-    (table,) = exposure_table([Exposure(2.0, source, target)])
-    assert table[0].tolist() == [2.0] * 4
-    np.testing.assert_allclose(table[1], np.subtract(target.shot, np.multiply(source.shot, 2)))
-    np.testing.assert_allclose(table[2], np.subtract(target.read, np.multiply(source.read, 4)))
-    np.testing.assert_allclose(table[4], np.multiply(source.read, 4), rtol=1e-6)
 
 
 # -- light and exposures far beyond any camera's ----------------------------------------------

@@ -271,9 +271,9 @@ def test_the_noise_of_four_planes_averages() -> None:
 
 # -- flat, tiny, black and blinding images ---------------------------------------------------------
 
-IMAGE_SIZES = ((1, 1), (2, 3), (17, 1), (16, 19))
-#: Black, negative, ordinary, saturated, blinding.
-LEVELS = (0.0, -0.07, 2.0**-14, 0.2, 1.0, 1e4)
+IMAGE_SIZES = ((1, 1), (17, 2))
+#: Black, negative, saturated, blinding.
+LEVELS = (0.0, -0.07, 1.0, 1e4)
 
 
 @pytest.mark.parametrize("preset", [*BUILDERS])

@@ -127,23 +127,6 @@ def _apart(light: torch.Tensor, mask: np.ndarray, path: Path, own: Path) -> torc
     )
 
 
-def test_a_subject_moves_in_front_of_the_background() -> None:
-    """Against SciPy: the smeared mask hides the background, which continues behind it."""
-    rng = np.random.default_rng(0)
-    light = rng.random((2, 28, 30)).astype(np.float32)
-    mask = np.zeros((28, 30), bool)
-    mask[8:17, 11:20] = True
-    path, own = Path(4.0, 0.3, 1.0), Path(4.0, 0.3, 1.0, drift_x=2.0, drift_y=-7.0)
-    found = _apart(torch.from_numpy(light), mask, path, own)
-    shake, moves = (_dense(path_taps(p, 28, 30)) for p in (path, own))
-    cover = correlate(mask.astype(float), moves, mode="nearest")
-    for plane, result in zip(light.astype(float), found, strict=True):
-        background = np.where(mask, plane[0, 0], plane)
-        wanted = (1.0 - cover) * correlate(background, shake, mode="nearest")
-        wanted += correlate(mask * plane, moves, mode="nearest")
-        np.testing.assert_allclose(result, wanted, atol=1e-5)
-
-
 def test_a_moving_subject_keeps_its_light_and_has_no_dark_fringe() -> None:
     mask = np.zeros((40, 40), bool)
     mask[15:22, 15:22] = True

@@ -142,24 +142,17 @@ def test_render_sizes(size):
         (render_srgb, {"exposure_ev": math.nan}, "exposure_ev"),
         (render_srgb, {"raw": object()}, "raw"),
         (develop, {"images": torch.zeros(4, 8, 8)}, "images"),
-        (develop, {"images": torch.zeros(1, 3, 8, 8)}, "images"),
-        (develop, {"images": torch.full((1, 4, 2, 2), math.nan)}, "images"),
-        (develop, {"images": torch.zeros(1, 4, 2, 2, dtype=torch.uint8)}, "images"),
         (develop, {"white_balance": (1.0, 1.0)}, "white_balance"),
-        (develop, {"white_balance": torch.ones(3, 3)}, "white_balance"),
-        (develop, {"white_balance": (1.0, 0.0, 1.0)}, "white_balance"),
         (develop, {"white_balance": (1.0, math.nan, 1.0)}, "white_balance"),
         (develop, {"colour_matrix": torch.eye(4)}, "colour_matrix"),
-        (develop, {"colour_matrix": torch.full((3, 3), math.inf)}, "colour_matrix"),
         (develop, {"colour_matrix": torch.ones(3, 3)}, "colour_matrix"),
         (develop, {"colour_matrix": -torch.eye(3)}, "colour_matrix"),
-        (develop, {"tone": "photografic"}, "did you mean 'photographic'"),
     ],
 )
 def test_bad_arguments(function, arguments, message):
     raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
     usual = {"images": torch.zeros(2, 4, 2, 2)} if function is develop else {"raw": raw}
-    with pytest.raises(ValueError, match=message if " " in message else f"`{message}`"):
+    with pytest.raises(ValueError, match=f"`{message}`"):
         function(**(usual | arguments))
 
 

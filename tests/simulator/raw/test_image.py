@@ -62,17 +62,12 @@ BAD = {
     "data": [
         torch.zeros(3, 4, 4),
         torch.zeros(4, 4),
-        torch.zeros(1, 4, 4, 4),
         torch.zeros(4, 0, 4),
         torch.zeros(4, 2, 2, dtype=torch.int16),
-        np.zeros((4, 2, 2), np.uint16),
         torch.full((4, 2, 2), math.nan),
-        torch.tensor([1.0, -math.inf, 0.0, 0.0]).reshape(4, 1, 1),
         torch.full((4, 2, 2), 1e300, dtype=torch.float64),  # beyond float32
         [[0.0]],
-        np.array(["a"]),
         torch.zeros(4, 2, 2).to_sparse(),
-        None,
     ],
     "white_balance": [(1.0, 1.0), *((1.0, v, 1.0) for v in (0.0, -1.0, math.nan))],
     "camera": ["nikon_z6"],

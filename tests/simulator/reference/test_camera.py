@@ -154,20 +154,10 @@ def test_rounding_and_box_average_in_the_variance():
 
 
 def test_each_photosite_sees_its_own_colour_at_its_own_place():
-    """A point lands in the plane of its photosite; stripes of one photosite tell G1 from G2."""
-    for cfa, order in (("RGGB", (0, 1, 2, 3)), ("GBRG", (2, 3, 0, 1))):
+    """Stripes of one photosite tell G1 from G2."""
+    for cfa in ("RGGB", "GBRG"):
         body = sensor(1e-4, 1e-8)
         camera = ReferenceCamera(replace(body, cfa=BayerPattern(cfa)))
-        # A lens of half a photosite, cut at two: what falls on photosites of the same plane.
-        middle = 1 + 2 * math.exp(-8.0)
-        middle = (middle / (middle + 2 * math.exp(-2.0))) ** 2
-        for plane, (row, column) in zip(order, ((4, 4), (4, 5), (5, 4), (5, 5)), strict=True):
-            light = torch.zeros(3, 8, 8)
-            light[(0, 1, 1, 2)[plane], row, column] = 1.0
-            seen = camera.blurred_light(scene(light), 4.0)
-            assert float(seen[plane].sum()) == pytest.approx(middle, rel=1e-3)
-            others = seen.sum((1, 2)) > 0
-            assert others.tolist() == [i == plane or {i, plane} == {1, 2} for i in range(4)]
         # Rows red and green in turn at the finest pitch: G1 shares red's rows, G2 does not.
         rows = torch.arange(16) % 2
         light = torch.stack([1.0 - rows, 1.0 * rows, 0.0 * rows])[:, :, None].expand(3, 16, 16)
@@ -230,7 +220,7 @@ def test_black_offset_moves_the_numbers_but_not_the_noise_of_light():
 
 
 def test_drawn_bodies():
-    assert BodyError.none().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
+    assert BodyError().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
     bodies = [BodyError.draw(Z6, seed) for seed in range(300)]
     assert bodies[5] == BodyError.draw(Z6, 5) != bodies[6]
     assert pickle.loads(pickle.dumps(bodies[5])) == bodies[5]  # for workers of a data loader

@@ -163,7 +163,7 @@ def test_a_step_gives_the_same_batch_and_another_one_another() -> None:
 def test_recorded_noise_has_the_variance_that_is_stated() -> None:
     """shot x + read in each plane, of 24 x 64^2 samples: within four errors, 1.8 %."""
     crops, seen = DetailCrops([flat(side=128)], [Z6, CANON]), 0
-    for index in range(12):
+    for index in range(6):
         batch = crops.captures(index, 24, 64)
         clean, shot, read = batch.clean[0, :, 0, 0], batch.shot[0], batch.read[0]
         variance = (shot * clean + read).double()
@@ -172,7 +172,7 @@ def test_recorded_noise_has_the_variance_that_is_stated() -> None:
             np.testing.assert_allclose(error.var(dim=1), variance, rtol=0.02)
             assert bool((error.mean(dim=1).abs() < 5 * (variance / error.shape[1]).sqrt()).all())
             seen += 1
-    assert seen > 6
+    assert seen > 2
 
 
 def test_what_is_recorded_is_clipped_and_whole_numbers() -> None:
@@ -189,9 +189,9 @@ def test_what_is_recorded_is_clipped_and_whole_numbers() -> None:
 
 def test_planes_are_sampled_at_their_own_places_but_for_some_crops() -> None:
     """A tenth of the crops has coinciding planes; there alone the greens are equal."""
-    clean = DetailCrops([picture(3, 128, 128)], [Z6]).batch(0, 400, 16).clean
+    clean = DetailCrops([picture(3, 128, 128)], [Z6]).batch(0, 200, 16).clean
     equal = [torch.equal(each[1], each[2]) for each in clean]
-    assert 0.1 - 0.06 < np.mean(equal) < 0.1 + 0.06  # four standard errors
+    assert np.mean(equal) == pytest.approx(0.1, abs=0.085)  # four standard errors
 
 
 def test_a_mosaic_is_transposed_with_its_greens() -> None:
@@ -212,19 +212,16 @@ def test_a_mosaic_is_transposed_with_its_greens() -> None:
 def test_a_recorded_mosaic_serves_only_where_it_is_quiet() -> None:
     """Its own noise, brought to the crop's light, is at most a sixteenth of what is added."""
     own = NoiseLevelFunction((2e-6,) * 4, (2e-8,) * 4)
-    batch = DetailCrops([flat(0.5, side=31, nlf=own)], [Z6, CANON]).batch(0, 200, 16)
+    batch = DetailCrops([flat(0.5, side=31, nlf=own)], [Z6, CANON]).batch(0, 100, 16)
     scale = batch.clean.mean(dim=(1, 2, 3))[:, None] / 0.5
     assert bool((batch.shot >= 16 * 2e-6 * scale * (1 - 1e-5)).all())
     assert bool((batch.read >= 16 * 2e-8 * scale**2 * (1 - 1e-5)).all())
-    clean = DetailCrops([flat(0.5, side=31)], [Z6, CANON]).batch(0, 200, 16)
+    clean = DetailCrops([flat(0.5, side=31)], [Z6, CANON]).batch(0, 100, 16)
     level = clean.clean.mean(dim=(1, 2, 3))[:, None] / 0.5
     assert not bool((clean.shot >= 16 * 2e-6 * level).all())  # the rule did leave some out
 
 
-def test_pictures_and_crops_that_are_none() -> None:
-    for pictures, bodies in (([], [Z6]), ([flat()], [])):
-        with pytest.raises(ValueError, match="`pictures` and `cameras`"):
-            DetailCrops(pictures, bodies)
+def test_no_crop_is_larger_than_the_largest_picture() -> None:
     crops = DetailCrops([flat(side=40), picture(3, 96, 100)], [Z6])
     assert crops.batch(0, 2, 48).noisy.shape == (2, 4, 48, 48)
     with pytest.raises(ValueError, match="`crop`"):

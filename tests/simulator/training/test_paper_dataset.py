@@ -173,10 +173,8 @@ def test_a_cell_that_is_no_value_is_named(tmp_path, changes, message):
     "content",
     [
         np.zeros((4, 6), np.float32),
-        np.zeros((6, 8, 4), np.float32),
         np.full((4, 2, 2), math.nan, np.float32),
         np.zeros((4, 2, 2), np.uint16),
-        b"",
         b"not an array at all",
         np.array([{}], dtype=object),  # nothing pickled is run
     ],
@@ -284,7 +282,7 @@ def test_batches_hold_what_the_files_and_the_table_say(folder: Path) -> None:
 def test_a_network_learns_from_captures(tmp_path: Path, folder: Path) -> None:
     """The baseline's error on sequences that it does not see falls to less than half."""
     train, held_out = split_dataset(folder)
-    stage = {"steps": 60, "batch": 4, "crop": 32, "learning_rate": 0.003}
+    stage = {"steps": 30, "batch": 2, "crop": 32, "learning_rate": 0.003}
     training = config("pc", baseline=stage)
     path = train_on_captures(training, train, tmp_path / "pc", command="test")
     torch.manual_seed(0)
@@ -299,17 +297,17 @@ def test_a_network_learns_from_captures(tmp_path: Path, folder: Path) -> None:
 def test_all_stages_are_trained_and_a_second_run_resumes(tmp_path: Path, folder: Path) -> None:
     train, _ = split_dataset(folder)
     path = tmp_path / "out" / "paper"
-    written = train_on_captures(config("paper"), train, path, command="test")
-    modules, card = load_modules(written)
-    assert {name: s["steps"] for name, s in card["stages"].items()} == dict.fromkeys(
-        ("exposure", "noise", "aperture"), 2
-    )
+    stages = dict.fromkeys(("exposure", "noise", "aperture"), STAGE | {"steps": 1, "batch": 1})
+    training = config("paper", **stages)
+    modules, card = load_modules(train_on_captures(training, train, path, command="test"))
+    assert [(name, own["steps"]) for name, own in card["stages"].items()] == [
+        (name, 1) for name in stages
+    ]
     assert (card["sequences"], card["training"]["preset"]) == (3, "paper")
     assert modules["exposure"].w != 1.0
-    again = train_on_captures(config("paper"), train, path, command="test")
+    again = train_on_captures(training, train, path, command="test")
     state = load_modules(again)[0].state_dict()
     assert all(torch.equal(state[name], t) for name, t in modules.state_dict().items())
-    stages = dict.fromkeys(("exposure", "noise", "aperture"), STAGE)
     compact = SimulatorConfig.model_validate({"preset": "compact", **stages})
     with pytest.raises(ValueError, match="`preset`"):
         train_on_captures(compact, train, tmp_path / "a", command="test")
