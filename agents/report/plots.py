@@ -369,7 +369,7 @@ def write_film(
     total = len(recordings[0].pictures)
     for frame in range(total):
         panels = [_panel(recording, frame) for recording in recordings]
-        width = sum(panel.width for panel in panels) + GAP * (len(panels) - 1)
+        width = (PICTURE + GAP) * len(panels) - GAP
         image = Image.new("RGB", (width, panels[0].height), _PAPER)
         for i, panel in enumerate(panels):
             image.paste(panel, (i * (PICTURE + GAP), 0))
