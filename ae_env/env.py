@@ -18,8 +18,8 @@ from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
 from ae_env.scorers.captures import Captures, describe_captures, reads_pixels
-from ae_env.scorers.composite import CompositeScorer, depends_on
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES, FrameSource, FrameStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction

@@ -85,7 +85,9 @@ def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
         code.
     """
     height, width = codes.shape[-2:]
-    rows, columns = (_zone_starts(n, zones) for n, zones in ((height, ZONES[0]), (width, ZONES[1])))
+    rows, columns = (
+        np.arange(zones) * size // zones for size, zones in zip((height, width), ZONES, strict=True)
+    )
     sums = np.add.reduceat(decode_observation(codes), rows, axis=-2)
     sums = np.add.reduceat(sums, columns, axis=-1)
     area = np.diff(rows, append=height)[:, None] * np.diff(columns, append=width)
@@ -101,10 +103,6 @@ def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _zone_starts(size: int, zones: int) -> np.ndarray:
-    return np.arange(zones) * size // zones
-
-
 def decode_observation(raw: np.ndarray) -> np.ndarray:
     """Signal of 8-bit codes, float32 in [-1/1024, 1]: the inverse of `encode_observation`.
 
@@ -115,20 +113,15 @@ def decode_observation(raw: np.ndarray) -> np.ndarray:
     return np.asarray(table.astype(np.float32)[raw])
 
 
-def _to_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    low, high = ranges[:, 0], ranges[:, 1]
-    unit = 2.0 * (values - low) / (high - low) - 1.0
-    return np.asarray(np.minimum(np.maximum(unit, -1.0), 1.0), np.float32)
-
-
 def _from_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    low, high = ranges[:, 0], ranges[:, 1]
+    low, high = ranges.T
     return np.asarray(low + (np.asarray(values, np.float64) + 1.0) * 0.5 * (high - low))
 
 
 def encode_settings(apex: np.ndarray) -> np.ndarray:
     """Av, Tv and Sv (..., 3) as float32 in [-1, 1]."""
-    return _to_unit(apex, SETTINGS_RANGES)
+    low, high = SETTINGS_RANGES.T
+    return np.clip(2.0 * (apex - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
 
 def decode_settings(settings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,9 +15,9 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import prepare_scene
-from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.develop import develop

@@ -394,22 +394,17 @@ def _shifted(planes: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
 class _Bracket(AutoExposureBase):
     """The limits that both environments of the bracket task add."""
 
+    #: Time that all frames of an episode may take together [s].
+    budget: float
+    #: Frames of an episode at most.
+    max_frames: int
+
     def _set_limits(self, budget: float, max_frames: int) -> None:
-        self._budget = check_number("budget", budget, 1e-5, _MOST_SECONDS, more=" seconds")
-        self._max_frames = check_integer("max_frames", max_frames, 1, _MOST_FRAMES)
+        self.budget = check_number("budget", budget, 1e-5, _MOST_SECONDS, more=" seconds")
+        self.max_frames = check_integer("max_frames", max_frames, 1, _MOST_FRAMES)
         self._make_task = functools.partial(
-            ExposureBracket, budget=self._budget, max_frames=self._max_frames
+            ExposureBracket, budget=self.budget, max_frames=self.max_frames
         )
-
-    @property
-    def budget(self) -> float:
-        """Time that all frames of an episode may take together [s]."""
-        return self._budget
-
-    @property
-    def max_frames(self) -> int:
-        """Frames of an episode at most."""
-        return self._max_frames
 
 
 class ExposureBracketEnv(_Bracket, AutoExposureEnv):

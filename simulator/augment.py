@@ -43,23 +43,14 @@ _F_NUMBER, _TIME = 4.0, 1.0
 
 
 class DrawnSettings(NamedTuple):
-    """What an `ExposureAugmentation` draws for one picture.
+    """What an `ExposureAugmentation` draws for one picture."""
 
-    Args:
-        stops: Exposure relative to the picture's [EV].
-        iso: ISO speed, whose noise the new picture has.
-        defocus: Diameter of the defocus disc [pixel].
-        motion: Length of the motion blur [pixel].
-        direction: Of the motion [rad]; 0 is along the rows.
-        highlights: By how much light that was clipped is raised above white [EV].
-    """
-
-    stops: float
-    iso: float
-    defocus: float
-    motion: float
-    direction: float
-    highlights: float
+    stops: float  # exposure relative to the picture's [EV]
+    iso: float  # speed, whose noise the new picture has
+    defocus: float  # diameter of the disc [pixel]
+    motion: float  # length of the blur [pixel]
+    direction: float  # of the motion [rad]; 0 is along the rows
+    highlights: float  # by how much light that was clipped is raised above white [EV]
 
 
 @dataclass(frozen=True)
@@ -224,15 +215,9 @@ def _in_pieces(
 
 
 def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -> list[int]:
-    """Seeds of the samples of an epoch, for a batch that is augmented after it was collated.
+    """Seeds of the samples `indices` of an epoch, for a batch that is augmented once collated.
 
-    Args:
-        seed: Of the training, >= 0.
-        epoch: Number of the epoch, >= 0: each has pictures of its own.
-        indices: Of the samples in the data set, >= 0.
-
-    Returns:
-        An integer for each index, a function of it, of `seed` and of `epoch`.
+    Each is a function of its index, of the training's `seed` and of the `epoch`, all >= 0.
 
     >>> sample_seeds(0, 1, [5, 7]) == sample_seeds(0, 1, [5]) + sample_seeds(0, 1, [7])
     True
@@ -248,8 +233,7 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
 class AugmentedDataset(Dataset[Any]):
     """A data set whose pictures are augmented where they are loaded, in the workers.
 
-    The seed of a sample comes from `seed`, the epoch and its index: the order of the samples and
-    the number of workers do not matter.
+    Neither the order of the samples nor the number of workers matters.
 
     Args:
         dataset: Map-style data set of pictures (C, H, W), or of tuples and lists that begin with

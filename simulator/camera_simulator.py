@@ -305,14 +305,10 @@ class CameraSimulator:
 
     @torch.no_grad()
     def denoise(self, prepared: PreparedScene, noise: NoiseModule | None = None) -> torch.Tensor:
-        """The prepared scene's light (4, H, W) with little noise.
+        """The prepared scene's light (4, H, W) with little noise, by `noise` or the best module.
 
         The result serves every exposure: the family commutes with exposure. Those of the paper
         and of its authors' code do not; they are run at the exposure of the source.
-
-        Args:
-            prepared: The scene.
-            noise: The noise module; by default the best.
 
         Raises:
             ValueError: If this simulator has no noise module.
@@ -470,8 +466,7 @@ class CameraSimulator:
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-            scene: `image_speed`, `defocus` and `depth`, see `prepare`; by default the depth is
-                unknown.
+            scene: See `prepare`; by default the depth is unknown.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.

@@ -28,8 +28,8 @@ from ae_env.observation import (
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import in_episode, prepare_scene
-from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.score_table import ScoreTable
+from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,8 +66,8 @@ class LookupBatch:
         signals: np.ndarray | None = None,
     ) -> FrameStatistics:
         """Copies frames to every output that is given; see `CaptureBatch.record`."""
-        pairs = zip(indices.tolist(), states.tolist(), strict=True)
-        shown = np.stack([self._frame(scene, state) for scene, state in pairs])
+        frames_of: Any = [self._scenes[scene].recorded for scene in indices.tolist()]
+        shown = np.stack([f[s].numpy() for f, s in zip(frames_of, states.tolist(), strict=True)])
         digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
         if codes is not None:
             encode_observation(torch.from_numpy(shown), out=torch.from_numpy(codes))
@@ -84,11 +85,6 @@ class LookupBatch:
             source_noise=np.zeros((count, 2, 4)),
             keys=noise_keys(seeds, frames),
         )
-
-    def _frame(self, scene: int, state: int) -> np.ndarray:
-        recorded = self._scenes[scene].recorded
-        assert recorded is not None
-        return recorded[state].numpy()
 
 
 def nearest_recorded(scene: Scene, grid: ExposureGrid) -> np.ndarray:

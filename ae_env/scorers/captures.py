@@ -239,8 +239,9 @@ def describe_captures(
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
-    discs = defocus * _aperture_blurs(settings) * height / 64.0
-    own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
+    f_numbers = np.array([s.effective_f_number for s in settings])
+    discs = defocus * (4.0 / f_numbers) * height / 64.0
+    own = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
     # Exactly the others' where `own` is 0.
     blur = np.hypot(np.hypot(speed * times * height, discs), own)
     moves = [ALONG_ROWS] * len(scenes) if movements is None else movements
@@ -312,10 +313,6 @@ def _stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlu
     return PixelBlur(levels, shares)
 
 
-def _aperture_blurs(settings: Sequence[CameraSettings]) -> np.ndarray:
-    return np.array([4.0 / s.effective_f_number for s in settings])
-
-
 @dataclass(frozen=True)
 class _AtRest:
     """Captures of a scene at rest in its own light, and the numbers that blur depends on."""
@@ -330,7 +327,8 @@ class _AtRest:
         """
         states = self.captures.settings
         times = [state.exposure_time for state in states]
-        numbers = np.stack([times, _aperture_blurs(states), self.captures.blur_px.numpy()], axis=1)
+        aperture_blurs = [4.0 / state.effective_f_number for state in states]
+        numbers = np.stack([times, aperture_blurs, self.captures.blur_px.numpy()], axis=1)
         few, alike = np.unique(numbers, axis=0, return_inverse=True)
         return few.T.copy(), alike.reshape(-1)
 

@@ -16,8 +16,8 @@ import torch
 from torch.nn.functional import avg_pool2d, pad
 
 from ae_env.scorers.captures import Captures, Domain
-from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.measures import by_parts, immerkaer_sigma, luma_of, luminance_of, srgb_decode
+from ae_env.scorers.terms import CompositeScorer
 
 # -- signs: one number of the picture for each defect ---------------------------------------------
 # All take gamma-encoded sRGB pictures (B, 3, H, W) in [0, 1] and return (B,) float64. Each grows
@@ -294,7 +294,8 @@ class Defects(CompositeScorer):
     worst_share = 0.75
 
     def __init__(self) -> None:
-        super().__init__({name: measure() for name, measure in ANALYTIC.items()})
+        parts: dict[str, Any] = {name: measure() for name, measure in ANALYTIC.items()}
+        super().__init__(parts)
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total score from the parts' scores: tensors or arrays of any one shape."""

@@ -15,8 +15,8 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import structural_similarity
 
 from ae_env.scorers.captures import Captures, DependsOn, Domain
-from ae_env.scorers.composite import developed
 from ae_env.scorers.measures import luma_of
+from ae_env.scorers.terms import developed
 
 #: CIEDE2000 difference that brings the colour term to 1/e: plainly another colour.
 COLOUR_SCALE = 10.0

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -362,20 +362,18 @@ class Classifier:
         return torch.cat(scores)
 
     def _outputs(self, pictures: Tensor) -> Any:
-        model = self._model
-        run = model if callable(model) else partial(self._run, _session(*model))
         try:
-            return run(pictures)
+            if callable(self._model):
+                return self._model(pictures)
+            session = _session(*self._model)
+            missing = 0 if self.batch is None else self.batch - len(pictures)
+            if missing:
+                pictures = torch.cat([pictures, pictures[-1:].expand(missing, -1, -1, -1)])
+            outputs = session.run(None, {session.get_inputs()[0].name: pictures.numpy()})[0]
+            return outputs[: len(outputs) - missing]
         except Exception as error:  # whatever a user's network raises
             text = f"the classifier raised {type(error).__name__}: {error}"
             raise UserCodeError(text) from error
-
-    def _run(self, session: Any, pictures: Tensor) -> Any:
-        missing = 0 if self.batch is None else self.batch - len(pictures)
-        if missing:
-            pictures = torch.cat([pictures, pictures[-1:].expand(missing, -1, -1, -1)])
-        outputs = session.run(None, {session.get_inputs()[0].name: pictures.numpy()})[0]
-        return outputs[: len(outputs) - missing]
 
 
 def _confidence(outputs: Any, count: int) -> Tensor:

@@ -50,13 +50,13 @@ def srgb_decode(encoded: torch.Tensor) -> torch.Tensor:
 
 def luminance_of(images: torch.Tensor) -> torch.Tensor:
     """Linear CIE Y (B, H, W) in [0, 1], 1 is white, of sRGB `images` (B, 3, H, W) in [0, 1]."""
-    return by_parts(_luminance, images)
 
+    def luminance(part: torch.Tensor) -> torch.Tensor:
+        red, green, blue = srgb_decode(part).unbind(dim=1)
+        r, g, b = LUMINANCE_SHARES
+        return (red * r).add_(green, alpha=g).add_(blue, alpha=b)
 
-def _luminance(images: torch.Tensor) -> torch.Tensor:
-    red, green, blue = srgb_decode(images).unbind(dim=1)
-    r, g, b = LUMINANCE_SHARES
-    return (red * r).add_(green, alpha=g).add_(blue, alpha=b)
+    return by_parts(luminance, images)
 
 
 def by_parts(

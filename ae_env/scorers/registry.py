@@ -2,8 +2,8 @@
 
 | file | scorers |
 |---|---|
-| `composite.py` | `balanced`, weighted means |
-| `terms.py` | `brightness`, `highlights`, `shadows`, `noise`, `sharpness`, `banding` |
+| `terms.py` | weighted means, `balanced`; `brightness`, `highlights`, `shadows`, `noise`, |
+| | `sharpness`, `banding` |
 | `measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy`; `shim`, |
 | | `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
@@ -22,9 +22,9 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-from ae_env.scorers import composite, defects, fidelity, learnt, measures, terms
+from ae_env.scorers import defects, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
-from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.terms import CompositeScorer
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
@@ -34,7 +34,7 @@ PYIQA = "pyiqa"
 Factory = TypeVar("Factory", bound=Callable[[], Any])
 
 _REGISTRY: dict[str, Callable[[], Any]] = {
-    "balanced": composite.Balanced,
+    "balanced": terms.Balanced,
     "brightness": terms.Brightness,
     "highlights": terms.Highlights,
     "shadows": terms.Shadows,
@@ -268,14 +268,22 @@ def describe_scorers() -> list[ScorerRow]:
     rows = []
     for name in list_scorers():
         factory = registered_scorer(name)
-        package = _package(points[name]) if factory is None else _origin(factory)
+        if factory is None:
+            point = points[name]
+            package = point.dist.name if point.dist is not None else point.module.partition(".")[0]
+        else:
+            package = factory.__module__.partition(".")[0].replace("ae_env", "ae-env")
         needs = getattr(factory, "needs", "")
         try:
             # Where a file may be missing, the class says everything.
             found = factory if needs else _made(name)
             rows.append(_row(name, found, package))
         except (Exception, SystemExit) as error:
-            rows.append(ScorerRow(name, package=package, error=_cause(error)))
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # the last error only repeats the scorer's name
+                cause = cause.__cause__
+            line = " ".join(f"{type(cause).__name__}: {cause}".split())
+            rows.append(ScorerRow(name, package=package, error=line))
     return rows
 
 
@@ -302,19 +310,3 @@ def _domains(found: Any) -> set[str]:
     """Domains of a scorer, or of all parts of a composite."""
     parts = getattr(found, "parts", {}).values()
     return set().union(*map(_domains, parts)) if parts else {found.domain}
-
-
-def _package(point: Any) -> str:
-    return str(point.dist.name if point.dist is not None else point.module.partition(".")[0])
-
-
-def _origin(factory: Callable[[], Any]) -> str:
-    package = factory.__module__.partition(".")[0]
-    return "ae-env" if package == "ae_env" else package
-
-
-def _cause(error: BaseException) -> str:
-    """The first error of a chain, in one line: the last one only repeats the scorer's name."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return " ".join(f"{type(error).__name__}: {error}".split())

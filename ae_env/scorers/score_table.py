@@ -20,8 +20,8 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import prepare_scene
-from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.term_scores import CHUNK, TermScores, slices
+from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene

@@ -21,15 +21,16 @@ from scipy.special import ndtr
 from ae_env.observation import PEDESTAL, encode_array
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import Captures, DependsOn, SceneCaptures, reads_pixels
-from ae_env.scorers.composite import CompositeScorer, is_own
 from ae_env.scorers.terms import (
     Banding,
     Brightness,
+    CompositeScorer,
     Highlights,
     Noise,
     Shadows,
     Sharpness,
     code_signals,
+    is_own,
 )
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import PreparedScene

@@ -1,16 +1,253 @@
-"""The terms that `balanced` is made of, and `Banding`.
+"""`CompositeScorer`, the weighted mean of others; `Balanced`, the default one, and its terms.
 
-Exposure and blur are known of a capture; `Highlights`, `Shadows` and `Noise` are measured on the
-frame that was recorded. Their constants were frozen before any agent was trained.
+Each part is checked: it may be the user's own. Of the terms, exposure and blur are known of a
+capture; `Highlights`, `Shadows` and `Noise` are measured on the frame that was recorded. Their
+constants were frozen before any agent was trained.
 """
 
 from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
+from numbers import Real
+from typing import Any, get_args
 
 import numpy as np
 import torch
 
 from ae_env.observation import decode_observation, encode_observation
-from ae_env.scorers.captures import Captures, DependsOn, Domain, PixelBlur
+from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, PixelBlur, Scorer
+from ae_env.utils.user_files import UserCodeError
+from simulator.raw.develop import develop
+
+logger = logging.getLogger(__name__)
+
+#: A user's scorer that takes longer than this for one batch is named in the log, once [s].
+SLOW_SECONDS = 5.0
+#: Scores may be this far outside [0, 1] by rounding.
+ROUNDING = 1e-6
+#: Names of the scorers that were found to be slow in this process.
+_slow: set[str] = set()
+
+
+def depends_on(scorer: Scorer) -> DependsOn:
+    """The `DependsOn` of `scorer`; ``"image"`` unless it says otherwise."""
+    found: DependsOn = getattr(scorer, "depends_on", "image")
+    return found
+
+
+class CompositeScorer:
+    """Weighted mean of several scorers.
+
+    Args:
+        parts: Scorers by name.
+        weights: Weight of each part, > 0; they are divided by their sum. Equal by default.
+
+    Raises:
+        ValueError: If there are no parts, one is not a scorer, or a weight is missing or not
+            positive.
+    """
+
+    domain: Domain = "raw"
+
+    def __init__(
+        self, parts: Mapping[str, Scorer], weights: Mapping[str, float] | None = None
+    ) -> None:
+        weights = dict.fromkeys(parts, 1.0) if weights is None else dict(weights)
+        if not parts or set(weights) != set(parts):
+            raise ValueError(f"`weights` (={weights}) must name exactly the parts {list(parts)}")
+        if not all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values()):
+            raise ValueError(f"`weights` (={weights}) must all be > 0, and finite numbers")
+        for name, part in parts.items():
+            _check_part(name, part)
+        total = sum(weights.values())
+        self.parts = dict(parts)
+        self.weights = {name: weight / total for name, weight in weights.items()}
+
+    @cached_property
+    def closed_form(self) -> bool:
+        """Whether every part has a closed form, so that no noise needs to be drawn."""
+        return all(depends_on(part) != "image" for part in self.parts.values())
+
+    @property
+    def depends_on(self) -> DependsOn:
+        """The `DependsOn` of the whole, as a part of another scorer."""
+        if not self.closed_form:
+            return "image"
+        return "blur" if self.names("blur") else "light"
+
+    def names(self, *kinds: DependsOn) -> list[str]:
+        """Names of the parts that depend on one of `kinds`."""
+        return [name for name, part in self.parts.items() if depends_on(part) in kinds]
+
+    def subset(self, names: Collection[str]) -> CompositeScorer | None:
+        """The parts of `names` alone, equally weighted; None if there are none."""
+        parts = {name: part for name, part in self.parts.items() if name in names}
+        return CompositeScorer(parts) if parts else None
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of raw `images` (B, 4, H, W) in [0, 1]."""
+        scores: torch.Tensor = self.combine(self.score_parts(images, captures))
+        return scores
+
+    def score_parts(
+        self,
+        images: torch.Tensor | None,
+        captures: Captures,
+        kinds: tuple[DependsOn, ...] = ("image", "light", "blur"),
+    ) -> dict[str, torch.Tensor]:
+        """Score (B,) float64 of each part that depends on one of `kinds`.
+
+        The images are developed to sRGB only if a part asks for it.
+        """
+        srgb: torch.Tensor | None = None
+        scores = {}
+        for name in self.names(*kinds):
+            part = self.parts[name]
+            view: torch.Tensor | None = None
+            if depends_on(part) == "image":
+                if images is None:
+                    raise ValueError(f"scorer {name!r} needs `images`, got None")
+                view = images
+                if part.domain == "srgb":
+                    if srgb is None:
+                        gains, matrices = captures.white_balance, captures.colour_matrices
+                        srgb = developed(images, gains, matrices)
+                    view = srgb
+                if len(self.names("image")) > 1:
+                    view = view.clone()  # a part may write to its images
+            scores[name] = scores_of(name, part, view, captures)
+        return scores
+
+    def combine(self, scores: Mapping[str, Any]) -> Any:
+        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
+        total: Any = sum(weight * scores[name] for name, weight in self.weights.items())
+        # Rounding may leave [0, 1].
+        return total.clip(0.0, 1.0) if torch.is_tensor(total) else np.clip(total, 0.0, 1.0)
+
+    def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
+        """`combine` of arrays of any one shape, checked, because a user's class may override it.
+
+        Raises:
+            UserCodeError: If a total is not in [0, 1].
+        """
+        totals = np.asarray(self.combine(scores), np.float64)
+        if not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
+            found = _describe_range(totals)
+            raise UserCodeError(
+                f"scorer {type(self).__name__!r}: `combine` returned {found}: rule is [0, 1]"
+            )
+        return np.minimum(np.maximum(totals, 0.0), 1.0)
+
+
+def developed(
+    images: torch.Tensor, white_balance: torch.Tensor, matrices: Sequence[ColourMatrix | None]
+) -> torch.Tensor:
+    """sRGB (B, 3, H, W), each image with the colours of its own scene's camera.
+
+    Args:
+        images: (B, 4, H, W) raws.
+        white_balance: (B, 3) gains of R, G, B.
+        matrices: XYZ (D65) to camera RGB of each, B long; None where unknown.
+    """
+    if len(set(matrices)) == 1:
+        return develop(images, white_balance, matrices[0])
+    pairs = zip(images, white_balance, matrices, strict=True)
+    return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
+
+
+def _check_part(name: str, part: Any) -> None:
+    """Raises a `ValueError` unless `part` is a scorer."""
+    if not callable(part):
+        raise ValueError(f"`scorer` (={name!r}) must be callable, got {type(part).__name__}")
+    for attribute, known, value in (
+        ("domain", get_args(Domain), getattr(part, "domain", None)),
+        ("depends_on", get_args(DependsOn), depends_on(part)),
+    ):
+        if value not in known:
+            *others, last = map(repr, known)
+            rule = f"{', '.join(others)} or {last}"
+            raise ValueError(f"scorer {name!r} has `{attribute}` (={value!r}); it must be {rule}")
+
+
+# -- calling one scorer, which may be the user's own ----------------------------------------------
+
+
+def scores_of(
+    name: str, scorer: Scorer, images: torch.Tensor | None, captures: Captures
+) -> torch.Tensor:
+    """Scores (B,) float64 in [0, 1] of one scorer.
+
+    Args:
+        name: Name of the scorer in errors.
+        scorer: The scorer.
+        images: (B, C, H, W), or None where it has a closed form.
+        captures: The B captures that the images come from.
+
+    Raises:
+        UserCodeError: If it raises (the cause is chained), returns anything but B numbers in
+            [0, 1], or changes `captures`.
+    """
+    if not is_own(scorer):
+        return _checked(name, scorer(images, captures), len(captures))
+    before, begin = _versions(captures), time.perf_counter()
+    try:
+        scores = scorer(images, captures)
+    except Exception as error:
+        raise UserCodeError(f"scorer {name!r} raised {type(error).__name__}: {error}") from error
+    if time.perf_counter() - begin > SLOW_SECONDS and name not in _slow:
+        _slow.add(name)
+        logger.warning("scorer %r takes more than %g s for one batch", name, SLOW_SECONDS)
+    if _versions(captures) != before:
+        raise UserCodeError(
+            f"scorer {name!r} changed its `captures` in place: it must work on copies, because "
+            "other scorers get the same ones"
+        )
+    return _checked(name, scores, len(captures))
+
+
+def is_own(scorer: Any) -> bool:
+    """Whether `scorer`, or a part of it, comes from outside of this package."""
+    if not type(scorer).__module__.startswith("ae_env."):
+        return True
+    return any(is_own(part) for part in getattr(scorer, "parts", {}).values())
+
+
+def _versions(captures: Captures) -> dict[str, int]:
+    """The counts of writes that torch keeps for each tensor of `captures`, views included.
+
+    Zero counts are left out, as are properties that have not been computed yet.
+    """
+    tensors = {name: value for name, value in vars(captures).items() if torch.is_tensor(value)}
+    counted = {name: t._version for name, t in tensors.items() if not t.is_inference()}
+    return {name: version for name, version in counted.items() if version}
+
+
+def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
+    """`scores` on the CPU as float64, clipped to [0, 1] where rounding left it."""
+    if not isinstance(scores, torch.Tensor) or scores.shape != (count,) or scores.is_complex():
+        found = type(scores).__name__
+        if isinstance(scores, torch.Tensor):
+            found = f"{tuple(scores.shape)} {scores.dtype}"
+        raise UserCodeError(f"scorer {name!r} returned {found}: it must return a tensor ({count},)")
+    found64: torch.Tensor = scores.detach().to("cpu", torch.float64)
+    low, high = (float(value) for value in found64.aminmax()) if count else (0.0, 1.0)
+    if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # NaN is not
+        raise UserCodeError(f"scorer {name!r} returned {_describe_range(found64)}: rule is [0, 1]")
+    return found64.clamp(0.0, 1.0)
+
+
+def _describe_range(values: Any) -> str:
+    """The range of an array or a tensor, for messages."""
+    if bool((values != values).any()):
+        return "NaN"
+    return f"scores from {float(values.min())} to {float(values.max())}"
+
+
+# -- the terms, and the default scorer -------------------------------------------------------------
 
 
 class Brightness:
@@ -165,3 +402,33 @@ class Sharpness:
         if isinstance(blur, PixelBlur):
             return (blur.shares / (1.0 + (blur.levels * scale) ** 2)).sum(dim=1)
         return 1.0 / (1.0 + (blur * scale) ** 2)
+
+
+class Balanced(CompositeScorer):
+    """The default scorer: a photograph is as good as its worst fault allows.
+
+    Product of the five terms, each to its weight, times ``(1 - fh^4) (1 - fs^4)``, fh and fs the
+    shares of blown and blocked pixels: a frame that is all white or all black scores near 0.
+    """
+
+    def __init__(self) -> None:
+        parts: dict[str, Any] = {
+            "brightness": Brightness(),
+            "highlights": Highlights(),
+            "shadows": Shadows(),
+            "noise": Noise(),
+            "sharpness": Sharpness(),
+        }
+        super().__init__(parts, dict(zip(parts, (0.30, 0.15, 0.10, 0.20, 0.25), strict=True)))
+
+    def combine(self, scores: Mapping[str, Any]) -> Any:
+        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
+        # The logarithm of arrays by NumPy: torch's threads do not survive a fork.
+        log: Any = torch.log if torch.is_tensor(scores["highlights"]) else np.log
+        blown = -Highlights.scale * log(scores["highlights"])
+        blocked = -Shadows.scale * log(scores["shadows"])
+        # Rounding may leave a share above 1.
+        score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
+        for name, weight in self.weights.items():
+            score = score * scores[name] ** weight
+        return score

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from simulator import CameraSimulator, RawImage, render_srgb
 from simulator.raw.develop import quarter_turns, srgb_from_camera
+from simulator.utils.checks import check_number
 from simulator.utils.files import write_atomically
 
 #: Ends and step of the bracket [EV].
@@ -70,8 +71,8 @@ def hdr_picture(
 
     Args:
         raw: The photograph.
-        stops: The bracket reaches from -`stops` to +`stops` [EV], in (0, 10].
-        step: Between its pictures [EV], in (0, `stops`].
+        stops: The bracket reaches from -`stops` to +`stops` [EV], in [0.05, 10].
+        step: Between its pictures [EV], in [0.05, `stops`].
         simulator: What reduces noise; by default ``CameraSimulator.from_pretrained()``.
 
     Raises:
@@ -94,10 +95,8 @@ def bracket_exposures(stops: float = STOPS, step: float = STEP) -> tuple[float, 
     >>> bracket_exposures(1.0, 0.5)
     (-1.0, -0.5, 0.0, 0.5, 1.0)
     """
-    if not 0.0 < stops <= 10.0:
-        raise ValueError(f"`stops` (={stops!r}) must be in (0, 10]")
-    if not 0.05 <= step <= stops:
-        raise ValueError(f"`step` (={step!r}) must be in [0.05, {stops:g}], at most `stops`")
+    check_number("stops", stops, 0.05, 10.0)
+    check_number("step", step, 0.05, stops, more=", at most `stops`")
     count = math.floor(stops / step + 1e-9)
     return tuple(step * i for i in range(-count, count + 1))
 

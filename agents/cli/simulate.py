@@ -206,6 +206,7 @@ def refocus(
 
     from agents.applications import refocus as applied
     from simulator.raw.develop import quarter_turns
+    from simulator.utils.checks import check_number
 
     f_number = console.parse_f_number(aperture)
     for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale, "focus": focus}
@@ -213,8 +214,8 @@ def refocus(
     for name, value in for_depth.items():
         if depth is None and value is not None:
             raise ValueError(f"`{name}` (={value}) is an option of a known `--depth`")
-    if pixel_pitch is not None and not 0.1 <= pixel_pitch <= 100.0:
-        raise ValueError(f"`pixel-pitch` (={pixel_pitch:g}) must be in [0.1, 100] micrometres")
+    if pixel_pitch is not None:
+        check_number("pixel-pitch", pixel_pitch, 0.1, 100.0, more=" micrometres")
     check_outputs(raw, depth, out=(out, ".dng"), png=(png, ".png"))
     source = _read(raw, source_iso, source_shutter, source_aperture)
     metres, lens = None, None
@@ -246,14 +247,14 @@ def _lens(
 ) -> Lens:
     """The lens that the options and the file describe."""
     from simulator import Lens
+    from simulator.utils.checks import check_number
 
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length
     if millimetres is None:
         raise ValueError("`focal-length` (=None) must be given: the file does not say it")
-    if not float(millimetres) > 0.0:
-        raise ValueError(f"`focal-length` (={millimetres:g}) must be above 0 mm")
+    millimetres = check_number("focal-length", float(millimetres), 1e-3, 1e6, more=" mm")
     with console.option_names(focus_distance="focus", focal_length="focal-length"):
-        return Lens(float(millimetres) / 1000.0, _focus_distance(focus, metres))
+        return Lens(millimetres / 1000.0, _focus_distance(focus, metres))
 
 
 def _focus_distance(focus: str | None, metres: np.ndarray) -> float:

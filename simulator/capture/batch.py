@@ -128,8 +128,7 @@ class CaptureBatch:
     A pickled copy works everything out again.
 
     Args:
-        prepared: Function that returns the scene of an index, in its own light; called when the
-            scene is first photographed.
+        prepared: Returns the scene of an index, in its own light, when it is first photographed.
         num_scenes: Number of scenes, n.
         states: The settings of the S states.
         camera: The body.

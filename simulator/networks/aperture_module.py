@@ -96,14 +96,14 @@ class ApertureModule(nn.Module):
         # Eighteen normalisations in a row: bfloat16 would change half of the residual.
         with torch.autocast(image.device.type, enabled=False):
             if self.preset == "ncs":
-                return image + self.network(image.float(), f_numbers)  # type: ignore[no-any-return]
+                return image + self.network(image.float(), f_numbers)
             # One scalar per image is divided out before the network and multiplied in after it. So
             # it sees every exposure alike and commutes with exposure, like the compact one.
             scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
             residual = self.network((image / scale).float(), f_numbers)
             # A picture without detail has a constant residual; without it, it stays as it is.
             flat = self.network(image.new_zeros(len(image), 4, 1, 1).float(), f_numbers)
-        return image + (residual - flat) * scale  # type: ignore[no-any-return]
+        return image + (residual - flat) * scale
 
 
 def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:

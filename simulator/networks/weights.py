@@ -19,7 +19,7 @@ from simulator.capture.statistics import Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule
-from simulator.utils.checks import check_word, did_you_mean
+from simulator.utils.checks import check_type, check_word, did_you_mean
 from simulator.utils.files import sibling, write_atomically
 
 
@@ -142,8 +142,7 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
         ValueError: If there is no such file, its hash is not the card's, or its tensors are not
             those of the preset's networks.
     """
-    if not isinstance(name, str | Path) or not str(name):
-        raise ValueError(f"`weights` (={name!r}) must be a name or a path")
+    check_type("weights", name, str, Path)
     known = list_pretrained()
     path: Any = name
     if str(name) in known:
@@ -187,8 +186,9 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
     elif "sha256" not in card:
         rule = "the .json must hold the hash, `sha256`"
     elif card.get("preset") not in list(BUILDERS):
-        found = card.get("preset")
-        rule = f"unknown preset {found!r} in the .json, the presets are {list(BUILDERS)}"
+        rule = (
+            f"unknown preset {card.get('preset')!r} in the .json, the presets are {list(BUILDERS)}"
+        )
     if rule is not None:
         raise ValueError(f"`weights` (={str(name)!r}): {rule}")
 

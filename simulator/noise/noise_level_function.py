@@ -148,7 +148,7 @@ class ReadNoise:
         """The part that rows share, (..., 4, H, 1).
 
         An average over k x k pixels has k rows: it keeps 1/k of their variance, where independent
-        noise keeps 1/k^2. The larger k, the more the rows show.
+        noise keeps 1/k^2.
 
         Args:
             variance: (4, 1, 1) of all read noise of the averages, as independent noise has it.

@@ -41,6 +41,8 @@ DEFAULT_COLOUR_MATRIX = (
     (-0.9689, 1.8758, 0.0415),
     (0.0557, -0.2040, 1.0570),
 )
+#: A field to write: its type and its values (rationals as numbers, text as ``str``).
+Tag = tuple[DATATYPE, Sequence[float] | str | bytes]
 #: How EXIF spells a date that is not known.
 _NO_DATE = "    :  :     :  :  "
 _CFA_BYTE = {"R": 0, "G": 1, "B": 2}
@@ -113,37 +115,38 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
     aspect = raw.metadata.get("pixel_aspect", 1.0)
     unique = model if model.lower().startswith(make.lower()) else f"{make} {model}"
     return {
-        "NewSubfileType": Tag(DATATYPE.LONG, [0]),  # a full-resolution image
-        "ImageWidth": Tag(DATATYPE.LONG, [width]),
-        "ImageLength": Tag(DATATYPE.LONG, [height]),
-        "BitsPerSample": Tag(DATATYPE.SHORT, [16]),
-        "Compression": Tag(DATATYPE.SHORT, [_UNCOMPRESSED]),
-        "PhotometricInterpretation": Tag(DATATYPE.SHORT, [_COLOUR_FILTER_ARRAY]),
-        "Make": Tag(DATATYPE.ASCII, make),
-        "Model": Tag(DATATYPE.ASCII, model),
-        "Orientation": Tag(DATATYPE.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
-        "SamplesPerPixel": Tag(DATATYPE.SHORT, [1]),
-        "RowsPerStrip": Tag(DATATYPE.LONG, [height]),
-        "PlanarConfiguration": Tag(DATATYPE.SHORT, [1]),
-        "Software": Tag(DATATYPE.ASCII, f"{SOFTWARE_NAME} {__version__}"),
-        "DateTime": Tag(DATATYPE.ASCII, _date(raw)),
-        "CFARepeatPatternDim": Tag(DATATYPE.SHORT, [2, 2]),
-        "CFAPattern": Tag(DATATYPE.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),
-        "DNGVersion": Tag(DATATYPE.BYTE, [1, 4, 0, 0]),
-        "DNGBackwardVersion": Tag(DATATYPE.BYTE, [1, 1, 0, 0]),
-        "UniqueCameraModel": Tag(DATATYPE.ASCII, unique),
-        "CFAPlaneColor": Tag(DATATYPE.BYTE, [0, 1, 2]),
-        "CFALayout": Tag(DATATYPE.SHORT, [_RECTANGULAR]),
-        "WhiteLevel": Tag(DATATYPE.LONG, [round(camera.white_level)]),
-        "ColorMatrix1": Tag(DATATYPE.SRATIONAL, [v for row in matrix for v in row]),
-        "CalibrationIlluminant1": Tag(DATATYPE.SHORT, [D65]),
+        "NewSubfileType": (DATATYPE.LONG, [0]),  # a full-resolution image
+        "ImageWidth": (DATATYPE.LONG, [width]),
+        "ImageLength": (DATATYPE.LONG, [height]),
+        "BitsPerSample": (DATATYPE.SHORT, [16]),
+        "Compression": (DATATYPE.SHORT, [_UNCOMPRESSED]),
+        "PhotometricInterpretation": (DATATYPE.SHORT, [_COLOUR_FILTER_ARRAY]),
+        "Make": (DATATYPE.ASCII, make),
+        "Model": (DATATYPE.ASCII, model),
+        "Orientation": (DATATYPE.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
+        "SamplesPerPixel": (DATATYPE.SHORT, [1]),
+        "RowsPerStrip": (DATATYPE.LONG, [height]),
+        "PlanarConfiguration": (DATATYPE.SHORT, [1]),
+        "Software": (DATATYPE.ASCII, f"{SOFTWARE_NAME} {__version__}"),
+        "DateTime": (DATATYPE.ASCII, _date(raw)),
+        "CFARepeatPatternDim": (DATATYPE.SHORT, [2, 2]),
+        "CFAPattern": (DATATYPE.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),
+        "DNGVersion": (DATATYPE.BYTE, [1, 4, 0, 0]),
+        "DNGBackwardVersion": (DATATYPE.BYTE, [1, 1, 0, 0]),
+        "UniqueCameraModel": (DATATYPE.ASCII, unique),
+        "CFAPlaneColor": (DATATYPE.BYTE, [0, 1, 2]),
+        "CFALayout": (DATATYPE.SHORT, [_RECTANGULAR]),
+        "WhiteLevel": (DATATYPE.LONG, [round(camera.white_level)]),
+        "ColorMatrix1": (DATATYPE.SRATIONAL, [v for row in matrix for v in row]),
+        "CalibrationIlluminant1": (DATATYPE.SHORT, [D65]),
         # A grey card's values: one over the gains, to the 12 digits that matter.
-        "AsShotNeutral": Tag(
-            DATATYPE.RATIONAL, [float(f"{1.0 / gain:.12g}") for gain in raw.white_balance]
+        "AsShotNeutral": (
+            DATATYPE.RATIONAL,
+            [float(f"{1.0 / gain:.12g}") for gain in raw.white_balance],
         ),
-        "BaselineExposure": Tag(DATATYPE.SRATIONAL, [0.0]),
+        "BaselineExposure": (DATATYPE.SRATIONAL, [0.0]),
         **_black_tags(raw),
-        **({} if aspect == 1.0 else {"DefaultScale": Tag(DATATYPE.RATIONAL, [aspect, 1])}),
+        **({} if aspect == 1.0 else {"DefaultScale": (DATATYPE.RATIONAL, [aspect, 1])}),
         **_noise_tags(raw),
     }
 
@@ -154,11 +157,11 @@ def _black_tags(raw: RawImage) -> dict[str, Tag]:
     kind = DATATYPE.LONG if whole else DATATYPE.RATIONAL
     values = [round(b) for b in black] if whole else list(black)
     if len(set(black)) == 1:
-        return {"BlackLevel": Tag(kind, values[:1])}
+        return {"BlackLevel": (kind, values[:1])}
     tile = [values[0]] * 4
     for value, (row, column) in zip(values, raw.camera.cfa.offsets, strict=True):
         tile[2 * row + column] = value
-    return {"BlackLevelRepeatDim": Tag(DATATYPE.SHORT, [2, 2]), "BlackLevel": Tag(kind, tile)}
+    return {"BlackLevelRepeatDim": (DATATYPE.SHORT, [2, 2]), "BlackLevel": (kind, tile)}
 
 
 def _noise_tags(raw: RawImage) -> dict[str, Tag]:
@@ -168,7 +171,7 @@ def _noise_tags(raw: RawImage) -> dict[str, Tag]:
     for planes in ((0,), (1, 2), (3,)):
         pairs += [float(np.mean([noise.shot[p] for p in planes]))]
         pairs += [float(np.mean([noise.read[p] for p in planes]))]
-    return {"NoiseProfile": Tag(DATATYPE.DOUBLE, pairs)}
+    return {"NoiseProfile": (DATATYPE.DOUBLE, pairs)}
 
 
 def _exif_tags(raw: RawImage) -> dict[str, Tag]:
@@ -177,17 +180,17 @@ def _exif_tags(raw: RawImage) -> dict[str, Tag]:
     source = (camera.colour_matrix_source or "given") if camera.colour_matrix else ""
     record = OwnRecord(settings, raw.box_factor, source)
     return {
-        "ExposureTime": Tag(DATATYPE.RATIONAL, [settings.exposure_time]),
-        "FNumber": Tag(DATATYPE.RATIONAL, [settings.f_number]),
+        "ExposureTime": (DATATYPE.RATIONAL, [settings.exposure_time]),
+        "FNumber": (DATATYPE.RATIONAL, [settings.f_number]),
         # 65535 sends readers to RecommendedExposureIndex, which SensitivityType 2 announces.
-        "PhotographicSensitivity": Tag(DATATYPE.SHORT, [min(iso, 65535)]),
-        "SensitivityType": Tag(DATATYPE.SHORT, [2]),
-        "RecommendedExposureIndex": Tag(DATATYPE.LONG, [iso]),
-        "ExifVersion": Tag(DATATYPE.UNDEFINED, b"0230"),
-        "DateTimeOriginal": Tag(DATATYPE.ASCII, _date(raw)),
-        "DateTimeDigitized": Tag(DATATYPE.ASCII, _date(raw)),
-        "FocalLength": Tag(DATATYPE.RATIONAL, [float(raw.metadata.get("focal_length", 0.0))]),
-        "UserComment": Tag(DATATYPE.UNDEFINED, record.to_comment()),
+        "PhotographicSensitivity": (DATATYPE.SHORT, [min(iso, 65535)]),
+        "SensitivityType": (DATATYPE.SHORT, [2]),
+        "RecommendedExposureIndex": (DATATYPE.LONG, [iso]),
+        "ExifVersion": (DATATYPE.UNDEFINED, b"0230"),
+        "DateTimeOriginal": (DATATYPE.ASCII, _date(raw)),
+        "DateTimeDigitized": (DATATYPE.ASCII, _date(raw)),
+        "FocalLength": (DATATYPE.RATIONAL, [float(raw.metadata.get("focal_length", 0.0))]),
+        "UserComment": (DATATYPE.UNDEFINED, record.to_comment()),
     }
 
 
@@ -203,27 +206,17 @@ def _date(raw: RawImage) -> str:
 # -- TIFF -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Tag:
-    """A field to write: its type and its values (rationals as numbers, text as ``str``)."""
-
-    type: DATATYPE
-    values: Sequence[float] | str | bytes
-
-    def encode(self) -> tuple[int, bytes]:
-        """Number of values and their bytes, little endian."""
-        if isinstance(self.values, str):
-            data = self.values.encode("ascii", "replace") + b"\0"
-            return len(data), data
-        if isinstance(self.values, bytes):
-            return len(self.values), self.values
-        flat: list[Any] = list(self.values)
-        if self.type in (DATATYPE.RATIONAL, DATATYPE.SRATIONAL):
-            signed = self.type == DATATYPE.SRATIONAL
-            flat = [part for v in flat for part in as_rational(v, signed=signed)]
-        return len(self.values), struct.pack(
-            f"<{len(flat)}{tifffile.TIFF.DATA_FORMATS[self.type][-1]}", *flat
-        )
+def _encode(kind: DATATYPE, values: Sequence[float] | str | bytes) -> tuple[int, bytes]:
+    """Number of the values of a field, and their bytes, little endian."""
+    if isinstance(values, str):
+        values = values.encode("ascii", "replace") + b"\0"
+    if isinstance(values, bytes):
+        return len(values), values
+    flat: list[Any] = list(values)
+    if kind in (DATATYPE.RATIONAL, DATATYPE.SRATIONAL):
+        signed = kind == DATATYPE.SRATIONAL
+        flat = [part for value in flat for part in as_rational(value, signed=signed)]
+    return len(values), struct.pack(f"<{len(flat)}{tifffile.TIFF.DATA_FORMATS[kind][-1]}", *flat)
 
 
 def as_rational(value: float, *, signed: bool = False) -> tuple[int, int]:
@@ -251,13 +244,13 @@ def _pack_directory(tags: Mapping[str, Tag], offset: int) -> bytes:
     values_at = offset + 2 + 12 * len(tags) + 4
     codes = {int(tifffile.TIFF.EXIF_TAGS[name]): tag for name, tag in tags.items()}
     for code, tag in sorted(codes.items()):
-        count, data = tag.encode()
+        count, data = _encode(*tag)
         if len(data) > 4:
             field = struct.pack("<I", values_at + len(outside))
             outside += data + b"\0" * (len(data) % 2)
         else:
             field = data.ljust(4, b"\0")
-        entries.append(struct.pack("<HHI", code, tag.type, count) + field)
+        entries.append(struct.pack("<HHI", code, tag[0], count) + field)
     return struct.pack("<H", len(tags)) + b"".join(entries) + b"\0\0\0\0" + outside
 
 
@@ -269,7 +262,7 @@ def tiff_head(tags: Mapping[str, Tag], exif: Mapping[str, Tag], size: int) -> by
 
     def directory(strip_at: int, exif_at: int) -> bytes:
         positions = {"StripOffsets": strip_at, "StripByteCounts": size, "ExifTag": exif_at}
-        own = {name: Tag(DATATYPE.LONG, [value]) for name, value in positions.items()}
+        own: dict[str, Tag] = {name: (DATATYPE.LONG, [value]) for name, value in positions.items()}
         return _pack_directory({**tags, **own}, 8)
 
     exif_at = 8 + len(directory(0, 0))

@@ -196,14 +196,10 @@ class BodyError:
 
     @classmethod
     def draw(cls, camera: CameraProfile, seed: int) -> BodyError:
-        """Draw a body of `camera` as it might leave the factory.
+        """Draw a body of `camera` as it might leave the factory; the same `seed` gives the same.
 
         Shutter: 15 us (standard deviation, at most 60 us, so that 1/8000 s stays open) and 1 %.
         Light of each aperture stop: 2 %, at most 6 %. Black: up to 2 digital numbers per plane.
-
-        Args:
-            camera: Gives the size of a digital number.
-            seed: Integer >= 0; the same seed gives the same body.
         """
         rng = np.random.default_rng([seed, 0xB0D1])
         errors = np.clip(rng.normal(0.0, 0.02, len(_STOPS)), -0.06, 0.06)

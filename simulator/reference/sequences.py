@@ -59,12 +59,7 @@ _GREY = 0.18
 
 @dataclass(frozen=True)
 class Sequence:
-    """One scene and the settings it is captured with.
-
-    Args:
-        scene: The scene.
-        settings: The settings of each capture, at least two.
-    """
+    """One scene and the settings of each of its captures, at least two."""
 
     scene: ReferenceScene
     settings: tuple[CameraSettings, ...]
@@ -85,13 +80,7 @@ class HasSettings(Protocol):
 
 @dataclass(frozen=True, order=True)
 class Pair:
-    """Two captures of one sequence: the input of a module and its target.
-
-    Args:
-        sequence: Index of the sequence.
-        source: Index of the input among the sequence's settings.
-        target: Index of the output among them.
-    """
+    """Two captures of one sequence, the input of a module and its target, by their indices."""
 
     sequence: int
     source: int
@@ -101,9 +90,8 @@ class Pair:
 def exposure_error(illuminance: float, settings: CameraSettings) -> float:
     """Exposure error of `settings` against an incident-light meter [EV], > 0 if too bright.
 
-    Args:
-        illuminance: Light on the scene [lux].
-        settings: The settings; the f-number counts as the exact stop that it stands for.
+    The light on the scene is `illuminance` [lux]; f-numbers count as the exact stops that they
+    stand for.
 
     >>> exposure_error(2.5 * 2**13, CameraSettings(iso=100, exposure_time=1 / 64, f_number=8))
     1.0

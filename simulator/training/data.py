@@ -269,8 +269,6 @@ class DetailCrops:
     def __init__(
         self, pictures: Sequence[DetailPicture], cameras: Sequence[CameraProfile], seed: int = 0
     ) -> None:
-        if not pictures or not cameras:
-            raise ValueError("`pictures` and `cameras` must not be empty")
         self.cameras, self.seed = list(cameras), seed
         kinds: dict[str, list[DetailPicture]] = {}
         for picture in pictures:

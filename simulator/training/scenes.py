@@ -349,8 +349,8 @@ def _procedural(
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
         depth, lens = torch.from_numpy(depths), Lens(FOCAL_LENGTH, distance)
     name, source = f"reference-{seed}-{first + position:06d}-{kind}", "procedural, ae-env (MIT)"
-    about = {"scene_id": name, "group": name, "kind": kind, "source": source}
-    light = {"lux": drawing.illuminance, "illuminant": drawing.illuminant}
+    about: dict[str, Any] = {"scene_id": name, "group": name, "kind": kind, "source": source}
+    light: dict[str, Any] = {"lux": drawing.illuminance, "illuminant": drawing.illuminant}
     return _scene(drawing.light, camera, **light, **about, depth=depth, lens=lens)
 
 
@@ -613,7 +613,7 @@ def _focused(
     light, inverse = unprocess(image, rng)[:, :height, :width], inverse[:height, :width]
     far, middle, front, near = np.quantile(inverse, [0.02, 0.5, 0.95, 0.98])
     depth = torch.from_numpy((1.0 / inverse).astype(np.float32))
-    about = {"group": group, "kind": "depth_photograph", "source": source}
+    about: dict[str, Any] = {"group": group, "kind": "depth_photograph", "source": source}
     for name, focus in (("front", front), ("middle", middle)):
         spread = max(near - focus, focus - far)
         # c = f^2 (F - D) / (N (1 - f F)), solved for the focal length f at the largest |F - D|.

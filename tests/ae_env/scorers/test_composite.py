@@ -42,7 +42,7 @@ def test_callables_see_the_view_they_ask_for(monkeypatch: pytest.MonkeyPatch) ->
     both = CompositeScorer({"raw": Own(), "picture": channels})
     assert both.score_parts(images, captures)["picture"].tolist() == [0.75] * 3
     # Nothing is developed where nobody asks for sRGB.
-    monkeypatch.setattr("ae_env.scorers.composite.develop", None)
+    monkeypatch.setattr("ae_env.scorers.terms.develop", None)
     make_scorer(Own())(images, captures)
     with pytest.raises(ValueError, match="needs `images`"):
         make_scorer(Own())(None, captures)

@@ -12,8 +12,8 @@ import torch
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import Scorer, reads_pixels
-from ae_env.scorers.composite import depends_on
 from ae_env.scorers.score_table import ScoreTables
+from ae_env.scorers.terms import depends_on
 from simulator import CameraSettings, NoiseLevelFunction
 from tests.ae_env.scorer_images import CAMERA, GRID, make_captures, make_scene, random_scene
 

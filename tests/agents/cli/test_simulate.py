@@ -216,7 +216,7 @@ SMALL, FITS = (("--depth", name, "--focal-length", "3") for name in ("small.png"
         ((*OPEN, "--depth", "depth.png", "--png", "depth.png"), ["`png`"]),
         ((*OPEN, "--depth-kind", "disparity"), ["`depth-kind`"]),
         ((*OPEN, *SMALL, "--depth-kind", "far"), ["`depth-kind`"]),
-        ((*OPEN, *SMALL, "--focal-length", "-3"), ["`focal-length` (=-3)"]),
+        ((*OPEN, *SMALL, "--focal-length", "-3"), ["`focal-length` (=-3"]),
         ((*OPEN, *SMALL[:2]), ["`focal-length` (=None)"]),
         ((*OPEN, *FITS, "--focus", "0.001"), ["`focus` (=0.001)"]),
         ((*OPEN, *SMALL, "--focus", "9,9"), ["`focus`", "8 x 8"]),

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture.exposure import Exposure
-from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
 from simulator.noise.noise_level_function import (
     NoiseLevelFunction,
@@ -24,6 +24,7 @@ from simulator.noise.noise_level_function import (
     noise_variance,
     tukey_lambda,
 )
+from simulator.optics.discs import disc_kernel
 from simulator.reference.camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
@@ -190,6 +191,21 @@ def test_a_noisy_source_lacks_a_part_of_each() -> None:
     between = frame.mean(axis=2).var(axis=1) - frame.var(axis=2).mean(axis=1) / WIDTH
     assert between.mean() == pytest.approx(0.4 * READ * ROW**2, rel=5 / math.sqrt(HEIGHT))
     assert frame.var() == pytest.approx(0.4 * READ, rel=5 * math.sqrt(2 / HEIGHT))
+
+
+def test_more_is_added_where_a_blur_has_left_less() -> None:
+    """Half of the frame is behind a disc of the bank's, which averages the source's noise."""
+    source, half = NoiseLevelFunction((0.0,) * 4, (0.6 * READ,) * 4), WIDTH // 2
+    layout = Layout((torch.arange(WIDTH) >= half).float().expand(HEIGHT, WIDTH))
+    light = torch.full((4, HEIGHT, WIDTH), 0.2)
+    blur = {"defocus": 4.0, "layout": layout, "tolerance": 0.0}
+    body = replace(camera(), nlf_by_iso={100.0: NoiseLevelFunction((0.0,) * 4, (READ,) * 4)})
+    scene = PreparedScene(light, BASE, body, source, **blur)  # type: ignore[arg-type]
+    frame = scene.expose([BASE], seed=5, noise="sensor")[0].double()
+    sharp, soft = (float(part.var()) for part in (frame[..., :half], frame[..., half:]))
+    assert sharp == pytest.approx(0.4 * READ, rel=0.1)
+    left = 0.6 * (disc_kernel(4.0) ** 2).sum()  # rows stay as they are
+    assert soft == pytest.approx((0.4 * ROW**2 + (1 - left) * (1 - ROW**2)) * READ, rel=0.1)
 
 
 def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
