@@ -89,10 +89,9 @@ def training_seeds(name: str) -> list[str]:
     """The names under which `make_policy` knows the training seeds of a learnt agent.
 
     Args:
-        name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
-            ``"ppo:video"`` or ``"regression:video"`` for those of `AutoExposureVideo-v0`;
-            ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself. Options
-            of the name are those of each.
+        name: ``"ppo"`` or ``"regression"``, alone or with ``":video"``, for all seeds that come
+            with the package; ``"ppo:runs/ppo-*"`` for the files that match; anything else stands
+            for itself. Options of the name are those of each.
 
     Raises:
         ValueError: If no file matches a pattern.
@@ -185,15 +184,14 @@ def make_policy(
 
     Args:
         name: ``"random"``, ``"best_fixed"``; ``"oracle"``, alone or with what it knows, such as
-            ``"oracle:clairvoyant"``; a meter and a program such as
-            ``"centre_weighted:P"`` (the program defaults to P); ``"rpi_agc"``, alone or with a
-            program; ``"recorded:FOLDER"``; ``"regression"`` and ``"ppo"``, the
-            agents that come with the package, ``"regression:video"`` and ``"ppo:video"``, those for
-            `AutoExposureVideo-v0`, or ``"regression:PATH"`` and ``"ppo:PATH"`` with weights of
-            one's own; for `ExposureBracket-v0` ``"bracket:fixed"``, ``"bracket:hasinoff"``,
-            ``"bracket:planned"`` and ``"bracket"``, which also allows for blur;
-            ``"package.module:Class"`` or ``"path/to/file.py:Class"`` for a policy of one's own.
-            Options may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
+            ``"oracle:clairvoyant"``; a meter and a program such as ``"centre_weighted:P"`` (the
+            program defaults to P); ``"rpi_agc"``, alone or with a program; ``"recorded:FOLDER"``;
+            ``"regression"`` and ``"ppo"``, the agents that come with the package, with ``":video"``
+            those for `AutoExposureVideo-v0`, with ``":PATH"`` weights of one's own; for
+            `ExposureBracket-v0` ``"bracket:fixed"``, ``"bracket:hasinoff"``, ``"bracket:planned"``
+            and ``"bracket"``, which also allows for blur; ``"package.module:Class"`` or
+            ``"path/to/file.py:Class"`` for a policy of one's own. Options may follow:
+            ``"centre_weighted:P?compensation=-1&damping=0.5"``.
         context: The camera.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.

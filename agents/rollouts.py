@@ -160,9 +160,9 @@ class RolloutPlan:
             valid = np.arange(envs.num_envs) < len(index)
             index = np.concatenate([index, np.resize(index, envs.num_envs - len(index))])
             scenes = [self.scenes[i] for i in self.scene[index]]
-            states = [self.starts[i] for i in index]
+            states = [self.starts[i] for i in index.tolist()]
             options = {"scene": [scene.scene_id for scene in scenes], "state": states}
-            seeds: Any = [self.seeds[i] for i in index]
+            seeds: Any = [self.seeds[i] for i in index.tolist()]
             observations, info = envs.unwrapped.reset(seed=seeds, options=options)
             yield EpisodeBatch(
                 index=index,

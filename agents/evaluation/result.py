@@ -430,7 +430,7 @@ def scene_rows(result: EvaluationResult) -> pd.DataFrame:
         del values["ev_error"]
         frame = pd.DataFrame({**of_scene, **values, "final_state": track.states[0, :, -1]})
         scenes = frame.groupby("scene_id", sort=False)
-        rows = scenes.agg({name: first.get(name, "mean") for name in frame})
+        rows = scenes.agg({str(name): first.get(str(name), "mean") for name in frame})
         own = [errors[:, result.scene_ids == name] for name in rows.index]
         found.append(
             rows.assign(

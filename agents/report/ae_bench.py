@@ -335,21 +335,21 @@ def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     real = is_real(first.groups)
     parts = {"procedural": ~real, "real": real}
     rows = []
-    for one in ranking.itertuples():
+    for one in ranking.to_dict("records"):
         means = {
-            key: np.mean([result.mean(one.policy, key) for result in results.values()])
+            key: np.mean([result.mean(one["policy"], key) for result in results.values()])
             for key in _MEANS[first.measure]
         }
         scores = {
-            name: np.mean([r.normalised(one.policy, part) for r in results.values()])
+            name: np.mean([r.normalised(one["policy"], part) for r in results.values()])
             for name, part in parts.items()
             if part.any()
         }
-        track = first.tracks[one.policy]
-        low, high = one.ci95 or (None, None)
+        track = first.tracks[one["policy"]]
+        low, high = one["ci95"] or (None, None)
         row = {
-            "policy": one.policy,
-            "score": one.normalised_score,
+            "policy": one["policy"],
+            "score": one["normalised_score"],
             "ci95_low": low,
             "ci95_high": high,
             "ms_alone": 1000.0 * means["seconds"] if "seconds" in means else track.ms_alone,

@@ -616,12 +616,12 @@ def summary(
     if result.measure == "quality":
         lines = [
             {
-                "policy": one.policy,
-                "all": f"{one.normalised_score:.4f}",
-                "95 % interval": _interval(one.ci95, ".4f"),
-                **{name: f"{r.normalised(one.policy):.4f}" for name, r in results.items()},
+                "policy": one["policy"],
+                "all": f"{one['normalised_score']:.4f}",
+                "95 % interval": _interval(one["ci95"], ".4f"),
+                **{name: f"{r.normalised(one['policy']):.4f}" for name, r in results.items()},
             }
-            for one in ranking.itertuples()
+            for one in ranking.to_dict("records")
         ]
         title = "quality of the merged picture, by time of all frames"
         return [(title, pd.DataFrame(lines))]
@@ -636,13 +636,13 @@ def summary(
     else:
         lines = [
             {
-                "tier": "-" if one.tier is None else str(one.tier),
-                "policy": one.policy,
-                "all conditions": f"{one.normalised_score:.3f}",
-                "95 % interval": _interval(one.ci95),
-                static: f"{result.normalised(one.policy):.3f}",
+                "tier": "-" if one["tier"] is None else str(one["tier"]),
+                "policy": one["policy"],
+                "all conditions": f"{one['normalised_score']:.3f}",
+                "95 % interval": _interval(one["ci95"]),
+                static: f"{result.normalised(one['policy']):.3f}",
             }
-            for one in ranking.itertuples()
+            for one in ranking.to_dict("records")
         ]
         table = pd.DataFrame(lines)
         title = f"normalised score over {len(results)} conditions, and in {static!r}"

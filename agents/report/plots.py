@@ -69,7 +69,12 @@ def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
             if interval is not None:
                 axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
         label = f"{part} ({parts[part].num_groups.iloc[0]} groups)"
-        marks = {"color": colour, "marker": marker, "markersize": 6, "linestyle": "none"}
+        marks: dict[str, Any] = {
+            "color": colour,
+            "marker": marker,
+            "markersize": 6,
+            "linestyle": "none",
+        }
         axes.plot(own.normalised_score, heights, label=label, **marks)
     axes.axvline(1.0, color="0.35", lw=1.0)
     axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
@@ -369,7 +374,7 @@ def write_film(
     total = len(recordings[0].pictures)
     for frame in range(total):
         panels = [_panel(recording, frame) for recording in recordings]
-        width = sum(panel.width for panel in panels) + GAP * (len(panels) - 1)
+        width = (PICTURE + GAP) * len(panels) - GAP
         image = Image.new("RGB", (width, panels[0].height), _PAPER)
         for i, panel in enumerate(panels):
             image.paste(panel, (i * (PICTURE + GAP), 0))
