@@ -210,18 +210,19 @@ def compare(image: np.ndarray, real: np.ndarray, pair: Pair, moved: tuple[int, i
     scores: Row = {"psnr_db": _decibel(error), "ssim": float(similarity[use].mean())}
     scores |= {"psnr_linear_range_db": _decibel(square[linear].mean())}
     scores |= {"relative_rmse": float(np.sqrt(error / power))}
-    ours, theirs = (texture(torch.from_numpy(x), torch.from_numpy(inside)) for x in (image, real))
+    ours, theirs = (
+        texture(torch.from_numpy(x), torch.from_numpy(inside[1:, 1:])) for x in (image, real)
+    )
     return scores | {"texture_ratio": ours / theirs}
 
 
 def texture(image: torch.Tensor, use: torch.Tensor) -> float:
-    """Mean square of the diagonal difference of 2 x 2 neighbours, all of them in `use` (H, W).
+    """Mean square of the diagonal difference of 2 x 2 neighbours: noise, and detail alike.
 
-    That is noise, and detail alike.
+    `use` (H - 1, W - 1) chooses them; 0 where it is nowhere true.
     """
     a, b, c, d = (image[:, i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
-    inside = use[:-1, :-1] & use[1:, :-1] & use[:-1, 1:] & use[1:, 1:]
-    return float(((a - b - c + d) / 2.0)[:, inside].square().mean()) if inside.any() else 0.0
+    return float(((a - b - c + d) / 2.0)[:, use].square().mean()) if use.any() else 0.0
 
 
 def _decibel(mean_square: float) -> float | None:

@@ -158,8 +158,9 @@ def _compared(
                 truth, of_two = real[s][:, mask], _ceiling(scene, grid, s, mask)
                 state |= {"psnr_db": psnr(frames[s][:, mask], truth), "ceiling_db": of_two}
                 state["psnr_expected_db"] = psnr(expected[s][:, mask], truth)
+            whole = mask[:-1, :-1] & mask[1:, :-1] & mask[:-1, 1:] & mask[1:, 1:]
             # How many stops the noise is off, which detail that both have dilutes.
-            ours, theirs = (texture(frame[s], mask) for frame in (frames, real))
+            ours, theirs = (texture(frame[s], whole) for frame in (frames, real))
             if min(ours, theirs) > 0.0:
                 state["noise_error_stops"] = abs(float(np.log2(ours / theirs)))
             states.append(state)

@@ -153,7 +153,7 @@ def _small(
         scene = replace(scene, box_factor=1) if native else scene
         at_one_second = [CameraSettings(iso, 1.0, F_NUMBER) for iso, _ in taken]
         states = [
-            replace(s, exposure_time=2.0 ** (ev - s.log2_exposure - scene.ev100))
+            replace(s, exposure_time=2.0 ** (-s.log2_exposure - scene.ev100 + ev))
             for s, (_, ev) in zip(at_one_second, taken, strict=True)
         ]
         captures = _described(scene, states, camera)
