@@ -16,8 +16,7 @@ from ae_env.registration import register_envs
 def _check_simulator() -> None:
     """The packages that are installed together have common names: whose it is is checked."""
     own, spec = Path(__file__).resolve().parents[1] / "simulator", find_spec("simulator")
-    folders = [] if spec is None else [*(spec.submodule_search_locations or [spec.origin])]
-    found = next(iter(folders), None)
+    found = None if spec is None else next(iter(spec.submodule_search_locations or ()), spec.origin)
     if found is None or Path(found).resolve() != own:
         raise ImportError(
             f"ae-env needs its own package 'simulator' ({own}), but Python finds {found}: "

@@ -234,14 +234,20 @@ def environment_scenes(
     """
     needs_networks = finds_defocus or from_raw
     recorded = RecordedOptions.of(spec)
-    key: tuple[Any, ...] | None = (split, camera, resolution, crop, from_raw)
-    key += (finds_defocus, simulator, noise) if needs_networks else ()
+    facts = (split, camera, resolution, crop, from_raw)
+    known_by = (finds_defocus, simulator, noise) if needs_networks else ()
+    key: tuple[Any, ...] | None
     if needs_networks and simulator not in (None, *SIZES):
         key = None  # a user's weights may have other content next time
     elif recorded is not None:
-        key += (grid, tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files))
+        key = (
+            *facts,
+            *known_by,
+            grid,
+            tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files),
+        )
     elif isinstance(spec, str) and spec in NAMED:
-        key += (spec,)
+        key = (*facts, *known_by, spec)
     else:
         key = None
     known = None if key is None else _LOADED.get(key)

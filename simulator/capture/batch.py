@@ -321,8 +321,9 @@ class CaptureBatch:
         if np.isnan(self._excess_variance[row]):
             balance = noise_balance(self._light[row], exposure)
             self._excess_variance[row] = balance.relative_excess_variance
-        if exposure.opened_to is not None and not self._cache_light:
-            self._scenes[index].aperture_blur.forget()
+        aperture_blur = self._scenes[index].aperture_blur
+        if exposure.opened_to is not None and aperture_blur is not None and not self._cache_light:
+            aperture_blur.forget()
 
 
 def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:

@@ -265,7 +265,15 @@ class BlurredLight:
 
     def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
-        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes, pool)
+        copied = BlurredLight(
+            self.light,
+            self.denoised_lights,
+            self.residuals.nlf,
+            self.aperture_blur,
+            statistics=self.statistics,
+            cache_bytes=cache_bytes,
+            pool=pool,
+        )
         copied.residuals = self.residuals
         return copied
 

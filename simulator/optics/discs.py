@@ -226,7 +226,7 @@ def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
     """
     wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
     if wide:
-        parallel_ranges(lambda a, b: [_wide_disc(blur, limit) for blur in wide[a:b]], len(wide))
+        parallel_ranges(lambda a, b: _wide_discs(wide[a:b], limit), len(wide))
         blurs = [b for b in blurs if b.defocused is None or b.diameter_px <= _WIDE_PX]
         moved_on = [b for b in wide if b.moved is not None]
         blurs += [Blur(b.defocused, extent_px=b.extent_px, moved=b.moved) for b in moved_on]  # type: ignore[arg-type]
@@ -258,17 +258,18 @@ def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
     parallel_ranges(run, len(blurs))
 
 
-def _wide_disc(blur: Blur, limit: float) -> None:
+def _wide_discs(blurs: Sequence[Blur], limit: float) -> None:
     """`disc_blur` by numpy, whose transforms are safe in a forked process."""
-    assert blur.defocused is not None
-    weights = disc_kernel(blur.diameter_px)
-    radius = len(weights) // 2
-    light = np.clip(blur.light.numpy(), -limit, limit).astype(np.float64)
-    padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
-    size = padded.shape[-2:]
-    spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
-    blurred = np.fft.irfft2(spectrum, s=size)
-    blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
+    for blur in blurs:
+        assert blur.defocused is not None
+        weights = disc_kernel(blur.diameter_px)
+        radius = len(weights) // 2
+        light = np.clip(blur.light.numpy(), -limit, limit).astype(np.float64)
+        padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
+        size = padded.shape[-2:]
+        spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
+        blurred = np.fft.irfft2(spectrum, s=size)
+        blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
 
 
 @_jit()
