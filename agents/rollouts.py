@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ae_env.scenes import Scene
     from ae_env.scenes.load import SceneSpec
 
-ENV_ID = "ae_env/AutoExposure-v0"
+ENV_ID = "ae_env:ae_env/AutoExposure-v0"
 #: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
 MIN_TRAINING_GROUPS = 15
 

@@ -352,13 +352,13 @@ def simulate_source_raw(
 
 def check_weights(name: str) -> None:
     """Raises a `ValueError` unless `name` is that of weights or the path of some; reads none."""
-    is_text = isinstance(name, str) and name != ""
-    if is_text and (name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file()):
+    is_text = isinstance(name, str)
+    if is_text and name and (name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file()):
         return
     from simulator.networks.weights import list_pretrained
 
     known = sorted({DEFAULT_SIMULATOR, *list_pretrained()})
-    if name not in known:
+    if not is_text or name not in known:
         raise ValueError(
             f"`simulator` (={name!r}) must be None, one of {known} or the path of a .safetensors "
             f"file that exists{did_you_mean(name, known)}"

@@ -130,8 +130,11 @@ def test_networks_run_once_for_a_raw(
     torch.testing.assert_close(read_raw("first.dng").data, expected, atol=1e-6, rtol=0)
     assert ae_env(*sweep, "--out", "first")[0] == 0
 
+    def runs_again(*_: object) -> None:
+        raise AssertionError("the network's result was cached")
+
     for network in ("denoise", "estimate_defocus"):
-        monkeypatch.setattr(CameraSimulator, network, None)  # it does not run again
+        monkeypatch.setattr(CameraSimulator, network, runs_again)
     assert ae_env(*simulate, "-o", "second.dng")[0] == 0
     assert ae_env(*sweep, "--out", "second")[0] == 0
     for written in ("{}.dng", "{}/contact_sheet.png"):
