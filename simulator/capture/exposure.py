@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -92,7 +93,8 @@ class Step(NamedTuple):
         name: Its name in `SimulationPlan.modules`.
         runs: Whether it runs.
         reason: Why it does, or does not; ``{extent}`` and ``{error}`` stand for the numbers.
-        error: Error of leaving it out, in units of the target's noise.
+        estimate: Error of leaving it out, in units of the target's noise; or a function for it
+            where nothing is decided by it, and its statistics take time.
         extent: Extent of its blur [pixel], where it is one.
         residual: Error that it makes itself where it runs, as far as that is known.
         network: The network that it runs, if any.
@@ -103,11 +105,16 @@ class Step(NamedTuple):
     name: str
     runs: bool
     reason: str
-    error: float = 0.0
+    estimate: float | Callable[[], float] = 0.0
     extent: float = 0.0
     residual: float = 0.0
     network: DenoisedLight | None = None
     operations: int = 0
+
+    @property
+    def error(self) -> float:
+        """Error of leaving it out, in units of the target's noise."""
+        return self.estimate() if callable(self.estimate) else self.estimate
 
 
 @dataclass(frozen=True)
@@ -278,9 +285,11 @@ def _decide_noise_reduction(wanted: _Wanted) -> Step:
         return Step(name, False, "the source carries no noise")
     statistics, residuals = scene.blurred_light.statistics, scene.blurred_light.residuals
     error_of = statistics.excess_error if noise else statistics.relative_noise
-    error, networks = error_of(ratio, scene.nlf, target), scene.denoised_lights
+    networks = scene.denoised_lights
     if not networks:
-        return Step(name, False, "the simulator has no noise module", error)
+        estimate = functools.partial(error_of, ratio, scene.nlf, target)
+        return Step(name, False, "the simulator has no noise module", estimate)
+    error = error_of(ratio, scene.nlf, target)
 
     def own_error(network: DenoisedLight) -> float:  # 0 where it was not measured
         found = network.residual
@@ -321,18 +330,19 @@ def _decide_blurs(wanted: _Wanted, noise_reduction: Step) -> list[Step]:
     Several missing blurs shift it the same way and add up; the error of each is what it adds to the
     square, so that the root of the sum of squares of all errors is right for any set of steps.
     """
-    scene = wanted.scene
-    missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
-    # No network can mend it: blur has the tolerance to itself.
-    if missing_noise > scene.tolerance or not scene.denoised_lights:
+    scene, estimated = wanted.scene, wanted.scene.aperture_blur is not None
+    if not any(wanted.extents.values()):
+        return [_without_blur(name, estimated, wanted.opens) for name in wanted.extents]
+    missing_noise = 0.0
+    if scene.denoised_lights:
+        missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
+    if missing_noise > scene.tolerance:  # no network can mend it: blur has it all to itself
         missing_noise = 0.0
-    disc = row = 0.0
-    if any(wanted.extents.values()):
-        disc, row = _curvature(wanted, noise_reduction.network)
+    disc, row = _curvature(wanted, noise_reduction.network)
     blurs, missing_blur = [], 0.0
     for name, extent in wanted.extents.items():
         if not extent:
-            blurs.append(Step(name, False, _without_blur(name, wanted)))
+            blurs.append(_without_blur(name, estimated, wanted.opens))
             continue
         curvature = row if name == "motion_blur" else disc
         error = math.inf if extent == math.inf else curvature * extent * extent
@@ -363,20 +373,22 @@ def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, f
     return disc, row if wanted.along_rows else _STREAK_TO_DISC * disc
 
 
-def _without_blur(name: str, wanted: _Wanted) -> str:
-    """Reason why a blur would do nothing."""
+@functools.cache
+def _without_blur(name: str, estimated: bool, opens: bool) -> Step:
+    """A blur that would do nothing, where the scene's defocus was `estimated` or not."""
     if name == "motion_blur":
-        return "the image does not move"
-    estimated = wanted.scene.aperture_blur is not None
-    if name == "defocus":
+        reason = "the image does not move"
+    elif name == "defocus":
+        reason = "the scene is taken as far or in focus throughout"
         if estimated:
-            return "none is given for the whole frame: each pixel's was estimated"
-        return "the scene is taken as far or in focus throughout"
-    if not estimated:
-        return "the scene is taken as in focus: `depth` is not 'unknown'"
-    if wanted.opens:
-        return "the picture was found to be in focus throughout"
-    return "the aperture does not open; what is blurred in the source stays so"
+            reason = "none is given for the whole frame: each pixel's was estimated"
+    elif not estimated:
+        reason = "the scene is taken as in focus: `depth` is not 'unknown'"
+    elif opens:
+        reason = "the picture was found to be in focus throughout"
+    else:
+        reason = "the aperture does not open; what is blurred in the source stays so"
+    return Step(name, False, reason)
 
 
 _WITHOUT = "; leaving it out would be an error of {error:.2g}"

@@ -246,7 +246,7 @@ def _planned(step: Step, samples: int) -> Step:
     else:  # else of the taps of a disc
         per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)
         operations = per_sample * samples
-    return step._replace(reason=reason, error=0.0, operations=operations)
+    return step._replace(reason=reason, estimate=0.0, operations=operations)
 
 
 # -- predicted errors -------------------------------------------------------------------------
