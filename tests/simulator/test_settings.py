@@ -1,7 +1,5 @@
 """Photographic arithmetic against APEX, ISO 12232 and the tables printed on cameras."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -50,9 +48,7 @@ def test_apex_values_add_up() -> None:
         *[(11.0, 2**3.5), (16.0, 16.0), (22.0, 2**4.5), (1.8, 2 ** (5 / 6)), (3.5, 2 ** (11 / 6))],
     ],
 )
-def test_marked_f_numbers_stand_for_powers_of_the_sixth_root_of_two(
-    marked: float, exact: float
-) -> None:
+def test_marked_f_numbers_stand_for_powers_of_the_sixth_root_of_two(marked, exact):
     assert CameraSettings(100, 1.0, marked).effective_f_number == pytest.approx(exact, rel=1e-12)
 
 
@@ -101,9 +97,7 @@ def test_recorded_speeds_snap_and_given_ones_stay(recorded: float, exact: float)
         ((320, 1 / 50, 3.5), (250, 1 / 30, 6.3), (5 / 3) * (25 / 32) * 2.0 ** ((11 - 16) / 3)),
     ],
 )
-def test_exposure_ratio_closed_form(
-    source: tuple[float, float, float], target: tuple[float, float, float], ratio: float
-) -> None:
+def test_exposure_ratio_closed_form(source, target, ratio):
     first, second = CameraSettings(*source), CameraSettings(*target)
     assert exposure_ratio(first, second) == pytest.approx(ratio, rel=1e-12)
     assert exposure_ratio(second, first) == pytest.approx(1 / ratio, rel=1e-12)
@@ -163,9 +157,7 @@ SETTINGS = settings_within()
 
 
 @given(SETTINGS, SETTINGS, SETTINGS)
-def test_exposure_ratios_form_a_group(
-    a: CameraSettings, b: CameraSettings, c: CameraSettings
-) -> None:
+def test_exposure_ratios_form_a_group(a, b, c):
     # A stop is below 2**7, so each of three differences of stops is rounded by up to 2**-47; what
     # that moves a power of 2 by is below it, as ln 2 is below 1, even with the power's own ulp.
     bound = 3 * 2.0**-47

@@ -1,7 +1,5 @@
 """Captures in batches: the same frames as one by one, their statistics, and what is forgotten."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The exposure and the aperture module, and all networks on images that they never saw."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

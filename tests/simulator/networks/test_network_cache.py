@@ -1,7 +1,5 @@
 """Networks run once for one result, and again for whatever could change it."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +20,7 @@ SOURCE = CameraSettings(6400, 1 / 1024, 8)
 def counted(simulator: CameraSimulator) -> list[int]:
     """One entry for each run of a simulator's networks."""
     runs: list[int] = []
-    networks = simulator.noise.network.tail, simulator.aperture.network  # type: ignore[union-attr]
+    networks = simulator.noise.network.tail, simulator.aperture.network
     for network in networks:  # not where operations are counted
         network.register_forward_hook(lambda _m, _in, out: None if out.is_meta else runs.append(1))
     return runs
@@ -38,7 +36,7 @@ def _raw(seed: int = 0, size: int = 24) -> RawImage:
 def _simulator(**options: Any) -> CameraSimulator:
     torch.manual_seed(0)
     made = CameraSimulator("nano", device="cpu", **options)
-    torch.nn.init.normal_(made.noise.network.tail.weight)  # type: ignore[union-attr]
+    torch.nn.init.normal_(made.noise.network.tail.weight)
     return made
 
 
@@ -67,7 +65,7 @@ def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path, depth: Any) ->
         assert torch.equal(light, expected)
         assert light.stride() == expected.stride()
         if depth == "unknown":
-            assert torch.equal(prepared.aperture_blur.diameter, made.aperture_blur.diameter)  # type: ignore[union-attr]
+            assert torch.equal(prepared.aperture_blur.diameter, made.aperture_blur.diameter)
 
 
 def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
@@ -92,7 +90,7 @@ def test_everything_that_changes_the_result_is_seen(where: Any, folder: Path) ->
     sources = [raw, replace(raw, data=brighter), replace(raw, nlf=CAMERA.nlf(6400).scaled(2.0))]
     sources.append(replace(raw, data=raw.data.reshape(4, 28, 24)))
     for other, precision in [(source, "float32") for source in sources] + [(raw, "bfloat16")]:
-        simulator.precision = precision  # type: ignore[assignment]
+        simulator.precision = precision
         before = len(runs)
         _denoised(simulator, other)
         assert len(runs) > before, other

@@ -1,7 +1,5 @@
 """The noise module: noise levels, stabilised noise, any exposure, a mean that stays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -82,7 +80,7 @@ def test_sizes_of_the_family(preset: Preset, limit: int) -> None:
     assert module.commutes
     assert module.residual is None
     with pytest.raises(ValueError, match="`preset`"):
-        NoiseModule("tiny")  # type: ignore[arg-type]
+        NoiseModule("tiny")
 
 
 def test_operations_by_hand() -> None:
@@ -162,16 +160,6 @@ def test_the_generalised_anscombe_transform_exact_for_any_shot(shot: float, read
         cancelled = 1e-15 * np.sqrt(c) / slope
     found = stabiliser(shot, read).forward(torch.from_numpy(y).expand(1, 4, 1, -1))[0, 0, 0]
     np.testing.assert_allclose(found.double().numpy(), exact, rtol=1e-5, atol=cancelled)
-
-
-@pytest.mark.parametrize("electrons", [6, 40, 500])
-def test_it_makes_noise_of_variance_1_at_every_level(electrons: int) -> None:
-    """Poisson counts and 2 electrons of read noise; the error of 65,536 is 1 % at 3.6 of it."""
-    rng = np.random.default_rng(0)
-    counts = rng.poisson(electrons, (1, 4, 128, 128)) + rng.normal(0.0, 2.0, (1, 4, 128, 128))
-    gain = 1e-3
-    z = stabiliser(gain, (2 * gain) ** 2).forward(torch.from_numpy(counts * gain).float())
-    assert float(z.std()) == pytest.approx(1.0, abs=0.03)
 
 
 def test_the_inverse_and_other_exposures() -> None:

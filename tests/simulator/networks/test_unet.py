@@ -1,7 +1,5 @@
 """The two U-Nets against transcriptions of their papers in NumPy and PyTorch's own layers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.ndimage
@@ -32,9 +30,7 @@ def normal(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> to
     ("widths", "size"),
     [((2,) * 5, (1, 1)), ((2,) * 5, (1, 7)), ((2,) * 5, (17, 33)), ((4, 6, 8), (11, 6))],
 )
-def test_any_size_and_every_parameter_learns(
-    kind: type[nn.Module], widths: tuple[int, ...], size: tuple[int, int]
-) -> None:
+def test_any_size_and_every_parameter_learns(kind, widths, size):
     torch.manual_seed(0)
     net = kind(widths=widths).double()
     inputs = (normal(2, 8, *size),)

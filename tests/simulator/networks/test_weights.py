@@ -1,7 +1,5 @@
 """Trained weights on disk: what comes back, and what is refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -107,9 +105,7 @@ def test_files_that_are_not_there_or_cannot_be_read(saved: Path, ending: str) ->
         weights.read_pair(saved)
 
 
-def test_shipped_weights_load_by_name(
-    saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_shipped_weights_load_by_name(saved, monkeypatch, tmp_path_factory):
     """From a package that ships two sizes, in a folder without any; the second errs as its card
     says."""
     root = tmp_path_factory.mktemp("package")
@@ -130,7 +126,7 @@ def test_shipped_weights_load_by_name(
         nano = simulator.noises[0].residual
         assert nano is not None
         assert nano.to_card() == residual
-    assert simulators[1].noise.residual is None  # type: ignore[union-attr]
+    assert simulators[1].noise.residual is None
     with pytest.raises(
         ValueError, match=r"one of \['compact', 'nano'\] .* did you mean 'compact'\?"
     ):

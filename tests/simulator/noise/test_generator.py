@@ -3,8 +3,6 @@
 Every bound is a sampling error of white noise.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -106,7 +104,7 @@ def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
     given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
     states = [CameraSettings(*values) for values in given]
     for seed in (7, np.int64(8), MASK):
-        keys = sweep_keys(seed, states)  # type: ignore[arg-type]
+        keys = sweep_keys(seed, states)
         assert keys.tolist() == [key_of(int(seed), *values) for values in given]
     assert len(sweep_keys(7, [])) == 0
 

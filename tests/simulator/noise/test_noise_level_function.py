@@ -1,9 +1,6 @@
 """Noise of a pixel: its variance, what of it is missing, and the rows and tails of read noise."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -72,16 +69,14 @@ def test_arithmetic() -> None:
 def test_bad_noise_level_functions_are_refused(name: str, value: object) -> None:
     arguments = {"shot": (1e-5,) * 4, "read": (1e-8,) * 4, name: value}
     with pytest.raises(ValueError, match=f"`{name}`"):
-        NoiseLevelFunction(**arguments)  # type: ignore[arg-type]
+        NoiseLevelFunction(**arguments)
 
 
 # -- the variance that is missing -------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("source", "target"), [(CLEAN, NOISY), (NOISY, CLEAN), (NOISY, NOISY)])
-def test_what_is_missing_is_the_difference_of_the_two_noises(
-    source: NoiseLevelFunction, target: NoiseLevelFunction
-) -> None:
+def test_what_is_missing_is_the_difference_of_the_two_noises(source, target):
     """A quarter of the source's variance is left of the second pixels: the rest is missing, too."""
     levels, share = signal(-0.05, 0.0, 0.2, 0.9, 0.5), torch.tensor([[1.0, 0.25, 1.0, 0.25, 0.0]])
     table = exposure_table([Exposure(1.0, source, target)])[0, 1:]
@@ -147,7 +142,7 @@ def test_kurtosis_falls_with_the_number_of_averaged_pixels(shape: float, k: int)
 def camera(row: float = ROW, shape: float = -0.05) -> CameraProfile:
     nlf = NoiseLevelFunction((SHOT,) * 4, (READ,) * 4)
     tables = {"nlf_by_iso": {100.0: nlf}, "read_noise_by_iso": {100.0: ReadNoise(row, shape)}}
-    return CameraProfile("round", "RGGB", 3000, 3000 + SPAN, 14, **tables)  # type: ignore[arg-type]
+    return CameraProfile("round", "RGGB", 3000, 3000 + SPAN, 14, **tables)
 
 
 def by_engine(level: float, k: int, source: NoiseLevelFunction = ZERO) -> np.ndarray:
@@ -165,9 +160,7 @@ def by_reference(level: float, k: int) -> np.ndarray:
 
 @pytest.mark.parametrize("capture", [by_engine, by_reference])
 @pytest.mark.parametrize(("level", "k"), [(0.0, 1), (0.2, 1), (0.0, 3)])
-def test_rows_and_pixels_share_the_variance(
-    capture: Callable[[float, int], np.ndarray], level: float, k: int
-) -> None:
+def test_rows_and_pixels_share_the_variance(capture, level, k):
     frame = capture(level, k) - level
     rows, pixels = ROW**2 * READ / k, (1 - ROW**2) * READ / k**2 + SHOT * level / k**2
     sampling = 5 * math.sqrt(2 / HEIGHT)
@@ -200,7 +193,7 @@ def test_more_is_added_where_a_blur_has_left_less() -> None:
     light = torch.full((4, HEIGHT, WIDTH), 0.2)
     blur = {"defocus": 4.0, "layout": layout, "tolerance": 0.0}
     body = replace(camera(), nlf_by_iso={100.0: NoiseLevelFunction((0.0,) * 4, (READ,) * 4)})
-    scene = PreparedScene(light, BASE, body, source, **blur)  # type: ignore[arg-type]
+    scene = PreparedScene(light, BASE, body, source, **blur)
     frame = scene.expose([BASE], seed=5, noise="sensor")[0].double()
     sharp, soft = (float(part.var()) for part in (frame[..., :half], frame[..., half:]))
     assert sharp == pytest.approx(0.4 * READ, rel=0.1)
@@ -213,7 +206,7 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     plain = replace(known, read_noise_by_iso={})
     scenes = [PreparedScene(light, BASE, body, ZERO) for body in (known, plain)]
     for noise in ("exact", "bank"):
-        first, second = (scene.expose([BASE], noise=noise) for scene in scenes)  # type: ignore[arg-type]
+        first, second = (scene.expose([BASE], noise=noise) for scene in scenes)
         assert torch.equal(first, second)
     drawn = [
         ReferenceCamera(body).record(light, 100.0, torch.Generator().manual_seed(1))

@@ -43,7 +43,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize("black", [(500.0, 510.0, 520.0, 530.0), (64.25,) * 4])
 def test_libraw_sees_the_same_mosaic(path, cfa, black):
-    raw = make_raw(CameraProfile("bench_camera", cfa, black, 15000, 14))  # type: ignore[arg-type]
+    raw = make_raw(CameraProfile("bench_camera", cfa, black, 15000, 14))
     write_dng(path, raw)
     back = read_raw(path)
     assert torch.equal(back.data, raw.data)
@@ -200,6 +200,6 @@ def test_bad_arguments_leave_what_is_there(tmp_path, path):
     before = path.read_bytes()
     for target, raw, name in ((tmp_path / "a.tif", make_raw(), "path"), (path, None, "raw")):
         with pytest.raises(ValueError, match=f"`{name}`"):
-            write_dng(target, raw)  # type: ignore[arg-type]
+            write_dng(target, raw)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.dng"]

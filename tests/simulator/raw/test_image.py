@@ -15,7 +15,7 @@ BLACK = (64.0, 60.25, 59.5, 63.0)  # R, G1, G2, B
 
 
 def camera(cfa: str = "RGGB", black: tuple[float, ...] | float = BLACK) -> CameraProfile:
-    return CameraProfile("bench", cfa, black, 4095, 12)  # type: ignore[arg-type]
+    return CameraProfile("bench", cfa, black, 4095, 12)
 
 
 @given(mosaics(cameras()), st.booleans(), st.booleans())

@@ -110,7 +110,7 @@ def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match="at least 2"):
         Sequence(scene(), (CameraSettings(100, 1, 4),))
     with pytest.raises(ValueError, match=r"`stage` \(='noises'\).*did you mean 'noise'"):
-        select_pairs([], "noises", Z6)  # type: ignore[arg-type]
+        select_pairs([], "noises", Z6)
 
 
 def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():

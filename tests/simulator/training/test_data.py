@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -28,7 +26,7 @@ LIGHT = CameraSettings(100, 1 / 16, 4)
 
 
 def pairs(*settings: CameraSettings, seed: int = 0, **scene_changes: object) -> ReferencePairs:
-    sequence = Sequence(scene(**scene_changes), settings or (DARK, LIGHT))  # type: ignore[arg-type]
+    sequence = Sequence(scene(**scene_changes), settings or (DARK, LIGHT))
     return ReferencePairs([sequence], ReferenceCamera(Z6), "exposure", seed=seed)
 
 
@@ -136,7 +134,7 @@ def test_defocus_is_the_thin_lens_at_the_sources_aperture():
 def picture(*size: int, seed: int = 0, **named: object) -> DetailPicture:
     light = torch.rand(size, generator=torch.Generator().manual_seed(seed))
     given = {"name": "a", "group": "a", "kind": "radiance", "light": light} | named
-    return DetailPicture(**given)  # type: ignore[arg-type]
+    return DetailPicture(**given)
 
 
 def flat(level: float = 0.5, side: int = 64, **named: object) -> DetailPicture:

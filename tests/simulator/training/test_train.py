@@ -1,7 +1,5 @@
 """Training in stages: configurations, cards, budgets, stops and resumes, calibration."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -328,18 +326,6 @@ CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "simulator"
 def load_text(folder: Path, text: str) -> SimulatorConfig:
     (folder / "a.yaml").write_text(text)
     return load_config(folder / "a.yaml")
-
-
-def test_stages_in_order_with_their_defaults(tmp_path):
-    config = load_text(tmp_path, COMPACT)
-    assert list(config.stages()) == ["noise", "exposure", "aperture"]
-    assert (config.noise.average, config.card()["noise"]["average"]) == (0.0, 0.0)
-    assert (config.noise.steps, config.noise.minutes, config.noise.batch) == (3, None, 8)
-    assert (config.aperture.steps, config.aperture.minutes) == (None, 0.5)
-    for preset, stage in (("pc", "baseline"), ("nano", "noise"), ("large", "noise")):
-        assert list(load_text(tmp_path, f"preset: {preset}\n{stage}: {{steps: 1}}").stages()) == [
-            stage
-        ]
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda f: f.name)

@@ -51,7 +51,7 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
         assert checksum() != before
         (tmp_path / name).write_text(texts[name])
     monkeypatch.undo()
-    stamp = kernel()(add)._cache._cache_file._source_stamp  # type: ignore[attr-defined]
+    stamp = kernel()(add)._cache._cache_file._source_stamp
     assert stamp[1] == jit._checksum(Path(__file__))
 
 

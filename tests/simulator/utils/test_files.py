@@ -68,7 +68,7 @@ def test_targets_that_cannot_be_written(tmp_path):
         assert ".tmp" not in str(caught.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
     with pytest.raises(ValueError, match=r"`path` \(=3\) must be a file's name"):
-        write_atomically(3, "x")  # type: ignore[arg-type]
+        write_atomically(3, "x")
 
 
 def test_the_folder_of_real_files(tmp_path, monkeypatch):
