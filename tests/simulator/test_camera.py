@@ -115,7 +115,7 @@ def profile(**fields: object) -> CameraProfile:
     return CameraProfile(**(defaults | {"bit_depth": 10} | fields))
 
 
-def test_levels() -> None:
+def test_levels_and_full_well() -> None:
     camera = profile(black_level=(64, 60.5, 60, 63))
     assert camera.span == (959, 962.5, 963, 960)
     assert camera.pedestal == pytest.approx((64 / 959, 60.5 / 962.5, 60 / 963, 63 / 960))
@@ -124,10 +124,7 @@ def test_levels() -> None:
     z6 = get_camera("nikon_z6")
     assert z6.span == (15520 - 1008,) * 4
     assert z6.pedestal == pytest.approx((1008 / 14512,) * 4)
-
-
-def test_full_well() -> None:
-    assert get_camera("nikon_z6").full_well == pytest.approx(133_827, abs=1)  # 1 / 7.472343e-6
+    assert z6.full_well == pytest.approx(133_827, abs=1)  # 1 / 7.472343e-6
     assert get_camera("canon_70d").full_well == pytest.approx(15583 / 0.4075, rel=1e-4)
     assert profile().full_well is None
 
@@ -140,10 +137,7 @@ def test_full_well() -> None:
         ({"black_level": -1}, "`white_level`"),
         ({"black_level": (0, 0, 0, 1023)}, "`white_level`"),
         ({"white_level": 70_000, "bit_depth": 16}, "`white_level`"),
-        ({"white_level": math.nan}, "`white_level`"),
-        ({"black_level": math.nan}, "`white_level`"),
         ({"bit_depth": 0}, "`bit_depth`"),
-        ({"bit_depth": 17}, "`bit_depth`"),
         ({"bit_depth": 10.5}, "`bit_depth`"),
         ({"white_level": 1022.5}, "`white_level`"),
     ],

@@ -12,20 +12,22 @@ from simulator.capture import batch as batch_module
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import MapApertureBlur
 from simulator.capture.plan import noise_balance
+from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import Noise, Transitions, noise_keys, record, single_normals
+from simulator.optics.motion import Movement
 
 Z6 = get_camera("nikon_z6")
 REFERENCE = CameraSettings(800, 1 / 64, 4)
 STATES = [CameraSettings(iso, time, 4) for iso in (100, 6400) for time in (1 / 500, 1 / 8)]
 STATES += [CameraSettings(400, 1 / 30, 8), CameraSettings(200, 1 / 30, 2)]
-LIGHTS = [torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(5)]
-SCENES = np.arange(5)
+LIGHTS = [torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(7)]
+SCENES = np.arange(7)
 KEYS = noise_keys(SCENES, SCENES + 5)
 
 
 def prepared(index: int) -> PreparedScene:
-    """Two at rest, one that moves, one that is also out of focus, one whose aperture opens; the
-    first and third are free of noise."""
+    """Two at rest, one that moves, one that is also out of focus, one whose aperture opens,
+    two with a layout and a subject that moves; the first and third are free of noise."""
     light = LIGHTS[index]
     changes: dict[str, Any] = {"image_speed": 0.3} if index in (2, 3) else {}
     if index == 3:
@@ -33,6 +35,12 @@ def prepared(index: int) -> PreparedScene:
     if index == 4:
         found = torch.full((24, 20), 1.0)
         changes["aperture_blur"] = MapApertureBlur(light, found, 4.0)
+    if index > 4:
+        rows, columns = torch.arange(24)[:, None], torch.arange(20)
+        subject = (abs(rows - 12) < 5) & (abs(columns - 8) < 5)
+        changes["layout"] = Layout((columns >= 10).float().expand(24, 20).contiguous(), subject)
+        changes["movement"] = Movement(0.6, 2.0, subject_speed=0.4, subject_direction=2.0)
+        changes |= {"defocus": 3.0} | ({"image_speed": 0.2} if index == 5 else {})
     nlf = NoiseLevelFunction.zero() if index in (0, 2) else Z6.nlf(800)
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
@@ -51,14 +59,14 @@ class Counted:
 def made(
     noise: Noise | None = "bank", *, cache_light: bool = True, scenes: Any = prepared
 ) -> CaptureBatch:
-    return CaptureBatch(scenes, 5, STATES, Z6, noise=noise, cache_light=cache_light)
+    return CaptureBatch(scenes, 7, STATES, Z6, noise=noise, cache_light=cache_light)
 
 
 def photographed(
-    batch: CaptureBatch, states: Any, gains: Any = (1.0,) * 5, **options: Any
+    batch: CaptureBatch, states: Any, gains: Any = (1.0,) * 7, **options: Any
 ) -> tuple[np.ndarray, Any]:
     """Frames of all scenes, and their statistics."""
-    chosen, frames = np.broadcast_to(states, 5), np.empty((5, 4, 24, 20), np.float32)
+    chosen, frames = np.broadcast_to(states, 7), np.empty((7, 4, 24, 20), np.float32)
     batch.prepare(SCENES, chosen, np.array(gains))
     return frames, batch.record(SCENES, chosen, SCENES, SCENES + 5, signals=frames, **options)
 
@@ -78,9 +86,9 @@ def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: 
     scenes, rng, seen = Counted(), np.random.default_rng(0), set()
     batch = made(noise, cache_light=cache_light, scenes=scenes)
     for _ in range(12):
-        states, gains = rng.integers(len(STATES), size=5), rng.choice([0.25, 1.0, 3.0], 5)
+        states, gains = rng.integers(len(STATES), size=7), rng.choice([1e-6, 0.25, 1.0, 3.0], 7)
         frames, found = photographed(batch, states, gains)
-        for i in range(5):
+        for i in range(7):
             key = None if noise is None else int(KEYS[i])
             wanted, counts, exposure = alone(i, states[i], gains[i], key, noise or "bank")
             np.testing.assert_array_equal(frames[i], wanted)
@@ -97,7 +105,7 @@ def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: 
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
     assert seen >= {"aperture", "defocus", "motion_blur"}
-    assert sorted(scenes.calls) == [0, 1, 2, 3, 4]
+    assert sorted(scenes.calls) == list(range(7))
     assert noise is None or seen >= {"noise", "excess"}
 
 
@@ -107,7 +115,7 @@ def test_normals_for_sensors_belong_to_the_frame() -> None:
 
 
 def test_rows_have_the_light_that_is_given() -> None:
-    rows = np.ones((5, 24))
+    rows = np.ones((7, 24))
     rows[1:, 12:] = 0.5
     plain, _ = photographed(made(None), 0)
     banded, _ = photographed(made(None), 0, row_gain=rows)
@@ -120,13 +128,13 @@ def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -
     scenes = Counted()
     batch, calls = made(scenes=scenes), scenes.calls
     first, again, _ = photographed(batch, 1)[0], photographed(batch, 1)[0], photographed(batch, 4)
-    assert sorted(calls) == [0, 1, 2, 3, 4]
+    assert sorted(calls) == list(range(7))
     # The pool is private: memory that is not used again would show as a slow environment only.
     assert not batch._pool.free
     batch.forget(np.array([3]))
     assert len(batch._pool.free) == 3  # discs of two apertures, and a streak
     after, _ = photographed(batch, 1)
-    assert (calls[5:], len(batch._pool.free)) == ([3], 1)
+    assert (calls[7:], len(batch._pool.free)) == ([3], 1)
     np.testing.assert_array_equal(again, first)
     np.testing.assert_array_equal(after, first)
 
@@ -155,6 +163,6 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
 
 def test_a_pickled_copy_works_everything_out_again() -> None:
     batch = made()
-    first, _ = photographed(batch, [1, 2, 3, 4, 5])
+    first, _ = photographed(batch, [1, 2, 3, 4, 5, 0, 1])
     copy = pickle.loads(pickle.dumps(batch))
-    np.testing.assert_array_equal(photographed(copy, [1, 2, 3, 4, 5])[0], first)
+    np.testing.assert_array_equal(photographed(copy, [1, 2, 3, 4, 5, 0, 1])[0], first)

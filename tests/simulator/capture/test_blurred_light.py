@@ -12,14 +12,12 @@ from scipy.ndimage import correlate
 from torch import Tensor
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
-from simulator.capture import blurred_light as module
-from simulator.capture.batch import CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.exposure import Exposure
 from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
-from simulator.optics.discs import DIAMETERS, HALO, DiscBank, added_blur, disc_blur
+from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur
 from simulator.optics.motion import Movement, motion_blur, path_blur, path_taps
 from simulator.utils.tiles import make_tiles
 
@@ -104,23 +102,6 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(size, tile, monkeypa
         assert not torch.equal(result, image) or min(size) == 1
 
 
-def test_only_what_is_out_of_focus_is_blurred(monkeypatch: pytest.MonkeyPatch) -> None:
-    pixels: list[int] = []
-
-    class Spy(DiscBank):
-        def blurred(self, diameter: Tensor) -> Tensor:
-            pixels.append(diameter.numel())
-            return super().blurred(diameter)
-
-    monkeypatch.setattr("simulator.capture.blurred_light.DiscBank", Spy)
-    image, diameter = torch.rand(4, 300, 400), torch.zeros(300, 400)
-    assert torch.equal(MapApertureBlur(image, diameter, 8.0).opened(4.0, None), image)
-    assert not pixels
-    diameter[-32:, -32:] = 5.0
-    MapApertureBlur(image, diameter, 8.0).opened(4.0, None)
-    assert (32 + HALO) ** 2 <= sum(pixels) <= (48 + HALO) ** 2  # in cells of 16 pixels
-
-
 def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
     calls: list[int] = []
 
@@ -144,24 +125,6 @@ LIGHT = torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(0))
 CLEAN = DenoisedLight(LIGHT * 0.5)
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
-    """The blurs that are made, and their extents."""
-    calls: list[tuple[str, float]] = []
-
-    def streak(light: Tensor, extent: float, *args: Any, **options: Any) -> Tensor:
-        calls.append(("streak", extent))
-        return motion_blur(light, extent, *args, **options)
-
-    def disc(light: Tensor, diameter: float) -> Tensor:
-        calls.extend([("disc", diameter)] * bool(diameter))
-        return disc_blur(light, diameter)
-
-    monkeypatch.setattr(module, "motion_blur", streak)
-    monkeypatch.setattr(module, "disc_blur", disc)
-    return calls
-
-
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
     source = CLEAN.light if denoised else LIGHT
@@ -170,19 +133,9 @@ def test_disc_then_streak(denoised: bool) -> None:
     assert blurred_light.blurred(exposure) is source  # what needs no blur is not copied
     exposure = replace(exposure, defocus_px=2.0, motion_px=3.0)
     expected = motion_blur(disc_blur(source, 2.0), 3.0)
-    assert torch.equal(blurred_light.blurred(exposure), expected)
-
-
-def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
-    """Two apertures, two exposure times, many ISO speeds: two discs and four streaks."""
-    blurred_light = BlurredLight(LIGHT, (), ZERO, None)
-    for ratio in (1.0, 2.0, 4.0):
-        for disc in (2.0, 1.0):
-            for streak in (3.0, 0.0, 6.0):
-                blurred_light.blurred(Exposure(ratio, ZERO, ZERO, streak, disc))
-    assert sorted(made) == [("disc", 1.0), ("disc", 2.0)] + 2 * [("streak", 3.0)] + 2 * [
-        ("streak", 6.0)
-    ]
+    found = blurred_light.blurred(exposure)
+    assert torch.equal(found, expected)
+    assert blurred_light.blurred(replace(exposure, ratio=4.0)) is found  # made once
 
 
 def test_the_opened_aperture_comes_first() -> None:
@@ -288,41 +241,6 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
         ratio = ratio[:, :4]
     assert float(ratio.median()) == pytest.approx(1.0, abs=0.06)  # of the draws
     assert float(ratio.quantile(0.95)) < 1.2
-
-
-@pytest.mark.parametrize("cache_light", [True, False])
-@pytest.mark.parametrize("noisy", [True, False])
-def test_batches_have_the_light_of_sweeps(cache_light: bool, noisy: bool) -> None:
-    scenes = [
-        _prepared(noisy, defocus=3.0, image_speed=0.2),
-        _prepared(noisy, defocus=3.0, movement=Movement(subject_speed=0.5)),
-        _prepared(noisy, image_speed=0.2, layout=None),
-        _prepared(noisy, defocus=4.0, image_speed=0.2, layout=None),
-        _prepared(noisy, defocus=3.0, image_speed=0.2, movement=Movement()),
-        _prepared(noisy),
-        _prepared(noisy, defocus=3.0, tolerance=0.1),
-    ]
-    states = [CameraSettings(iso, t, n) for iso in (100, 6400) for t in (0.5, 1e-3) for n in (4, 8)]
-    batch = CaptureBatch(
-        scenes.__getitem__, len(scenes), states, Z6, noise="bank", cache_light=cache_light
-    )
-    indices, rng = np.arange(len(scenes)), np.random.default_rng(0)
-    for step in range(8):
-        if step % 2 == 0:
-            chosen = rng.integers(len(states), size=len(scenes))
-        gain = (1.0, 1e-6)[step % 2]  # in little light, blur is left out where it may be
-        frames = np.empty((len(scenes), 4, SIZE, SIZE), np.float32)
-        batch.prepare(indices, chosen, np.full(len(scenes), gain))
-        found = batch.record(indices, chosen, indices, indices, signals=frames)
-        assert np.isfinite(found.excess_variance).all()
-        for i, scene in enumerate(scenes):
-            exposure = scene.exposure(states[chosen[i]], gain=gain)
-            one, expected = np.array([i]), exposure.remaining_variance
-            transitions = batch.transitions(one, chosen[one])
-            assert torch.equal(transitions.light[0], scene.blurred_light.blurred(exposure))
-            (left,) = transitions.shares()
-            assert (left is None) == (expected is None)
-            assert expected is None or torch.equal(left, expected.float())
 
 
 def test_whole_captures_by_hand() -> None:

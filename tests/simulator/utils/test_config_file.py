@@ -71,7 +71,6 @@ def test_what_cannot_be_read(tmp_path, monkeypatch, name, message):
     ("text", "parts"),
     [
         ("name: x\npart: {steps: 0}", ["part.steps (=0)", "greater than or equal to 1"]),
-        ("name: x\npart: {steps: 3}", ["part.steps (=3): must be even"]),
         ("name: x\nprat: {steps: 2}", ["prat (={'steps': 2}): unknown", "did you mean `part`?"]),
         ("name: x\npart: {stesp: 2}", ["part.stesp (=2): unknown", "did you mean `steps`?"]),
         ("", ["is empty: it must map entries to values; known entries: name, part, parts"]),
@@ -80,16 +79,11 @@ def test_what_cannot_be_read(tmp_path, monkeypatch, name, message):
         ("name: " + "[" * 700, ["nested too deeply"]),
         ("name: &a [*a]", ["name (=", "valid string"]),
         (BOMB, ["a9 (=", "unknown"]),
-        ("name: !!int x", ["is not YAML: invalid literal"]),
         ("name: 2001-13-45", ["is not YAML: month must be"]),
         ("name: x" + " " * 2**20, ["must not be larger than"]),
-        ("name: true", ["name (=True): Input should not be true or false"]),
         (b"name: \xff\xfe", ["is not YAML"]),
         ("name: x\nparts: {a: {stesp: 3}}", ["parts.a.stesp (=3): unknown, the", "mean `steps`"]),
         ("name: x\nrows: [{steps: 2}, {foo: 3}]", ["rows.1.foo (=3): unknown", "'steps'"]),
-        ("name: x\nrows: 3", ["rows (=3): must be a list"]),
-        ("name: x\nparts: {a: 3}", ["parts.a (=3): must be a mapping"]),
-        ("name: x\npart: {steps: yes}", ["part.steps (=True)", "not be true or false"]),
         ("name: !!python/object/apply:os.getcwd []", ["is not YAML"]),  # nothing is executed
     ],
 )
