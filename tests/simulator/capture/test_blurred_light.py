@@ -314,15 +314,11 @@ class Counted:
         return prepared(index)
 
 
-def made(
-    noise: Noise | None = "bank", *, cache_light: bool = True, scenes: Any = prepared
-) -> CaptureBatch:
+def made(noise="bank", *, cache_light=True, scenes=prepared):
     return CaptureBatch(scenes, 7, STATES, Z6, noise=noise, cache_light=cache_light)
 
 
-def photographed(
-    batch: CaptureBatch, states: Any, gains: Any = (1.0,) * 7, **options: Any
-) -> tuple[np.ndarray, Any]:
+def photographed(batch, states, gains=(1.0,) * 7, **options):
     """Frames of all scenes, and their statistics."""
     chosen, frames = np.broadcast_to(states, 7), np.empty((7, 4, 24, 20), np.float32)
     batch.prepare(SCENES, chosen, np.array(gains))

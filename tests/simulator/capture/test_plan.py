@@ -67,15 +67,6 @@ def test_every_step_runs_or_has_a_reason(settings, networks, tolerance):
     assert plan.predicted_error == pytest.approx(math.hypot(*plan.errors.values()))
     assert plan.error_bound >= plan.predicted_error
     assert (plan.network is None) is ("noise_reduction" not in plan.modules)
-    lines = str(plan).splitlines()
-    assert len(lines) == 3
-    assert max(map(len, lines)) < 200
-    if plan.predicted_error <= tolerance:
-        assert lines[1].endswith(f"(tolerance {tolerance:g}: kept)")
-    elif math.hypot(plan.errors["left out"], plan.errors["network"]) <= tolerance:
-        assert lines[1].endswith(("no module can fix)", "kept)"))
-    else:
-        assert lines[1].endswith("out of reach, the least of these networks)")
 
 
 def test_the_networks_run_where_they_are_needed() -> None:
@@ -386,13 +377,6 @@ def test_each_decision_says_what_it_costs() -> None:
         assert plan.predicted_error == pytest.approx(found, rel=1e-3)
         assert plan.error_bound == pytest.approx(math.hypot(bound, _LEAST_BOUND), rel=1e-3)
         assert plan.network == ("nano" if found == 0.1 else None)
-    assert "noise_reduction (nano)" in strict.explain()
-    assert "network 0.1 (tolerance 0.2: kept)" in strict.explain()
-    assert "network 0.1 (tolerance 0.09: out of reach, the least of these networks)" in str(tiny)
-    assert "90 % bound 0.17: network" in strict.explain()
-    assert "left out 0.25 (tolerance 0.3: kept)" in loose.explain()
-    assert "within the tolerance" in loose.left_out["noise_reduction"]
-    assert "(error 0.25)" in loose.details()
     alone = replace(made, denoised_lights=()).plan(settings)
     assert alone.errors["left out"] == pytest.approx(0.25)
 

@@ -243,17 +243,6 @@ def test_balance_where_there_is_no_noise() -> None:
     assert balance == NoiseBalance(1e24, False)
 
 
-@pytest.mark.parametrize("source", [100, 6400])
-def test_noise_is_drawn_only_where_the_source_lacks_some(source, monkeypatch):
-    light, share = torch.full((4, 8, 8), 0.2), torch.full((8, 8), 0.5)
-    enough = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
-    blurred = replace(enough, remaining_variance=share)
-    short = Exposure(1.0, Z6.nlf(source), Z6.nlf(12800))
-    for exposures, lacks in (([enough], False), ([blurred], True), ([enough, short], True)):
-        assert Transitions.of([light] * len(exposures), exposures).lacks_noise is lacks
-    assert Transitions([light], exposure_table([enough])).lacks_noise is False
-
-
 # -- the fused kernel -------------------------------------------------------------------------
 
 

@@ -74,13 +74,7 @@ def variance(signal: np.ndarray, iso: float) -> np.ndarray:
     return read + shot * np.maximum(signal, 0.0)
 
 
-def blur_error(
-    statistics: LightStatistics,
-    ratio: float,
-    target: NoiseLevelFunction,
-    streak: float = 0.0,
-    disc: float = 0.0,
-) -> float:
+def blur_error(statistics, ratio, target, streak=0.0, disc=0.0):
     """Bound on the error of leaving out a blur of these extents [pixel]."""
     per_disc, per_streak = statistics.curvature(ratio, target)
     return per_disc * disc**2 + per_streak * streak**2

@@ -118,17 +118,6 @@ def test_values_and_gradients_of_torch_instance_norm() -> None:
     torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("size", [(1, 1), (17, 33)])
-@pytest.mark.parametrize("value", [-0.37, 1000.1])
-def test_flat_map_becomes_the_shift(dtype: torch.dtype, size: tuple, value: float) -> None:
-    shift = torch.tensor([[0.25, -1.5]], dtype=dtype)
-    x = torch.full((1, 2, *size), value, dtype=dtype)
-    result = instance_norm(x, torch.full((1, 2), 100.0, dtype=dtype), shift)
-    assert result.dtype == dtype
-    assert torch.equal(result, shift[:, :, None, None].expand_as(x))
-
-
 def test_statistics_of_half_precision_are_not_half_precise() -> None:
     """256 bfloat16 steps above zero, the mean itself would round by a third of the deviation."""
     x = (1.0 + normal(1, 1, 32, 32) / 64).bfloat16()

@@ -341,9 +341,7 @@ def test_a_point_lands_in_the_plane_of_its_colour_and_place(cfa: BayerPattern) -
 EXACT_F = {4.0: 4.0, 5.6: 2**2.5, 8.0: 8.0, 11.0: 2**3.5, 16.0: 16.0, 22.0: 2**4.5}
 
 
-def lit_scene(
-    illuminance: float | None = 320.0, reference: CameraSettings | None = None, light: float = 0.1
-) -> ReferenceScene:
+def lit_scene(illuminance=320.0, reference=None, light=0.1):
     frame, reference = torch.full((4, 2, 3), light), reference or CameraSettings(100, 0.01, 4)
     return ReferenceScene("s", "g", "k", frame, reference, illuminance=illuminance)
 

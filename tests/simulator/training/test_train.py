@@ -71,9 +71,7 @@ def quick_calibration():
         yield
 
 
-def save(
-    folder: Path, *given: Any, progress: Any = no_progress, scenes: Any = scenes, **changes: Any
-) -> Path:
+def save(folder, *given, progress=no_progress, scenes=scenes, **changes):
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
     return train_and_save(
