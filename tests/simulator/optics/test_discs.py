@@ -195,17 +195,6 @@ def test_a_streak_is_the_same_compiled_and_loaded(compiled_and_loaded):
     assert (hits, loaded) == ("1", compiled)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@BOTH
-@pytest.mark.parametrize("extent", [0.4, 3.0, 30.0])
-def test_cuda_agrees(blur, extent):
-    image = picture(4, 33, 31)
-    torch.testing.assert_close(
-        blur(image.cuda(), extent).cpu(), blur(image, extent), atol=2e-5, rtol=0
-    )
-
-
 @pytest.mark.parametrize("window", [1, 3, 5, 7, 9, 25])
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (1, 30), (23, 41)])
 def test_box_mean_is_scipys_uniform_filter(window, size):

@@ -214,22 +214,6 @@ def test_the_halo_covers_what_the_networks_see(size):
     torch.testing.assert_close(alone, found[0], rtol=0, atol=1e-4)
 
 
-def test_what_is_not_needed_is_not_computed():
-    seen: list[int] = []
-
-    def spy(image: Tensor) -> Tensor:
-        seen.append(image[0, 0].numel())
-        return image + 1
-
-    image, nothing = frame(320, 480), torch.zeros(320, 480, dtype=torch.bool)
-    for needed, most in ((patches(320, 480), 0.05), (nothing, 0)):
-        seen.clear()
-        result = in_tiles(spy, image, halo=8, needed=needed, fallback=image)
-        assert sum(seen) <= most * 320 * 480
-        assert torch.equal(result, image + needed)
-    assert len(make_tiles(320, 480, halo=8, needed=~nothing)) == 1
-
-
 @pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
 def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density):
     needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
