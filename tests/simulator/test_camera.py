@@ -29,21 +29,16 @@ from tests.strategies import settings_within
         (100, 1.0, 1.0, 0.0),  # the definition
         (100, 1 / 128, 16.0, 15.0),  # the sunny-16 rule
         (3200, 1 / 32, 2.0, 2.0),
+        (800, 1 / 250, 4.0, 4.0 + 7.965784 - 3.0),
         (400, 1 / 125, 5.6, 9.93664),  # log2(5.6^2 * 125) - 2, with the marked f-number
     ],
 )
-def test_ev100(iso: float, exposure_time: float, f_number: float, ev100: float) -> None:
-    assert CameraSettings(iso, exposure_time, f_number).ev100 == pytest.approx(ev100, abs=1e-4)
-
-
-def test_apex_values_add_up() -> None:
-    settings = CameraSettings(iso=800, exposure_time=1 / 250, f_number=4.0)
-    assert settings.aperture_value == 4.0
-    assert settings.time_value == pytest.approx(7.965784, abs=1e-6)
-    assert settings.speed_value == 8.0  # APEX: Sv 5 is ISO 100
-    # APEX: Ev = Av + Tv, and Ev at ISO 100 is that minus the gain
-    assert settings.ev100 == pytest.approx(4.0 + 7.965784 - 3.0, abs=1e-6)
-    assert CameraSettings(100, 1.0, 1.0).speed_value == 5.0
+def test_apex_values_add_up(iso, exposure_time, f_number, ev100):
+    settings = CameraSettings(iso, exposure_time, f_number)
+    assert settings.ev100 == pytest.approx(ev100, abs=1e-4)
+    assert settings.speed_value == pytest.approx(5.0 + math.log2(iso / 100))  # Sv 5 is ISO 100
+    sums = settings.aperture_value + settings.time_value - settings.speed_value + 5.0
+    assert settings.ev100 == pytest.approx(sums, abs=1e-6)  # Ev = Av + Tv, less the gain
 
 
 @pytest.mark.parametrize(
