@@ -334,14 +334,10 @@ def test_tolerance_nought_forgets_what_another_one_left_out(compact, depth):
     torch.testing.assert_close(shared.data, full.data, rtol=0, atol=1.01 / 14512)
 
 
-SETTINGS = settings_within()
-NOISES = st.sampled_from(["exact", "bank"])
-
-
 # -- for any input --------------------------------------------------------------------
 
 
-@given(mosaics(cameras()), SETTINGS, SEEDS, NOISES)
+@given(mosaics(cameras()), settings_within(), SEEDS, st.sampled_from(["exact", "bank"]))
 def test_simulating_the_own_settings_changes_nothing(mosaic, settings, seed, noise):
     """A raw has its noise already; its digital numbers come back, and noise-free light as it is.
 
@@ -399,20 +395,10 @@ def test_two_hops_have_the_noise_of_one(level, hops, shot, read, box_factor, see
 
 FULL_SOURCE = CameraSettings(1600, 1 / 64, 8)
 #: Cleaner, noisier, closing and opening; ratios that are no powers of two.
-TARGETS = [
-    CameraSettings(100, 1 / 3, 8),
-    CameraSettings(6400, 1 / 50, 8),
-    CameraSettings(100, 1 / 70, 11),
-    CameraSettings(400, 1 / 60, 4),
-    CameraSettings(100, 1 / 4000, 2.8),
-    FULL_SOURCE,
-]
-SCENES = [
-    {},
-    {"depth": "unknown"},
-    {"depth": "unknown", "image_speed": 0.6, "defocus": 1.7},
-    {"image_speed": 2e-3, "defocus": 0.02},
-]
+TARGETS = [(100, 1 / 3, 8), (6400, 1 / 50, 8), (100, 1 / 70, 11), (400, 1 / 60, 4)]
+TARGETS = [CameraSettings(*values) for values in (*TARGETS, (100, 1 / 4000, 2.8))] + [FULL_SOURCE]
+SCENES = [{}, {"depth": "unknown"}, {"image_speed": 2e-3, "defocus": 0.02}]
+SCENES += [{"depth": "unknown", "image_speed": 0.6, "defocus": 1.7}]
 
 
 def full_raw(noise: bool = True) -> RawImage:
