@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -308,10 +307,10 @@ def test_bad_profiles_are_refused(fields: dict[str, object], message: str) -> No
         profile(**fields)
 
 
-@pytest.mark.parametrize("iso", [0, -100, math.nan, math.inf, "100"])
-def test_bad_iso(iso: Any) -> None:
-    with pytest.raises(ValueError, match="`iso`"):
-        get_camera("nikon_z6").nlf(iso)
+def test_bad_iso() -> None:
+    for iso in (0, -100, math.nan, math.inf, "100"):
+        with pytest.raises(ValueError, match="`iso`"):
+            get_camera("nikon_z6").nlf(iso)
     with pytest.raises(ValueError, match=r"'bench' has no noise calibration.*estimate_nlf"):
         profile().nlf(100)
 
