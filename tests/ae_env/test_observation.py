@@ -58,9 +58,7 @@ def test_observations_are_monotone_and_within_half_a_code(light: torch.Tensor) -
 
 
 @given(st.floats(0.0, 1e300), log_uniform(1e-3, 1e3), st.floats(-10, 10), st.floats(-10, 10))
-def test_sensors_are_decoded_as_they_read(
-    speed: float, defocus: float, first: float, second: float
-) -> None:
+def test_sensors_are_decoded_as_they_read(speed, defocus, first, second):
     noise = np.array([[first, second]])
     encoded = encode_sensors(np.array([speed]), np.array([defocus]), noise)
     assert np.abs(encoded).max() <= 1.0

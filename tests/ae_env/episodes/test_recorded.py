@@ -1,17 +1,14 @@
 """Environments on recorded grids show the captures that there are, and nothing else."""
 
-import functools
 import pickle
 import warnings
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 from ae_env import contact_sheet, load_scenes
@@ -20,9 +17,10 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
 from simulator import CameraSettings, get_camera
-from tests.ae_env.environments import ID, assert_same, make_env, make_envs, named
+from tests.ae_env.environments import ID, check_parity, make_env
 from tests.ae_env.recorded_files import GRID, capture, write_raws, write_states, write_video
 
+CAMERA = get_camera("nikon_z6")
 #: States that scene "b" lacks: the brightest, and one with others as bright.
 HOLES = (5, 6)
 
@@ -47,15 +45,9 @@ def arguments(scenes: Any, **more: Any) -> dict[str, Any]:
     return {"scenes": spec, "split": "test", **more}
 
 
-def central(settings: CameraSettings, seed: int) -> torch.Tensor:
-    """What the reference camera took, as written to the file; its middle 36 x 36 pixels."""
-    return capture(settings, seed).data[:, 2:38, 2:38]
-
-
 def test_every_observation_is_the_capture(raws: Path) -> None:
-    camera = get_camera("nikon_z6")
-    black = np.array(camera.black_level)[:, None, None]
-    span = np.array(camera.span)[:, None, None]
+    black = np.array(CAMERA.black_level)[:, None, None]
+    span = np.array(CAMERA.span)[:, None, None]
     envs = {kind: make_env(**arguments(raws, observation=kind)) for kind in ("linear", "dn")}
     envs["uint8"] = make_env(**arguments(raws))
     for kind, env in envs.items():
@@ -75,45 +67,32 @@ def test_every_observation_is_the_capture(raws: Path) -> None:
 
 
 def test_states_without_a_capture_are_masked_and_never_shown(raws: Path) -> None:
-    env = make_env(**arguments(raws))
-    base: Any = env.unwrapped
+    base: Any = make_env(**arguments(raws)).unwrapped
+    assert base.action_space.n == len(GRID)
     for seed in range(8):  # no episode starts there
-        _, info = env.reset(seed=seed, options={"scene": "b"})
+        _, info = base.reset(seed=seed, options={"scene": "b"})
         assert info["state"] not in HOLES
-    masks = base.action_masks()
-    assert np.flatnonzero(~masks).tolist() == list(HOLES)
+    assert np.flatnonzero(~base.action_masks()).tolist() == list(HOLES)
     # ISO 1600, 1/1000 s, f/8 is missing: ISO 100, 1/125 s, f/8 is a stop darker, others more off.
     for action, shown in ((5, 3), (6, 7)):
-        observation, _, _, _, info = env.step(action)
+        observation, _, _, _, info = base.step(action)
         assert info["state"] == shown
         assert (info["iso"], info["exposure_time"]) == (GRID[shown].iso, GRID[shown].exposure_time)
         expected = encode_observation(central(GRID[shown], 1)[None])[0].numpy()
         np.testing.assert_array_equal(observation["raw"], expected)
-    _, info = env.reset(seed=0, options={"scene": "b", "state": 5})
+    _, info = base.reset(seed=0, options={"scene": "b", "state": 5})
     assert info["state"] == 3
-
-
-def test_the_grid_is_that_of_the_captures_unless_one_is_named(raws: Path) -> None:
-    assert make_env(**arguments(raws)).action_space.n == len(GRID)
-    named: Any = make_env(**arguments(raws, grid="default"))
-    assert named.action_space.n == 64
     # Of the 64 states those at f/4 and f/8 with ISO 100 or 1600 and 1/1000 or 1/125 s were taken.
-    (whole,) = (scene for scene in named.unwrapped.scenes if scene.scene_id == "a")
+    named: Any = make_env(**arguments(raws, grid="default")).unwrapped
+    assert named.action_space.n == 64
+    (whole,) = (scene for scene in named.scenes if scene.scene_id == "a")
     assert whole.allowed.sum() == 8
 
 
 def test_the_nearest_capture_is_nearest_in_exposure_first() -> None:
     grid = ExposureGrid((100, 200, 400), (1 / 64, 1 / 32), (4,))
-    light = torch.full((4, 4, 4), 0.1)
-    allowed = np.array([True, True, False, True, True, False])
-    scene = Scene.from_array(
-        light,
-        grid[0],
-        get_camera("nikon_z6"),
-        scene_id="a",
-        recorded=torch.zeros(6, 4, 4, 4),
-        allowed=allowed,
-    )
+    fields = {"recorded": torch.zeros(6, 4, 4, 4), "allowed": np.array([1, 1, 0, 1, 1, 0], bool)}
+    scene = Scene.from_array(torch.full((4, 4, 4), 0.1), grid[0], CAMERA, scene_id="a", **fields)
     # ISO 200, 1/64 s: ISO 100, 1/32 s is as bright. ISO 400, 1/32 s: a stop off are two, both a
     # stop away in one control; the lower ISO wins.
     assert nearest_recorded(scene, grid).tolist() == [0, 1, 1, 3, 4, 3]
@@ -127,11 +106,8 @@ def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str,
         observation, _, _, _, info = env.step(action)
         shown.append(info["scene_id"])
     assert shown == [f"street/frame_{i:04d}" for i in (0, 1, 2, 2, 2)]  # the last one stays
-    given = {"camera": get_camera("nikon_z6"), "resolution": 36}
-    expected = load_scenes(video, "all", **given)[2].recorded
-    assert expected is not None
-    expected = expected[1]
-    np.testing.assert_array_equal(observation["raw"], encode_observation(expected[None])[0].numpy())
+    expected = load_scenes(video, "all", camera=CAMERA, resolution=36)[2].recorded[1:2]
+    np.testing.assert_array_equal(observation["raw"], encode_observation(expected)[0].numpy())
     _, info = env.reset(seed=0, options={"frame": 1})
     assert info["scene_id"] == "street/frame_0001"
 
@@ -155,14 +131,7 @@ def test_the_table_is_what_stepping_gives(raws: Path) -> None:
 def test_native_vector_environments_show_the_same(raws: Path, video: dict[str, Any]) -> None:
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
-        envs = make_envs(autoreset_mode="SAME_STEP", **given)
-        single = SyncVectorEnv(
-            [functools.partial(make_env, **given)] * 3, autoreset_mode="SameStep"
-        )
-        assert_same(named(envs, envs.reset(seed=0)), single.reset(seed=0))
-        for actions in ([0, 1, 2], [2, 2, 2]):
-            chosen = np.array(actions)
-            assert_same(named(envs, envs.step(chosen)), single.step(chosen))
+        check_parity(0, 4, max_episode_steps=3, **given)
 
 
 def test_the_checkers_find_nothing(raws: Path, tmp_path: Path, video: dict[str, Any]) -> None:
@@ -177,25 +146,25 @@ def test_the_checkers_find_nothing(raws: Path, tmp_path: Path, video: dict[str, 
                     check_for_sb3(env.unwrapped)
 
 
-def test_specs_and_environments_are_restored(raws: Path) -> None:
-    env = make_env(**arguments(raws))
-    assert env.spec is not None
-    again = gym.make(pickle.loads(pickle.dumps(env.spec)))
-    first, second = (e.reset(seed=3)[0] for e in (env, again))
-    np.testing.assert_array_equal(first["raw"], second["raw"])
-    copy: Any = pickle.loads(pickle.dumps(env.unwrapped))
-    for e in (env, copy):
+def test_environments_are_restored(raws: Path) -> None:
+    env = make_env(**arguments(raws)).unwrapped
+    for e in (env, copy := pickle.loads(pickle.dumps(env))):
         e.reset(seed=4)
     np.testing.assert_array_equal(env.step(1)[0]["raw"], copy.step(1)[0]["raw"])
 
 
 def test_a_changed_folder_is_read_again(tmp_path: Path) -> None:
     write_raws(tmp_path / "a")
-    assert len(make_env(**arguments(tmp_path)).unwrapped.scenes) == 1  # type: ignore[attr-defined]
+    assert len(make_env(**arguments(tmp_path)).unwrapped.scenes) == 1
     (tmp_path / "a" / "IMG_0007.dng").unlink()
-    scene = make_env(**arguments(tmp_path)).unwrapped.scenes[0]  # type: ignore[attr-defined]
+    scene = make_env(**arguments(tmp_path)).unwrapped.scenes[0]
     assert scene.allowed is not None
     assert not scene.allowed[7]
+
+
+def central(settings: CameraSettings, seed: int) -> torch.Tensor:
+    """What the reference camera took, as written to the file; its middle 36 x 36 pixels."""
+    return capture(settings, seed).data[:, 2:38, 2:38]
 
 
 REAL = {"motion": 0.3, "depth": 1.0, "lighting": "step", "noise": "exact", "source": "raw"}
@@ -205,10 +174,7 @@ REAL = {"motion": 0.3, "depth": 1.0, "lighting": "step", "noise": "exact", "sour
 def test_nothing_of_real_captures_can_be_simulated(raws: Path, name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"`{name}` .* must be .* for recorded"):
         make_env(**arguments(raws, **{name: value}))
-
-
-def test_where_recorded_scenes_would_be_simulated_they_are_refused(raws: Path) -> None:
-    scenes = load_scenes(f"recorded:{raws}", "all", camera=get_camera("nikon_z6"), resolution=36)
+    scenes = load_scenes(f"recorded:{raws}", "all", camera=CAMERA, resolution=36)
     with pytest.raises(ValueError, match=r"must name the folder of recorded scenes"):
         make_env(scenes=scenes)
     with pytest.raises(ValueError, match=r"`scenes` .* must not be recorded: of a bracket's"):
@@ -216,7 +182,7 @@ def test_where_recorded_scenes_would_be_simulated_they_are_refused(raws: Path) -
 
 
 def test_a_contact_sheet_leaves_holes_empty(raws: Path) -> None:
-    scenes = load_scenes(f"recorded:{raws}", "all", camera=get_camera("nikon_z6"), resolution=36)
+    scenes = load_scenes(f"recorded:{raws}", "all", camera=CAMERA, resolution=36)
     sheets = [np.asarray(contact_sheet(scene, grid=GRID)) for scene in scenes]
     background = sheets[0][0, 0]
     empty = [int((sheet == background).all(axis=2).sum()) for sheet in sheets]

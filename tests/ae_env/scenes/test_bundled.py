@@ -23,9 +23,9 @@ from ae_env.scenes.load import _LOADED
 from ae_env.scenes.measured_depth import depth_scenes
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
-from simulator.radiance.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
+from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
-from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
+from simulator.radiance.procedural import HARD_KINDS, dead_leaves, list_kinds
 from simulator.utils.cache import disk_cache
 from tests.ae_env.environments import assert_equal
 from tests.ae_env.scorer_images import make_scene
@@ -107,15 +107,6 @@ def test_a_scene_is_the_same_wherever_it_is_asked_for(unseen: list[Scene]) -> No
         assert scene.reference == by_id[scene.scene_id].reference
 
 
-def test_unknown_kinds_and_sizes_are_named() -> None:
-    rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match="did you mean 'night'"):
-        draw("nights", rng)
-    for arguments, message in (((32, "fron"), "`focus`"), ((8,), "`size`")):
-        with pytest.raises(ValueError, match=message):
-            draw_depth(rng, *arguments)
-
-
 def test_unprocess_inverts_tone_and_gamma() -> None:
     """0.5 is a fixed point of the tone curve; sRGB 0.5 is 0.2140 linear (IEC 61966-2-1)."""
     rng = np.random.default_rng(0)
@@ -130,9 +121,7 @@ def test_unprocess_inverts_tone_and_gamma() -> None:
     assert np.abs(again * 255 - shown).max() <= 0.51
 
 
-def test_cached_scenes_equal_fresh_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_cached_scenes_equal_fresh_ones(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
     caplog.set_level(logging.INFO)
 
@@ -167,14 +156,10 @@ def test_cached_scenes_equal_fresh_ones(
 PITCH = 11.88e-6  # packed pixels of the Nikon Z6
 
 
-def drawn_depth(seed: int, size: int = 48, focus: str = "middle") -> DepthDrawing:
-    return draw_depth(np.random.default_rng(seed), size, focus)
-
-
 def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:
     """c = f^2 / (N (s - f)) |z - s| / z with f = 50 mm and N = 11, by hand."""
     for seed, focus in enumerate(FOCUSES * 2):
-        picture = drawn_depth(seed, focus=focus)
+        picture = draw_depth(np.random.default_rng(seed), 48, focus)
         distance, z = lens_and_depth(picture.blur, picture.far, PITCH)
         z = z.astype(float)
         c = 0.05**2 / (11.0 * (distance - 0.05)) * (z - distance) / z / PITCH
@@ -186,7 +171,8 @@ def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:
 def test_what_is_in_focus() -> None:
     for seed in range(8):
         everything, front, back = (
-            drawn_depth(seed, focus=focus).blur for focus in ("everything", "front", "back")
+            draw_depth(np.random.default_rng(seed), 48, focus).blur
+            for focus in ("everything", "front", "back")
         )
         assert np.abs(everything).max() <= 0.3 + 1e-6
         # Slants and floating leaves reach at most 1.8 pixels past the level of the thing.
@@ -311,7 +297,7 @@ def test_episodes_do_not_depend_on_when_scenes_are_drawn(name: str) -> None:
         envs = gym.make_vec(
             f"ae_env/{name}", num_envs=3, scenes="bundled:spot_light", split="test", resolution=36
         )
-        core = envs.unwrapped.core  # type: ignore[attr-defined]
+        core = envs.unwrapped.core
         loaded.append(len(core.scenes.loaded))
         found: list[tuple[object, ...]] = [envs.reset(seed=5)]
         found += [envs.step(np.full(3, action)) for action in range(0, 21, 3)]

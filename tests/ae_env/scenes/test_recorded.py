@@ -1,6 +1,6 @@
 """Scenes of real captures: which file is which state, their pixels and light, bad input."""
 
-import logging
+import functools
 import shutil
 from pathlib import Path
 
@@ -32,10 +32,7 @@ from tests.ae_env.recorded_files import (
 from tests.simulator.training.scenes import scene as reference_scene
 
 CAMERA = get_camera("nikon_z6")
-
-
-def load(spec: object, resolution: int | None = None, **options: object):
-    return load_scenes(spec, "all", camera=CAMERA, resolution=resolution, **options)  # type: ignore[arg-type]
+load = functools.partial(load_scenes, split="all", camera=CAMERA, resolution=None)
 
 
 def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
@@ -115,13 +112,10 @@ def test_the_body_of_the_raws_is_the_camera(tmp_path: Path) -> None:
         np.testing.assert_allclose(body.nlf(iso).shot, CAMERA.nlf(iso).shot, rtol=0.02)
 
 
-def test_states_without_a_capture_are_forbidden_and_said(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_states_without_a_capture_are_forbidden_and_said(tmp_path, caplog):
     write_raws(tmp_path / "a")
     write_raws(tmp_path / "b", [s for i, s in enumerate(GRID) if i not in (2, 5)], seed=1)
-    with caplog.at_level(logging.WARNING, "ae_env.scenes.recorded"):
-        a, b = load(f"recorded:{tmp_path}")
+    a, b = load(f"recorded:{tmp_path}")
     assert a.allowed.all()
     assert np.flatnonzero(~b.allowed).tolist() == [2, 5]
     assert not b.recorded[[2, 5]].any()
@@ -134,73 +128,47 @@ def test_states_without_a_capture_are_forbidden_and_said(
     torch.testing.assert_close(a.recorded[1], capture(GRID[6]).data)
 
 
-def _cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:300])
-
-
-def _cut_raw(path: Path) -> None:
+def _spoil(path: Path, fault: str) -> None:
     folder = path.parents[3]
-    shutil.rmtree(folder / "l1")
-    write_raws(folder)
-    (folder / "IMG_0003.dng").write_bytes((folder / "IMG_0003.dng").read_bytes()[:4000])
-
-
-def _other_size(path: Path) -> None:
-    with Image.open(path) as picture:
-        picture.resize((44, 40)).save(path)
-
-
-def _sixteen_bits(path: Path) -> None:
-    path.unlink()
-    Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
-
-
-def _one_state(path: Path) -> None:
-    for folder in path.parents[2].iterdir():
-        if folder.name != "param_3":
-            shutil.rmtree(folder)
+    if fault == "cut":
+        path.write_bytes(path.read_bytes()[:300])
+    elif fault == "cut raw":
+        shutil.rmtree(folder / "l1")
+        write_raws(folder)
+        (folder / "IMG_0003.dng").write_bytes((folder / "IMG_0003.dng").read_bytes()[:4000])
+    elif fault == "twice":
+        shutil.copy(path, path.with_suffix(".png"))
+    elif fault == "other size":
+        with Image.open(path) as picture:
+            picture.resize((44, 40)).save(path)
+    elif fault == "no table":
+        (folder / "grid-options-2x2x2.csv").unlink()
+    elif fault == "16 bits":
+        path.unlink()
+        Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
+    elif fault == "one state":
+        for other in set((folder / "l1").iterdir()) - {folder / "l1" / "param_3"}:
+            shutil.rmtree(other)
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("fault", "message"),
     [
-        (_cut, r"recorded file '.*param_3.*val_1.JPEG' cannot be read: "),
-        (_cut_raw, r"recorded file '.*IMG_0003.dng' cannot be read: .*truncated"),
-        (
-            lambda path: shutil.copy(path, path.with_suffix(".png")),
-            r"'l1/n00000001/val_1' must have",
-        ),
-        (_other_size, r"val_1.JPEG' \(\(40, 44\) packed"),
-        (lambda path: path.parents[3].joinpath("grid-options-2x2x2.csv").unlink(), "val_0.JPEG"),
-        (_sixteen_bits, r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
-        (None, r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
-        (_one_state, r"\(1 of 1 captures in the grid, .*param_3.*\) must have two states or more"),
+        ("cut", r"recorded file '.*param_3.*val_1.JPEG' cannot be read: "),
+        ("cut raw", r"recorded file '.*IMG_0003.dng' cannot be read: .*truncated"),
+        *(("twice", "'l1/n00000001/val_1' must have"), ("no table", "val_0.JPEG")),
+        ("other size", r"val_1.JPEG' \(\(40, 44\) packed"),
+        ("16 bits", r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
+        ("", r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
+        ("one state", "1 of 1 captures in the grid, .*param_3"),
     ],
 )
-def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: str) -> None:
+def test_bad_files_get_one_line_that_names_them(tmp_path: Path, fault: str, message: str) -> None:
     write_states(tmp_path)
-    if spoil:
-        spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
+    _spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG", fault)
     with pytest.raises(ValueError, match=message) as error:
-        load(f"recorded:{tmp_path}", resolution=None if spoil else 64)
+        load(f"recorded:{tmp_path}", resolution=None if fault else 64)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("recorded:", r"`scenes\['recorded'\]` \(=''\) must be the path of a folder"),
-        ({"recorded": 3}, r"`scenes\['recorded'\]` \(=3\) must be the path"),
-        ({"recorded": "a", "isos": 3}, r"did you mean 'iso'"),
-        ("recorded:a?iso=-3", r"`iso` \(=-3.0\) must be"),
-        ("recorded:a?iso=fast", r"f_number=4: 'fast' must be a number"),
-    ],
-)
-def test_bad_options(spec: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        load(spec)
-    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
-    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -209,6 +177,45 @@ def touch(folder: Path, *names: str) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).touch()
     return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        *(
+            ("settings.csv", "a,b\n1,2", "column file"),
+            ("settings.csv", "file,iso\nx,many", "line 2"),
+        ),
+        *(("settings.csv", "idx,iso\nfirst,100", "line 2"), ("s.txt", "", "must hold captures")),
+        ("settings.csv", "file,iso\nx,100\nx,200", "one row for 'x'"),
+        ("settings.csv", "file,iso\n\udcff,100", "CSV file in UTF-8"),
+        (".hidden/iso1_1s_f1.png", "", "must hold captures"),
+        *(("1-8s/x.png", "", "its iso and f_number"), ("a.dng", "", r"a.dng': `path`")),
+    ],
+)
+def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(text, errors="surrogateescape")
+    with pytest.raises(ValueError, match=message):
+        index_recorded(tmp_path, {})
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        *(("recorded:", r"`scenes\['recorded'\]`"), ({"recorded": 3}, r"`scenes\['recorded'\]`")),
+        *(("recorded:none", "existing folder"), ("recorded:a?iso=-3", "`iso`")),
+        *(({"recorded": "a", "isos": 3}, "did you mean 'iso'"), ("recorded:a?iso=fast", "number")),
+    ],
+)
+def test_options(tmp_path: Path, spec: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load(spec)
+    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
+    names = [f"iso{i}_1-{i}s_f{i / 100}.png" for i in range(100, 1800, 100)]
+    with pytest.raises(ValueError, match="4913 combinations; at most 4096"):
+        recorded_grid(index_recorded(touch(tmp_path, *names), {}))
 
 
 @pytest.mark.parametrize(
@@ -262,33 +269,3 @@ def test_video_stacks(tmp_path: Path) -> None:
     flat = touch(tmp_path / "flat", *(f"v/frame_{i}_1-{t}s.png" for i in (9, 10) for t in (8, 15)))
     files = index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
     assert [(f.sequence, f.frame) for f in files] == [("v", 9), ("v", 9), ("v", 10), ("v", 10)]
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        ("a,b\n1,2", r"columns \['a', 'b'\]\) must have the column file"),
-        ("file,iso\nx,many", r"settings.csv', line 2: 'many' must be a number"),
-        ("idx,iso\nfirst,100", r"settings.csv', line 2: 'first' must be a number"),
-        ("file,iso\nx,100\nx,200", r"settings.csv' must have one row for 'x': two say"),
-        ("file,iso\n\udcff,100", r"settings.csv' must be a CSV file in UTF-8"),
-    ],
-)
-def test_wrong_tables(tmp_path: Path, table: str, message: str) -> None:
-    (tmp_path / "settings.csv").write_text(table, errors="surrogateescape")
-    with pytest.raises(ValueError, match=message):
-        index_recorded(tmp_path, {})
-
-
-def test_files_that_are_no_state(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'recorded:.*none'\) must name an existing folder"):
-        index_recorded(tmp_path / "none", {})
-    with pytest.raises(ValueError, match=r"must hold captures: raws \(.*pictures \("):
-        index_recorded(touch(tmp_path / "a", "read_me.txt", ".hidden/iso1_1s_f1.png"), {})
-    with pytest.raises(ValueError, match=r"x.png' does not state its iso and f_number: name it"):
-        index_recorded(touch(tmp_path / "b", "1-8s/x.png"), {})
-    with pytest.raises(ValueError, match=r"file '.*a.dng': `path` \(='a.dng'\) must be a"):
-        index_recorded(touch(tmp_path / "d", "a.dng"), {})
-    names = [f"iso{i}_1-{i}s_f{i / 100}.png" for i in range(100, 1800, 100)]
-    with pytest.raises(ValueError, match=r"17 ISO speeds.*4913 combinations; at most 4096"):
-        recorded_grid(index_recorded(touch(tmp_path / "e", *names), {}))
