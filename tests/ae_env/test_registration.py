@@ -60,11 +60,9 @@ def test_import_is_light_and_registers_once() -> None:
 
 def test_public_names_resolve_and_nothing_else_is_listed() -> None:
     assert set(dir(ae_env)) == {*ae_env.__all__, "__version__"}
-    for name in ae_env.__all__:
-        assert getattr(ae_env, name).__doc__
-    assert {*ae_env.wrappers.__all__} <= {*ae_env.__all__}
+    assert all(getattr(ae_env, name).__doc__ for name in ae_env.__all__)
     lightings = {kind.__name__ for kind in ae_env.lighting.KINDS.values()}
-    assert lightings <= {*ae_env.__all__}
+    assert {*ae_env.wrappers.__all__} | lightings <= {*ae_env.__all__}
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = ae_env.nonsense
 
@@ -107,14 +105,10 @@ def test_presets_run_on_small_scenes(name: str) -> None:
 
 
 def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"`env` .*did you mean 'tunnel'"):
-        ae_env.load_preset("tunel")
-    for name in (None, ["snow"], ""):
-        with pytest.raises(ValueError, match=r"`env` \(=.*\) must be one of .*snow"):
-            ae_env.load_preset(name)
     own = tmp_path / "own.yaml"
-    with pytest.raises(ValueError, match=r"`env` \(='.*own.yaml'\): there is no such file"):
-        ae_env.load_preset(own)
+    for name in ("tunel", None, ["snow"], "", own):
+        with pytest.raises(ValueError, match=r"`env` \(=.*(snow|did you mean|no such file)"):
+            ae_env.load_preset(name)
     own.write_text("lighting: sine\nmax_episode_steps: 4\n")
     expected = {"lighting": "sine", "max_episode_steps": 4}
     assert ae_env.load_preset(own) == ae_env.load_preset(str(own)) == expected

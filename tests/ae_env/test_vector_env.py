@@ -142,16 +142,21 @@ def test_construction_in_spawned_processes() -> None:
 
 @pytest.mark.slow
 def test_workers_that_are_forked_from_a_process_with_environments() -> None:
-    """Gymnasium's default: torch's threads do not survive the fork, a worker must not need them."""
+    # Gymnasium's default: torch's threads do not survive the fork, a worker must not need them.
     code = (
         "import gymnasium as gym\n"
         "envs = gym.make_vec('ae_env:ae_env/AutoExposure-v0', num_envs=2,"
         " vectorization_mode='async', scenes='bundled:small')\n"
-        "envs.reset(seed=0); print(envs.step([3, 40])[1].shape); envs.close()\n"
+        "envs.reset(seed=0)\n"
+        "print(envs.step([3, 40])[1].shape)\n"
+        "envs.close()\n"
     )
     variables = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
     command = [sys.executable, "-c", code]
-    assert subprocess.check_output(command, env=variables, timeout=120) == b"(2,)\n"
+    done = subprocess.run(
+        command, env=variables, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "(2,)\n"), done.stderr
 
 
 STATM = Path("/proc/self/statm")

@@ -81,15 +81,14 @@ def test_pictures_are_developed_back(tmp_path: Path) -> None:
 
 def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
     for number, settings in enumerate(GRID):
-        path = tmp_path / "exif" / f"IMG_{number}.jpg"
-        write_picture(path, settings, exif=("iso", "exposure_time", "f_number"))
+        picture = tmp_path / "exif" / f"IMG_{number}.jpg"
+        write_picture(picture, settings, exif=("iso", "exposure_time", "f_number"))
+        write_picture(tmp_path / "a" / f"{number}.jpg", settings, exif=("exposure_time", "iso"))
     write_states(tmp_path / "table", seeds=(0,))
     (by_exif,), (by_table,) = (load(f"recorded:{tmp_path / n}") for n in ("exif", "table"))
     assert (by_exif.scene_id, by_table.scene_id) == ("exif", "l1/n00000000/val_0")
     torch.testing.assert_close(by_exif.recorded, by_table.recorded, rtol=0.0, atol=0.0)
     # They complete each other.
-    for number, settings in enumerate(GRID):
-        write_picture(tmp_path / "a" / f"{number}.jpg", settings, exif=("exposure_time", "iso"))
     rows = [f"{number}.jpg,f{settings.f_number:g}" for number, settings in enumerate(GRID)]
     (tmp_path / "a" / "settings.csv").write_text("\n".join(["file,aperture", *rows]))
     files = index_recorded(tmp_path / "a", {})

@@ -17,8 +17,6 @@ import examples.convert_nima as convert_nima
 from ae_env.scorers import make_scorer
 from ae_env.scorers.learnt import PUBLISHED, Classifier, NimaMobileNet, read_network
 from ae_env.utils.user_files import UserCodeError
-from tests.ae_env.environments import make_env
-from tests.ae_env.recorded_files import GRID, write_raws
 
 KERAS = """
     import os, sys
@@ -139,12 +137,9 @@ def write_network(
     nodes = [node("GlobalAveragePool", ["x"], ["m"]), node("Flatten", ["m"], ["logits"])]
     if softmax:
         nodes.append(node("Softmax", ["logits"], ["shares"]))
-    graph = onnx.helper.make_graph(
-        nodes,
-        "means",
-        [info("x", onnx.TensorProto.FLOAT, [batch, 3, size, size])],
-        [info("shares" if softmax else "logits", onnx.TensorProto.FLOAT, [batch, 3])],
-    )
+    given = info("x", onnx.TensorProto.FLOAT, [batch, 3, size, size])
+    found = info("shares" if softmax else "logits", onnx.TensorProto.FLOAT, [batch, 3])
+    graph = onnx.helper.make_graph(nodes, "means", [given], [found])
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 13)])
     model.ir_version = 8
     onnx.save(model, str(path))
@@ -195,17 +190,6 @@ def test_a_callable_sees_normalised_squares() -> None:
     powers = np.exp(images.mean(dim=(2, 3)).numpy() / 0.5)
     expected = powers.max(axis=1) / powers.sum(axis=1)
     np.testing.assert_allclose(own(images, None).numpy(), expected, rtol=1e-4)
-
-
-def test_it_rates_the_captures_of_a_recorded_grid(tmp_path, monkeypatch):
-    write_raws(tmp_path / "grid" / "desk")
-    monkeypatch.setenv("AE_ENV_CLASSIFIER", str(write_network(tmp_path / "a.onnx")))
-    given = {"scenes": f"recorded:{tmp_path / 'grid'}", "split": "test", "with_oracle": True}
-    env = make_env(scorer="classifier", **given)
-    env.reset(seed=0)
-    rewards, infos = zip(*(env.step(state)[1::3] for state in range(len(GRID))), strict=True)
-    assert np.ptp(rewards) > 0.01
-    assert int(np.argmax(rewards)) == infos[-1]["oracle_state"]
 
 
 def test_what_is_no_classifier_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

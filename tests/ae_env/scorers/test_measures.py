@@ -214,15 +214,11 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
     luma = torch.from_numpy(codes / 255.0)
     expected = [shannon_entropy(picture, base=2) for picture in codes]
     np.testing.assert_allclose(histogram_entropy(luma).numpy(), expected, rtol=1e-9)
+    for bad in (torch.zeros(2, 3), torch.zeros(1, 2, 3, dtype=torch.uint8)):
+        with pytest.raises(ValueError, match="`luma`"):
+            histogram_entropy(bad)
     every = torch.arange(256.0).reshape(1, 16, 16) / 255.0
     assert _score("entropy", every[:, None].expand(-1, 3, -1, -1)) == pytest.approx([1.0])
-
-
-def test_bad_luma_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"`luma` \(=\(2, 3\)"):
-        histogram_entropy(torch.zeros(2, 3))
-    with pytest.raises(ValueError, match="floating point"):
-        histogram_entropy(torch.zeros(1, 2, 3, dtype=torch.uint8))
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from scipy.integrate import quad
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
-from ae_env.scorers.captures import Scorer, describe_captures, prepare_scene, reads_pixels
+from ae_env.scorers.captures import describe_captures, prepare_scene
 from ae_env.scorers.score_table import ScoreTables
-from ae_env.scorers.terms import Sharpness, depends_on
+from ae_env.scorers.terms import Sharpness
 from simulator import CameraSettings, NoiseLevelFunction
 from simulator.capture.prepared_scene import Layout
 from simulator.optics.motion import Movement
@@ -154,16 +154,6 @@ def test_bands_by_hand() -> None:
     assert 0.0 < make_scorer("banding")(None, dark).item() < 1e-4
 
 
-def test_terms_say_what_they_read() -> None:
-    for name in ("brightness", "highlights", "shadows", "noise", "sharpness", "banding"):
-        part = make_scorer(name).parts[name]
-        assert (part.domain, isinstance(part, Scorer)) == ("raw", True)
-        measured = name in ("highlights", "shadows", "noise")
-        settled = "blur" if name == "sharpness" else "light"
-        assert depends_on(part) == ("image" if measured else settled)
-        assert reads_pixels(part) == measured
-
-
 SIZE = 40
 MOVEMENT = Movement(0.3, 4.0, subject_speed=0.5, subject_direction=2.5)
 BLUR_GRID = ExposureGrid((100, 800), (1 / 100, 1 / 4), (4, 8))
@@ -181,19 +171,15 @@ def _scene(name: str = "laid-out") -> Scene:
 
 def _wanted(scene: Scene, speed: float, defocus: float, movement: Movement) -> np.ndarray:
     """Mean sharpness of every state, pixel by pixel and by quadrature of the subject's path."""
-    assert scene.layout is not None
+    own = movement.subject_speed * np.exp(1j * movement.subject_direction)
+
+    def velocity(time: float) -> float:
+        return abs(speed * np.exp(1j * (movement.direction + movement.turn * time)) + own)
+
     found = []
     for state in BLUR_GRID:
-
-        def velocity(time: float) -> float:
-            angle = movement.direction + movement.turn * time
-            own = movement.subject_speed * np.exp(1j * movement.subject_direction)
-            return abs(speed * np.exp(1j * angle) + own)
-
-        subject = scene.layout.subject
-        path = quad(velocity, 0.0, state.exposure_time)[0]
         motion = np.full((SIZE, SIZE), speed * state.exposure_time)
-        motion[subject] = path
+        motion[scene.layout.subject] = quad(velocity, 0.0, state.exposure_time)[0]
         disc = scene.layout.defocus.numpy() * defocus * 4.0 / state.effective_f_number / 64.0
         found.append((1.0 / (1.0 + 64.0**2 * (motion**2 + disc**2))).mean())
     return np.array(found)
@@ -209,16 +195,14 @@ def test_sharpness_is_the_mean_over_the_pixels(defocus: float, movement: Movemen
 
 
 def test_captures_of_several_scenes_are_those_of_each() -> None:
-    plain = replace(_scene("plain"), layout=None)
-    scenes, states = [_scene(), plain, _scene()], list(BLUR_GRID)[-3:]
+    scenes = [_scene(), replace(_scene(), scene_id="plain", layout=None), _scene()]
+    given = {"speed": (0.2, 0.1, 0.0), "defocus": (3.0, 3.0, 0.0), "gain": (1.0, 1.0, 1.0)}
     captures = describe_captures(
         scenes,
-        states,
+        list(BLUR_GRID)[-3:],
         CAMERA,
-        speed=np.array([0.2, 0.1, 0.0]),
-        defocus=np.array([3.0, 3.0, 0.0]),
         movements=[MOVEMENT, MOVEMENT, replace(MOVEMENT, subject_speed=0.0)],
-        gain=np.ones(3),
+        **{name: np.array(values) for name, values in given.items()},
     )
     found = Sharpness()(None, captures).numpy()
     alone = 1.0 / (1.0 + (captures.blur_px[1] * 64.0 / SIZE) ** 2)
@@ -228,21 +212,14 @@ def test_captures_of_several_scenes_are_those_of_each() -> None:
 
 
 def test_the_extent_is_the_root_mean_square() -> None:
-    scene = _scene()
-    assert scene.layout is not None
-    tables = ScoreTables(BLUR_GRID, CAMERA, make_scorer("balanced"))
+    scene, tables = _scene(), ScoreTables(BLUR_GRID, CAMERA, make_scorer("balanced"))
     prepared = prepare_scene(scene, CAMERA, defocus=5.0)
     captures = tables.term_scores.captures.describe(scene, prepared)
     wanted = 5.0 * SIZE / 64.0 * float(scene.layout.defocus.double().square().mean().sqrt())
     assert captures.blur_px[0] == pytest.approx(wanted, rel=2e-3)
-
-
-def test_sharpness_knows_that_discs_end_where_the_frame_has_them_end() -> None:
-    # 64 of 256 packed pixels at f/4; the bank's largest disc has 32.
-    layout = Layout(torch.ones(256, 256))
-    scene = make_scene(np.full((4, 256, 256), 0.12), 640.0, scene_id="large", layout=layout)
-    tables = ScoreTables(BLUR_GRID, CAMERA, make_scorer("balanced"))
-    sharp = tables.table(scene, defocus=16.0).parts["sharpness"]
+    # Discs end where the frame has them end: 64 of 256 packed pixels at f/4, the bank's has 32.
+    light, layout = np.full((4, 256, 256), 0.12), Layout(torch.ones(256, 256))
+    sharp = tables.table(make_scene(light, 640.0, layout=layout), defocus=16.0).parts["sharpness"]
     np.testing.assert_allclose(sharp, 1.0 / (1.0 + (32.0 / 256.0 * 64.0) ** 2), rtol=1e-2)
 
 
