@@ -11,12 +11,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NumpyToTorch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.ae_env.environments import assert_same, check_parity, make_envs, make_worker_env
+from tests.ae_env.environments import assert_same, check_parity, make_envs
 from tests.strategies import SEEDS
 
 RICH = {"with_oracle": True, "observation": "linear", "lighting": "sine", "delay": 1}
@@ -126,18 +126,6 @@ def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
         for name, values in wanted.items():
             others = ~np.array(mask)
             np.testing.assert_array_equal(shown[-1][name][others], values[others])
-
-
-@pytest.mark.slow
-def test_construction_in_spawned_processes() -> None:
-    envs = AsyncVectorEnv([make_worker_env], context="spawn")
-    try:
-        native = make_envs(1)
-        assert_same(envs.reset(seed=5)[0], native.reset(seed=5)[0])
-        for action in ([8], [33]):
-            assert_same(envs.step(action)[0], native.step(action)[0])
-    finally:
-        envs.close()
 
 
 @pytest.mark.slow
