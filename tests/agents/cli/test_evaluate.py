@@ -35,30 +35,23 @@ def preset(tmp_path: Path) -> str:
     return str(tmp_path / "mine.yaml")
 
 
-def test_plain_options_mean_one_condition():
-    plan = make_plan(
-        None, None, ["random"], {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5}
-    )
+def test_the_plan_of_options_of_a_preset_and_of_an_environment(preset, tmp_path):
+    """Plain options mean one condition; others replace what a preset or an environment says."""
+    options = {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5}
+    plan = make_plan(None, None, ["random"], options)
     ((name, condition),) = plan.all_conditions.items()
     assert (name, condition.lighting, condition.delay) == ("sine", "sine", 2)
     assert (plan.starts, plan.frames, plan.seeds) == (("random",), 8, (5, 6, 7))
     assert plan.environment == {"scenes": "bundled", "resolution": 64}
-
-
-def test_options_replace_what_a_preset_says(preset):
     plan = make_plan(preset, None, [], {})
     assert list(plan.all_conditions) == ["static", "step+4", "static/delay1", "step+4/delay1"]
     assert plan.policies == ("matrix:P", "random", "oracle")
-    changed = make_plan(
-        preset, None, ["random"], {"scorer": "noise", "frames": 3, "lighting": "ramp"}
-    )
+    options = {"scorer": "noise", "frames": 3, "lighting": "ramp"}
+    changed = make_plan(preset, None, ["random"], options)
     assert changed.environment["scorer"] == "noise"
     assert changed.environment["scenes"] == "bundled:small"
     assert (changed.policies, changed.frames) == (("random",), 3)
     assert list(changed.all_conditions) == ["ramp"]
-
-
-def test_an_environment_is_the_base(tmp_path):
     (tmp_path / "env.yaml").write_text(
         "scenes: 'bundled:small'\nresolution: 40\nlighting: {kind: tunnel}\ndelay: 1\n"
         "max_episode_steps: 30\n"

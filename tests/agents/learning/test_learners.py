@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import nn
 
 from agents.learning.networks import Session
@@ -48,7 +49,9 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path, observati
     loaded = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
     assert isinstance(loaded, PPOPolicy)
     ours = PPOPolicy(context, network=network)
-    # The three extractors of SB3's policy are one again.
+    # The three extractors of SB3's policy are stored once, and are one again.
+    names = load_file(tmp_path / "ppo.safetensors")
+    assert len({name.split(".")[0] for name in names if "extractor" in name}) == 2  # and the MLP
     extractor = loaded.network.features_extractor
     assert loaded.network.pi_features_extractor is extractor
     rng = np.random.default_rng(0)

@@ -7,7 +7,6 @@ import gymnasium as gym
 import pytest
 import torch
 from safetensors.torch import load_file
-from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.learning import weights as agent_weights
@@ -45,16 +44,6 @@ def test_round_trip(agent: Path, context: PolicyContext) -> None:
     with pytest.raises(ValueError, match="must be finite"):
         agent_weights.save_agent(agent, "regression", network, 8, context, {})
     assert load_file(sibling(agent, ".safetensors")).keys() == on_disk.keys()
-
-
-def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
-    module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
-    module["again"] = module["a"]
-    agent_weights.save_agent(tmp_path / "m", "ppo", module, 2, None, {})
-    assert len(load_file(tmp_path / "m.safetensors")) == 4
-    tensors, _ = agent_weights.load_agent(tmp_path / "m", "ppo")
-    assert set(tensors) == set(module.state_dict())
-    assert torch.equal(tensors["again.weight"], module["a"].weight)
 
 
 @pytest.mark.parametrize(
