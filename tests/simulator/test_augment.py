@@ -208,37 +208,19 @@ def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
 # -- bad input ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("stops", v) for v in ((1.0, -1.0), (-1.0, math.nan), 2.0)),
-        ("isos", (0.0, 100.0)),
-        ("defocus", (0.0, 65.0)),
-        ("motion", (-1.0, 1.0)),
-        ("highlights", ("a", "b")),
-        *(("modules", v) for v in (("exposure", "colour"), "noise", None)),
-        ("camera", "nikon_z7"),
-    ],
-)
-def test_bad_settings(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f"`{name}`"):
-        ExposureAugmentation(**{name: value})
-
-
-@pytest.mark.parametrize(
-    "images",
-    [
-        torch.zeros(3, 4, 4),
-        torch.zeros(1, 2, 4, 4),
-        torch.full((1, 3, 4, 4), 1.5),
-        torch.full((1, 3, 4, 4), math.nan),
-        torch.full((1, 4, 4, 4), math.inf),
-        torch.zeros(1, 4, 4, 4, dtype=torch.uint8),
-    ],
-)
-def test_bad_images(images: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="`images`"):
-        ExposureAugmentation()(images, [0])
+def test_bad_settings_and_images():
+    bad = {"stops": [(1.0, -1.0), (-1.0, math.nan), 2.0], "isos": [(0.0, 100.0)]}
+    bad |= {"defocus": [(0.0, 65.0)], "motion": [(-1.0, 1.0)], "highlights": [("a", "b")]}
+    bad |= {"modules": [("exposure", "colour"), "noise", None], "camera": ["nikon_z7"]}
+    for name, value in ((n, v) for n, values in bad.items() for v in values):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            ExposureAugmentation(**{name: value})
+    images = [torch.zeros(3, 4, 4), torch.zeros(1, 2, 4, 4)]
+    images += [torch.full((1, 3, 4, 4), level) for level in (1.5, math.nan)]
+    images += [torch.full((1, 4, 4, 4), math.inf), torch.zeros(1, 4, 4, 4, dtype=torch.uint8)]
+    for each in images:
+        with pytest.raises(ValueError, match="`images`"):
+            ExposureAugmentation()(each, [0])
 
 
 def test_bad_samples_and_seeds() -> None:

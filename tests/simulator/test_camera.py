@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -99,7 +98,7 @@ def test_speeds_far_from_a_nominal_stop_are_kept(exposure_time: float) -> None:
 def test_exposure_ratio_closed_form(source, target, ratio):
     first, second = CameraSettings(*source), CameraSettings(*target)
     assert exposure_ratio(first, second) == pytest.approx(ratio, rel=1e-12)
-    assert exposure_ratio(second, first) == pytest.approx(1 / ratio, rel=1e-9)
+    assert exposure_ratio(second, first) == pytest.approx(1 / ratio, rel=1e-12)
 
 
 def test_incident_meter() -> None:
@@ -308,10 +307,10 @@ def test_bad_profiles_are_refused(fields: dict[str, object], message: str) -> No
         profile(**fields)
 
 
-@pytest.mark.parametrize("iso", [0, -100, math.nan, math.inf, "100"])
-def test_bad_iso(iso: Any) -> None:
-    with pytest.raises(ValueError, match="`iso`"):
-        get_camera("nikon_z6").nlf(iso)
+def test_bad_iso() -> None:
+    for iso in (0, -100, math.nan, math.inf, "100"):
+        with pytest.raises(ValueError, match="`iso`"):
+            get_camera("nikon_z6").nlf(iso)
     with pytest.raises(ValueError, match=r"'bench' has no noise calibration.*estimate_nlf"):
         profile().nlf(100)
 

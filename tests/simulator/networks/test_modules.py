@@ -454,6 +454,16 @@ def test_the_generalised_anscombe_transform_exact_for_any_shot(shot: float, read
     np.testing.assert_allclose(found.double().numpy(), exact, rtol=1e-5, atol=cancelled)
 
 
+@pytest.mark.parametrize("electrons", [6, 40, 500])
+def test_it_makes_noise_of_variance_1_at_every_level(electrons: int) -> None:
+    """Poisson counts and 2 electrons of read noise; the error of 65,536 is 1 % at 3.6 of it."""
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(electrons, (1, 4, 128, 128)) + rng.normal(0.0, 2.0, (1, 4, 128, 128))
+    gain = 1e-3
+    z = stabiliser(gain, (2 * gain) ** 2).forward(torch.from_numpy(counts * gain).float())
+    assert float(z.std()) == pytest.approx(1.0, abs=0.03)
+
+
 def test_the_inverse_and_other_exposures() -> None:
     y = torch.tensor([-3.0, -1e-4, 0.0, 1e-6, 0.02, 1.0, 300.0]).expand(1, 4, 1, -1)
     for shot, read in ((1e-3, 1e-6), (1e-6, 1e-3), (1e-4, 0.0), (0.0, 1e-5)):

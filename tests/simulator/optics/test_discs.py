@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy import ndimage
 
-from simulator.optics import discs
 from simulator.optics.discs import (
     DIAMETERS,
     Blur,
@@ -151,35 +150,30 @@ def test_light_beyond_the_limit_is_clipped_first(extent):
 def test_many_images_are_scipys_correlation(threads, monkeypatch):
     for module in ("utils.compute", "optics.discs"):
         monkeypatch.setattr(f"simulator.{module}.thread_count", lambda: threads)
-    extents = [(0.0, 5.0), (3.3, 0.0), (8.0, 17.0), (1e-4, 1e-7), (2.0, 90.0), (0.7, 0.4)]
+    extents = [
+        (48.0, 5.0),
+        (0.0, 5.0),
+        (3.3, 0.0),
+        (8.0, 17.0),
+        (1e-4, 1e-7),
+        (2.0, 90.0),
+        (0.7, 0.4),
+    ]
     blurs = []
     for extent in extents:
         outputs = [torch.empty(4, 21, 40) if each else None for each in extent]
         blurs.append(Blur(torch.rand(4, 21, 40), extent[0], outputs[0], extent[1], outputs[1]))
     blur_many(blurs)
     for light, diameter, defocused, extent, moved in blurs:
+        rtol = 5e-6 if diameter < 40 else 1e-4  # wide discs in the Fourier domain
         weights = disc_kernel(diameter)[None]
         wanted = ndimage.correlate(light.double().numpy(), weights, mode="nearest")
         if defocused is not None:
-            np.testing.assert_allclose(defocused, wanted, rtol=5e-6)
+            np.testing.assert_allclose(defocused, wanted, rtol=rtol)
         wanted = ndimage.correlate1d(wanted, motion_kernel(extent), mode="nearest")
         if moved is not None:
-            np.testing.assert_allclose(moved, wanted, rtol=1e-5)
+            np.testing.assert_allclose(moved, wanted, rtol=2 * rtol)
     blur_many([])
-
-
-@pytest.mark.parametrize("extent", [0.0, 5.0])
-def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(monkeypatch, extent):
-    light, narrow = torch.rand(4, 64, 48), torch.empty(4, 64, 48)
-    light[:, 20, 20], results = 1e6, []
-    for widest in (discs._WIDE_PX, 1e9):
-        monkeypatch.setattr(discs, "_WIDE_PX", widest)
-        defocused, moved = torch.empty_like(light), torch.empty_like(light)
-        wide = Blur(light, 48.0, defocused, extent, moved if extent else None)
-        blur_many([wide, Blur(light, 3.0, narrow)], limit=1e3)
-        results.append([defocused, narrow.clone()] + [moved] * bool(extent))
-    for fourier, direct in zip(*results, strict=True):
-        torch.testing.assert_close(fourier, direct, rtol=1e-4, atol=1e-5)
 
 
 def test_a_streak_is_the_same_compiled_and_loaded(compiled_and_loaded):

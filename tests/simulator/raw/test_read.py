@@ -462,17 +462,9 @@ def test_identities_of_other_containers(tmp_path):
     known |= {ciff: ("Canon", "PowerShot"), b"": ("", ""), bytes(99): ("", "")}
     for content, identity in known.items():
         assert camera_identity(io.BytesIO(content), []) == identity
-    kinds = {
-        raf: True,
-        mrw: True,
-        cr3: True,
-        b"FOVb": True,
-        ciff: False,
-        b"text": False,
-        b"": False,
-    }
-    for content, is_raw in kinds.items():  # a whole Canon CRW names its camera
-        assert is_raw_container(io.BytesIO(content)) is is_raw
+    kinds = dict.fromkeys((raf, mrw, cr3, b"FOVb"), True)
+    for content, is_raw in (kinds | dict.fromkeys((ciff, b"text", b""), False)).items():
+        assert is_raw_container(io.BytesIO(content)) is is_raw  # a whole Canon CRW names its camera
 
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
