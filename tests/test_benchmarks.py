@@ -103,10 +103,8 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_every_benchmark_of_the_command_is_there() -> None:
     for name in BENCHMARKS:
-        module = importlib.import_module(
-            f"benchmarks.{ {'simulator': 'fidelity'}.get(name, name) }"
-        )
-        assert callable(module.run)
+        module = "fidelity" if name == "simulator" else name
+        assert callable(importlib.import_module(f"benchmarks.{module}").run)
 
 
 @pytest.mark.parametrize(
@@ -114,6 +112,7 @@ def test_every_benchmark_of_the_command_is_there() -> None:
     [
         (("paper",), "ae-env bench paper FOLDER"),
         (("paper", "none"), "`folder` (='none')"),
+        (("paper", "runs"), "must hold a camera_params.csv"),
         (("paper", "runs"), "`folder` (='runs')"),
         (("paper", "data", "--weights", "none.safetensors"), "there is no none.json"),
         (("convergence", "data"), "`folder` (='data')"),
@@ -122,15 +121,17 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("throughput", "--against", "none"), "`against` (='none')"),
         (("recorded", "none"), "`scenes` (='recorded:"),
         (("recorded", "runs"), "must hold captures"),
+        (("recorded", "runs", "--weights", "a"), "`weights` (='a')"),
     ],
 )
 def test_errors_before_any_work(ae_env, benchmarks_here: Path, arguments, named: str) -> None:
     (benchmarks_here / "runs").mkdir()
     write_dataset(benchmarks_here / "data")
-    code, _, error = ae_env("bench", *arguments, "--out", "results")
-    assert (code, error.strip().count("\n")) == (2, 0)
-    assert named in error
-    assert not list(benchmarks_here.glob("results/*"))
+    for out in ((), ("--out", "here")):
+        code, _, error = ae_env("bench", *arguments, *out)
+        assert (code, error.strip().count("\n")) == (2, 0), error
+        assert named in error
+    assert {path.name for path in benchmarks_here.iterdir()} == {"data", "runs"}
 
 
 # -- measures -------------------------------------------------------------------------------------
@@ -242,6 +243,7 @@ def test_features_are_trained_judged_and_reported(
 ) -> None:
     monkeypatch.setattr(training, "RUNS", tmp_path / "runs" / "bench")
     monkeypatch.setattr(training, "QUICK_STEPS", 2)
+    monkeypatch.setattr(features, "median_seconds", lambda call, **_: 1e-3)  # each is called once
     monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
     (tmp_path / "photo_pool").mkdir()
     names: dict[str, list[str]] = {split: [] for split in ("train", "validation", "test")}
@@ -437,6 +439,7 @@ def test_worlds_differ_in_the_source_only() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_spawn")
 def test_a_tiny_transfer_trains_judges_predicts_and_trains_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,9 +1,10 @@
-"""README and docs: links lead somewhere, code runs as printed, commands parse."""
+"""README, docs and site: links lead somewhere, code runs as printed, commands parse, it builds."""
 
 import os
 import pkgutil
 import re
 import shlex
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -61,7 +62,7 @@ def _anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_files_and_modules_are_there(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
     for link in (link for link in links if "://" not in link):
@@ -70,11 +71,6 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert target.exists(), f"{link} in {_name(page)}"
         if anchor:
             assert anchor in _anchors(target), f"{link} in {_name(page)}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_files_and_modules_are_there(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
     for path in re.findall(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|yaml))`", text):
         assert (ROOT / path).is_file(), path
     for name in re.findall(r"`((?:simulator|ae_env|agents)(?:\.\w+)+)`", text):
@@ -171,15 +167,11 @@ def test_commands_parse(page: Path) -> None:
             assert {word for word in rest if word.startswith("-")} <= {*known, "--help"}
 
 
-@pytest.fixture
-def my_scorer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def test_the_scorer_computes_what_it_says_and_is_used_as_printed(
+    ae_env, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """In Python, in a configuration, on the command line and in a package."""
     (tmp_path / "my_scorer.py").write_text(_blocks(SCORER_PAGE, "python")[0])
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.mark.usefixtures("my_scorer")
-def test_the_scorer_computes_what_it_says_and_is_used_as_printed(capsys) -> None:
     pictures = torch.zeros(2, 3, 40, 40)
     pictures[0, :, 10:30, 10:20] = 0.8  # half of the middle: standard deviation 0.4
     pictures[1, :, :10] = 1.0  # outside of the middle
@@ -195,18 +187,52 @@ def test_the_scorer_computes_what_it_says_and_is_used_as_printed(capsys) -> None
     assert config.environment["scorer"] == {"my_scorer.py:CentreContrast": 0.5, "noise": 0.5}
     with pytest.raises(ValueError, match=r"your_scorer\.py"):
         AgentConfig.model_validate(yaml.safe_load(text.replace("my_", "your_")))
-
-
-def test_the_scorer_on_the_command_line_and_in_a_package(ae_env, my_scorer: Path) -> None:
     (words,) = _commands(SCORER_PAGE, r"`ae-env (evaluate [^`]+)`")
     assert words[-2:] == ["--scorer", "my_scorer.py:CentreContrast"]
     small = "--scenes bundled:snow --resolution 36 --frames 2 --episodes 1 --workers 1 --out out"
     code, _, err = ae_env(*words, *small.split())
     assert code == 0, err
-    assert (my_scorer / "out" / "results.json").is_file()
+    assert (tmp_path / "out" / "results.json").is_file()
     project = tomllib.loads(_blocks(SCORER_PAGE, "toml")[0])
     (module,) = project["tool"]["setuptools"]["py-modules"]
     assert project["project"]["entry-points"] == {
         "ae_env.scorers": {"centre_contrast": f"{module}:CentreContrast"}
     }
-    assert (my_scorer / f"{module}.py").is_file()
+    assert (tmp_path / f"{module}.py").is_file()
+
+
+def test_the_site(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sphinx", "-q", "--fail-on-warning", "--keep-going", "-j2"]
+    # But for `viewcode`: 40 pages of the packages' own text, of which nothing is tested here.
+    command += ["-D", "extensions=myst_parser,sphinx.ext.autodoc,sphinx.ext.napoleon"]
+    done = subprocess.run(
+        [*command, "-d", str(tmp_path / "doctrees"), str(ROOT / "docs"), str(tmp_path / "html")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    site = tmp_path / "html"
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 40
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r'<(?:script|img|iframe|source)[^>]+src="([^"]+)"', text)
+        loaded += re.findall(
+            r'<link[^>]+rel="(?:stylesheet|preload|icon)"[^>]+href="([^"]+)"', text
+        )
+        assert loaded
+        assert [address for address in loaded if "//" in address] == [], page.name
+    for sheet in site.rglob("*.css"):
+        imports = re.findall(r"(?:url\(|@import )['\"]?(https?:[^'\")]+)", sheet.read_text("utf-8"))
+        assert imports == [], sheet.name
+    # The tasks are the docstrings of their classes.
+    text = (site / "tasks.html").read_text(encoding="utf-8")
+    for title in ("AutoExposure-v0", "AutoExposureVideo-v0", "ExposureBracket-v0"):
+        assert f"<h2>{title}" in text
+    assert text.count("<h3>Action Space") == 3
+    assert "{docstring}" not in text
+    # Tutorials are pages of text and code.
+    text = (site / "tutorials" / "explore_a_raw.html").read_text(encoding="utf-8")
+    assert "<h1>Explore a raw" in text
+    assert "# %%" not in text
+    assert 'class="highlight-python' in text

@@ -44,6 +44,8 @@ def test_batch_of_different_parameters_equals_single_runs(
     images = normal(3, 4, 9, 7).double()
     alone = [net(images[i : i + 1], PARAMETERS[i : i + 1]) for i in range(3)]
     torch.testing.assert_close(net(images, PARAMETERS), torch.cat(alone))
+    with pytest.raises(ValueError, match="`parameters`"):
+        net(images, PARAMETERS[:1])
 
 
 def test_scaled_parameters() -> None:
@@ -51,12 +53,6 @@ def test_scaled_parameters() -> None:
     extremes = torch.tensor([[0.0, -12.97, 2.0, 7.33, 2.0, 4.46]])
     expected = [[0.0, 0.00375, 0.25, 0.91625, 1.875, 0.5575]]
     torch.testing.assert_close(scaled_parameters(extremes, normal(1, 1)), torch.tensor(expected))
-
-
-@pytest.mark.parametrize("make", [ParameterConcatenation, DecoupledNet])
-def test_parameters_are_checked(make: type[ParameterConcatenation | DecoupledNet]) -> None:
-    with pytest.raises(ValueError, match="`parameters`"):
-        make(width=4)(normal(2, 4, 4, 4), PARAMETERS[:1])
 
 
 def test_trained_baselines_come_back(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ def load(
 ) -> list[Scene]:
     """Scenes of `spec`, which is a path where there are `options`."""
     camera, spec = get_camera("nikon_z6"), {"path": spec, **options} if options else spec
-    return load_scenes(spec, split, camera=camera, resolution=resolution)  # type: ignore[arg-type]
+    return load_scenes(spec, split, camera=camera, resolution=resolution)
 
 
 def write_hdr(path: Path, seed: int = 0, height: int = 20, width: int = 24) -> None:

@@ -1,5 +1,6 @@
-"""The observation's encodings and their inverses."""
+"""The exposure grid, and the observation's encodings and their inverses."""
 
+import json
 import math
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ae_env.grid import ExposureGrid
 from ae_env.observation import (
     PEDESTAL,
     SENSOR_RANGES,
@@ -20,7 +22,7 @@ from ae_env.observation import (
     frame_statistics,
 )
 from tests.ae_env.environments import make_envs
-from tests.strategies import LIGHT, lights, log_uniform
+from tests.strategies import LIGHT, SEEDS, grids, lights, log_uniform
 
 
 def test_codes_follow_the_formula() -> None:
@@ -58,9 +60,7 @@ def test_observations_are_monotone_and_within_half_a_code(light: torch.Tensor) -
 
 
 @given(st.floats(0.0, 1e300), log_uniform(1e-3, 1e3), st.floats(-10, 10), st.floats(-10, 10))
-def test_sensors_are_decoded_as_they_read(
-    speed: float, defocus: float, first: float, second: float
-) -> None:
+def test_sensors_are_decoded_as_they_read(speed, defocus, first, second):
     noise = np.array([[first, second]])
     encoded = encode_sensors(np.array([speed]), np.array([defocus]), noise)
     assert np.abs(encoded).max() <= 1.0
@@ -112,3 +112,56 @@ def test_environments_observe_the_statistics_of_their_frames(resolution: int) ->
     np.testing.assert_array_equal(envs.render(), whole.render())  # the picture is the whole frame
     numbers = sum(np.prod(space.shape) for space in envs.single_observation_space.values())
     assert numbers == 4 * 12 * 16 + 128 + 2 + 3 + 2
+
+
+def test_exposure_values_by_hand() -> None:
+    times = (1 / 1000, 1 / 125, 1 / 15, 1 / 2)
+    grid = ExposureGrid((100, 400, 1600, 6400), times, (4, 5.6, 8, 11))
+    assert ExposureGrid.default() == grid
+    # f/4 at 1/1000 s, ISO 100: log2(16 * 1000); marked f/5.6 and f/11 stand for sqrt(32), sqrt(128)
+    assert grid.ev100[0] == pytest.approx(np.log2(16 * 1000))
+    assert grid.ev100[grid.index(0, 1, 1)] == pytest.approx(np.log2(32 * 125))
+    assert grid.ev100[grid.index(3, 3, 3)] == pytest.approx(np.log2(128 * 2 / 64))
+
+
+def test_nearest_takes_the_lower_iso() -> None:
+    grid = ExposureGrid.default()
+    for target in (-5.0, 0.0, 7.2, 30.0):
+        distance = np.abs(grid.ev100 - target)
+        assert grid.nearest(target) == np.flatnonzero(distance < distance.min() + 1e-9)[0]
+    with pytest.raises(ValueError, match="`ev100`"):
+        grid.nearest(float("nan"))
+
+
+def test_third_stop_grid() -> None:
+    grid = ExposureGrid.third_stop()
+    assert len(grid) == 19 * 28 * 4
+    np.testing.assert_allclose(np.diff(np.log2(grid.isos)), 1 / 3)
+    np.testing.assert_allclose(np.diff(np.log2(grid.exposure_times)), 1 / 3)
+    assert (grid.isos[0], grid.isos[-1]) == pytest.approx((100, 6400))
+    assert grid.exposure_times[-1] == pytest.approx(1 / 2)
+
+
+def test_axes_are_any_numbers() -> None:
+    lists = ([100, 200], [0.125, 0.25], [2.0, 4.0])
+    wanted = ExposureGrid(*map(tuple, lists))
+    for make in (torch.tensor, np.array, iter, dict.fromkeys):
+        grid = ExposureGrid(*map(make, lists))
+        assert grid == wanted
+        assert {type(value) for value in grid.isos} == {float}
+
+
+@given(grids(), SEEDS)
+def test_grids_are_what_their_lists_say(grid: ExposureGrid, seed: int) -> None:
+    lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
+    assert ExposureGrid.from_spec(json.loads(json.dumps(lists))) == grid
+    states = np.arange(len(grid))
+    controls = grid.controls(states)
+    assert [grid.index(*row) for row in controls.tolist()] == states.tolist()
+    for state, (i, t, n) in zip(grid, controls.tolist(), strict=True):
+        wanted = (grid.isos[i], grid.exposure_times[t], grid.f_numbers[n])
+        assert (state.iso, state.exposure_time, state.f_number) == wanted
+    for state in np.random.default_rng(seed).choice(states, 3):
+        nearest = grid.nearest(grid.ev100[state])
+        assert nearest <= state
+        assert grid.ev100[nearest] == pytest.approx(grid.ev100[state], abs=1e-9)

@@ -68,13 +68,10 @@ def test_values_that_are_fine(name: str, value: Any) -> None:
         AutoExposureVectorEnv(**{**SMALL, name: value})
 
 
-@pytest.mark.parametrize("value", ODD)
-def test_odd_scenes(value: Any) -> None:
-    with pytest.raises(ValueError, match="scenes"):
-        AutoExposureEnv(scenes=value)
-
-
 GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
+
+
+BAD_AXES = [None, "100", [], [100, "x"], [True, 200], [NAN, 1], [2, 1], [1, 1], 100, [100, INF]]
 
 
 @pytest.mark.usefixtures("idle")
@@ -82,49 +79,35 @@ GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
     ("arguments", "message"),
     [
         *(
-            ({"costs": {"flicker": value}}, r"`costs\['flicker'\]` \(=.*number in \[0, 1e\+06\]")
+            ({"costs": {"flicker": value}}, r"`costs\['flicker'\]`")
             for value in (None, True, "x", -1, NAN, INF, [], [1.0])
         ),
-        ({"costs": {"flicer": 1.0}}, "did you mean 'flicker'"),
-        ({"costs": {3: 1.0}}, r"`costs` \(=3\)"),
+        *(({"costs": {"flicer": 1.0}}, "did you mean 'flicker'"), ({"costs": {3: 1.0}}, "`costs`")),
+        *(({"grid": {**GRID, "isos": value}}, "`grid.*iso") for value in BAD_AXES),
+        *(({"grid": {**GRID, "f_numbers": [n]}}, "`grid.*f_number") for n in (0.1, 45)),
+        *(({"grid": {**GRID, **a}}, "`grid") for a in ({"isos": [25]}, {"exposure_times": [60]})),
+        *(({"grid": {"iso": [100]}}, "did you mean 'isos'"), ({"grid": {"isos": [100]}}, "`grid`")),
         *(
-            ({"grid": {**GRID, "isos": value}}, r"`grid`: `isos` \(=.*ascending list of numbers")
-            for value in (None, "100", [], [100, "x"], [True, 200], [NAN, 1], [2, 1], [1, 1], 100)
+            ({name: wrong}, f"did you mean '{right}'")
+            for name, wrong, right in (
+                *(("camera", "nikon_z7", "nikon_z6"), ("grid", "third_stops", "third_stop")),
+                *(("lighting", "tunel", "tunnel"), ("simulator", "compcat", "compact")),
+                *(("depth", "unknwon", "unknown"), ("noise", "bnak", "bank")),
+                *(("scorer", {"niose": 1.0}, "noise"), ("autoreset_mode", "NEXT", "NEXT_STEP")),
+            )
         ),
-        ({"grid": {**GRID, "isos": [100, INF]}}, r"`grid`: `iso` \(=inf\)"),
-        ({"grid": {**GRID, "f_numbers": [8, 45]}}, r"`grid\['f_numbers'\]` \(=45\) .*\[1, 32\]"),
-        ({"grid": {**GRID, "exposure_times": [60]}}, r"`grid\['exposure_times'\]` \(=60\)"),
-        ({"grid": {**GRID, "isos": [25]}}, r"`grid\['isos'\]` \(=25\) must be in \[50, 409600\]"),
-        ({"grid": {**GRID, "f_numbers": [0.1]}}, r"`grid`: `f_number` \(=0.1\)"),
-        ({"grid": {"iso": [100]}}, "`grid`.*did you mean 'isos'"),
-        ({"grid": {"isos": [100]}}, "`grid`"),
-        ({"camera": "nikon_z7"}, "did you mean 'nikon_z6'"),
-        ({"lighting": "tunel"}, "did you mean 'tunnel'"),
-        ({"simulator": "compcat"}, "did you mean 'compact'"),
-        ({"depth": "unknwon"}, "did you mean 'unknown'"),
-        ({"depth": 300.0, "resolution": 128}, r"`depth` \(=300.0\) must be .*256"),
-        ({"depth": "unknown", "simulator": None}, r"`depth` \(='unknown'\) needs.*`simulator`"),
-        ({"grid": "third_stops"}, "did you mean 'third_stop'"),
-        *(
-            ({"scorer": {"noise": value}}, "`scorer`.*must map names to weights")
-            for value in (None, True, "x", 0, -1, NAN, INF, [1])
-        ),
-        ({"scorer": {"niose": 1.0}}, "did you mean 'noise'"),
+        *(({"scorer": {"noise": v}}, "`scorer`") for v in (None, True, "x", 0, -1, NAN, INF, [1])),
         ({"scorer": {"noise": 1.0, "mine:noise": 1.0}}, "differ behind the colon"),
-        ({"noise": "bnak"}, "one of True, False, 'bank', 'exact', 'sensor'; did you mean 'bank'"),
-        ({"noise": ["bank"]}, r"`noise` \(=\['bank'\]\) must be one of True, False"),
-        ({"autoreset_mode": "NEXT"}, "did you mean 'NEXT_STEP'"),
-        ({"num_envs": 2**16 + 1}, r"`num_envs` \(=65537\) .*\[1, 65536\]"),
-        ({"max_episode_steps": 0}, ">= 1, or None for never"),
-        ({"delay": 17}, r"in \[0, 16\] frames"),
-        ({"delay": {"shutter": 1}}, r"`delay` \(='shutter'\)"),
-        ({"delay": {"iso": 17}}, r"`delay\['iso'\]` \(=17\)"),
-        ({"delay": {"iso": True}}, r"`delay\['iso'\]`"),
-        ({"resolution": 35}, r"\[36, 4096\]"),
-        ({"motion": 1e3 + 1}, r"`motion` \(=1001.0\) .*or one of \['random', 'none'\]"),
+        ({"depth": 300.0, "resolution": 128}, "`depth`.*256"),
+        ({"depth": "unknown", "simulator": None}, "`depth`.*`simulator`"),
+        *(({"delay": {"iso": value}}, r"`delay\['iso'\]`") for value in (17, True)),
+        *(({"delay": 17}, "`delay`"), ({"delay": {"shutter": 1}}, "`delay`")),
+        *(({"resolution": 35}, "`resolution`"), ({"motion": 1e3 + 1}, "`motion`")),
+        *(({"num_envs": 2**16 + 1}, "`num_envs`"), ({"noise": ["bank"]}, "`noise`")),
+        ({"max_episode_steps": 0}, "`max_episode_steps`"),
     ],
 )
-def test_errors_name_value_and_rule(arguments: dict[str, Any], message: str) -> None:
+def test_what_else_is_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         AutoExposureVectorEnv(**{**SMALL, **arguments})
 
@@ -172,22 +155,9 @@ def test_refused_resets_and_steps_change_nothing(for_many: bool) -> None:
     good = [5] * 3 if for_many else 5
     assert_equal(env.step(good), twin.step(good))
     assert_equal(env.reset(), twin.reset())
-
-
-def test_seeds_of_numpy_and_of_any_size() -> None:
-    env, envs = AutoExposureEnv(**SMALL), AutoExposureVectorEnv(num_envs=3, **SMALL)
     for seed in (np.int64(11), 2**64, 2**100):
-        single, _ = env.reset(seed=seed)
-        many, _ = envs.reset(seed=[0, seed, None])
-        np.testing.assert_array_equal(single["raw"], many["raw"][1])
-    first, _ = envs.reset(seed=np.array([11, 12, 13]))
-    second, _ = envs.reset(seed=11)
-    np.testing.assert_array_equal(first["raw"], second["raw"])
-
-
-def test_a_mapping_with_an_unknown_entry_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"unknown argument `scorrer`.*did you mean `scorer`"):
-        EnvOptions.from_kwargs({"scorrer": "noise"})
+        first, second = ([0, s, 5] if for_many else s for s in (seed, int(seed)))
+        assert_equal(env.reset(seed=first), twin.reset(seed=second))
 
 
 def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
@@ -201,9 +171,11 @@ def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
 
 
 def test_cameras_of_one_name_have_scenes_of_their_own() -> None:
-    other = replace(CAMERA, colour_matrix=CAMERA.colour_matrix[::-1])  # type: ignore[index]
+    other = replace(CAMERA, colour_matrix=CAMERA.colour_matrix[::-1])
     for one in (CAMERA, other):
         assert EnvOptions(camera=one, **SMALL).load_scenes()[0].camera == one
+    with pytest.raises(ValueError, match=r"unknown argument `scorrer`.*did you mean `scorer`"):
+        EnvOptions.from_kwargs({"scorrer": "noise"})
 
 
 def test_a_black_scene_in_unknown_light_is_refused_by_name() -> None:
@@ -212,3 +184,6 @@ def test_a_black_scene_in_unknown_light_is_refused_by_name() -> None:
         EnvOptions(scenes=[black], resolution=36).load_scenes()
     lit = replace(black, illuminance=10.0)
     assert EnvOptions(scenes=[lit], resolution=36).load_scenes()[0].ev100 == 2.0
+    for value in ODD:
+        with pytest.raises(ValueError, match="scenes"):
+            AutoExposureEnv(scenes=value)

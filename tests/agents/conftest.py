@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
+import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -50,6 +51,12 @@ def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
         }
 
     return take
+
+
+@pytest.fixture(autouse=True, scope="session")
+def coarse_plots() -> None:
+    """Plots of reports have few pixels: what is drawn is the same."""
+    matplotlib.rcParams["figure.dpi"] = 40
 
 
 #: Few small scenes and frames: what the trainings of the tests run on.

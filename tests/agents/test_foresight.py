@@ -49,9 +49,7 @@ def test_every_control_is_chosen_for_the_first_frame_that_has_it(context, photog
 
     expected = [promise(*controls) for controls in product(range(4), repeat=3)]
     np.testing.assert_allclose(found, expected)
-
-
-def test_without_delay_it_is_the_best_state_of_the_next_frame(context, photograph):
+    # Without delay it is the best state of the next frame.
     foresight = Foresight(context, Known(lambda frames: frames))
     foresight.observe(_reading(9.0), photograph(np.ones((64, 64)), 9.0, 3))
     table = np.random.default_rng(0).random((1, 64))

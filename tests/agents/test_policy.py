@@ -1,17 +1,19 @@
 """Policies by their names, and those that look at no frame."""
 
+import dataclasses
 import textwrap
 from contextlib import closing
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-import agents
 from agents import evaluate
-from agents.policy import Policy, PolicyContext, masked_argmax
-from agents.policy_names import METERS, PROGRAMS, list_policies, make_policy
+from agents.evaluation.jobs import policy_content
+from agents.policy import Policy, PolicyContext
+from agents.policy_names import METERS, PROGRAMS, list_policies, make_policy, training_seeds
 from agents.rollouts import make_envs
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
@@ -21,7 +23,7 @@ def test_every_listed_name_makes_a_policy(context):
     assert len(names) == len(set(names)) == 8 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
     learnt = {"ppo", "regression", "ppo:video", "regression:video"}
     assert learnt < set(names)
-    for name in set(names) - learnt:  # they come at one resolution: test_pretrained
+    for name in set(names) - learnt:  # they come at one resolution, below
         policy = make_policy(name, context)
         assert policy.name == name
         assert isinstance(policy, Policy)
@@ -51,6 +53,7 @@ def test_every_listed_name_makes_a_policy(context):
         ("spot:A?iso=100", r"`iso` \(=100(\.0)?\)"),
         ("ppo:runs/ppo-*", r"`training_seeds`"),
         ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\)"),
+        (f"recorded:{Path(__file__).parent}", "`path`"),  # holds no raw
         ("recorded", r"recorded:FOLDER"),
         ("spot?", r"name\?key=value&key=value"),
         ("spot?damping=[1]", r"'damping' \(='\[1\]'\)"),
@@ -135,25 +138,11 @@ def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_
     assert policy.act(photograph(np.ones((64, 64)), 9.0, states), masks)[0] != states[0]
 
 
-def test_masked_argmax():
-    utility = np.array([[3.0, 2.0, 2.0], [1.0, 5.0, 4.0]])
-    masks = np.array([[False, True, True], [True, True, True]])
-    assert masked_argmax(utility, masks).tolist() == [1, 1]
-    assert masked_argmax(utility, None).dtype == np.int64
-
-
-def test_public_names():
-    assert agents.__all__ == sorted(agents.__all__)
-    for name in agents.__all__:
-        assert getattr(agents, name).__module__.startswith("agents.")
-    with pytest.raises(AttributeError, match="'nothing'"):
-        agents.nothing  # noqa: B018
-
-
 FRAMES = {"raw": np.zeros((500, 4, 8, 8), np.uint8)}
 
 
-def test_random_is_seeded_uniform_and_masked(context):
+def test_policies_that_look_at_no_frame(context):
+    """Random is seeded, uniform and masked; the best fixed state is the best that is allowed."""
     policy = make_policy("random", context)
     masks = np.zeros((500, 64), bool)
     masks[:, 10:14] = True
@@ -164,24 +153,15 @@ def test_random_is_seeded_uniform_and_masked(context):
     assert not np.array_equal(first, second)
     policy.reset(500, seed=3)
     np.testing.assert_array_equal(policy.act(FRAMES, masks), first)
-
-
-def test_best_fixed_takes_the_best_mean_or_the_best_allowed(context):
-    policy = make_policy("best_fixed", context)
+    fixed, oracle = (make_policy(name, context) for name in ("best_fixed", "oracle"))
     with pytest.raises(ValueError, match="call fit"):
-        policy.act(FRAMES)
-    policy.mean_scores = np.linspace(0, 1, 64)
-    assert set(policy.act(FRAMES)) == {63}
-    masks = np.ones((500, 64), bool)
-    masks[:, 60:] = False
-    assert set(policy.act(FRAMES, masks)) == {59}
-
-
-def test_oracle_reads_info_and_nothing_else(context):
-    policy = make_policy("oracle", context)
-    assert policy.act({}, None, info={"oracle_state": np.array([4, 5])}).tolist() == [4, 5]
+        fixed.act(FRAMES)
+    fixed.mean_scores = np.linspace(0, 1, 64)
+    assert set(fixed.act(FRAMES)) == {63}
+    assert set(fixed.act(FRAMES, masks)) == {13}
+    assert oracle.act({}, None, info={"oracle_state": np.array([4, 5])}).tolist() == [4, 5]
     with pytest.raises(ValueError, match="with_oracle=True"):
-        policy.act({})
+        oracle.act({})
 
 
 SETTINGS = (
@@ -215,8 +195,53 @@ def test_a_recording_is_replayed_on_its_own_raws(tmp_path, delay):
     np.testing.assert_array_equal(result.scores[0, 1], result.scores[0, 3])
 
 
-def test_a_folder_without_raws_is_refused(context, tmp_path):
-    (tmp_path / "notes.txt").write_text("not a raw")
-    for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(ValueError, match="`path`"):
-            make_policy(f"recorded:{folder}", context)
+SCENES = {"scenes": "bundled:small", "split": "test", "resolution": 64}
+
+
+@pytest.mark.parametrize("name", ["regression", "ppo"])
+def test_shipped_agents_beat_a_plain_meter_and_differ_by_their_seed(name):
+    context = PolicyContext.from_envs(make_envs(SCENES, num_envs=1, frames=1))
+    policies = {n: make_policy(n, context) for n in (name, "centre_weighted:P")}
+    result = evaluate(policies, SCENES, frames=4, batch=16)
+    gains = {n: result.group_gains(n)[0].mean() for n in policies}
+    assert gains[name] > gains["centre_weighted:P"]
+    seeds = [make_policy(own, context) for own in training_seeds(name)]
+    weights = [next(iter(p.network.parameters())) for p in seeds]
+    assert len(seeds) == 3
+    assert not any((a == b).all() for a, b in combinations(weights, 2))
+
+
+def test_agents_for_moving_light_come_with_their_forecasts():
+    """They foresee with what ships, and refuse a grid that they were not trained on."""
+    video = {**SCENES, "grid": "video", "delay": {"iso": 1, "exposure_time": 2, "f_number": 2}}
+    video["lighting"] = {"kind": "moving", "kinds": "sines"}
+    context = PolicyContext.from_envs(make_envs(video, num_envs=1, frames=1))
+    names = ("regression:video", "regression:video?foresight=learnt", "ppo:video", "average:P")
+    result = evaluate({n: make_policy(n, context) for n in names}, video, frames=32, batch=16)
+    gains = {n: result.group_gains(n)[0].mean() for n in names}
+    assert gains["regression:video?foresight=learnt"] > gains["regression:video"]
+    assert gains["ppo:video"] > gains["average:P"]
+    with pytest.raises(ValueError, match=r"`foresight` \(='runs/none'\) must be 'none', 'trend'"):
+        make_policy("regression:video?foresight=runs/none", context)
+    with pytest.raises(ValueError, match=r"`foresight` \(=None\) must be 'none', 'trend'"):
+        make_policy("regression:video?foresight=", context)
+    late = dataclasses.replace(context, delays=(4, 4, 4))
+    with pytest.raises(ValueError, match="forecasts 4 frames, and a delay of 4 asks for 5"):
+        make_policy("regression:video?foresight=learnt", late)
+    # A stored evaluation is of these files: each other one decides another result.
+    content = {n: policy_content(n) for n in ("regression", *names)}
+    assert len(set(content.values())) == 5
+    assert content["average:P"] == ""
+    still = PolicyContext.from_envs(make_envs(SCENES, num_envs=1, frames=1))
+    with pytest.raises(ValueError, match="was trained with exposure_times from"):
+        make_policy("regression:video", still)
+
+
+def test_a_pattern_names_the_training_seeds(tmp_path):
+    for file in ("ppo-1.safetensors", "ppo-0.safetensors", "ppo-0.json", "other.safetensors"):
+        (tmp_path / file).touch()
+    expected = [f"ppo:{tmp_path}/ppo-{seed}" for seed in (0, 1)]
+    assert training_seeds(f"ppo:{tmp_path}/ppo-*") == expected
+    assert training_seeds(f"ppo:{tmp_path}/ppo-0") == [f"ppo:{tmp_path}/ppo-0"]
+    with pytest.raises(ValueError, match=r"no \.safetensors file fits"):
+        training_seeds(f"regression:{tmp_path}/regression-*")

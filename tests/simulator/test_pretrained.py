@@ -13,12 +13,7 @@ import torch
 
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.optics.discs import added_blur
-from simulator.reference.camera import (
-    ReferenceCamera,
-    ReferenceScene,
-    lens_blur,
-    sample_mosaic,
-)
+from simulator.reference.camera import ReferenceCamera, ReferenceScene, lens_blur, sample_mosaic
 from simulator.training.scenes import detail_pictures, reference_scenes
 
 FOLDER = Path(str(resources.files("simulator").joinpath("pretrained")))
@@ -57,9 +52,7 @@ def held_out(kind: str) -> torch.Tensor:
     return light / light.mean(dim=(1, 2, 3), keepdim=True)
 
 
-def gains_db(
-    simulator: CameraSimulator, size: int, light: torch.Tensor, iso: float, camera: str
-) -> torch.Tensor:
+def gains_db(simulator, size, light, iso, camera):
     """Error of noise drawn by NumPy over that after denoising, of each picture."""
     rng, nlf = np.random.default_rng(0), get_camera(camera).nlf(iso)
     shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))

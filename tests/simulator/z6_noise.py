@@ -1,7 +1,5 @@
 """Noise of the Nikon Z6, retyped from the published table: its DNG NoiseProfile tags."""
 
-from __future__ import annotations
-
 import numpy as np
 
 #: Shot and read noise of R, G, B by ISO.

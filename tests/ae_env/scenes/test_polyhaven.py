@@ -10,6 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
+from ae_env.lighting.moving import read_pans
 from ae_env.scenes import polyhaven
 from ae_env.scenes.load import load_scenes
 from ae_env.scenes.polyhaven import (
@@ -19,10 +20,13 @@ from ae_env.scenes.polyhaven import (
     cut_values,
     download,
     incident_light,
+    light_around,
     list_assets,
+    split_assets,
 )
 from simulator import get_camera
 from simulator.radiance.light import WHITE_SIGNAL
+from simulator.radiance.maps import read_radiance
 
 CAMERA = get_camera("nikon_z6")
 
@@ -35,9 +39,6 @@ def test_the_list_splits_places_and_each_kind_is_tested():
     tested = {a.kind for a in list_assets() if a.split == "test"}
     assert tested >= {"night", "indoor", "backlit", "forest", "sun", "overcast", "studio", "tunnel"}
     assert list(splits.values()).count("test") >= 15  # enough for intervals
-
-
-# -- light ----------------------------------------------------------------------------------------
 
 
 def panorama(light) -> np.ndarray:
@@ -129,21 +130,25 @@ def test_maps_that_are_cut_say_so(an_asset):
     assert "highlights are cut" in next(asset_views(asset, CAMERA, size=16)).source
 
 
-# -- real maps ------------------------------------------------------------------------------------
-
-
 def test_real_scenes_alone_and_mixed(data_dir):
     real = load_scenes("polyhaven", "test", camera=CAMERA, resolution=64)
     assert len({s.group for s in real}) >= 15
-    assert all(s.light.shape == (4, 64, 64) and s.box_factor == 4 for s in real)
     again = load_scenes("polyhaven", "test", camera=CAMERA, resolution=64)  # from the cache
     assert all(a.content == b.content for a, b in zip(real, again, strict=True))
     for scene in real:
+        assert (scene.light.shape, scene.box_factor) == ((4, 64, 64), 4)
         assert 1e-3 < scene.illuminance <= ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
     mixed = load_scenes("mixed", "test", camera=CAMERA, resolution=64)
     kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
     assert kinds[True] == kinds[False] > 60
     assert {s.group for s in mixed if s.source.startswith("Poly")} == {s.group for s in real}
+    # Pans of moving light are of places to test on, and of their maps.
+    places = read_pans()
+    assert set(places) == {asset.name for asset in list_assets() if asset.split == "test"}
+    assert {len(turn) for turn in places.values()} == {72}
+    asset = next(a for a in split_assets("polyhaven", "test") if a.name == "spree_bank")
+    found = light_around(read_radiance(asset.path))
+    np.testing.assert_allclose(places["spree_bank"], found, atol=6e-4)
 
 
 def test_missing_maps_name_the_command(tmp_path, monkeypatch):
@@ -154,8 +159,6 @@ def test_missing_maps_name_the_command(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
         load_scenes("mixed", "train", camera=CAMERA)
 
-
-# -- downloads ------------------------------------------------------------------------------------
 
 CONTENT = {f"map_{i}": bytes([i]) * (5000 + i) for i in range(3)}
 
@@ -216,15 +219,19 @@ def test_a_download_fetches_what_is_missing(server, tmp_path):
     assert seen[0] == (0, total, "map_0")
     assert seen[-1][:2] == (total, total)
     assert download(url=url, progress=None) == []
-    assert len(asked) == 3
+    (damaged,) = tmp_path.rglob("map_1_1k.hdr")
+    damaged.write_bytes(bytes(len(CONTENT["map_1"])))  # of the right length
+    assert download(url=url, progress=None) == [damaged]
+    assert asked[3:] == ["map_1"]
+    assert stored(tmp_path) == {f"{name}_1k.hdr": content for name, content in CONTENT.items()}
     with pytest.raises(ValueError, match="`url`"):
         download(url="ftp://a", progress=None)
 
 
 @pytest.mark.parametrize("fault", ["error", "truncated", "other", "slow"])
 def test_a_broken_answer_is_asked_for_again_and_what_stays_broken_is_said(
-    server, tmp_path, monkeypatch, fault: str
-) -> None:
+    server, tmp_path, monkeypatch, fault
+):
     url, faults, asked = server
     if fault != "slow":
         monkeypatch.setattr("time.sleep", lambda seconds: None)
@@ -239,13 +246,3 @@ def test_a_broken_answer_is_asked_for_again_and_what_stays_broken_is_said(
     download(url=url, timeout=0.5, progress=None)
     assert asked[-3:] == ["map_1", "map_1", "map_2"]
     assert stored(tmp_path)["map_1_1k.hdr"] == CONTENT["map_1"]
-
-
-def test_a_damaged_file_of_the_right_length_is_fetched_again(server, tmp_path):
-    url, _, asked = server
-    download(url=url, progress=None)
-    (damaged,) = tmp_path.rglob("map_1_1k.hdr")
-    damaged.write_bytes(bytes(len(CONTENT["map_1"])))
-    assert download(url=url, progress=None) == [damaged]
-    assert asked[3:] == ["map_1"]
-    assert stored(tmp_path) == {f"{name}_1k.hdr": content for name, content in CONTENT.items()}

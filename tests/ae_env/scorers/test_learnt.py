@@ -17,8 +17,6 @@ import examples.convert_nima as convert_nima
 from ae_env.scorers import make_scorer
 from ae_env.scorers.learnt import PUBLISHED, Classifier, NimaMobileNet, read_network
 from ae_env.utils.user_files import UserCodeError
-from tests.ae_env.environments import make_env
-from tests.ae_env.recorded_files import GRID, write_raws
 
 KERAS = """
     import os, sys
@@ -82,13 +80,7 @@ def keras_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _pictures(folder: Path) -> torch.Tensor:
-    return torch.from_numpy(np.load(folder / "pictures.npy")).permute(0, 3, 1, 2)
-
-
-def test_a_converted_file_scores_as_keras_does(
-    keras_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_converted_file_scores_as_keras_does(keras_files, tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
     for name in ("nima_aesthetic", "nima_technical"):
         with pytest.raises(ValueError, match=rf"AE_ENV_{name.upper()}.*{PUBLISHED[name]}"):
@@ -106,12 +98,12 @@ def test_a_converted_file_scores_as_keras_does(
     pictures = torch.from_numpy(np.load(keras_files / "pictures.npy")).permute(0, 3, 1, 2)
     for name in ("nima_aesthetic", "nima_technical"):
         scorer = make_scorer(name).parts[name]
-        scores = scorer(pictures, None)  # type: ignore[arg-type]
+        scores = scorer(pictures, None)
         np.testing.assert_allclose(scores.numpy(), (means - 1.0) / 9.0, atol=2e-5)
-    alone = torch.cat([scorer(p[None], None) for p in pictures])  # type: ignore[arg-type]
+    alone = torch.cat([scorer(p[None], None) for p in pictures])
     torch.testing.assert_close(alone, scores, rtol=0.0, atol=1e-6)
     for size in (1, 300):  # any picture is resized
-        score = scorer(torch.full((1, 3, size, size + 1), 0.5), None)  # type: ignore[arg-type]
+        score = scorer(torch.full((1, 3, size, size + 1), 0.5), None)
         assert 0.0 < float(score) < 1.0
 
 
@@ -123,15 +115,12 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["other.hdf5"]
     weights = {k: v for k, v in NimaMobileNet().state_dict().items() if "num_batches" not in k}
     assert sum(values.numel() for values in weights.values()) == 3_239_114  # as Keras counts
-    damaged: list[dict[str, torch.Tensor]] = [
-        {k: v for k, v in weights.items() if k != "head.bias"},
-        {**weights, "head.bias": torch.zeros(11)},
-        {**weights, "head.bias": torch.full((10,), float("nan"))},
-    ]
-    for index, arrays in enumerate(damaged):
-        save_file(arrays, tmp_path / f"{index}.safetensors")
+    bias = weights.pop("head.bias")
+    file = tmp_path / "damaged.safetensors"
+    for damaged in ({}, {"head.bias": torch.zeros(11)}, {"head.bias": bias * torch.nan}):
+        save_file({**weights, **damaged}, file)
         with pytest.raises(ValueError, match=r"`file`(.|\n)*head.bias"):
-            read_network(tmp_path / f"{index}.safetensors")
+            read_network(file)
     with pytest.raises(ValueError, match="`file`"):
         read_network(tmp_path / "nothing.safetensors")
 
@@ -148,12 +137,9 @@ def write_network(
     nodes = [node("GlobalAveragePool", ["x"], ["m"]), node("Flatten", ["m"], ["logits"])]
     if softmax:
         nodes.append(node("Softmax", ["logits"], ["shares"]))
-    graph = onnx.helper.make_graph(
-        nodes,
-        "means",
-        [info("x", onnx.TensorProto.FLOAT, [batch, 3, size, size])],
-        [info("shares" if softmax else "logits", onnx.TensorProto.FLOAT, [batch, 3])],
-    )
+    given = info("x", onnx.TensorProto.FLOAT, [batch, 3, size, size])
+    found = info("shares" if softmax else "logits", onnx.TensorProto.FLOAT, [batch, 3])
+    graph = onnx.helper.make_graph(nodes, "means", [given], [found])
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 13)])
     model.ir_version = 8
     onnx.save(model, str(path))
@@ -173,16 +159,14 @@ def confidences(images: torch.Tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("batch", ["batch", 1, 2], ids=str)
 @pytest.mark.parametrize("softmax", [False, True], ids=["logits", "probabilities"])
-def test_the_confidence_is_the_largest_probability(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int | str, softmax: bool
-) -> None:
+def test_the_confidence_is_the_largest_probability(tmp_path, monkeypatch, batch, softmax):
     monkeypatch.setenv(
         "AE_ENV_CLASSIFIER", str(write_network(tmp_path / "a.onnx", batch, 32, softmax=softmax))
     )
     scorer = make_scorer("classifier").parts["classifier"]
     assert scorer.size == 32  # the file's own
     images = pictures()
-    scores = scorer(images, None)  # type: ignore[arg-type]
+    scores = scorer(images, None)
     np.testing.assert_allclose(scores.numpy(), confidences(images), rtol=1e-5)
     again = pickle.loads(pickle.dumps(scorer))(images[:1], None)
     np.testing.assert_allclose(again.numpy(), confidences(images[:1]), rtol=1e-5)
@@ -196,7 +180,7 @@ def test_a_callable_sees_normalised_squares() -> None:
         return x.numpy().mean(axis=(2, 3))
 
     images = pictures(20)
-    scores = Classifier(network, size=24)(images, None)  # type: ignore[arg-type]
+    scores = Classifier(network, size=24)(images, None)
     np.testing.assert_allclose(scores.numpy(), confidences(images), rtol=1e-5)
     assert {x.shape[1:] for x in seen} == {(3, 24, 24)}
     expected = (images.mean(dim=(2, 3)).numpy() - MEAN) / STD
@@ -205,55 +189,30 @@ def test_a_callable_sees_normalised_squares() -> None:
     own = Classifier(torch.nn.Flatten().eval(), size=1, mean=(0, 0, 0), std=(0.5, 0.5, 0.5))
     powers = np.exp(images.mean(dim=(2, 3)).numpy() / 0.5)
     expected = powers.max(axis=1) / powers.sum(axis=1)
-    np.testing.assert_allclose(own(images, None).numpy(), expected, rtol=1e-4)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("network", "message"),
-    [
-        (lambda x: "a cat", r"returned str: it must return \(B, classes\)"),
-        (lambda x: x.mean(dim=(1, 2, 3))[:, None], r"returned \(2, 1\): it must"),
-        (lambda x: [[1.0, 2.0], [3.0]], "returned list: it must"),
-        (lambda x: torch.zeros(len(x), 3, dtype=torch.complex64), "returned complex numbers"),
-        (lambda x: 1 / 0, "the classifier raised ZeroDivisionError: division by zero"),
-    ],
-)
-def test_what_a_callable_does_wrong_is_one_kind_of_error(network, message: str) -> None:
-    with pytest.raises(UserCodeError, match=message):
-        Classifier(network)(pictures(2), None)  # type: ignore[arg-type]
-
-
-def test_it_rates_the_captures_of_a_recorded_grid(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_raws(tmp_path / "grid" / "desk")
-    monkeypatch.setenv("AE_ENV_CLASSIFIER", str(write_network(tmp_path / "a.onnx")))
-    given = {"scenes": f"recorded:{tmp_path / 'grid'}", "split": "test", "with_oracle": True}
-    env = make_env(scorer="classifier", **given)
-    env.reset(seed=0)
-    rewards, infos = zip(*(env.step(state)[1::3] for state in range(len(GRID))), strict=True)
-    assert np.ptp(rewards) > 0.01
-    assert int(np.argmax(rewards)) == infos[-1]["oracle_state"]
+    np.testing.assert_allclose(own(images, None).numpy(), expected, rtol=1e-4)
 
 
 def test_what_is_no_classifier_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    with pytest.raises(ValueError, match=r"needs a model file.*AE_ENV_CLASSIFIER=FILE.*\.onnx"):
+    with pytest.raises(ValueError, match=r"AE_ENV_CLASSIFIER=FILE"):
         make_scorer("classifier")
     (tmp_path / "classifier.onnx").write_text("no network")
     with pytest.raises(ValueError, match=r"classifier.onnx'\) cannot be read"):
         make_scorer("classifier")
     fixed = write_network(tmp_path / "fixed.onnx", size=32)
-    with pytest.raises(ValueError, match=r"`size` \(=224\) must be that of .*fixed.onnx', 32"):
-        Classifier(fixed, size=224)
     for model, arguments, name in (
-        (fixed, {"std": (0, 1, 1)}, "std"),
-        (fixed, {"mean": "abc"}, "mean"),
+        *((fixed, {"size": 224}, "size"), (fixed, {"std": (0, 1, 1)}, "std")),
+        *((fixed, {"mean": "abc"}, "mean"), (b"file.onnx", {}, "model")),
         (torch.nn.Dropout(), {}, "model"),  # in training mode
-        (b"file.onnx", {}, "model"),
     ):
         with pytest.raises(ValueError, match=f"`{name}`"):
-            Classifier(model, **arguments)  # type: ignore[arg-type]
+            Classifier(model, **arguments)
+    for network in (
+        *(lambda x: "a cat", lambda x: x.mean(dim=(1, 2, 3))[:, None], lambda x: 1 / 0),
+        *(lambda x: [[1.0, 2.0], [3.0]], lambda x: torch.zeros(len(x), 3, dtype=torch.complex64)),
+    ):
+        with pytest.raises(UserCodeError, match=r"returned|the classifier raised ZeroDivision"):
+            Classifier(network)(pictures(2), None)
     other = write_network(tmp_path / "other.onnx", batch=1)  # not read before
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match=r"pip install 'ae-env\[onnx\]'"):

@@ -1,25 +1,46 @@
-"""Scorers by name, from files, from other packages and from pyiqa, and the list of them all."""
+"""Scorers by name, from files, from other packages and of the user's own, and their composites."""
 
+import dataclasses
+import math
 import sys
 import types
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ae_env.grid import ExposureGrid
+from ae_env import AutoExposureEnv, AutoExposureVectorEnv
 from ae_env.scenes import Scene
-from ae_env.scorers import CompositeScorer, list_scorers, make_scorer, register_scorer, registry
+from ae_env.scorers import (
+    Balanced,
+    CompositeScorer,
+    list_scorers,
+    make_scorer,
+    register_scorer,
+    registry,
+)
 from ae_env.scorers.captures import Captures
 from ae_env.scorers.defects import DEFECTS
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
 from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
+from ae_env.utils.user_files import UserCodeError
 from simulator import NoiseLevelFunction
-from tests.ae_env.scorer_images import CAMERA, random_pictures
+from tests.ae_env.environments import SMALL
+from tests.ae_env.scorer_images import (
+    CAMERA,
+    GRID,
+    Own,
+    make_captures,
+    mean_signal,
+    random_pictures,
+    random_scene,
+)
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 MINE = '''
@@ -40,40 +61,30 @@ class Level:
 
 def _install(folder: Path, name: str, module: str, entries: str) -> None:
     """A package as pip leaves it: its module, and metadata with entry points."""
-    folder.mkdir(exist_ok=True)
-    (folder / f"{name}.py").write_text(module)
     info = folder / f"{name}-1.0.dist-info"
-    info.mkdir()
+    info.mkdir(parents=True)
+    (folder / f"{name}.py").write_text(module)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(f"[ae_env.scorers]\n{entries}\n")
 
 
-@pytest.fixture
-def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One package that works, and one with three entry points that do not."""
-    folder = tmp_path / "site"
-    _install(folder, "their_scores", MINE, "their_level = their_scores:Level")
+def test_a_real_entry_point_works_and_is_listed_beside_broken_ones(tmp_path, monkeypatch):
+    _install(tmp_path, "their_scores", MINE, "their_level = their_scores:Level")
     broken = "broken = broken_scores:Mine\ngone = not_there:Mine\nends = broken_scores_2:Mine"
-    _install(folder, "broken_scores", "raise OSError('no licence')", broken)
-    (folder / "broken_scores_2.py").write_text("raise SystemExit(3)")
-    monkeypatch.syspath_prepend(folder)
+    _install(tmp_path, "broken_scores", "raise OSError('no licence')", broken)
+    (tmp_path / "broken_scores_2.py").write_text("raise SystemExit(3)")
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-
-
-@pytest.mark.usefixtures("packages")
-def test_a_real_entry_point_works_and_is_listed_beside_broken_ones() -> None:
     images = torch.full((2, 4, 5, 5), 0.25)
     scorer = make_scorer({"their_level": 1.0})
-    assert scorer.parts["their_level"](images, None).tolist() == [0.25, 0.25]  # type: ignore[arg-type]
+    assert scorer.parts["their_level"](images, None).tolist() == [0.25, 0.25]
     rows = {row.name: row for row in describe_scorers()}
     assert list(rows) == list_scorers()
     level = ScorerRow("their_level", "raw", "image", "", "Level of the *frame*.", "their_scores")
     assert rows["their_level"] == level
-    for name, error in (
-        ("broken", "OSError: no licence"),
-        ("gone", "ModuleNotFoundError: No module named 'not_there'"),
-        ("ends", "SystemExit: 3"),
-    ):
+    errors = {"broken": "OSError: no licence", "ends": "SystemExit: 3"}
+    errors["gone"] = "ModuleNotFoundError: No module named 'not_there'"
+    for name, error in errors.items():
         assert rows[name].error == error
         with pytest.raises(ValueError, match=rf"`scorer` \(='{name}'\) cannot be loaded.*{error}"):
             make_scorer(name)
@@ -81,11 +92,7 @@ def test_a_real_entry_point_works_and_is_listed_beside_broken_ones() -> None:
     assert (rows["balanced"].depends_on, rows["noise"].depends_on) == ("image", "image")
     assert rows["nima_technical"].needs == "weights: AE_ENV_NIMA_TECHNICAL"
     assert rows["keypoints"].needs == "extra cv"
-    for row in rows.values():
-        if row.package == "ae-env":
-            assert not row.error
-            assert row.domain in ("raw", "srgb")
-            assert row.summary.endswith(".")
+    assert {name for name, row in rows.items() if row.error} == set(errors)
     sys.modules.pop("their_scores", None)
 
 
@@ -109,6 +116,8 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 class FakeMetric:
+    """A metric of pyiqa, which states its range."""
+
     def __init__(self, mode: str, lower: bool | None, score_range: str | None) -> None:
         self.metric_mode, self.lower_better, self.score_range = mode, lower, score_range
 
@@ -117,9 +126,7 @@ class FakeMetric:
         return 100.0 * images.mean(dim=(1, 2, 3))[:, None]
 
 
-@pytest.fixture
-def pyiqa(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A module with pyiqa's interface: a factory of metrics that state their range."""
+def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
     metrics = {
         "musiq": FakeMetric("NR", False, "~0, ~100"),
         "niqe": FakeMetric("NR", True, "-50.0, 150"),
@@ -127,29 +134,18 @@ def pyiqa(monkeypatch: pytest.MonkeyPatch) -> None:
         "open": FakeMetric("NR", True, "0, inf"),
         "old": FakeMetric("NR", None, None),
     }
-    module = types.ModuleType("pyiqa")
-
-    def create_metric(name: str, device: torch.device) -> FakeMetric:
-        assert device.type == "cpu"
-        return metrics[name]
-
-    module.create_metric = create_metric  # type: ignore[attr-defined]
+    module: Any = types.ModuleType("pyiqa")
+    module.create_metric = lambda name, device: metrics[name]
     monkeypatch.setitem(sys.modules, "pyiqa", module)
-
-
-@pytest.mark.usefixtures("pyiqa")
-def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
     images = torch.tensor([0.0, 0.25, 1.0])[:, None, None, None].expand(3, 3, 4, 4)
     higher = make_scorer("pyiqa:musiq")
     assert list(higher.parts) == ["musiq"]
-    assert higher.parts["musiq"](images, None).tolist() == [0.0, 0.25, 1.0]  # type: ignore[arg-type]
+    assert higher.parts["musiq"](images, None).tolist() == [0.0, 0.25, 1.0]
     lower = make_scorer({"pyiqa:niqe": 0.5, "noise": 0.5}).parts["niqe"]
-    assert lower(images, None).tolist() == [0.75, 0.625, 0.25]  # type: ignore[arg-type]
+    assert lower(images, None).tolist() == [0.75, 0.625, 0.25]
     assert lower.domain == "srgb"
     for name, message in (
-        ("lpips", "needs no reference"),
-        ("open", r"'0, inf', which must be two finite numbers"),
-        ("old", "None, which must be two finite"),
+        *(("lpips", "needs no reference"), ("open", "two finite"), ("old", "two finite")),
         ("nothing", "KeyError: 'nothing'"),
     ):
         with pytest.raises(ValueError, match=rf"`scorer` \(='pyiqa:{name}'\).*{message}"):
@@ -248,15 +244,8 @@ def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
     st.sampled_from([1.0, 2.0**-20, 2.0**20]),
 )
 def test_scores_are_shares_and_the_oracle_has_the_highest(
-    light: torch.Tensor,
-    reference: Any,
-    grid: ExposureGrid,
-    illuminance: float | None,
-    is_noisy: bool,
-    speed: float,
-    defocus: float,
-    gain: float,
-) -> None:
+    light, reference, grid, illuminance, is_noisy, speed, defocus, gain
+):
     if float((light[1:3] > 0).double().mean()) <= 0.2:
         illuminance = illuminance or 640.0  # no exposure is right for a black frame
     nlf = CAMERA.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
@@ -272,3 +261,131 @@ def test_scores_are_shares_and_the_oracle_has_the_highest(
         best = table.mean.max()
         assert table.mean[table.oracle] >= best - TIE
         assert bool((table.mean[: table.oracle] < best - TIE).all())
+
+
+#: The fields and the properties worked out from them that a scorer could write to.
+TENSORS = [f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type)]
+TENSORS += [name for name, value in vars(Captures).items() if isinstance(value, cached_property)]
+
+
+def test_a_mapping_is_the_weighted_mean() -> None:
+    captures = make_captures(random_scene(), [GRID[i] for i in (3, 20, 50)], 0.1, 1.0)
+    mixed = make_scorer({"brightness": 3.0, "sharpness": 1.0})
+    expected = 0.75 * make_scorer("brightness")(None, captures)
+    expected += 0.25 * make_scorer("sharpness")(None, captures)
+    torch.testing.assert_close(mixed(None, captures), expected)
+    assert mixed.closed_form
+    assert mixed.depends_on == "blur"
+    assert make_scorer("balanced").depends_on == "image"
+
+
+def test_callables_see_the_view_they_ask_for() -> None:
+    captures = make_captures(random_scene(), [GRID[20]] * 3)
+    images = torch.rand(3, 4, 40, 40)
+    scorer = make_scorer(Own())
+    assert not scorer.closed_form
+    torch.testing.assert_close(scorer(images, captures), images.mean(dim=(1, 2, 3)).double())
+    channels = Own(lambda images, _: torch.full((3,), images.shape[1] / 4), "srgb")
+    both = CompositeScorer({"raw": Own(), "picture": channels})
+    assert both.score_parts(images, captures)["picture"].tolist() == [0.75] * 3
+    with pytest.raises(ValueError, match="needs `images`"):
+        make_scorer(Own())(None, captures)
+
+
+@pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
+def test_a_scorer_that_raises_is_named_with_its_cause(depends_on: str) -> None:
+    env = AutoExposureEnv(scorer=Own(lambda *_: 1 / 0, depends_on=depends_on), **SMALL)
+    with pytest.raises(UserCodeError, match="scorer 'Own' raised ZeroDivisionError") as caught:
+        env.reset(seed=0)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize(
+    "returned",
+    [
+        *(None, 0.5, [0.5], np.full(1, 0.5), torch.full((1, 1), 0.5), torch.tensor(0.5)),
+        *(torch.full((2,), 0.5), torch.full((1,), 0.5 + 0j)),
+        *(torch.full((1,), value) for value in (math.nan, math.inf, -0.01, 2)),
+    ],
+    ids=repr,
+)
+def test_rubbish_is_refused(returned: Any) -> None:
+    env = AutoExposureEnv(scorer=Own(lambda *_: returned), **SMALL)
+    with pytest.raises(UserCodeError, match=r"scorer 'Own' returned "):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("observation", ["uint8", "linear", "dn"])
+def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) -> None:
+    """Neither the observation nor the other scorers see it."""
+
+    def blacken(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        images.numpy()[:] = 0.0  # past torch's own counting
+        return images.new_zeros(len(images))
+
+    def step(scorer: Any) -> Any:
+        envs = AutoExposureVectorEnv(3, scorer=scorer, observation=observation, **SMALL)
+        envs.reset(seed=0)
+        return envs.step(np.array([3, 20, 40]))
+
+    for domain in ("raw", "srgb"):
+        frames = []
+        for first in (None, blacken):
+            parts = {"first": Own(first or mean_signal, domain), "mean": Own(domain=domain)}
+            scorer = CompositeScorer(parts)
+            frames.append(step(scorer))
+        (plain, _, _, _, info), (black, _, _, _, black_info) = frames
+        np.testing.assert_array_equal(plain["raw"], black["raw"])
+        np.testing.assert_array_equal(info["rewards"]["mean"], black_info["rewards"]["mean"])
+    np.testing.assert_array_equal(step(Own(blacken))[0]["raw"], plain["raw"])
+
+
+@pytest.mark.parametrize("name", TENSORS)
+@pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
+def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
+    """The scene, which other environments show too, stays as it is."""
+
+    def write(images: Any, captures: Captures) -> torch.Tensor:
+        getattr(captures, name)[0] *= 0.5
+        return torch.zeros(len(captures))
+
+    lighting = "flicker" if name == "row_gain" else "static"
+    env = AutoExposureEnv(scorer=Own(write, depends_on=depends_on), lighting=lighting, **SMALL)
+    before = [scene.clean_light.clone() for scene in env.scenes]
+    with pytest.raises(UserCodeError, match="scorer 'Own' changed its `captures` in place"):
+        env.reset(seed=0)
+    assert all(torch.equal(s.clean_light, b) for s, b in zip(env.scenes, before, strict=True))
+
+
+def test_misspelt_attributes_are_refused() -> None:
+    for scorer, word in (
+        (Own(depends_on="imgae"), "imgae"),
+        (Own(domain="RGB"), "RGB"),
+        (3, "`sc"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            CompositeScorer({"a": scorer})
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind: Any) -> None:
+    highlights = np.exp(-1.0 / 0.15) * (1.0 - np.array([0.0, 1e-16, 1e-15, 1e-12, 1e-9]))
+    assert (-0.15 * np.log(highlights) > 1.0).any()  # else this shows nothing
+    scores = dict.fromkeys(("brightness", "shadows", "noise", "sharpness"), np.ones(5))
+    scores["highlights"] = highlights
+    totals = Balanced().combine({name: kind(values) for name, values in scores.items()})
+    assert 0.0 <= float(totals.min()) <= float(totals.max()) <= 1.0
+    assert Balanced().combine(dict.fromkeys(scores, kind(np.ones(3)))).tolist() == [1.0] * 3
+
+
+@pytest.mark.parametrize("total", [math.nan, math.inf, -0.1, 1.1])
+@pytest.mark.parametrize("part", ["noise", "own"])
+def test_a_combination_of_ones_own_is_checked(total: float, part: str) -> None:
+    class Mine(CompositeScorer):
+        def combine(self, scores: Any) -> Any:
+            return scores[part] * 0.0 + total
+
+    parts = {"noise": make_scorer("noise"), "own": Own()}
+    env = AutoExposureEnv(scorer=Mine({part: parts[part]}), **SMALL)
+    with pytest.raises(UserCodeError, match=r"scorer 'Mine': `combine` returned .* \[0, 1\]"):
+        env.reset(seed=0)

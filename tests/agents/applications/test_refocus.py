@@ -132,26 +132,20 @@ def test_bad_arguments(simulator, arguments, named: str) -> None:
 
 # -- depth maps -----------------------------------------------------------------------------------
 
-MAP = np.array([[500, 1000, 0], [2000, 4000, 65535]], np.uint16)
 
-
-def test_millimetres_of_a_png_with_a_hole(tmp_path) -> None:
-    Image.fromarray(MAP).save(tmp_path / "depth.png")
+def test_millimetres_with_a_hole_disparity_and_an_exr(tmp_path) -> None:
+    millimetres = np.array([[500, 1000, 0], [2000, 4000, 65535]], np.uint16)
+    Image.fromarray(millimetres).save(tmp_path / "depth.png")
     depth = read_depth(tmp_path / "depth.png")
     np.testing.assert_allclose(depth[:, :2], [[0.5, 1.0], [2.0, 4.0]])
     assert depth[0, 2] in (1.0, 65.535)  # that of a neighbour
     np.testing.assert_allclose(read_depth(tmp_path / "depth.png", scale=0.01)[0, 0], 5.0)
-
-
-def test_disparity_is_inverse_distance(tmp_path) -> None:
+    # Disparity is inverse distance.
     np.save(tmp_path / "disparity.npy", np.array([[0.0, 2.0], [4.0, np.nan]], np.float32))
     depth = read_depth(tmp_path / "disparity.npy", kind="disparity", scale=0.25)
     assert depth[0, 0] == np.inf
     np.testing.assert_allclose([depth[0, 1], depth[1, 0]], [2.0, 1.0])
     assert depth[1, 1] in (1.0, 2.0)
-
-
-def test_an_exr(tmp_path) -> None:
     openexr = pytest.importorskip("OpenEXR")
     values = np.array([[1.5, 2.5]], np.float32)
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
@@ -171,7 +165,6 @@ def test_bad_maps(tmp_path) -> None:
     for name in names if importlib.util.find_spec("OpenEXR") else names - {"text.exr"}:
         with pytest.raises(ValueError, match=rf"`depth` \(='.*{name}'"):
             read_depth(tmp_path / name)
-    Image.fromarray(MAP).save(tmp_path / "depth.png")
     for wrong in ({"kind": "metres"}, {"kind": "disparity"}, {"scale": 0.0}):
         with pytest.raises(ValueError, match=r"`kind` \(='metres'|`scale` \(=(None|0\.0)\)"):
-            read_depth(tmp_path / "depth.png", **wrong)
+            read_depth(tmp_path / "photo.jpg", **wrong)

@@ -35,30 +35,23 @@ def preset(tmp_path: Path) -> str:
     return str(tmp_path / "mine.yaml")
 
 
-def test_plain_options_mean_one_condition():
-    plan = make_plan(
-        None, None, ["random"], {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5}
-    )
+def test_the_plan_of_options_of_a_preset_and_of_an_environment(preset, tmp_path):
+    """Plain options mean one condition; others replace what a preset or an environment says."""
+    options = {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5}
+    plan = make_plan(None, None, ["random"], options)
     ((name, condition),) = plan.all_conditions.items()
     assert (name, condition.lighting, condition.delay) == ("sine", "sine", 2)
     assert (plan.starts, plan.frames, plan.seeds) == (("random",), 8, (5, 6, 7))
     assert plan.environment == {"scenes": "bundled", "resolution": 64}
-
-
-def test_options_replace_what_a_preset_says(preset):
     plan = make_plan(preset, None, [], {})
     assert list(plan.all_conditions) == ["static", "step+4", "static/delay1", "step+4/delay1"]
     assert plan.policies == ("matrix:P", "random", "oracle")
-    changed = make_plan(
-        preset, None, ["random"], {"scorer": "noise", "frames": 3, "lighting": "ramp"}
-    )
+    options = {"scorer": "noise", "frames": 3, "lighting": "ramp"}
+    changed = make_plan(preset, None, ["random"], options)
     assert changed.environment["scorer"] == "noise"
     assert changed.environment["scenes"] == "bundled:small"
     assert (changed.policies, changed.frames) == (("random",), 3)
     assert list(changed.all_conditions) == ["ramp"]
-
-
-def test_an_environment_is_the_base(tmp_path):
     (tmp_path / "env.yaml").write_text(
         "scenes: 'bundled:small'\nresolution: 40\nlighting: {kind: tunnel}\ndelay: 1\n"
         "max_episode_steps: 30\n"
@@ -75,11 +68,9 @@ def test_an_environment_is_the_base(tmp_path):
         (("--preset", "ae_bench_v1", "--frames", 3), "is a fixed benchmark: it does not take --fr"),
         (("--preset", "mine.yaml", "--append", "x.csv"), "takes the results of a benchmark only"),
         (("--policy", "random", "--scorer", "nois"), "did you mean 'noise'"),
-        (("--policy", "matix:P", "--scenes", "bundled:small"), "did you mean 'matrix"),
         (("--preset", "broken.yaml"), "starts"),
         (("--policy", "random", "--author", "me"), "give --append too"),
         (("--preset", "ae_bench_v2_still", "--append", "none/x.csv"), "there is no folder none"),
-        (("--policy", "random", "--delay", "8"), "condition 'static': `delay` (=8)"),
         (("--policy", "random", "--on-error", "skip"), "give that, too"),
         (("--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop' for recorded grids"),
         (("--preset", "ae_bench_v1", "--append", "."), "must be a file, but it is a folder"),

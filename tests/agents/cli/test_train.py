@@ -27,8 +27,9 @@ aperture: {steps: 2, batch: 2, crop: 16}
 def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the second stage; the same command finishes, and simulate takes the result.
 
-    Without a folder of real files, on a few drawn pictures."""
-    monkeypatch.delenv("AE_ENV_DATA", raising=False)
+    Without real files, on a few drawn pictures."""
+    (tmp_path / "data").mkdir()
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path / "data"))
     monkeypatch.setattr(pictures, "_DRAWN", {"train": 2, "validation": 1})
     monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
     monkeypatch.setattr(train, "_CROPS", 8)

@@ -77,7 +77,7 @@ class Bad(Policy):
         return self.answer
 
 
-def test_wrong_actions_name_the_policy(small, few):
+def test_wrong_actions_name_the_policy_and_arguments_are_checked(small, few):
     policy = Bad(small)
     for policy.answer in (
         *(np.zeros(3, int), np.zeros(8), np.full(8, 64), np.full(8, -1)),
@@ -85,9 +85,6 @@ def test_wrong_actions_name_the_policy(small, few):
     ):
         with pytest.raises(UserCodeError, match="policy 'mine'"):
             evaluate({"mine": policy}, few, frames=1)
-
-
-def test_arguments_are_checked(small):
     policies = {"random": make_policy("random", small)}
     for name, value in (("frames", 0), ("seed", -1), ("batch", 0), ("episodes_per_scene", 1.5)):
         with pytest.raises(ValueError, match=rf"`{name}` \(={value}\)"):

@@ -45,14 +45,25 @@ def test_shapes(size: int, sensors: bool) -> None:
         ExposureFeatures(space(size, dtype=np.float32))
 
 
-def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> None:
-    # One scene at four states, four stops apart in all, without noise and blur.
-    envs = make_tiny_envs(num_envs=4, noise=False, motion="none", depth="far", split="test")
-    base = envs.unwrapped
-    scene = next(s for s in base.scenes if s.kind == "dead_leaves")
-    exposure = scene.ev100 - np.array(base.grid.ev100)  # stops above the proper one
-    wanted = [int(np.argmin(np.abs(exposure - stops))) for stops in (-2.5, -1.5, -0.5, 0.5)]
-    frames, _ = envs.reset(seed=0, options={"scene": scene.scene_id, "state": wanted})
+@pytest.fixture
+def exposed(make_tiny_envs):
+    """The environment, its scene of dead leaves, and frames so many stops above its exposure."""
+
+    def make(*stops: float):
+        options = {"noise": False, "motion": "none", "depth": "far", "split": "test"}
+        envs = make_tiny_envs(num_envs=len(stops), **options)
+        base = envs.unwrapped
+        scene = next(s for s in base.scenes if s.kind == "dead_leaves")
+        above = scene.ev100 - np.array(base.grid.ev100)
+        states = [int(np.argmin(np.abs(above - each))) for each in stops]
+        frames, _ = envs.reset(seed=0, options={"scene": scene.scene_id, "state": states})
+        return base, scene, frames
+
+    return make
+
+
+def test_absolute_luminance_does_not_depend_on_the_settings(exposed) -> None:
+    base, scene, frames = exposed(-2.5, -1.5, -0.5, 0.5)
     features, seen = ExposureFeatures(base.single_observation_space), []
     features.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     with torch.no_grad():
@@ -87,15 +98,11 @@ def test_foretold_blur_is_that_of_the_scorer() -> None:
     np.testing.assert_allclose(foretold[..., 1].numpy() * 2.0, np.log1p(blur**2), atol=0.05)
 
 
-def test_foretold_shares_are_those_of_the_captures(make_tiny_envs) -> None:
+def test_foretold_shares_are_those_of_the_captures(exposed) -> None:
     # What each state would put above white, from one frame that is not clipped.
-    envs = make_tiny_envs(num_envs=1, noise=False, motion="none", depth="far", split="test")
-    base = envs.unwrapped
-    scene = next(s for s in base.scenes if s.kind == "dead_leaves")
+    base, scene, frames = exposed(-1.5)
     grid = base.grid
     ev100 = np.array(grid.ev100)
-    state = int(np.argmin(np.abs(ev100 - scene.ev100 - 1.5)))
-    frames, _ = envs.reset(seed=0, options={"scene": scene.scene_id, "state": [state]})
     assert frames["raw"].max() < 255
     features, head = ExposureFeatures(base.single_observation_space), StateHead(grid, 6, True)
     codes, settings, sensors = observation_tensors(frames)

@@ -217,9 +217,7 @@ def test_tracker_jumps_far_averages_near_and_respects_bounds():
     assert tracker.update(_reading(5.0, black=True))[0] == 2.0  # half of the way to -1
     white = EVTracker(1, (-1.0, 17.0)).update(_reading(9.0, saturated=1.0))
     assert white[0] == 0.5 * (9.0 - 3.0 + 17.0)
-
-
-def test_damping_keeps_its_share_of_the_distance_in_ev():
+    # Damping keeps its share of the distance in EV.
     tracker = EVTracker(1, (-1.0, 17.0), damping=0.75)
     assert tracker.update(_reading(4.0))[0] == 4.0  # nothing to keep yet
     found = [tracker.update(_reading(12.0))[0] for _ in range(6)]

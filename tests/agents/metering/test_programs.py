@@ -17,11 +17,8 @@ from agents.metering.tuned import ScoreRegression
 
 #: ISO 100 and 400, 1/64 and 1/4 s, f/4 and f/8: every value a power of two.
 GRID = ExposureGrid((100, 400), (1 / 64, 1 / 4), (4, 8))
-#: Av, Tv and Sv of its states, in their order: ISO slowest, aperture fastest.
-APEX = np.array(
-    [(av, tv, sv) for sv in (5.0, 7.0) for tv in (6.0, 2.0) for av in (4.0, 6.0)], dtype=float
-)
-EV = np.array([10.0, 12.0, 6.0, 8.0, 8.0, 10.0, 4.0, 6.0])  # Av + Tv - (Sv - 5)
+#: Av + Tv - (Sv - 5) of its states, in their order: ISO slowest, aperture fastest.
+EV = [10.0, 12.0, 6.0, 8.0, 8.0, 10.0, 4.0, 6.0]
 
 
 def chooser(program="P", ceiling=False, grid=GRID, **options) -> StateChooser:
@@ -33,15 +30,6 @@ def best(found: StateChooser, target: float, preference=0.0) -> list[int]:
     cost = np.broadcast_to(np.asarray(preference, float), (len(EV),))
     utility = found.utility(np.array([target]), cost)[0]
     return np.flatnonzero(utility == utility.max()).tolist()
-
-
-def test_values_of_the_states():
-    found = chooser()
-    np.testing.assert_allclose(np.stack([found.aperture, found.time, found.speed], 1), APEX)
-    np.testing.assert_allclose(found.ev100, EV)
-    assert found.step == 2.0
-    assert found.hysteresis == pytest.approx(0.4)
-    assert not found.over_cap.any()
 
 
 @pytest.mark.parametrize(
@@ -83,8 +71,7 @@ def test_what_comes_first_in_the_choice_of_a_state():
     slow = 2e9 * (1 - 0.5e-6) + 1e3 * (3.0 - 1.0 - 1 / 6) + 3.0  # two stops slower than the cap
     assert -utility[3] == pytest.approx(slow, rel=1e-12)
 
-
-def test_ceiling_chooses_the_next_darker_state():
+    # Of a ceiling the next darker state.
     found = chooser(ceiling=True)
     assert best(found, 8.5) == [0, 5]  # 8 is nearer, but brighter
     assert best(found, 8.0) == [3, 4]
@@ -165,8 +152,7 @@ def test_ranges_of_the_options(option, low, high):
             ProgramOptions(**{option: value})
     assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
 
-
-def test_options_belong_to_programs():
+    # Options belong to programs.
     check_used("M", f_number=4.0, exposure_time=0.1, iso=100, weights=None)
     for program, option in (("A", "iso"), ("P", "f_number")):
         with pytest.raises(ValueError, match=f"`{option}`"):

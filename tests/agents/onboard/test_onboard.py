@@ -138,7 +138,9 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> No
         assert abs(np.log2(taken[last].exposure_time / taken[last - 3].exposure_time)) < 0.1
 
 
-def test_what_cannot_be_exported_is_named(context: PolicyContext, tmp_path: Path) -> None:
+def test_what_cannot_be_exported_or_loaded_is_named(
+    exported: Any, context: PolicyContext, tmp_path: Path
+) -> None:
     file = tmp_path / "x.onnx"
     for name in ("matrix:P", "regression?foresight=trend"):
         with pytest.raises(ValueError, match="`policy`"):
@@ -146,14 +148,11 @@ def test_what_cannot_be_exported_is_named(context: PolicyContext, tmp_path: Path
     with pytest.raises(ValueError, match="`out`"):
         export_agent(make_policy("ppo", context), tmp_path / "x")
     assert not file.exists()
-
-
-def test_a_controller_names_what_is_wrong(exported: Any, tmp_path: Path) -> None:
     broken = tmp_path / "broken.onnx"
     broken.write_bytes(b"no model")
-    for file in (broken, tmp_path / "none.onnx"):
+    for path in (broken, file):
         with pytest.raises(ValueError, match="`path`"):
-            Controller(file)
+            Controller(path)
     controller = Controller(exported[1])
     frame = np.zeros((1, 4, 64, 64), np.uint8)
     with pytest.raises(ValueError, match="`sensors`"):

@@ -92,7 +92,7 @@ def test_best_meter_differences_and_histogram():
     assert kinds["snow"]["oracle"] == pytest.approx(1.0)
 
 
-def test_brackets_by_hand():
+def test_brackets_by_hand(tmp_path):
     """16 groups, two budgets: the same differences in each group, so intervals without width."""
     quality = np.linspace(0.5, 0.8, 16)[None]
     results = {
@@ -108,6 +108,17 @@ def test_brackets_by_hand():
     assert low.to_best == pytest.approx(-0.05)
     np.testing.assert_allclose(low.to_best_ci95, [-0.05, -0.05])
     assert rows.loc[0.1, "high"].to_best == 0.0
+    # The report has a table for each budget.
+    files = write_report(results, tmp_path, command="ae-env x")
+    assert set(files) == {p.name for p in tmp_path.iterdir()} == {"results.json", "report.md"}
+    text = files["report.md"].read_text()
+    assert "```\nae-env x\n```" in text
+    places = [text.index(shown) for shown in ("## 0.1 s", "0.6500", "## 0.2 s", "0.7500")]
+    assert places == sorted(places)
+    content = json.loads(files["results.json"].read_text())
+    assert content["meta"]["plan"]["budgets"] == [0.1, 0.2]
+    shown = {(r["budget"], r["policy"]): r["quality"] for r in content["rows"]}
+    assert (shown[0.1, "low"], shown[0.2, "low"]) == pytest.approx((0.65, 0.75))
 
 
 NAMES = {
@@ -117,14 +128,9 @@ NAMES = {
 
 
 def test_files_of_a_report(tmp_path):
-    files = write_report(
-        made_result(),
-        tmp_path / "out",
-        command="ae-env evaluate --seed 11",
-        source="bundled",
-        split="test",
-        next_commands=["ae-env quickstart --scenes my_raws"],
-    )
+    names = {"command": "ae-env evaluate --seed 11", "source": "bundled", "split": "test"}
+    following = ["ae-env quickstart --scenes my_raws"]
+    files = write_report(made_result(), tmp_path / "out", **names, next_commands=following)
     assert {p.name for p in (tmp_path / "out").iterdir()} == set(files) == NAMES
     results = json.loads(files["results.json"].read_text())
     assert set(results) == {"meta", "rows"}
@@ -175,20 +181,6 @@ def test_names_from_outside_show_no_file_and_few_groups_every_value(tmp_path):
     assert all(f"group-{i:02d}<" in page for i in range(4))
 
 
-def test_brackets_have_a_table_for_each_budget(tmp_path):
-    quality = np.linspace(0.5, 0.8, 16)[None]
-    results = {"0.1 s": made_brackets(a=quality), "0.2 s": made_brackets(a=quality + 0.1)}
-    files = write_report(results, tmp_path, command="ae-env x")
-    assert set(files) == {p.name for p in tmp_path.iterdir()} == {"results.json", "report.md"}
-    text = files["report.md"].read_text()
-    assert "```\nae-env x\n```" in text
-    places = [text.index(shown) for shown in ("## 0.1 s", "0.6500", "## 0.2 s", "0.7500")]
-    assert places == sorted(places)
-    content = json.loads(files["results.json"].read_text())
-    assert content["meta"]["plan"]["budgets"] == [0.1, 0.2]
-    assert [row["quality"] for row in content["rows"]] == [pytest.approx(0.65), pytest.approx(0.75)]
-
-
 def test_the_terminal_shows_scores_or_every_group(tmp_path):
     ((title, frame),) = summary({"static": made_result(), "sine": made_result()})
     assert "over 2 conditions" in title
@@ -230,7 +222,7 @@ def test_names_are_shown_as_they_are(name):
     assert escape(plain) == plain  # stays readable
 
 
-def test_cells_of_a_table():
+def test_cells_of_a_table_and_a_block_of_code():
     rows = pd.DataFrame({"a": ["x", "y"], "b": [[0.5, 0.25], None], "c": [{"d": 2}, {}], "n": 1e-3})
     columns = {"a": "{a}", "pair": "{b:+.1f}", "d": "{c[d]:.1f} %", "f": lambda r: r["n"] * 2}
     found = [line.strip("|").split("|") for line in to_markdown(rows, columns).splitlines()]
@@ -241,9 +233,6 @@ def test_cells_of_a_table():
     assert "none" not in gaps
     assert "-:|" in gaps  # numbers to the right
     assert to_markdown([], {"a": "{a}", "b": "{b}"}).count("\n") == 1
-
-
-def test_a_block_of_code_ends_where_it_should():
     page = _rendered(code_block("ae-env --scenes '```'", "<b>\nmore"))
     assert page == "<pre><code>ae-env --scenes '```'\n&lt;b&gt; more\n</code></pre>\n"
 

@@ -148,18 +148,19 @@ def assert_shows_the_clicked_state(page):
     expect(page.get_by_text(re.compile(r"^\d+\.\d+% at white"))).to_be_visible()
 
 
-def test_starts_at_the_best_state(page):
+def test_starts_at_the_best_state_and_marks_where_a_policy_stands(page):
     expect(page.locator(".state", has_text=re.compile(r"\d"))).to_have_count(64)
-    scores = {
-        button.get_attribute("aria-label"): float(button.inner_text().split()[-1])
-        for button in page.locator(".state").all()
-    }
+    scores = [float(state.inner_text().split()[-1]) for state in page.locator(".state").all()]
     shown = page.locator(".state.shown")
     expect(shown).to_contain_text("★")
-    assert float(shown.inner_text().split()[-1]) == max(scores.values())
+    assert float(shown.inner_text().split()[-1]) == max(scores)
+    page.get_by_label(re.compile("Mark where policies")).click()
+    page.get_by_role("option", name="average", exact=True).click()
+    expect(page.get_by_text(re.compile(r"^A average: ISO"))).to_be_visible()
+    expect(page.locator(".state", has_text="A")).to_have_count(1)
 
 
-def test_zooms_to_the_pixels_and_back(page):
+def test_zooms_to_the_pixels_and_compares_two_states_with_a_divider(page):
     before = picture(page)
     page.locator(".stage img").first.click(position={"x": 100, "y": 100})
     assert_another_picture(page, before)
@@ -172,9 +173,6 @@ def test_zooms_to_the_pixels_and_back(page):
     page.keyboard.press("Escape")
     page.locator("body").press("z")
     expect(page.locator(".stage.whole")).to_be_visible()
-
-
-def test_compares_two_states_with_a_divider(page):
     page.get_by_text("Compare with this (P)").click()
     over = page.locator(".stage .over[src]")
     over.wait_for()
@@ -188,13 +186,6 @@ def test_compares_two_states_with_a_divider(page):
     page.locator("input.divider").focus()
     page.keyboard.press("Home")
     expect(over).to_have_css("clip-path", "inset(0px 0px 0px 0%)")
-
-
-def test_marks_where_a_policy_stands(page):
-    page.get_by_label(re.compile("Mark where policies")).click()
-    page.get_by_role("option", name="average", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^A average: ISO"))).to_be_visible()
-    expect(page.locator(".state", has_text="A")).to_have_count(1)
 
 
 def test_plays_an_episode_of_two_policies(page):
@@ -269,6 +260,11 @@ def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
     raw = read_raw(tmp_path / "soft.dng")
     assert back.data[:, 8:-8, :60].equal(raw.data[:, 8:-8, :60])
     assert back.data[1, :, 84:].std() < 0.8 * raw.data[1, :, 84:].std()
+    # The page lives while it is opened again.
+    page.get_by_role("button", name="Open the aperture").click()
+    expect(page.get_by_text(re.compile(r"^opening the aperture, 0\.1 megapix"))).to_be_visible()
+    page.get_by_role("tab", name="Exposure").click()
+    assert_shows_the_clicked_state(page)
 
 
 def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
@@ -282,15 +278,6 @@ def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
         assert file.channels()["RGB"].pixels.shape == (96, 144, 3)
     with Image.open(saved(soft_page, "png", tmp_path)) as fused:
         assert fused.size == (288, 192)
-
-
-def test_the_page_lives_while_the_aperture_opens(soft_page):
-    soft_page.get_by_role("button", name="Open the aperture").click()
-    expect(
-        soft_page.get_by_text(re.compile(r"^opening the aperture, 0\.1 megapixels \.\.\. "))
-    ).to_be_visible()
-    soft_page.get_by_role("tab", name="Exposure").click()
-    assert_shows_the_clicked_state(soft_page)
 
 
 def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
@@ -309,7 +296,13 @@ def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
     expect(page.get_by_role("button", name="Open the aperture")).to_be_enabled()
 
 
-def test_two_tabs_show_different_scenes(page, address):
+def test_fits_the_width_and_two_tabs_show_different_scenes(page, address):
+    for width in (390, 1280):
+        page.set_viewport_size({"width": width, "height": 844})
+        for tab, there in (("Refocus, HDR", "text=Fuse a bracket"), ("Exposure", ".state.shown")):
+            page.get_by_role("tab", name=tab).click()
+            page.locator(there).wait_for()
+            page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
     other = page.context.new_page()
     other.goto(address)
     ready(other)
@@ -320,15 +313,6 @@ def test_two_tabs_show_different_scenes(page, address):
     thumb.click()
     expect(other.locator(".title", has_text=name).first).to_be_visible()
     expect(page.locator(".title").first).not_to_have_text(name)
-
-
-def test_fits_the_width(page):
-    for width in (390, 1280):
-        page.set_viewport_size({"width": width, "height": 844})
-        for tab, there in (("Refocus, HDR", "text=Fuse a bracket"), ("Exposure", ".state.shown")):
-            page.get_by_role("tab", name=tab).click()
-            page.locator(there).wait_for()
-            page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,20 +13,8 @@ from PIL import Image
 
 from ae_env.scenes import Scene
 from agents.viewer.one_raw_page import wider_f_numbers
-from agents.viewer.viewed_scene import (
-    WINDOW_SIZE,
-    OpenedScene,
-    View,
-    ViewedScene,
-    find_scenes,
-)
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    RawImage,
-    get_camera,
-    write_dng,
-)
+from agents.viewer.viewed_scene import WINDOW_SIZE, OpenedScene, View, ViewedScene, find_scenes
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, write_dng
 from simulator.optics.discs import disc_blur
 
 CAMERA = get_camera("nikon_z6")
@@ -54,11 +43,9 @@ def test_the_window_lies_where_the_upright_picture_was_clicked(flip):
     assert sorted(window.shape) == sorted(2 * side for side in WINDOW_SIZE)
     found = np.argwhere(window > 0.8 * window.max()).mean(axis=0)
     np.testing.assert_allclose(found, np.array(window.shape) / 2, atol=8)
-
-
-def test_the_whole_frame_is_averaged_to_the_size_of_the_page():
-    seen = viewed(torch.rand(4, 1025, 1100, generator=torch.Generator().manual_seed(0)))
-    assert seen.picture(View(SETTINGS)).capture.shape == (4, 341, 366)  # thirds
+    # The whole frame is averaged to the size of the page: thirds.
+    seen = viewed(torch.zeros(4, 1025, 1100), flip)
+    assert sorted(seen.picture(View(SETTINGS)).capture.shape) == [4, 341, 366]
 
 
 def test_clipped_pixels_are_marked():
@@ -80,6 +67,12 @@ def test_numbers_of_a_flat_scene():
     assert (readout.white, readout.black) == (pytest.approx(1.0, abs=0.6), 0.0)
     assert readout.motion == pytest.approx(0.5 * 64 / 16)  # speed, height, time
     assert readout.defocus == pytest.approx(4.0)
+    large = viewed(torch.full((4, 512, 384), 0.1))
+    for centre in (None, (0.5, 0.5)):  # a window moves as the frame does
+        shown = replace(view, centre=centre)
+        readout = large.readout(shown, large.picture(shown).capture)
+        assert readout.motion == pytest.approx(0.5 * 512 / 16)
+        assert readout.defocus == pytest.approx(4.0 * 512 / 64)
     dark = View(CameraSettings(100, 1 / 128, 4))
     readout = seen.readout(dark, seen.picture(dark).capture)
     assert readout.histogram.argmax(axis=1).tolist() == [8] * 4  # 0.125 of white, in 64 bins
@@ -87,16 +80,6 @@ def test_numbers_of_a_flat_scene():
     nlf = CAMERA.nlf(100)
     snr = 20 * math.log10(0.12 / math.sqrt(nlf.read[1] + nlf.shot[1] * 0.12))
     assert readout.snr == pytest.approx(snr)
-
-
-def test_a_window_moves_as_the_frame_does():
-    seen = viewed(torch.full((4, 512, 384), 0.1))
-    view = View(CameraSettings(100, 1 / 16, 4), speed=0.5, defocus=2.0)
-    for centre in (None, (0.5, 0.5)):
-        shown = View(view.settings, view.speed, view.defocus, centre=centre)
-        readout = seen.readout(shown, seen.picture(shown).capture)
-        assert readout.motion == pytest.approx(0.5 * 512 / 16)
-        assert readout.defocus == pytest.approx(2.0 * 512 / 64)
 
 
 def test_the_best_state_has_the_highest_score():
@@ -121,18 +104,17 @@ def test_a_raw_is_read_when_it_is_opened_and_few_are_kept(tmp_path):
         library.open("1.dng")
 
 
-@pytest.mark.parametrize(
-    ("what", "why"),
-    [
+def test_a_scene_is_found_by_its_id_and_what_is_none_is_refused():
+    other = list(find_scenes("bundled:small").readers)[5]
+    found = find_scenes(other)
+    assert (found.first, other in found.readers) == (other, True)
+    for what, why in (
         ("snow-9999", "must be a raw, a radiance map"),
-        ("IMG_0001.dng", "must name an existing file"),
         ("no/such/folder", "must name an existing file"),
         ("recorded:no/such", "must name an existing folder"),
-    ],
-)
-def test_what_is_no_scene_is_refused(what, why):
-    with pytest.raises(ValueError, match=why):
-        find_scenes(what)
+    ):
+        with pytest.raises(ValueError, match=why):
+            find_scenes(what)
 
 
 def test_a_folder_opens_at_its_first_readable_raw(tmp_path):
@@ -182,11 +164,3 @@ def test_only_wider_f_numbers_than_the_raw_s_are_offered():
     assert offered(2.8) == offered(8**0.5) == (2.5, 2.2, 2.0, 1.8, 1.6, 1.4)
     assert offered(1.4) == offered(2**0.5) == ()
     assert offered(16)[:2] == (14.0, 13.0)
-
-
-def test_a_scene_is_found_by_its_id():
-    library = find_scenes("bundled:small")
-    other = list(library.readers)[5]
-    found = find_scenes(other)
-    assert found.first == other
-    assert other in found.readers

@@ -1,9 +1,8 @@
-"""Light behind apertures and in motion: against sums by hand, cached within bounds, in batches."""
-
-from __future__ import annotations
+"""Light behind apertures and in motion, cached within bounds; captures in batches."""
 
 import functools
 import math
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -14,14 +13,16 @@ from scipy.ndimage import correlate
 from torch import Tensor
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
-from simulator.capture import blurred_light as module
-from simulator.capture.batch import CaptureBatch
+from simulator.capture import batch as batch_module
+from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.exposure import Exposure
+from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import Layout
+from simulator.capture.sensor import Noise, Transitions, noise_keys, record, single_normals
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
-from simulator.optics.discs import DIAMETERS, HALO, DiscBank, added_blur, disc_blur
+from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur
 from simulator.optics.motion import Movement, motion_blur, path_blur, path_taps
 from simulator.utils.tiles import make_tiles
 
@@ -89,9 +90,7 @@ def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> No
 
 @pytest.mark.parametrize("size", [(1, 40), (40, 1), (35, 91), (150, 133)])
 @pytest.mark.parametrize("tile", [32, 768])
-def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
-    size: tuple[int, int], tile: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(size, tile, monkeypatch):
     generator = torch.Generator().manual_seed(2)
     image = torch.rand(4, *size, generator=generator) * 3
     diameter = 12 * torch.rand(size, generator=generator)
@@ -106,23 +105,6 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
         torch.testing.assert_close(result, whole, rtol=0, atol=3e-6)
         assert torch.equal(result[:, diameter == 0], image[:, diameter == 0])
         assert not torch.equal(result, image) or min(size) == 1
-
-
-def test_only_what_is_out_of_focus_is_blurred(monkeypatch: pytest.MonkeyPatch) -> None:
-    pixels: list[int] = []
-
-    class Spy(DiscBank):
-        def blurred(self, diameter: Tensor) -> Tensor:
-            pixels.append(diameter.numel())
-            return super().blurred(diameter)
-
-    monkeypatch.setattr("simulator.capture.blurred_light.DiscBank", Spy)
-    image, diameter = torch.rand(4, 300, 400), torch.zeros(300, 400)
-    assert torch.equal(MapApertureBlur(image, diameter, 8.0).opened(4.0, None), image)
-    assert not pixels
-    diameter[-32:, -32:] = 5.0
-    MapApertureBlur(image, diameter, 8.0).opened(4.0, None)
-    assert (32 + HALO) ** 2 <= sum(pixels) <= (48 + HALO) ** 2  # in cells of 16 pixels
 
 
 def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
@@ -148,24 +130,6 @@ LIGHT = torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(0))
 CLEAN = DenoisedLight(LIGHT * 0.5)
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
-    """The blurs that are made, and their extents."""
-    calls: list[tuple[str, float]] = []
-
-    def streak(light: Tensor, extent: float, *args: Any, **options: Any) -> Tensor:
-        calls.append(("streak", extent))
-        return motion_blur(light, extent, *args, **options)
-
-    def disc(light: Tensor, diameter: float) -> Tensor:
-        calls.extend([("disc", diameter)] * bool(diameter))
-        return disc_blur(light, diameter)
-
-    monkeypatch.setattr(module, "motion_blur", streak)
-    monkeypatch.setattr(module, "disc_blur", disc)
-    return calls
-
-
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
     source = CLEAN.light if denoised else LIGHT
@@ -174,19 +138,9 @@ def test_disc_then_streak(denoised: bool) -> None:
     assert blurred_light.blurred(exposure) is source  # what needs no blur is not copied
     exposure = replace(exposure, defocus_px=2.0, motion_px=3.0)
     expected = motion_blur(disc_blur(source, 2.0), 3.0)
-    assert torch.equal(blurred_light.blurred(exposure), expected)
-
-
-def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
-    """Two apertures, two exposure times, many ISO speeds: two discs and four streaks."""
-    blurred_light = BlurredLight(LIGHT, (), ZERO, None)
-    for ratio in (1.0, 2.0, 4.0):
-        for disc in (2.0, 1.0):
-            for streak in (3.0, 0.0, 6.0):
-                blurred_light.blurred(Exposure(ratio, ZERO, ZERO, streak, disc))
-    assert sorted(made) == [("disc", 1.0), ("disc", 2.0)] + 2 * [("streak", 3.0)] + 2 * [
-        ("streak", 6.0)
-    ]
+    found = blurred_light.blurred(exposure)
+    assert torch.equal(found, expected)
+    assert blurred_light.blurred(replace(exposure, ratio=4.0)) is found  # made once
 
 
 def test_the_opened_aperture_comes_first() -> None:
@@ -202,7 +156,6 @@ def test_blur_that_opening_adds_and_noise_that_it_leaves() -> None:
     """Squared diameters add: 2 pixels at f/8 take sqrt(16 - 4) more at f/4."""
     opens = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
     assert opens.extent(4.0) == pytest.approx(12**0.5)
-    assert opens.extent(8.0) == opens.extent(16.0) == 0.0
     alone = opens.remaining_variance(4.0)
     noisy = Exposure(1.0, Z6.nlf(800), Z6.nlf(800), opened_to=4.0)
     lights = BlurredLight(LIGHT, (), Z6.nlf(800), opens)
@@ -235,15 +188,6 @@ def _prepared(noisy: bool = False, **fields: Any) -> PreparedScene:
     nlf = Z6.nlf(800) if noisy else ZERO
     given = {"layout": _layout(), "movement": MOVEMENT, "tolerance": 0.0, **fields}
     return PreparedScene(SCENE, REFERENCE, Z6, nlf, **given)
-
-
-def test_only_what_the_layout_has_out_of_focus_is_blurred() -> None:
-    """A disc of the bank's at f/8, which is no blend of two."""
-    light = _prepared(defocus=2.0 * DIAMETERS[6], movement=Movement()).expected(SLOW)
-    ratio = _prepared().exposure(SLOW).ratio
-    torch.testing.assert_close(light[..., :16], SCENE[..., :16] * ratio)
-    wanted = disc_blur(SCENE.double(), DIAMETERS[6])[..., 16:].float() * ratio
-    torch.testing.assert_close(light[..., 16:], wanted, rtol=1e-4, atol=1e-5 * ratio)
 
 
 def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
@@ -304,41 +248,6 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
     assert float(ratio.quantile(0.95)) < 1.2
 
 
-@pytest.mark.parametrize("cache_light", [True, False])
-@pytest.mark.parametrize("noisy", [True, False])
-def test_batches_have_the_light_of_sweeps(cache_light: bool, noisy: bool) -> None:
-    scenes = [
-        _prepared(noisy, defocus=3.0, image_speed=0.2),
-        _prepared(noisy, defocus=3.0, movement=Movement(subject_speed=0.5)),
-        _prepared(noisy, image_speed=0.2, layout=None),
-        _prepared(noisy, defocus=4.0, image_speed=0.2, layout=None),
-        _prepared(noisy, defocus=3.0, image_speed=0.2, movement=Movement()),
-        _prepared(noisy),
-        _prepared(noisy, defocus=3.0, tolerance=0.1),
-    ]
-    states = [CameraSettings(iso, t, n) for iso in (100, 6400) for t in (0.5, 1e-3) for n in (4, 8)]
-    batch = CaptureBatch(
-        scenes.__getitem__, len(scenes), states, Z6, noise="bank", cache_light=cache_light
-    )
-    indices, rng = np.arange(len(scenes)), np.random.default_rng(0)
-    for step in range(8):
-        if step % 2 == 0:
-            chosen = rng.integers(len(states), size=len(scenes))
-        gain = (1.0, 1e-6)[step % 2]  # in little light, blur is left out where it may be
-        frames = np.empty((len(scenes), 4, SIZE, SIZE), np.float32)
-        batch.prepare(indices, chosen, np.full(len(scenes), gain))
-        found = batch.record(indices, chosen, indices, indices, signals=frames)
-        assert np.isfinite(found.excess_variance).all()
-        for i, scene in enumerate(scenes):
-            exposure = scene.exposure(states[chosen[i]], gain=gain)
-            one, expected = np.array([i]), exposure.remaining_variance
-            transitions = batch.transitions(one, chosen[one])
-            assert torch.equal(transitions.light[0], scene.blurred_light.blurred(exposure))
-            (left,) = transitions.shares()
-            assert (left is None) == (expected is None)
-            assert expected is None or torch.equal(left, expected.float())
-
-
 def test_whole_captures_by_hand() -> None:
     """Defocus, then the background along its path, then the subject along its own, by SciPy."""
     layout = _layout()
@@ -363,3 +272,151 @@ def test_whole_captures_by_hand() -> None:
         wanted += correlate(mask * plane, own, mode="nearest")
         np.testing.assert_allclose(result, wanted, atol=2e-5)
     assert math.isclose(cover.sum(), mask.sum(), rel_tol=1e-5)
+
+
+# -- batches ---------------------------------------------------------------------------------------
+
+STATES = [CameraSettings(iso, time, 4) for iso in (100, 6400) for time in (1 / 500, 1 / 8)]
+STATES += [CameraSettings(400, 1 / 30, 8), CameraSettings(200, 1 / 30, 2)]
+LIGHTS = [torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(7)]
+SCENES = np.arange(7)
+KEYS = noise_keys(SCENES, SCENES + 5)
+
+
+def prepared(index: int) -> PreparedScene:
+    """Two at rest, one that moves, one that is also out of focus, one whose aperture opens,
+    two with a layout and a subject that moves; the first and third are free of noise."""
+    light = LIGHTS[index]
+    changes: dict[str, Any] = {"image_speed": 0.3} if index in (2, 3) else {}
+    if index == 3:
+        changes["defocus"] = 2.0
+    if index == 4:
+        found = torch.full((24, 20), 1.0)
+        changes["aperture_blur"] = MapApertureBlur(light, found, 4.0)
+    if index > 4:
+        rows, columns = torch.arange(24)[:, None], torch.arange(20)
+        subject = (abs(rows - 12) < 5) & (abs(columns - 8) < 5)
+        changes["layout"] = Layout((columns >= 10).float().expand(24, 20).contiguous(), subject)
+        changes["movement"] = Movement(0.6, 2.0, subject_speed=0.4, subject_direction=2.0)
+        changes |= {"defocus": 3.0} | ({"image_speed": 0.2} if index == 5 else {})
+    nlf = NoiseLevelFunction.zero() if index in (0, 2) else Z6.nlf(800)
+    return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
+
+
+class Counted:
+    """Scenes of a batch, and which of them were asked for."""
+
+    def __init__(self) -> None:
+        self.calls: list[int] = []
+
+    def __call__(self, index: int) -> PreparedScene:
+        self.calls.append(index)
+        return prepared(index)
+
+
+def made(noise="bank", *, cache_light=True, scenes=prepared):
+    return CaptureBatch(scenes, 7, STATES, Z6, noise=noise, cache_light=cache_light)
+
+
+def photographed(batch, states, gains=(1.0,) * 7, **options):
+    """Frames of all scenes, and their statistics."""
+    chosen, frames = np.broadcast_to(states, 7), np.empty((7, 4, 24, 20), np.float32)
+    batch.prepare(SCENES, chosen, np.array(gains))
+    return frames, batch.record(SCENES, chosen, SCENES, SCENES + 5, signals=frames, **options)
+
+
+def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "bank") -> Any:
+    scene, frame = prepared(index), torch.empty(1, 4, 24, 20)
+    exposure = scene.exposure(STATES[state], gain=gain)
+    transitions = Transitions.of([scene.blurred_light.blurred(exposure)], [exposure])
+    keys = None if key is None else np.array([key], np.uint64)
+    counts = record(transitions, Z6, keys=keys, noise=noise, signals=frame, count=True)
+    return frame[0].numpy(), counts[0], exposure
+
+
+@pytest.mark.parametrize("noise", ["bank", "exact", None])
+@pytest.mark.parametrize("cache_light", [True, False])
+def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: bool) -> None:
+    scenes, rng, seen = Counted(), np.random.default_rng(0), set()
+    batch = made(noise, cache_light=cache_light, scenes=scenes)
+    for _ in range(12):
+        states, gains = rng.integers(len(STATES), size=7), rng.choice([1e-6, 0.25, 1.0, 3.0], 7)
+        frames, found = photographed(batch, states, gains)
+        for i in range(7):
+            key = None if noise is None else int(KEYS[i])
+            wanted, counts, exposure = alone(i, states[i], gains[i], key, noise or "bank")
+            np.testing.assert_array_equal(frames[i], wanted)
+            clipped = found.clipped_low[i], found.clipped_high[i]
+            assert clipped == tuple(counts / wanted.size)
+            assert clipped == ((wanted <= 2.0**-10).mean(), (wanted == 1.0).mean())
+            modules = ["exposure", *["aperture"] * (exposure.opened_to is not None)]
+            modules += ["defocus"] * (exposure.defocus_px > 0)
+            modules += ["motion_blur"] * (exposure.motion_px > 0) + ["noise"] * bool(noise)
+            assert MODULES[found.modules[i]] == "+".join(modules)
+            seen |= set(modules)
+            balance = noise_balance(prepared(i).blurred_light.blurred(exposure), exposure)
+            excess = balance.relative_excess_variance if noise else 0.0
+            assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
+            seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
+    assert seen >= {"aperture", "defocus", "motion_blur"}
+    assert sorted(scenes.calls) == list(range(7))
+    assert noise is None or seen >= {"noise", "excess"}
+
+
+def test_normals_for_sensors_belong_to_the_frame() -> None:
+    _, found = photographed(made(), 0)
+    np.testing.assert_array_equal(found.sensor_normals(3), single_normals(KEYS, 3))
+
+
+def test_rows_have_the_light_that_is_given() -> None:
+    rows = np.ones((7, 24))
+    rows[1:, 12:] = 0.5
+    plain, _ = photographed(made(None), 0)
+    banded, _ = photographed(made(None), 0, row_gain=rows)
+    np.testing.assert_array_equal(banded[:, :, :12], plain[:, :, :12])
+    np.testing.assert_array_equal(banded[0], plain[0])
+    np.testing.assert_allclose(banded[1:, :, 12:], 0.5 * plain[1:, :, 12:], atol=1e-4)
+
+
+def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -> None:
+    scenes = Counted()
+    batch, calls = made(scenes=scenes), scenes.calls
+    first, again, _ = photographed(batch, 1)[0], photographed(batch, 1)[0], photographed(batch, 4)
+    assert sorted(calls) == list(range(7))
+    # The pool is private: memory that is not used again would show as a slow environment only.
+    assert not batch._pool.free
+    batch.forget(np.array([3]))
+    assert len(batch._pool.free) == 3  # discs of two apertures, and a streak
+    after, _ = photographed(batch, 1)
+    assert (calls[7:], len(batch._pool.free)) == ([3], 1)
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(after, first)
+
+
+@pytest.mark.parametrize("stage", ["blur_many", "decide"])
+def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+    """While the light is blurred, or while the plan of a later frame is made."""
+    batch, calls = made(), []
+    photographed(batch, 0)
+    original = getattr(batch_module, stage)
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args)
+        if stage == "decide" and len(calls) < 4:
+            return original(*args, **kwargs)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch_module, stage, fail)
+        with pytest.raises(KeyboardInterrupt):
+            photographed(batch, 1)
+    for states in (1, 0):
+        expected, _ = photographed(made(), states)
+        np.testing.assert_array_equal(photographed(batch, states)[0], expected)
+
+
+def test_a_pickled_copy_works_everything_out_again() -> None:
+    batch = made()
+    first, _ = photographed(batch, [1, 2, 3, 4, 5, 0, 1])
+    copy = pickle.loads(pickle.dumps(batch))
+    np.testing.assert_array_equal(photographed(copy, [1, 2, 3, 4, 5, 0, 1])[0], first)

@@ -1,7 +1,5 @@
 """The plan: which steps run, why the others do not, and what is said about error and cost."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import FrozenInstanceError, replace
 
@@ -13,7 +11,7 @@ from scipy.integrate import quad
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
-from simulator.capture.exposure import DEFAULT_TOLERANCE, Exposure, Step, Target, check_tolerance
+from simulator.capture.exposure import Exposure, Step, Target
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
 from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT
@@ -39,7 +37,7 @@ LIGHT = torch.rand(4, 16, 20, generator=torch.Generator().manual_seed(0)) * 0.3
 def network(name: str, error: float, *, spread: float = 1.0, **known: object) -> DenoisedLight:
     """One that errs by `error` standard deviations of the noise that it removes, everywhere."""
     residual = Residual(np.array([0.0, 9.0]), np.full(2, error**2), np.zeros(2), spread)
-    return DenoisedLight(LIGHT, name=name, residual=residual, **known)  # type: ignore[arg-type]
+    return DenoisedLight(LIGHT, name=name, residual=residual, **known)
 
 
 def prepared(*, networks: bool = True, diameter: float = 2.0, **changes: object) -> PreparedScene:
@@ -48,15 +46,13 @@ def prepared(*, networks: bool = True, diameter: float = 2.0, **changes: object)
         denoised = (DenoisedLight(LIGHT, name="compact", operations=7, seconds=lambda: 0.25),)
         blur = MapApertureBlur(LIGHT, torch.full((16, 20), diameter), 8.0)
         made = replace(made, denoised_lights=denoised, aperture_blur=blur)
-    return replace(made, **changes)  # type: ignore[arg-type]
+    return replace(made, **changes)
 
 
 @pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
 @pytest.mark.parametrize("networks", [True, False])
 @pytest.mark.parametrize("tolerance", [0.0, 0.1, 5.0])
-def test_every_step_runs_or_has_a_reason(
-    settings: CameraSettings, networks: bool, tolerance: float
-) -> None:
+def test_every_step_runs_or_has_a_reason(settings, networks, tolerance):
     plan = prepared(networks=networks, tolerance=tolerance, image_speed=1e-3).plan(settings)
     assert " ".join(step.name for step in plan.steps) == STEPS
     assert plan.modules == tuple(s.name for s in plan.steps if s.runs)
@@ -71,15 +67,6 @@ def test_every_step_runs_or_has_a_reason(
     assert plan.predicted_error == pytest.approx(math.hypot(*plan.errors.values()))
     assert plan.error_bound >= plan.predicted_error
     assert (plan.network is None) is ("noise_reduction" not in plan.modules)
-    lines = str(plan).splitlines()
-    assert len(lines) == 3
-    assert max(map(len, lines)) < 200
-    if plan.predicted_error <= tolerance:
-        assert lines[1].endswith(f"(tolerance {tolerance:g}: kept)")
-    elif math.hypot(plan.errors["left out"], plan.errors["network"]) <= tolerance:
-        assert lines[1].endswith(("no module can fix)", "kept)"))
-    else:
-        assert lines[1].endswith("out of reach, the least of these networks)")
 
 
 def test_the_networks_run_where_they_are_needed() -> None:
@@ -110,11 +97,7 @@ def test_the_networks_run_where_they_are_needed() -> None:
         ({"defocus": 1e-4}, CLEANER, "defocus", "5e-05 pixel"),
         ({}, CLEANER, "motion_blur", "does not move"),
         ({"image_speed": 1e-6}, CLEANER, "motion_blur", "4e-06 pixel"),
-        ({}, SOURCE, "noise", "already, or more"),
         ({"noise": False}, SOURCE, "noise", "only the light"),
-        ({"noise": False}, SOURCE, "clip_and_quantise", "only the light"),
-        ({}, CLEANER, None, "noisier than the target"),
-        ({"noise": False}, CLEANER, None, "without noise"),
         ({}, OPENER, None, "adds blur (up to 3.5 pixel)"),
         ({"defocus": 3}, CLEANER, None, "disc is 1.5 pixel"),
         ({"image_speed": 0.25, "tolerance": 0}, CLEANER, None, "moves by 1 pixel"),
@@ -151,7 +134,7 @@ def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     assert plan.milliseconds == pytest.approx((52 * samples * 1e-6, 250.0))
     assert plan.explain().endswith(" ms a capture and 250 ms once for all settings")
     with pytest.raises(FrozenInstanceError):
-        plan.tolerance = 1.0  # type: ignore[misc]
+        plan.tolerance = 1.0
     large = PreparedScene(torch.full((4, 500, 1000), 0.1), SOURCE, Z6, ZERO).plan(SOURCE)
     assert large.explain().endswith("cost 44 million operations, about 44 ms a capture")
 
@@ -184,7 +167,7 @@ class Opening(ApertureBlur):
 
     def __init__(self, extent: float, *, needs_denoised: bool = False) -> None:
         super().__init__(16.0)
-        self._extent, self.needs_denoised = extent, needs_denoised  # type: ignore[misc]
+        self._extent, self.needs_denoised = extent, needs_denoised
 
     def remaining_variance(self, f_number: float) -> None:
         """None: no noise is left out of account here."""
@@ -208,7 +191,7 @@ def decided(
 ) -> Exposure:
     """What is decided where the noise's variance is 1; by default with a network without error."""
     exact = DenoisedLight(LIGHT)
-    exact.statistics = found  # type: ignore[misc]
+    exact.statistics = found
     if opened_px is not None:
         given["aperture_blur"] = Opening(opened_px)
     scene = PreparedScene(
@@ -219,14 +202,14 @@ def decided(
         denoised_lights=networks or (exact,),
         tolerance=tolerance,
         **given,
-    )  # type: ignore[arg-type]
+    )
     scene.blurred_light.statistics, scene.blurred_light.residuals = found, FLAT
     scene.targets[SOURCE] = Target(1.0, nlf[1])
     return scene.exposure(SOURCE, noise=noise)
 
 
 def steps(*given: object, **options: object) -> tuple[Step, ...]:
-    return decided(*given, **options).steps  # type: ignore[arg-type]
+    return decided(*given, **options).steps
 
 
 #: A disc, and a streak along the rows, of so many pixels at `SOURCE`.
@@ -259,9 +242,7 @@ FAMILY = (network("nano", 0.4), network("compact", 0.2), network("large", 0.1))
     ],
 )
 @pytest.mark.parametrize("noise", [True, False])
-def test_the_cheapest_network_within_the_tolerance_or_else_the_best(
-    tolerance: float, name: str | None, noise: bool
-) -> None:
+def test_the_cheapest_network_within_the_tolerance_or_else_the_best(tolerance, name, noise):
     """The noise would be an error of 0.6, the networks of 0.4, 0.2, 0.1."""
     step = steps(tolerance, Statistics(0.6), FAMILY, noise=noise)[0]
     assert (step.network.name if step.network else None) == name
@@ -292,7 +273,7 @@ def test_noise_and_blur_add_as_squares() -> None:
     assert left_out(steps(0.4999, Statistics(0.5))) == []
     for error, runs in ((0.41, True), (0.39, False)):  # beside a network that errs by 0.3
         own = network("nano", 0.3)
-        own.statistics = Statistics(disc=error)  # type: ignore[misc]
+        own.statistics = Statistics(disc=error)
         made = steps(0.5, Statistics(0.9), (own,), **disc(1.0))
         assert [made[0].runs, made[2].runs] == [True, runs]
 
@@ -333,19 +314,9 @@ def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
     assert made[1].reason == "the aperture opens and adds blur"
     assert made[1].error == math.inf
     assert steps(0.1, found, (lazy,), nlf=nlf)[0].runs
-    lazy.statistics = Statistics(disc=0.02)  # type: ignore[misc]
+    lazy.statistics = Statistics(disc=0.02)
     blurred = steps(0.1, found, (lazy,), **opens, **disc(2.0))
     assert blurred[2].error == pytest.approx(0.08)  # of the light that is blurred
-
-
-def test_tolerances() -> None:
-    assert DEFAULT_TOLERANCE == 0.1
-    for value in (0, 1e-9, 3, 1e6):
-        assert check_tolerance(value) == value
-        assert isinstance(check_tolerance(value), float)
-    for wrong in (-1e-9, math.inf, math.nan, None, "0.1", True):
-        with pytest.raises(ValueError, match="`tolerance`"):
-            check_tolerance(wrong)  # type: ignore[arg-type]
 
 
 def test_the_exposure_has_what_runs() -> None:
@@ -364,7 +335,7 @@ def test_the_exposure_has_what_runs() -> None:
         assert made.layout is (layout if moves else None)
         assert (made.ratio, made.source, made.denoised, made.opened_to) == (1.0, UNIT, None, None)
     exact = network("a", 0.0)
-    exact.statistics = Statistics(9, 9)  # type: ignore[misc]
+    exact.statistics = Statistics(9, 9)
     made = decided(0.1, Statistics(9, 9), (exact,), opened_px=9.0)
     assert (made.opened_to, made.source.is_zero, made.denoised) == (8.0, True, exact)
     assert made.left_out == 0.0
@@ -406,13 +377,6 @@ def test_each_decision_says_what_it_costs() -> None:
         assert plan.predicted_error == pytest.approx(found, rel=1e-3)
         assert plan.error_bound == pytest.approx(math.hypot(bound, _LEAST_BOUND), rel=1e-3)
         assert plan.network == ("nano" if found == 0.1 else None)
-    assert "noise_reduction (nano)" in strict.explain()
-    assert "network 0.1 (tolerance 0.2: kept)" in strict.explain()
-    assert "network 0.1 (tolerance 0.09: out of reach, the least of these networks)" in str(tiny)
-    assert "90 % bound 0.17: network" in strict.explain()
-    assert "left out 0.25 (tolerance 0.3: kept)" in loose.explain()
-    assert "within the tolerance" in loose.left_out["noise_reduction"]
-    assert "(error 0.25)" in loose.details()
     alone = replace(made, denoised_lights=()).plan(settings)
     assert alone.errors["left out"] == pytest.approx(0.25)
 

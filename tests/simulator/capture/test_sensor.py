@@ -3,8 +3,6 @@
 Tolerances are sampling errors: five standard errors, computed from the exact fourth moments.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -21,7 +19,6 @@ from simulator.capture.exposure import Exposure
 from simulator.capture.plan import NoiseBalance, noise_balance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (
-    Noise,
     Transitions,
     clip_and_quantise,
     exposed_light,
@@ -132,7 +129,7 @@ def test_noise_free_source_over_all_states() -> None:
 def test_digital_numbers_are_rounded_once() -> None:
     """Without noise the capture is round(x * span + black), clipped to [0, white level]."""
     black = (64.0, 60.0, 59.0, 63.0)
-    camera = CameraProfile("bench", "GRBG", black, 4095, 12)  # type: ignore[arg-type]
+    camera = CameraProfile("bench", "GRBG", black, 4095, 12)
     signal = np.random.default_rng(0).uniform(-0.05, 1.1, (4, 64, 64)).astype(np.float32)
     levels = np.array(black)[:, None, None]
     exact = signal.astype(np.float64) * (4095 - levels) + levels
@@ -195,7 +192,7 @@ def test_bands_come_before_the_noise() -> None:
     share = torch.full((2, 5000), 0.5)
     blurred = replace(exposure, remaining_variance=share)
     (known,) = Transitions.of([light], [blurred]).in_bands(rows).shares()
-    assert known[:, 0].tolist() == [0.25, 0.75]  # type: ignore[index]
+    assert known[:, 0].tolist() == [0.25, 0.75]
     assert plain.in_bands(np.ones((1, 2))).light[0] is plain.light[0]
 
 
@@ -246,28 +243,6 @@ def test_balance_where_there_is_no_noise() -> None:
     assert balance == NoiseBalance(1e24, False)
 
 
-@pytest.mark.parametrize("source", [100, 6400])
-def test_noise_is_drawn_only_where_the_source_lacks_some(
-    source: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    light, share = torch.full((4, 8, 8), 0.2), torch.full((8, 8), 0.5)
-    enough = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
-    blurred = replace(enough, remaining_variance=share)
-    short = Exposure(1.0, Z6.nlf(source), Z6.nlf(12800))
-    for exposures, lacks in (([enough], False), ([blurred], True), ([enough, short], True)):
-        assert Transitions.of([light] * len(exposures), exposures).lacks_noise is lacks
-    assert Transitions([light], exposure_table([enough])).lacks_noise is False
-    made = []
-    monkeypatch.setattr(
-        "simulator.capture.prepared_scene.record", lambda *_, keys, **__: made.append(keys)
-    )
-    settings = CameraSettings(source, 1 / 64, 4)
-    prepared = PreparedScene(light, settings, Z6, Z6.nlf(source))
-    prepared.expose([settings])
-    prepared.expose([settings, CameraSettings(12800, 1 / 256, 4)])
-    assert [keys is None for keys in made] == [True, False]
-
-
 # -- the fused kernel -------------------------------------------------------------------------
 
 
@@ -304,9 +279,7 @@ def in_numbers(signal: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("noisy_source", [False, True])
 @pytest.mark.parametrize("blurred", [False, True])
 @pytest.mark.parametrize("kind", ["exact", "bank"])
-def test_captures_are_those_of_the_reference(
-    size: tuple[int, int], noisy_source: bool, blurred: bool, kind: Noise
-) -> None:
+def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
     """By the fused kernel, and by the steps one by one; planes of up to 150,000 samples."""
     light = random_light(4, *size)
     light[:, 0, :3] = torch.tensor([-1e30, 1e30, 3e38])[: size[1]]
@@ -338,7 +311,7 @@ def test_captures_are_those_of_the_reference(
     [
         *map(get_camera, list_cameras()),
         *(
-            CameraProfile("x", "RGGB", black, white, 16)  # type: ignore[arg-type]
+            CameraProfile("x", "RGGB", black, white, 16)
             for black in ((0.0,) * 4, (64.5,) * 4, (3.0, 7.5, 0.0, 60.0))
             for white in (255.0, 65535.0)
         ),
@@ -367,9 +340,7 @@ def test_every_digital_number_is_written_exactly(body: CameraProfile) -> None:
 
 
 @pytest.mark.parametrize("kind", ["exact", "bank"])
-def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(
-    kind: Noise, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind, monkeypatch):
     """Planes of more than 65,536 samples, which are worked on in two pieces."""
     lights = [random_light(4, 250, 265, seed=i) for i in range(3)]
     exposures = [Exposure(0.6 * (i + 1), ZERO, Z6.nlf(400 * 4**i)) for i in range(3)]
@@ -390,35 +361,14 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(
     assert counts[1:, 1].min() > 10_000
 
 
-# -- light and exposures far beyond any camera's ----------------------------------------------
-
-CLEAN = replace(Z6, nlf_by_iso={100.0: ZERO}, segments=())
-REFERENCE = CameraSettings(100, 1, 4)
-STOPS = (-30.0, -10.0, -1.0, 0.0, 1.0, 10.0, 30.0)
-#: `STOPS` brighter than the reference, shared out to ISO and shutter.
-EXTREMES = [CameraSettings(100.0 * 2 ** (s / 2), 2 ** (s / 2), 4.0) for s in STOPS]
-SHAPE = (4, 48, 48)
-
-
-SIGNALS = {
-    "zero": torch.zeros(SHAPE),
-    "one digital number": torch.ones(SHAPE) / torch.tensor(Z6.span)[:, None, None],
-    "as dark as black goes": -torch.tensor(Z6.pedestal)[:, None, None].expand(SHAPE),
-    "white": torch.ones(SHAPE),
-    "hot pixels": (torch.arange(48) == 24).float().expand(SHAPE) * 1e6,
-    "checkerboard": (torch.arange(48)[:, None] + torch.arange(48)).remainder(2).expand(SHAPE),
-    "30 stops": torch.from_numpy(2.0 ** np.random.default_rng(0).uniform(-30, 0, SHAPE)),
-    "light of 1e6": torch.full(SHAPE, 1e6),
-}
-
-
-@pytest.mark.parametrize("name", SIGNALS)
-def test_extreme_signals_are_recorded_to_half_a_digital_number(name: str) -> None:
-    light = SIGNALS[name].float().contiguous()
-    frames = PreparedScene(light, REFERENCE, CLEAN, ZERO).expose(EXTREMES)
-    span, black = (np.array(v)[:, None, None] for v in (Z6.span, Z6.black_level))
-    for stops, frame in zip(STOPS, frames.double().numpy(), strict=True):
-        exact = light.double().numpy() * 2.0**stops * span + black
-        exact = exact.clip(0.0, Z6.white_level)
-        # Rounding to whole numbers, and float32 products of numbers of 14 bits.
-        assert np.abs(frame * span + black - exact).max() <= 0.5 + 4 * 2.0**-24 * 2**14
+def test_extreme_light_is_recorded_to_half_a_digital_number():
+    """Light of 50 stops and as dark as black goes, exposed by 2**-30 to 2**30."""
+    light = 2.0 ** np.random.default_rng(0).uniform(-30, 20, (4, 48, 48)).astype(np.float32)
+    light[:, 0], light[:, 1] = 0.0, -np.array(Z6.pedestal)[:, None]
+    stops = np.array([-30.0, -10.0, -1.0, 0.0, 1.0, 10.0, 30.0])
+    states = [CameraSettings(100.0 * 2 ** (s / 2), 2 ** (s / 2), 4.0) for s in stops.tolist()]
+    clean = replace(Z6, nlf_by_iso={100.0: ZERO}, segments=())
+    scene = PreparedScene(torch.from_numpy(light), CameraSettings(100, 1, 4), clean, ZERO)
+    exact = light * 2.0 ** stops[:, None, None, None] * SPAN + BLACK
+    off = scene.expose(states).double().numpy() * SPAN + BLACK - exact.clip(0.0, WHITE)
+    assert np.abs(off).max() <= 0.5 + 4 * 2.0**-24 * 2**14  # and float32 products of 14 bits

@@ -1,7 +1,5 @@
 """Statistics of a light against brute force and closed forms, and light that a network denoises."""
 
-from __future__ import annotations
-
 import math
 import pickle
 
@@ -76,13 +74,7 @@ def variance(signal: np.ndarray, iso: float) -> np.ndarray:
     return read + shot * np.maximum(signal, 0.0)
 
 
-def blur_error(
-    statistics: LightStatistics,
-    ratio: float,
-    target: NoiseLevelFunction,
-    streak: float = 0.0,
-    disc: float = 0.0,
-) -> float:
+def blur_error(statistics, ratio, target, streak=0.0, disc=0.0):
     """Bound on the error of leaving out a blur of these extents [pixel]."""
     per_disc, per_streak = statistics.curvature(ratio, target)
     return per_disc * disc**2 + per_streak * streak**2
@@ -134,17 +126,12 @@ def test_levels_in_units_of_the_noise() -> None:
     assert statistics.relative_noise(3.0, Z6.nlf(1600), Z6.nlf(400)) == pytest.approx(
         exact(light, 3.0, zero, deviation, 400), rel=0.01
     )
-
-
-@pytest.mark.parametrize("ratio", [0.5, 3.0])
-def test_excess_variance_over_all_pixels(ratio: float) -> None:
-    """Of a source that is on the target's scale."""
-    light = LIGHTS["natural"]
-    expected = np.maximum(variance(ratio * light, 1600) / variance(ratio * light, 400) - 1.0, 0.0)
-    stated = LightStatistics(tensor(light)).relative_excess_variance(
-        ratio, Z6.nlf(1600), Z6.nlf(400)
-    )
-    assert stated == pytest.approx(expected.mean(), rel=0.01)
+    for ratio in (0.5, 3.0):  # of a source that is on the target's scale
+        excess = variance(ratio * light, 1600) / variance(ratio * light, 400) - 1.0
+        stated = statistics.relative_excess_variance(ratio, Z6.nlf(1600), Z6.nlf(400))
+        assert stated == pytest.approx(excess.clip(0).mean(), rel=0.01)
+    assert statistics.excess_error(1.0, Z6.nlf(100), ZERO) > 1e6  # without noise all is seen
+    assert blur_error(statistics, 1.0, ZERO, 0.01, 0.0) > 1e6
 
 
 @pytest.mark.parametrize("name", list(LIGHTS))
@@ -193,12 +180,6 @@ def test_large_frames_are_sampled(shape: tuple[int, int]) -> None:
     expected = math.sqrt((laplacian**2).mean() / 1e-6) / 32
     # Of three rows only one is looked at, or of three columns two at the border.
     assert blur_error(statistics, 1.0, flat, 0.0, 1.0) == pytest.approx(expected, rel=0.25)
-
-
-def test_a_target_without_noise_sees_everything() -> None:
-    statistics = LightStatistics(tensor(LIGHTS["natural"]))
-    assert statistics.excess_error(1.0, Z6.nlf(100), ZERO) > 1e6
-    assert blur_error(statistics, 1.0, ZERO, 0.01, 0.0) > 1e6
 
 
 # -- errors of networks -----------------------------------------------------------------------
@@ -309,38 +290,23 @@ def test_tables_are_read_by_the_logarithm_of_the_wiener_error() -> None:
 
 def test_of_a_large_frame_some_rows_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
     light = torch.rand(1, 1, 64, generator=torch.Generator().manual_seed(0)).expand(4, 256, 64)
-    network, noise, rows = leaves(0.0, 0.2, detailed=3.0), nlf(1e-3, 1e-5), []
+    network, noise = leaves(0.0, 0.2, detailed=3.0), nlf(1e-3, 1e-5)
     whole = ResidualStatistics(light, noise).error(network, 2.0, noise)
-
-    def spy(light: torch.Tensor, noise: NoiseLevelFunction) -> torch.Tensor:
-        rows.append(light.shape[1])
-        return wiener_error(light, noise)
 
     # Frames that are large enough take seconds.
     monkeypatch.setattr(statistics_module, "_BLOCKS", 32)
-    monkeypatch.setattr(statistics_module, "wiener_error", spy)
     assert ResidualStatistics(light, noise).error(network, 2.0, noise) == pytest.approx(whole)
-    assert sum(rows) == 32
 
 
 CARD = {"wiener_error": [0.0, 0.5], "bias": [0.5, 0.25], "variance": [1.0, 0.75], "spread": 1.25}
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"spread": None},
-        {"bias": ["a", 1]},
-        {"bias": [1.0]},
-        {"variance": [1.0, math.nan]},
-        {"variance": [1.0, -1.0]},
-        {"spread": 0.9},
-    ],
-)
-def test_cards(change: dict) -> None:
+def test_cards() -> None:
     assert Residual.from_card(CARD).to_card() == CARD
-    with pytest.raises(ValueError, match=r"`residual`|must be"):
-        Residual.from_card(CARD | change)
+    bad = {"spread": [None, 0.9], "bias": [["a", 1], [1.0]], "variance": [[1, math.nan], [1, -1]]}
+    for change in ({name: value} for name, values in bad.items() for value in values):
+        with pytest.raises(ValueError, match=r"`residual`|must be"):
+            Residual.from_card(CARD | change)
 
 
 def test_the_network_runs_once_when_it_is_needed() -> None:

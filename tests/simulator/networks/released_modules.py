@@ -4,8 +4,6 @@ What they compute is written down again from the layers, without our code, so th
 compared with what our networks make of the same weights.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -71,11 +69,11 @@ class Norm(nn.Module):
         self.norm = nn.InstanceNorm2d(channels)
         self.style = Holder("linear", nn.Linear(2, 2 * channels))
         with torch.no_grad():  # weights of training are small: apertures are as large as 256
-            self.style.linear.weight.mul_(0.02)  # type: ignore[union-attr,operator]
-            self.style.linear.bias[:channels] = 1.0  # type: ignore[union-attr,index]
+            self.style.linear.weight.mul_(0.02)
+            self.style.linear.bias[:channels] = 1.0
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
-        scale, shift = self.style.linear(p)[:, :, None, None].chunk(2, dim=1)  # type: ignore
+        scale, shift = self.style.linear(p)[:, :, None, None].chunk(2, dim=1)
         return scale * self.norm(x) + shift
 
 
@@ -156,5 +154,5 @@ def make_released(seed: int = 0) -> dict[str, nn.Module]:
         for tensor in (norm.running_mean, norm.running_var, norm.weight, norm.bias):
             assert tensor is not None
             tensor.data.copy_(0.5 + torch.rand(tensor.shape, generator=generator))
-        norm.num_batches_tracked.fill_(7)  # type: ignore[union-attr]
+        norm.num_batches_tracked.fill_(7)
     return {name: module.eval() for name, module in made.items()}

@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy import ndimage
 
-from simulator.optics import discs
 from simulator.optics.discs import (
     DIAMETERS,
     Blur,
@@ -82,14 +81,6 @@ def test_a_bright_lamp_leaves_no_ringing(blur, extent):
     np.testing.assert_allclose(out.double().sum((1, 2)), [1e6] * 4, rtol=1e-5)
 
 
-def test_bad_extents_are_named():
-    for bad in (-1.0, math.nan, math.inf):
-        with pytest.raises(ValueError, match="`extent_px`"):
-            motion_blur(torch.zeros(4, 2, 2), bad)
-        with pytest.raises(ValueError, match="`diameter_px`"):
-            disc_blur(torch.zeros(4, 2, 2), bad)
-
-
 @pytest.mark.parametrize(
     ("motion", "defocus"), [(0, 0), (3.0, 0), (0, 4.0), (7.5, 2.5), (0.4, 14), (5000.3, 4.0)]
 )
@@ -128,13 +119,18 @@ def test_threads_and_views_change_nothing(blur, monkeypatch):
         assert torch.equal(blur(light, 4.0), alone)
 
 
-def test_outputs_and_no_extent():
+def test_outputs_and_no_or_bad_extents():
     light, out = lamp(4, 8, 8), torch.empty(4, 8, 8)
     assert motion_blur(light, 0.0) is light
     assert disc_blur(light, 0.0) is light
     assert torch.equal(motion_blur(light, 0.0, out), light)
     assert motion_blur(light, 3.0, out) is out
     assert torch.equal(out, motion_blur(light, 3.0))
+    for bad in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="`extent_px`"):
+            motion_blur(light, bad)
+        with pytest.raises(ValueError, match="`diameter_px`"):
+            disc_blur(light, bad)
 
 
 @pytest.mark.parametrize("extent", [3.0, 9.0, 200.0])
@@ -154,35 +150,30 @@ def test_light_beyond_the_limit_is_clipped_first(extent):
 def test_many_images_are_scipys_correlation(threads, monkeypatch):
     for module in ("utils.compute", "optics.discs"):
         monkeypatch.setattr(f"simulator.{module}.thread_count", lambda: threads)
-    extents = [(0.0, 5.0), (3.3, 0.0), (8.0, 17.0), (1e-4, 1e-7), (2.0, 90.0), (0.7, 0.4)]
+    extents = [
+        (48.0, 5.0),
+        (0.0, 5.0),
+        (3.3, 0.0),
+        (8.0, 17.0),
+        (1e-4, 1e-7),
+        (2.0, 90.0),
+        (0.7, 0.4),
+    ]
     blurs = []
     for extent in extents:
         outputs = [torch.empty(4, 21, 40) if each else None for each in extent]
         blurs.append(Blur(torch.rand(4, 21, 40), extent[0], outputs[0], extent[1], outputs[1]))
     blur_many(blurs)
     for light, diameter, defocused, extent, moved in blurs:
+        rtol = 5e-6 if diameter < 40 else 1e-4  # wide discs in the Fourier domain
         weights = disc_kernel(diameter)[None]
         wanted = ndimage.correlate(light.double().numpy(), weights, mode="nearest")
         if defocused is not None:
-            np.testing.assert_allclose(defocused, wanted, rtol=5e-6)
+            np.testing.assert_allclose(defocused, wanted, rtol=rtol)
         wanted = ndimage.correlate1d(wanted, motion_kernel(extent), mode="nearest")
         if moved is not None:
-            np.testing.assert_allclose(moved, wanted, rtol=1e-5)
+            np.testing.assert_allclose(moved, wanted, rtol=2 * rtol)
     blur_many([])
-
-
-@pytest.mark.parametrize("extent", [0.0, 5.0])
-def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(monkeypatch, extent):
-    light, narrow = torch.rand(4, 64, 48), torch.empty(4, 64, 48)
-    light[:, 20, 20], results = 1e6, []
-    for widest in (discs._WIDE_PX, 1e9):
-        monkeypatch.setattr(discs, "_WIDE_PX", widest)
-        defocused, moved = torch.empty_like(light), torch.empty_like(light)
-        wide = Blur(light, 48.0, defocused, extent, moved if extent else None)
-        blur_many([wide, Blur(light, 3.0, narrow)], limit=1e3)
-        results.append([defocused, narrow.clone()] + [moved] * bool(extent))
-    for fourier, direct in zip(*results, strict=True):
-        torch.testing.assert_close(fourier, direct, rtol=1e-4, atol=1e-5)
 
 
 def test_a_streak_is_the_same_compiled_and_loaded(compiled_and_loaded):
@@ -196,17 +187,6 @@ def test_a_streak_is_the_same_compiled_and_loaded(compiled_and_loaded):
     )
     (compiled,), (hits, loaded) = compiled_and_loaded(code)
     assert (hits, loaded) == ("1", compiled)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@BOTH
-@pytest.mark.parametrize("extent", [0.4, 3.0, 30.0])
-def test_cuda_agrees(blur, extent):
-    image = picture(4, 33, 31)
-    torch.testing.assert_close(
-        blur(image.cuda(), extent).cpu(), blur(image, extent), atol=2e-5, rtol=0
-    )
 
 
 @pytest.mark.parametrize("window", [1, 3, 5, 7, 9, 25])

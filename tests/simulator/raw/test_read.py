@@ -1,4 +1,3 @@
-import errno
 import gc
 import io
 import os
@@ -9,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -197,7 +195,7 @@ def test_camera_argument(path):
         (3, "`camera`"),
     ):
         with pytest.raises(ValueError, match=message):
-            read_raw(path, settings=SETTINGS, camera=camera)  # type: ignore[arg-type]
+            read_raw(path, settings=SETTINGS, camera=camera)
 
 
 def test_unknown_camera_is_estimated_and_declared(tmp_path):
@@ -276,13 +274,6 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path):
         read_raw(path)
 
 
-def test_files_that_may_not_be_read(own_dng, monkeypatch):
-    forbidden = PermissionError(errno.EACCES, "Permission denied", str(own_dng))
-    monkeypatch.setattr(Path, "open", Mock(side_effect=forbidden))
-    with pytest.raises(RawFileError, match=r"cannot be read: .*Permission denied"):
-        read_raw(own_dng)
-
-
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
 def test_a_dng_cut_anywhere_is_refused(path, own_dng, name):
     cut = path.with_name(name)
@@ -340,22 +331,17 @@ LARGEST = ("white_level", 65535)
     [
         ("AsShotNeutral", "6I", (0,) * 6, NEUTRAL),  # 0 / 0
         ("AsShotNeutral", "6I", (0, 1, 0, 1, 0, 1), NEUTRAL),
-        ("AsShotNeutral", "count", (0,), NEUTRAL),
         ("ExposureTime", "2I", (1, 0), EXACT),
         ("ExposureTime", "2I", (0, 1), EXACT),
         ("FNumber", "count", (0,), EXACT),
         ("RecommendedExposureIndex", "I", (0,), EXACT),
         ("Orientation", "H", (99,), ("flip", 0)),
-        ("Orientation", "count", (0,), ("flip", 0)),
         ("DateTimeOriginal", "19s", (b"9999:99:99 99:99:99",), ("datetime", None)),
         ("FocalLength", "2I", (5, 0), ("focal_length", None)),
         ("ImageWidth", "I", (0,), "64 x 0 pixels"),
-        ("ImageLength", "I", (0,), "0 x 96 pixels"),
         ("StripOffsets", "count", (2**28,), "at no position"),
         ("StripOffsets", "I", (2**32 - 1,), "truncated"),
-        ("StripByteCounts", "I", (2**32 - 1,), "truncated"),
         ("CFAPattern", "4B", (9, 1, 1, 2), r"CFAPattern is \(9, 1, 1, 2\)"),
-        ("CFAPattern", "4B", (0, 0, 0, 0), "CFAPattern"),
         ("BlackLevel", "I", (70_000,), "white level above its black levels"),
         # GoPro's, which LibRaw lacks: the file is whole all the same.
         ("Compression", "H", (9,), r"LibRaw lacks its compression, 9 \(VC-5.*convert"),
@@ -476,17 +462,9 @@ def test_identities_of_other_containers(tmp_path):
     known |= {ciff: ("Canon", "PowerShot"), b"": ("", ""), bytes(99): ("", "")}
     for content, identity in known.items():
         assert camera_identity(io.BytesIO(content), []) == identity
-    kinds = {
-        raf: True,
-        mrw: True,
-        cr3: True,
-        b"FOVb": True,
-        ciff: False,
-        b"text": False,
-        b"": False,
-    }
-    for content, is_raw in kinds.items():  # a whole Canon CRW names its camera
-        assert is_raw_container(io.BytesIO(content)) is is_raw
+    kinds = dict.fromkeys((raf, mrw, cr3, b"FOVb"), True)
+    for content, is_raw in (kinds | dict.fromkeys((ciff, b"text", b""), False)).items():
+        assert is_raw_container(io.BytesIO(content)) is is_raw  # a whole Canon CRW names its camera
 
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])

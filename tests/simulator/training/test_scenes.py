@@ -1,7 +1,5 @@
 """Scenes of the reference camera: splits, light, depth of real photographs, draped pictures."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import replace
@@ -43,9 +41,7 @@ def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
     return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
 
 
-def test_splits_are_apart_and_scenes_the_same_however_many(
-    scenes: dict[str, list[ReferenceScene]],
-) -> None:
+def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
     groups = [{s.group for s in scenes[split]} for split in SPLITS]
     assert all(groups)
     assert sum(map(len, groups)) == len(set().union(*groups))
@@ -82,9 +78,7 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
     assert 0.05 < np.median(surfaces) < 0.3  # reflectances of nature
 
 
-def test_panoramas_are_cut_and_coarse_pictures_left_out(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
     (tmp_path / "hdri_cc0").mkdir()
     row, column = np.mgrid[:256, :512]
     panorama = np.stack([1.0 + column % 128, 1.0 + row, 1.0 + row % 2], axis=2)
@@ -188,7 +182,7 @@ def test_softness_is_that_of_edges() -> None:
 
 
 def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
-    return {s: detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}  # type: ignore[arg-type]
+    return {s: detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}
 
 
 def the_only(folder: Path, name: str) -> DetailPicture:
@@ -278,12 +272,12 @@ def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptu
         assert not torch.equal(first.light, new.light)
         assert first.group != new.group
     with pytest.raises(ValueError, match=r"`split` \(='tests'\)"):
-        detail_pictures("tests", data=None)  # type: ignore[arg-type]
+        detail_pictures("tests", data=None)
 
 
 @pytest.mark.real_data
 def test_recorded_mosaics_of_one_subject_are_on_one_side(data_dir: Path) -> None:
-    drawn = {s: list(pictures.recorded_mosaics(data_dir, s)) for s in SPLITS}  # type: ignore[arg-type]
+    drawn = {s: list(pictures.recorded_mosaics(data_dir, s)) for s in SPLITS}
     assert_no_group_is_shared(drawn)
     found = {p.name: (split, p) for split, own in drawn.items() for p in own}
     assert [found[f"CRW_{n}"][0] for n in ("0101", "0112", "0117", "0119")] == 2 * ["train"] + 2 * [

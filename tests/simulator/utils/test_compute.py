@@ -1,3 +1,5 @@
+"""Kernels, threads and tiles."""
+
 import logging
 import multiprocessing
 import threading
@@ -7,10 +9,17 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+import torch
+import torch.nn.functional as F
 from numba.core import caching
+from torch import Tensor
 
+from simulator import camera_simulator
+from simulator.networks.aperture_module import DefocusMap
+from simulator.networks.noise_module import NoiseModule
 from simulator.utils import compute as jit
 from simulator.utils.compute import kernel, parallel_ranges
+from simulator.utils.tiles import in_tiles, make_tiles, varying
 
 
 def add(a: int, b: int) -> int:
@@ -51,7 +60,7 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
         assert checksum() != before
         (tmp_path / name).write_text(texts[name])
     monkeypatch.undo()
-    stamp = kernel()(add)._cache._cache_file._source_stamp  # type: ignore[attr-defined]
+    stamp = kernel()(add)._cache._cache_file._source_stamp
     assert stamp[1] == jit._checksum(Path(__file__))
 
 
@@ -119,3 +128,117 @@ def test_child_processes_make_threads_of_their_own():
     child.start()
     assert queue.get(timeout=60) == [1.0, 2.0]
     child.join(timeout=60)
+
+
+# -- tiles -----------------------------------------------------------------------------------------
+
+
+def frame(*size: int, seed: int = 0) -> Tensor:
+    return torch.rand(1, 4, *size, generator=torch.Generator().manual_seed(seed))
+
+
+def mean_of_neighbours(*images: Tensor) -> Tensor:
+    """Sees 2 pixels far, and the position modulo 4."""
+    total = F.avg_pool2d(F.pad(sum(images), (2,) * 4), 5, stride=1)
+    rows = torch.arange(total.shape[-2])[:, None] % 4
+    return total * (1 + rows) + torch.arange(total.shape[-1]) % 4
+
+
+def patches(height: int, width: int) -> Tensor:
+    """Two corners and a pixel in between."""
+    needed = torch.zeros(height, width, dtype=torch.bool)
+    needed[:9, :21] = needed[-5:, -30:] = True
+    needed[height // 2, width // 3] = True
+    return needed
+
+
+@pytest.mark.parametrize(
+    "size", [(1, 1), (12, 16), (16, 17), (40, 41), (5, 93), (93, 5), (61, 203), (200, 130)]
+)
+@pytest.mark.parametrize("tile", [12, 64, 512])
+def test_tiles_of_a_function_of_neighbourhood_and_phase(size, tile):
+    """Everywhere; and where only some pixels are needed, the fallback elsewhere."""
+    image, other = frame(*size), frame(*size, seed=1)
+    whole, needed = mean_of_neighbours(image, other), patches(*size)
+    tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=tile)
+    torch.testing.assert_close(tiled, whole, rtol=0, atol=1e-6)
+    options = {"tile": tile, "needed": needed, "fallback": -image}
+    some = in_tiles(mean_of_neighbours, image, other, halo=4, **options)
+    torch.testing.assert_close(some, torch.where(needed, whole, -image), rtol=0, atol=1e-6)
+    assert torch.equal(in_tiles(lambda x: x.sum(1), image, halo=4, tile=8), image.sum(1))
+
+
+def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once():
+    sizes: list[tuple[int, ...]] = []
+
+    def spy(image: Tensor) -> Tensor:
+        sizes.append(tuple(image.shape[-2:]))
+        return image.double()[:, :2]
+
+    image = frame(50, 130)
+    assert torch.equal(in_tiles(spy, image, halo=8, tile=16), image.double()[:, :2])
+    assert (max(max(s) for s in sizes), len(sizes)) == (16 + 2 * 8, 4 * 9)
+    sizes.clear()
+    in_tiles(spy, frame(24, 20), halo=8, tile=16)
+    assert sizes == [(24, 20)]
+
+
+@pytest.mark.parametrize("size", ["nano", "compact", "large", "map"])
+def test_the_halo_covers_what_the_networks_see(size):
+    """What lies beyond the halo changes no bit of the centre; what lies within does."""
+    if size == "map":
+        blur = DefocusMap(width=6).eval().requires_grad_(False)
+        network, halo = lambda x: blur(x, torch.full_like(x, 0.01)), camera_simulator._MAP_HALO
+    else:
+        noise = NoiseModule(size).eval().requires_grad_(False).network
+        torch.nn.init.normal_(noise.tail.weight)
+        shot, read, far = (
+            torch.full((1, 4), 1e-2),
+            torch.full((1, 4), 1e-4),
+            torch.zeros(1, 4, 1, 1),
+        )
+        halo = camera_simulator._NOISE_HALO
+        network = lambda x: noise.uncorrected(x, far.expand_as(x), shot, read)  # noqa: E731
+    image, (top, bottom) = frame(256, 256), (120, 128)
+    centre, found = (..., slice(top, bottom), slice(top, bottom)), []
+    for seen in (halo, 16):
+        keep = (..., *2 * [slice(top - seen, bottom + seen)])
+        other = frame(256, 256, seed=7) * 3
+        other[keep] = image[keep]
+        found.append(network(other)[centre])
+    assert torch.equal(found[0], network(image)[centre])
+    assert not torch.equal(found[1], found[0])
+    # A tile of it whose corner lies on a multiple of 8 gives the same.
+    tile = (..., *2 * [slice(top - halo, bottom + halo)])
+    alone = network(image[tile])[..., halo:-halo, halo:-halo]
+    torch.testing.assert_close(alone, found[0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
+def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density):
+    needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
+    tiles = make_tiles(333, 270, halo=12, tile=128, needed=needed)
+    count = torch.zeros(333, 270)
+    for each in tiles:
+        count[each.inner] += 1
+        assert each.top % 4 == each.left % 4 == 0
+        assert count[each.outer][each.core].shape == count[each.inner].shape
+    assert bool((count[needed] == 1).all())
+    assert bool((count <= 1).all())
+    whole = make_tiles(333, 270, halo=12, tile=128)
+    assert sum(t.area for t in tiles) <= sum(t.area for t in whole)
+
+
+def test_constant_parts_do_not_vary():
+    image, expected = frame(75, 100)[0], torch.ones(75, 100, dtype=torch.bool)
+    image[:, 32:, :50] = 1.0  # saturated
+    image[:, :16, 64:] = 0.0  # black, but for one plane's pixel
+    image[2, 3, 70] = 1e-6
+    expected[32:, :48] = expected[:16, 80:] = False
+    assert torch.equal(varying(image), expected)
+    expected[32:48] = expected[:, 48:] = expected[:, 32:48] = True
+    assert torch.equal(varying(image, 16), expected)
+    # A cell of one pixel cannot show that it varies.
+    corner = varying(torch.ones(4, 33, 49))
+    assert corner.nonzero().tolist() == [[32, 48]]
+    assert not varying(torch.ones(4, 33, 48)).any()

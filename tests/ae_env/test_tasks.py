@@ -1,5 +1,6 @@
-"""`ExposureBracket-v0`: its rules, its merged picture, and both environments of it."""
+"""`ExposureBracket-v0` and `AutoExposureVideo-v0`: their rules, and one and many of them."""
 
+import inspect
 import math
 from typing import Any
 
@@ -7,16 +8,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_sb3
 
+import ae_env
 from ae_env import ExposureGrid, Scene
+from ae_env.lighting.moving import KIND_SETS
 from ae_env.merging import log_error, merge
 from ae_env.tasks import displaced
 from simulator.camera import get_camera
 from simulator.capture.prepared_scene import Layout
-from simulator.radiance.light import WHITE_SIGNAL, reference_settings
-from tests.ae_env.environments import check_parity, make_env
+from simulator.radiance.light import WHITE_SIGNAL
+from tests.ae_env.environments import SMALL, assert_same, check_parity, make_env, make_envs
+from tests.ae_env.scorer_images import make_scene
 
 ID = "ae_env/ExposureBracket-v0"
 GRID = ExposureGrid.bracket()
@@ -32,27 +34,24 @@ def four(values: list[float]) -> torch.Tensor:
     return torch.tensor(values)[None, :, None].expand(1, -1, 4)
 
 
-# -- merging --------------------------------------------------------------------------------------
+def frames(*values: list[float]) -> torch.Tensor:
+    """(B, K, 4, 1, 1) signals of one pixel."""
+    return torch.tensor(values)[:, :, None, None, None].expand(-1, -1, 4, 1, 1)
 
 
 def test_merging_weighs_by_the_inverse_of_the_noise() -> None:
     """By hand: light 0.1 at gains 1 and 4, read noise 1e-4 and 4e-4, no shot noise."""
-    signals = torch.tensor([0.11, 0.38])[None, :, None, None, None].expand(1, 2, 4, 1, 1)
     gains = torch.tensor([[1.0, 4.0]])
-    light, precision = merge(signals, gains, four([0.0, 0.0]), four([1e-4, 4e-4]))
+    noise = four([0.0, 0.0]), four([1e-4, 4e-4])
+    light, precision = merge(frames([0.11, 0.38]), gains, *noise)
     weights = np.array([1.0 / 1e-4, 16.0 / 4e-4])
     expected = (weights * [0.11, 0.095]).sum() / weights.sum()
     np.testing.assert_allclose(light, expected, rtol=1e-6)
     np.testing.assert_allclose(precision, weights.sum(), rtol=1e-6)
-
-
-def test_white_samples_and_missing_frames_have_no_weight() -> None:
-    signals = torch.tensor([[0.3, 0.99], [0.99, 0.98]])[:, :, None, None, None].expand(
-        2, 2, 4, 1, 1
-    )
+    # White samples and missing frames have no weight.
     gains = torch.tensor([[1.0, 4.0], [1.0, 0.0]])
-    noise = four([1e-3, 1e-3]).expand(2, 2, 4)
-    light, precision = merge(signals, gains, noise, noise)
+    noise = (four([1e-3, 1e-3]).expand(2, 2, 4),) * 2
+    light, precision = merge(frames([0.3, 0.99], [0.99, 0.98]), gains, *noise)
     np.testing.assert_allclose(light[0], 0.3, rtol=1e-6)
     assert float(precision[0].min()) > 0.0
     assert not precision[1].any()
@@ -87,24 +86,11 @@ def test_log_error_by_hand() -> None:
     np.testing.assert_allclose(error[2], 1.0, rtol=1e-6)  # (0 + 0.1) / (0.1 + 0.1)
 
 
-# -- the environment ------------------------------------------------------------------------------
-
-
 def two_lights(low: float, high: float) -> Scene:
     """A scene at EV100 10: one half is `low` of white, the other `high`."""
-    camera = get_camera("nikon_z6")
-    light = torch.full((4, 36, 36), low * WHITE_SIGNAL)
+    light = np.full((4, 36, 36), low * WHITE_SIGNAL)
     light[:, :, 18:] = high * WHITE_SIGNAL
-    return Scene.from_array(
-        light, reference_settings(10.0), camera, scene_id="two", illuminance=2560.0
-    )
-
-
-def test_both_checkers_accept_it() -> None:
-    env = bracket()
-    check_env(env.unwrapped, skip_render_check=True)
-    check_sb3(env.unwrapped)
-    check_env(bracket(observation="statistics").unwrapped, skip_render_check=True)
+    return make_scene(light, 2560.0, scene_id="two")
 
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
@@ -187,14 +173,7 @@ def test_a_subject_moves_between_frames_and_leaves_ghosts() -> None:
     mask = torch.zeros(36, 36, dtype=torch.bool)
     mask[10:20, 4:12] = True
     light = torch.where(mask, 0.4, 0.1).expand(4, -1, -1)
-    scene = Scene.from_array(
-        light,
-        reference_settings(10.0),
-        get_camera("nikon_z6"),
-        scene_id="moves",
-        illuminance=2560.0,
-        layout=Layout(torch.zeros(36, 36), mask),
-    )
+    scene = make_scene(light.numpy(), 2560.0, layout=Layout(torch.zeros(36, 36), mask))
     there = displaced(scene, 3, -6)  # two columns of it leave the frame
     expected = torch.full((4, 36, 36), 0.1)
     expected[:, 13:23, 0:6] = 0.4
@@ -217,16 +196,10 @@ def test_a_subject_moves_between_frames_and_leaves_ghosts() -> None:
 
 
 def test_bad_arguments_are_refused() -> None:
-    for arguments, message in (
-        ({"budget": 0}, "`budget`"),
-        ({"budget": "long"}, "`budget`"),
-        ({"max_frames": 0}, "`max_frames`"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            bracket(**arguments)
-    with pytest.raises(TypeError, match=r"'buget'.*did you mean 'budget'"):
-        bracket(buget=1.0)
-    for name in ("scorer", "lighting", "with_oracle"):
+    for name, value in (("budget", 0), ("budget", "long"), ("max_frames", 0)):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            bracket(**{name: value})
+    for name in ("buget", "scorer", "lighting", "with_oracle"):
         with pytest.raises(TypeError, match=name):
             bracket(**{name: "balanced"})
     env = bracket()
@@ -235,3 +208,60 @@ def test_bad_arguments_are_refused() -> None:
         env.unwrapped.step(np.int64(25))
     with pytest.raises(ValueError, match="no score table"):
         env.unwrapped.expected_scores()
+
+
+VIDEO_ID = "ae_env/AutoExposureVideo-v0"
+VIDEO: dict[str, Any] = {
+    "grid": "video",
+    "lighting": "moving",
+    "delay": {"iso": 1, "exposure_time": 2, "f_number": 2},
+    "costs": {"flicker": 1.0},
+}
+
+
+def test_it_is_the_other_environment_with_its_defaults():
+    """The same frames as `AutoExposure-v0` with these arguments; 96 steps; defaults may change."""
+    video = gym.make_vec(VIDEO_ID, num_envs=3, **SMALL)
+    plain = make_envs(3, max_episode_steps=96, **VIDEO)
+    assert_same(video.reset(seed=5), plain.reset(seed=5))
+    for action in (7, 40, 63):
+        assert_same(video.step(np.full(3, action)), plain.step(np.full(3, action)))
+    assert video.unwrapped.max_episode_steps == gym.spec(VIDEO_ID).max_episode_steps == 96
+    for kind in (ae_env.AutoExposureVideoEnv, ae_env.AutoExposureVideoVectorEnv):
+        shown = inspect.signature(kind).parameters
+        assert {name: shown[name].default for name in VIDEO} == VIDEO
+    changed = gym.make(VIDEO_ID, delay=0, grid="default", **SMALL)
+    assert changed.unwrapped.delays == (0, 0, 0)
+    same = dict.fromkeys(("iso", "exposure_time", "f_number"), 2)
+    assert make_envs(1, delay=same).unwrapped.core.options.delay == 2
+    assert changed.unwrapped.grid == ae_env.ExposureGrid.default()
+    with pytest.raises(TypeError, match="did you mean 'lighting'"):
+        gym.make(VIDEO_ID, lightning="moving")
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+def test_one_video_and_many_are_the_same(mode: str) -> None:
+    check_parity(3, 7, mode, max_episode_steps=4, with_oracle=True, **VIDEO)
+
+
+def test_each_control_has_its_own_delay():
+    """ISO in the frame after the next, exposure time and aperture in the one after that."""
+    envs = make_envs(1, max_episode_steps=None, **(VIDEO | {"lighting": "static"}))
+    grid = envs.unwrapped.grid
+    envs.reset(seed=0, options={"state": [grid.index(0, 0, 0)]})
+    actions = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (0, 1, 2), (0, 0, 0)]
+    # Frame n + 1 has the ISO of action n - 1, and the time and the aperture of action n - 2.
+    expected = [(0, 0, 0), (1, 0, 0), (2, 1, 1), (3, 2, 2), (0, 3, 3)]
+    for action, shown in zip(actions, expected, strict=True):
+        info = envs.step(np.array([grid.index(*action)]))[4]
+        assert grid.controls(info["state"][0]).tolist() == list(shown)
+        state = grid[grid.index(*shown)]
+        assert (info["iso"][0], info["exposure_time"][0]) == (state.iso, state.exposure_time)
+
+
+def test_the_light_is_of_the_kinds_of_the_split() -> None:
+    pans = {"kind": "moving", "kinds": ["pans"]}
+    for split, kinds in KIND_SETS.items():
+        for given, wanted in (({}, kinds), ({"lighting": pans}, ("pans",))):
+            core = gym.make(VIDEO_ID, split=split, **given, **SMALL).unwrapped.core
+            assert core.episodes.lighting.drawn_from == wanted

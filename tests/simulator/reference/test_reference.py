@@ -1,6 +1,4 @@
-"""The reference camera against closed forms: geometry, Poisson and Gaussian statistics, ratios."""
-
-from __future__ import annotations
+"""The reference camera against closed forms, and sequences that it photographs."""
 
 import math
 import pickle
@@ -24,6 +22,17 @@ from simulator.reference.camera import (
     lens_blur,
     sample_mosaic,
 )
+from simulator.reference.sequences import (
+    EXPOSURE_TIMES,
+    F_NUMBERS,
+    ISO_SPEEDS,
+    Pair,
+    Sequence,
+    draw_settings,
+    exposure_error,
+    grey_signal,
+    select_pairs,
+)
 from simulator.settings import CameraSettings
 
 BASE = CameraSettings(100, 1 / 64, 4)
@@ -40,12 +49,12 @@ def sensor(shot: float, read: float, *, span: float = 16000.0, **options: object
     """A camera of round numbers: base ISO 100, the same noise in every plane."""
     table = {100.0: NoiseLevelFunction((shot,) * 4, (read,) * 4)}
     values = {"nlf_by_iso": table, "pixel_pitch_um": 5.0, **options}
-    return CameraProfile("round", BayerPattern.RGGB, (200.0,) * 4, 200.0 + span, 16, **values)  # type: ignore[arg-type]
+    return CameraProfile("round", BayerPattern.RGGB, (200.0,) * 4, 200.0 + span, 16, **values)
 
 
 def scene(light: torch.Tensor, depth: torch.Tensor | None = None, **options: object):
     settings = {"reference": BASE, "lens": Lens(0.05, 2.0), **options}
-    return ReferenceScene("s", "g", "test", light, depth=depth, **settings)  # type: ignore[arg-type]
+    return ReferenceScene("s", "g", "test", light, depth=depth, **settings)
 
 
 def flat(level: float, size: int = 8) -> torch.Tensor:
@@ -153,20 +162,12 @@ def test_rounding_and_box_average_in_the_variance():
     torch.testing.assert_close(average_planes(planes, 3), expected)
 
 
-def test_each_photosite_sees_its_own_colour_at_its_own_place():
-    """Stripes of one photosite tell G1 from G2."""
-    for cfa in ("RGGB", "GBRG"):
-        body = sensor(1e-4, 1e-8)
-        camera = ReferenceCamera(replace(body, cfa=BayerPattern(cfa)))
-        # Rows red and green in turn at the finest pitch: G1 shares red's rows, G2 does not.
-        rows = torch.arange(16) % 2
-        light = torch.stack([1.0 - rows, 1.0 * rows, 0.0 * rows])[:, :, None].expand(3, 16, 16)
-        g1, g2 = camera.blurred_light(scene(light.contiguous()), 4.0)[1:3, 2:-2, 2:-2]
-        first = cfa == "RGGB"  # G1 in the even rows, which are red
-        assert float((g2 if first else g1).min()) > 0.75
-        assert float((g1 if first else g2).max()) < 0.25
-    plain = camera.blurred_light(scene(torch.full((3, 8, 8), 0.3)), 4.0)
-    torch.testing.assert_close(plain, flat(0.3, 4))
+def test_three_colours_are_blurred_by_the_lens_and_sampled_by_the_mosaic():
+    light = torch.rand(3, 16, 16)
+    for cfa in map(BayerPattern, ("RGGB", "GBRG")):
+        camera = ReferenceCamera(replace(sensor(1e-4, 1e-8), cfa=cfa))
+        expected = sample_mosaic(lens_blur(light), cfa)
+        torch.testing.assert_close(camera.blurred_light(scene(light), 4.0), expected)
 
 
 def test_no_noise_at_all_is_exact():
@@ -314,21 +315,164 @@ def test_the_lens_is_scipys_gaussian(sigma: float) -> None:
 
 
 @pytest.mark.parametrize("cfa", BayerPattern)
-def test_a_point_lands_in_the_plane_of_its_colour_and_place(cfa: BayerPattern) -> None:
-    """The letters of the pattern say which: RGGB has red at (0, 0), green at (0, 1) and (1, 0)."""
-    seen: list[str] = []
-    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        for index, colour in enumerate("RGB"):
-            light = torch.zeros(3, 6, 8)
-            light[index, 2 + row, 4 + column] = 1.0
-            planes = sample_mosaic(light, cfa)
-            letter = cfa.name[2 * row + column]
-            assert float(planes.sum()) == (letter == colour)
-            if letter == colour:
-                plane = "RGGB"[int(planes.flatten(1).sum(dim=1).argmax())]
-                assert plane == colour
-                assert planes[:, 1, 2].sum() == 1.0
-                seen.append(letter)
-    assert "".join(seen) == cfa.name
-    odd = torch.rand(3, 7, 9)
-    assert torch.equal(sample_mosaic(odd, cfa), sample_mosaic(odd[:, :6, :8], cfa))
+def test_planes_are_sampled_by_their_colour_and_place(cfa: BayerPattern) -> None:
+    """By the letters of the pattern; G1 is on red's rows, G2 on blue's; odd sides are cut."""
+    light, red, blue = torch.rand(3, 7, 9), cfa.name.index("R"), cfa.name.index("B")
+    planes = sample_mosaic(light, cfa)
+    for plane, at in zip(planes, (red, red ^ 1, blue ^ 1, blue), strict=True):
+        assert torch.equal(plane, light["RGB".index(cfa.name[at]), at // 2 : 6 : 2, at % 2 : 8 : 2])
+
+
+# -- sequences -------------------------------------------------------------------------------------
+
+#: What the marked f-numbers stand for: powers of sqrt(2).
+EXACT_F = {4.0: 4.0, 5.6: 2**2.5, 8.0: 8.0, 11.0: 2**3.5, 16.0: 16.0, 22.0: 2**4.5}
+
+
+def lit_scene(illuminance=320.0, reference=None, light=0.1):
+    frame, reference = torch.full((4, 2, 3), light), reference or CameraSettings(100, 0.01, 4)
+    return ReferenceScene("s", "g", "k", frame, reference, illuminance=illuminance)
+
+
+def ideal(table: dict[float, tuple[float, float]]) -> CameraProfile:
+    """A sensor of these shot and read noises by ISO."""
+    nlfs = {iso: NoiseLevelFunction((s,) * 4, (r,) * 4) for iso, (s, r) in table.items()}
+    return CameraProfile("ideal", BayerPattern.RGGB, (0, 0, 0, 0), 1000, 10, nlf_by_iso=nlfs)
+
+
+#: Only the photons' noise, which grows with ISO.
+SHOT_ONLY = ideal({iso: (1e-7 * iso, 0.0) for iso in (100.0, 400.0, 6400.0)})
+
+
+def targets(camera: CameraProfile, ev: int, *settings: CameraSettings) -> set[int]:
+    """What the first of these settings is paired with, where incident light has `ev`."""
+    sequence = Sequence(lit_scene(2.5 * 2**ev), settings)
+    return {p.target for p in select_pairs([sequence], "noise", camera) if p.source == 0}
+
+
+def drawn(illuminance: float, count: int, camera: CameraProfile = Z6) -> list[CameraSettings]:
+    rng = np.random.default_rng(7)
+    return [s for _ in range(count) for s in draw_settings(illuminance, rng, camera)]
+
+
+@pytest.mark.parametrize("illuminance", [1.0, 300.0, 20_000.0])
+def test_a_sequence_has_20_to_25_different_captures_in_the_papers_ranges(illuminance):
+    rng = np.random.default_rng(1)
+    sequences = [draw_settings(illuminance, rng, Z6) for _ in range(40)]
+    assert {20, 25} <= {len(settings) for settings in sequences} <= set(range(20, 26))
+    for settings in sequences:
+        assert settings == sorted(set(settings))
+        for s in settings:
+            assert 100 <= s.iso <= 16_000
+            assert 2.0**-13 <= s.exposure_time <= 4.0  # 1/8000 s stands for 2**-13
+            assert s.f_number in EXACT_F
+
+
+def test_levels_are_what_cameras_offer():
+    assert tuple(EXACT_F) == F_NUMBERS
+    assert (ISO_SPEEDS[0], ISO_SPEEDS[-1]) == (100, 16_000)
+    np.testing.assert_allclose(np.diff(np.log2(ISO_SPEEDS)), 1 / 3, atol=0.04)
+    np.testing.assert_allclose(np.diff(np.log2(EXPOSURE_TIMES)), 1 / 3)
+    # A raw file that states one of these times, rounded or not, brings back the same number.
+    for time in EXPOSURE_TIMES:
+        assert CameraSettings.from_exif(100, time, 4).exposure_time == time
+    assert (EXPOSURE_TIMES[0], EXPOSURE_TIMES[-1]) == (2.0**-13, 4.0)
+
+
+def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
+    means = []
+    for illuminance in (1.0, 20.0, 400.0, 4000.0, 20_000.0):
+        levels = [(s.iso, s.exposure_time, 1 / s.f_number) for s in drawn(illuminance, 40)]
+        means.append(np.log2(levels).mean(axis=0))
+    assert (np.diff(means, axis=0) < 0).all()
+    # ISOs stay near the calibrated ones.
+    table = dict.fromkeys((200.0, 1600.0), Z6.nlf(100.0))
+    isos = {s.iso for s in drawn(30.0, 30, replace(Z6, nlf_by_iso=table))}
+    assert (min(isos), max(isos)) == (200, 4000)
+
+
+@pytest.mark.parametrize("illuminance", [10.0, 320.0, 20_000.0])
+def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
+    # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
+    states = [(s.iso, s.exposure_time, EXACT_F[s.f_number]) for s in drawn(illuminance, 40)]
+    iso, time, f_number = np.array(states).T
+    errors = math.log2(illuminance / 2.5) - np.log2(f_number**2 / time) + np.log2(iso / 100)
+    assert np.abs(errors).max() <= 3 + 1e-9
+    assert abs(np.median(errors)) < 0.5
+    assert np.percentile(errors, 5) < -2 < 2 < np.percentile(errors, 95)
+
+
+def test_bad_arguments_are_refused():
+    for light, camera, name in ((100.0, ideal({}), "camera"), (0, Z6, "illuminance")):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            draw_settings(light, np.random.default_rng(0), camera)
+    with pytest.raises(ValueError, match="`illuminance`"):  # no exposure of the levels suits it
+        draw_settings(1e-3, np.random.default_rng(0), Z6)
+    with pytest.raises(ValueError, match="at least 2"):
+        Sequence(lit_scene(), (CameraSettings(100, 1, 4),))
+    with pytest.raises(ValueError, match=r"`stage` \(='noises'\).*did you mean 'noise'"):
+        select_pairs([], "noises", Z6)
+
+
+def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
+    # 320 lux is EV 7: ISO 100, 1/8 s, f/4 is right; the error is positive where it is too bright.
+    for values, ev in (((100, 1 / 8, 4), 0), ((200, 1 / 4, 4), 2), ((100, 1 / 8, 5.6), -1)):
+        assert exposure_error(320.0, CameraSettings(*values)) == pytest.approx(ev)
+    # x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
+    card, settings = 0.18 * 250 / (120 * math.pi), CameraSettings(100, 1 / 8, 4)
+    assert card == pytest.approx(0.119, abs=5e-4)
+    assert grey_signal(lit_scene(320.0), settings) == pytest.approx(card)
+    assert grey_signal(lit_scene(640.0), settings) == pytest.approx(2 * card)
+    dark = lit_scene(None, CameraSettings(100, 1 / 4, 4), light=0.3)
+    assert grey_signal(dark, settings) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("stage", ["exposure", "all"])
+def test_any_two_captures_of_one_sequence_train_the_exposure(stage):
+    settings = tuple(CameraSettings(100, t, 4) for t in (0.1, 0.2, 0.4))
+    sequences = [Sequence(lit_scene(), settings), Sequence(lit_scene(), settings[:2])]
+    expected = [(0, 0, 1), (0, 0, 2), (0, 1, 0), (0, 1, 2), (0, 2, 0), (0, 2, 1)]
+    expected += [(1, 0, 1), (1, 1, 0)]
+    assert select_pairs(sequences, stage, Z6) == [Pair(*p) for p in expected]
+
+
+def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
+    # With photon noise alone, variance at a common exposure goes as 1 / (light collected): at one
+    # f-number the target's must be at most a quarter, so its exposure time at least fourfold.
+    source = CameraSettings(6400, 1 / 128, 8)
+    candidates = (
+        CameraSettings(100, 1 / 31.9, 8),
+        CameraSettings(100, 1 / 32.1, 8),  # not yet four times
+        CameraSettings(400, 1 / 16, 8),
+        CameraSettings(500, 1 / 16, 8),  # ISO above 400
+        CameraSettings(100, 1 / 16, 11),  # other defocus
+    )
+    # Each target is within the range of exposures asked of it.
+    assert targets(SHOT_ONLY, 9, source, *candidates) == {1, 3}
+
+
+def test_noise_targets_are_neither_black_nor_white():
+    source = CameraSettings(6400, 1 / 8192, 8)  # an eighth of the light of any target
+    # EV 12 is ISO 100, 1/64 s, f/8; 3 EV below and 2 EV above are the limits.
+    times = (2.0**-9 * 0.98, 2.0**-9 * 1.02, 2.0**-4 * 0.98, 2.0**-4 * 1.02)
+    assert targets(SHOT_ONLY, 12, source, *(CameraSettings(100, t, 8) for t in times)) == {2, 3}
+
+
+def test_read_noise_counts_in_dim_light():
+    # Source and target differ in exposure by 2 and in gain not at all: brought to the target's
+    # exposure the source's read variance is 4 times as large.
+    reads = ideal({100.0: (1e-12, 4e-6)})
+    assert targets(reads, 5, *(CameraSettings(100, t, 4) for t in (0.1, 0.2001))) == {1}
+    assert not targets(reads, 5, *(CameraSettings(100, t, 4) for t in (0.1, 0.1999)))
+
+
+def test_the_aperture_only_opens_and_seldom_stays():
+    f_numbers = (4.0, 4.0, 5.6, 5.6, 8.0, 8.0, 11.0, 11.0, 16.0, 22.0)
+    settings = tuple(CameraSettings(100, 0.1 + i / 10, n) for i, n in enumerate(f_numbers))
+    pairs = select_pairs([Sequence(lit_scene(), settings)] * 3, "aperture", Z6)
+    same = {p for p in pairs if f_numbers[p.source] == f_numbers[p.target]}
+    opened = {p for p in pairs if f_numbers[p.source] > f_numbers[p.target]}
+    assert len(opened) == 3 * (10 * 9 // 2 - 4)
+    assert pairs == sorted(opened | same)
+    assert 0 < len(same) <= 0.1 * len(pairs)
+    assert {p.sequence for p in same} == {0, 1, 2}
