@@ -5,8 +5,8 @@ cached beside the source, or in the user's cache folder where that cannot be wri
 (``NUMBA_CACHE_DIR`` names another); where neither can, each process compiles for itself.
 
 As many threads are used as torch would use (`torch.set_num_threads`, ``OMP_NUM_THREADS``). They
-belong to the process that made them: a forked child makes its own, where an OpenMP pool would hang
-or die.
+belong to the process that made them. A forked child computes on one thread: it would wait for ever
+for torch's OpenMP threads, which do not survive a fork.
 """
 
 from __future__ import annotations
@@ -45,6 +45,9 @@ _NOT_KEPT = (
     "compiling parts of the simulator, as in every run (10 s or so for all): no folder can be "
     "written to keep them; NUMBA_CACHE_DIR names one"
 )
+if hasattr(os, "register_at_fork"):
+    # As in the workers of torch's DataLoader; Gymnasium's AsyncVectorEnv forks, too.
+    os.register_at_fork(after_in_child=functools.partial(torch.set_num_threads, 1))
 #: Folder of the packages.
 _ROOT = Path(__file__).parents[2]
 #: The modules and names of imports from this project, one line or in parentheses.

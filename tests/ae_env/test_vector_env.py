@@ -129,20 +129,22 @@ def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
 
 
 @pytest.mark.slow
-def test_workers_that_are_forked_from_a_process_with_environments() -> None:
-    # Gymnasium's default: torch's threads do not survive the fork, a worker must not need them.
+def test_workers_that_are_forked_from_a_process_with_environments(tmp_path: Path) -> None:
+    # Gymnasium's default: torch's threads do not survive the fork, a worker must not need them,
+    # not even to draw the scenes, as nothing is cached yet.
     code = (
         "import gymnasium as gym\n"
         "envs = gym.make_vec('ae_env:ae_env/AutoExposure-v0', num_envs=2,"
-        " vectorization_mode='async', scenes='bundled:small')\n"
+        " vectorization_mode='async', scenes='bundled:snow')\n"
         "envs.reset(seed=0)\n"
         "print(envs.step([3, 40])[1].shape)\n"
         "envs.close()\n"
     )
     variables = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
+    variables["AE_ENV_CACHE"] = str(tmp_path)
     command = [sys.executable, "-c", code]
     done = subprocess.run(
-        command, env=variables, capture_output=True, text=True, timeout=120, check=False
+        command, env=variables, capture_output=True, text=True, timeout=300, check=False
     )
     assert (done.returncode, done.stdout) == (0, "(2,)\n"), done.stderr
 

@@ -1,5 +1,6 @@
 """The simulator: sources, seeds, limits; with networks, what it prepares, and its stages."""
 
+import copy
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from simulator import (
     get_camera,
 )
 from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
+from simulator.capture.statistics import Residual
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.weights import save_modules
 from tests.strategies import SEEDS, cameras, log_uniform, mosaics, prepared, settings_within
@@ -269,6 +271,30 @@ def test_bfloat16_is_close_to_float32(compact: CameraSimulator) -> None:
     assert rounded.dtype == torch.float32
     assert not torch.equal(exact, rounded)
     assert (exact - rounded).abs().mean() < 0.02 * (exact - noisy_raw().data).abs().mean()
+
+
+def test_tolerance_picks_the_network(compact: CameraSimulator) -> None:
+    """On a flat field, where the noise would be an error of 7, networks err by 0.5 and 0.2."""
+    made, source = CameraSimulator("nano", device="cpu"), torch.full((4, 16, 16), 0.2)
+    torch.nn.init.normal_(made.noise.network.tail.weight)
+    compact_alone = CameraSimulator(device="cpu")
+    compact_alone.noises = (copy.deepcopy(compact.noise),)
+    made.noises += compact_alone.noises
+    raw = RawImage(source, SOURCE, Z6)
+    ratio = exposure_ratio(SOURCE, CLEANER)
+    variances = [np.array(n.read) + np.array(n.shot) * 0.2 for n in map(Z6.nlf, (6400, 100))]
+    unit = math.sqrt((variances[0] * ratio**2 / variances[1]).mean())  # of the source's noise
+    for noise, error in zip(made.noises, (0.5, 0.2), strict=True):
+        tables = np.array([0.0, 1.0]), np.full(2, (error / unit) ** 2), np.zeros(2)
+        noise.residual = Residual(*tables, 1.0)
+    for tolerance, name in ((0.0, "compact"), (0.3, "compact"), (0.6, "nano"), (20.0, None)):
+        plan = made.plan(raw, CLEANER, tolerance=tolerance)
+        assert plan.network == name
+        error = {"nano": 0.5, "compact": 0.2, None: 0.0}[name]
+        assert plan.errors["network"] == pytest.approx(error, rel=1e-4)
+        frame = made.simulate(raw, CLEANER, tolerance=tolerance).data
+        alone = compact_alone.simulate(raw, CLEANER, tolerance=0.0).data
+        assert torch.equal(frame, alone) is (tolerance == 0.0)
 
 
 # Stages
