@@ -154,12 +154,12 @@ class MovingLighting(Lighting):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kinds = (self.kinds,) if isinstance(self.kinds, str) else tuple(self.kinds)
-        if not kinds:
+        kinds = (self.kinds,) if isinstance(self.kinds, str) else self.kinds
+        if not isinstance(kinds, Sequence) or not len(kinds):
             raise ValueError(f"`lighting['kinds']` (={self.kinds!r}) must name one kind or more")
         for kind in kinds:
             check_word("lighting['kinds']", kind, (*KIND_SETS, "all", *MOVES))
-        object.__setattr__(self, "kinds", kinds)
+        object.__setattr__(self, "kinds", tuple(kinds))
 
     @functools.cached_property
     def drawn_from(self) -> tuple[str, ...]:

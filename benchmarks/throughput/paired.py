@@ -36,12 +36,15 @@ def checkout(against: Path) -> Path:
     """The folder of another checkout; of a commit, a worktree of it under ``runs``."""
     if (against / "simulator" / "__init__.py").is_file():
         return against.absolute()
-    folder = ROOT / "runs" / "against" / against
+    find = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{against}^{{commit}}"]
+    found = subprocess.run(find, cwd=ROOT, capture_output=True, text=True, check=False)
+    if found.returncode:
+        rule = "must be a checkout of this project, or a commit"
+        raise ValueError(f"`against` (={str(against)!r}) {rule}")
+    folder = ROOT / "runs" / "against" / found.stdout.strip()
     if not folder.is_dir():
-        add = ["git", "worktree", "add", "--detach", str(folder), str(against)]
-        if subprocess.run(add, cwd=ROOT, capture_output=True, check=False).returncode:
-            rule = "must be a checkout of this project, or a commit"
-            raise ValueError(f"`against` (={str(against)!r}) {rule}")
+        add = ["git", "worktree", "add", "--detach", str(folder), folder.name]
+        subprocess.run(add, cwd=ROOT, capture_output=True, check=True)
     return folder
 
 
