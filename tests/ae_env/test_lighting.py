@@ -110,6 +110,7 @@ def lightings(draw: st.DrawFn) -> dict[str, Any]:
     values |= {"frequency": log_uniform(1e-3, 1e6), "frame_rate": log_uniform(1e-3, 1e6)}
     values |= {"depth": st.floats(0, 1), "duty": st.none() | st.floats(1e-6, 1)}
     values |= {"ev": st.lists(stops, min_size=1, max_size=3), "file": st.none()}
+    values |= {"kinds": st.sampled_from([*KIND_SETS, "all"])}
     kind = draw(st.sampled_from(sorted(KINDS)))
     drawn = {f.name: draw(values.get(f.name, frames)) for f in fields(KINDS[kind])}
     for first, last in (("enter", "leave"), ("on", "off")):
