@@ -171,25 +171,22 @@ def test_a_curve_has_means_over_parts_and_a_training_that_resumes_repeats_no_fra
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "agent.csv"
-    curve = LearningCurve(path)
-    for done in range(1, 1001):  # a row every 5 frames
-        curve(done, 1000, {"reward": float(done)})
-    found = load_curve(path)
-    assert found["frames"] == list(range(5, 1001, 5))
-    assert found["reward"] == list(range(3, 1000, 5))
+
+    def report(name: str, values: dict[int, float]) -> dict[str, list[float]]:
+        curve = LearningCurve(path)
+        for done, value in values.items():
+            curve(done, 1000, {name: value})
+        return load_curve(path)
+
+    found = report("mse", {done: done for done in range(1, 1001)})  # a row every 5 frames
+    assert found == {"frames": list(range(5, 1001, 5)), "mse": list(range(3, 1000, 5))}
     path.unlink()
-    first = LearningCurve(path)
-    for done in (200, 400, 600, 800):
-        first(done, 1000, {"mse": 1.0})
-    second = LearningCurve(path)  # its checkpoint was written after 500 frames
-    for done in (600, 800, 1000):
-        second(done, 1000, {"mse": 2.0})
-    found = load_curve(path)
-    assert found["frames"] == [200, 400, 600, 800, 1000]
-    assert found["mse"] == [1, 1, 2, 2, 2]
-    other = LearningCurve(path)  # another training of the same name
-    other(1000, 1000, {"reward": 3.0})
-    assert load_curve(path) == {"frames": [1000.0], "reward": [3.0]}
+    report("mse", dict.fromkeys((200, 400, 600, 800), 1))
+    # Its checkpoint was written after 500 frames.
+    found = report("mse", dict.fromkeys((600, 800, 1000), 2))
+    assert found == {"frames": [200, 400, 600, 800, 1000], "mse": [1, 1, 2, 2, 2]}
+    # Another training of the same name.
+    assert report("reward", {1000: 3}) == {"frames": [1000], "reward": [3]}
 
 
 @pytest.mark.parametrize("text", ["name,price\ntable,12\n", "", "frames,mse\n1\n", "\x00"])
@@ -201,61 +198,43 @@ def test_a_file_of_something_else_is_not_replaced(text: str, tmp_path: Path) -> 
     assert path.read_text() == text
 
 
-STOPPED = "stopped; run the same command again to continue"
-
-
-def command(folder: Path, started: Any, interval: float) -> None:
-    """Runs as `ae-env train` in the process that is stopped, in its step 4."""
+def _command(folder: Path, number: int) -> None:
+    """Runs as `ae-env train`, to which a signal comes in its step 4."""
     from agents.cli.main import main
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
-    checkpoint.INTERVAL = interval
+    checkpoint.INTERVAL = -1.0 if number == signal.SIGKILL else 20.0  # each step is saved
     curve = training.LearningCurve.__call__
 
-    def wait(self: Any, done: int, *report: Any) -> None:
-        curve(self, done, *report)
-        if done == 16:  # the fourth report; with a negative interval the third step is saved
-            started.set()
-            for _ in range(600):  # a signal just before a single sleep would not end it
-                time.sleep(0.1)
+    def report(self: Any, done: int, *values: Any) -> None:
+        curve(self, done, *values)
+        if done == 16:
+            os.kill(os.getpid(), number)
 
-    training.LearningCurve.__call__ = wait  # type: ignore[method-assign]
-    torch.set_num_threads(1)
-    words = os.open(folder / "words", os.O_WRONLY | os.O_CREAT)
-    os.dup2(words, 2)
-    sys.stderr = os.fdopen(2, "w", buffering=1)
+    training.LearningCurve.__call__ = report  # type: ignore[method-assign]
+    sys.stderr = (folder / "words").open("w")
     sys.argv = ["ae-env", "train", str(folder / "mine.yaml"), "--out", str(folder / "agent")]
     main()
 
 
 @pytest.mark.parametrize(
-    ("number", "status", "words", "steps"),
+    ("number", "status", "steps"),
     [
-        (signal.SIGTERM, 143, STOPPED, 4),
-        (signal.SIGINT, 130, STOPPED, 4),
-        (signal.SIGKILL, -signal.SIGKILL, "", 3),  # what was written before counts
+        *((signal.SIGTERM, 143, 4), (signal.SIGINT, 130, 4)),
+        (signal.SIGKILL, -signal.SIGKILL, 3),  # what was written before counts
     ],
 )
 def test_a_stopped_command(
-    number: int, status: int, words: str, steps: int, forkserver: Any, tmp_path: Path
+    number: int, status: int, steps: int, forkserver: Any, tmp_path: Path
 ) -> None:
-    config, seen = tiny(), []
+    config, out, seen = tiny(), tmp_path / "agent", []
     (tmp_path / "mine.yaml").write_text(json.dumps(config.model_dump(mode="json")))
-    started = forkserver.Event()
-    arguments = (tmp_path, started, -1.0 if number == signal.SIGKILL else 20.0)
-    process = forkserver.Process(target=command, args=arguments, daemon=True)
+    process = forkserver.Process(target=_command, args=(tmp_path, number), daemon=True)
     process.start()
-    assert started.wait(120)
-    os.kill(process.pid, number)
-    process.join(60)
+    process.join(120)
     assert process.exitcode == status
-    assert (tmp_path / "words").read_text().strip() == words
     names = {"mine.yaml", "words", "agent.checkpoint", "agent.csv"}  # the curve so far is kept
     assert {p.name for p in tmp_path.iterdir()} == names
-    stored = torch.load(tmp_path / "agent.checkpoint", weights_only=True)
-    assert stored["state"]["step"] == steps
-    training.train_agent(
-        config, tmp_path / "agent", progress=lambda *report: seen.append(report[:2])
-    )
-    assert seen == [(done, 24) for done in range(4 * steps + 4, 25, 4)]
-    assert training.is_trained(config, tmp_path / "agent")
+    training.train_agent(config, out, progress=lambda done, *_: seen.append(done))
+    assert seen == list(range(4 * steps + 4, 25, 4))
+    assert training.is_trained(config, out)
