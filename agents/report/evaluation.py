@@ -238,7 +238,7 @@ def write_report(
         assert result.plan is not None
         meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
         scenes = repr(result.plan.environment.get("scenes", "bundled"))
-        text = _fill("brackets.md", plan=result.plan, rows=rows, meta=meta, scenes=scenes)
+        text = fill("brackets.md", plan=result.plan, rows=rows, meta=meta, scenes=scenes)
         return {
             "results.json": write_results(folder / "results.json", _records(rows), meta),
             "report.md": write_atomically(folder / "report.md", text),
@@ -252,11 +252,10 @@ def write_report(
     columns = [name for name in ROW_COLUMNS if name != "ci95"]
     table = table[[*columns, "ci95_low", "ci95_high", *MORE_COLUMNS]]
     contents = _records(rows[list(ROW_COLUMNS)])
-    files = {
-        "results.json": write_results(folder / "results.json", contents, meta),
-        "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
-        "metrics.csv": _write_csv(folder / "metrics.csv", table),
-    }
+    files = {"results.json": write_results(folder / "results.json", contents, meta)}
+    for name, frame in (("scenes.csv", scene_rows(result)), ("metrics.csv", table)):
+        text = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        files[name] = write_atomically(folder / name, text)
     order = ranking.policy.tolist()
     order += [name for name in result.tracks if name not in order]
     pictures = _write_pictures(folder, results, rows, ranking, title, order)
@@ -301,12 +300,6 @@ def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(key): value for key, value in row.items()} for row in rows.to_dict("records")]
 
 
-def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
-    """Writes rows as CSV, numbers with six digits."""
-    text = rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    return write_atomically(path, text)
-
-
 def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
     best, described, differences = best_meter(result), None, []
@@ -349,7 +342,7 @@ def _report(
     costs = by[by.condition == static]
     kinds = {f"{kind} ({own['groups']})": own for kind, own in meta["by_kind"].items()}
     plan, policies = result.plan, pd.Index(result.tracks, name="policy")
-    return _fill(
+    return fill(
         "evaluation.md",
         meta=meta,
         results=results,
@@ -357,8 +350,7 @@ def _report(
         static=static,
         plan=plan,
         row=rows.iloc[0],
-        starts=["random"] if plan is None else plan.starts,
-        seeds=[result.seed] if plan is None else plan.seeds,
+        seed=result.seed,
         training_seeds=rows.training_seeds.max(),
         ranking=[
             row | {"best": _change(row["to_best"]), "next": _change(row["to_next"])}
@@ -373,7 +365,10 @@ def _report(
         kinds=pd.DataFrame(kinds).drop(index="groups").rename_axis("policy"),
         other_scorers=pd.DataFrame(meta["other_scorers"], index=policies),
         histogram=_histogram_rows(meta["oracle_histogram"]),
-        run=[{"condition": n, **dict(c)} for n, c in plan.all_conditions.items()] if plan else [],
+        run=[
+            {"condition": name, "lighting": str(one.lighting), "delay": str(one.delay)}
+            for name, one in (plan.all_conditions.items() if plan else ())
+        ],
         **more,
     )
 
@@ -426,14 +421,18 @@ def _histogram_rows(histogram: Mapping[str, Mapping[str, float]]) -> list[dict[s
         "exposure_time": format_exposure_time,
         "f_number": "f/{:g}".format,
     }
-    rows = []
-    for name, own in histogram.items():
-        shares = [f"{labels[name](float(value))}: {share:.0%}" for value, share in own.items()]
-        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
-    return rows
+    return [
+        {
+            "control": name.replace("_", " "),
+            "share": ", ".join(
+                f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()
+            ),
+        }
+        for name, own in histogram.items()
+    ]
 
 
-def _fill(template: str, **values: Any) -> str:
+def fill(template: str, **values: Any) -> str:
     """A template beside this module, filled in: one empty line between its parts."""
     text = _templates().get_template(template).render(values)
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
@@ -442,12 +441,8 @@ def _fill(template: str, **values: Any) -> str:
 @cache
 def _templates() -> jinja2.Environment:
     folder = jinja2.FileSystemLoader(Path(__file__).parent)
-    found = jinja2.Environment(
-        loader=folder,
-        trim_blocks=True,
-        undefined=jinja2.StrictUndefined,
-        keep_trailing_newline=True,
-    )
+    options = {"trim_blocks": True, "keep_trailing_newline": True}
+    found = jinja2.Environment(loader=folder, undefined=jinja2.StrictUndefined, **options)
     found.filters |= {"md": escape, "code": code, "table": to_markdown, "wide": _wide}
     found.globals["code_block"] = code_block
     return found
@@ -461,9 +456,7 @@ def summary(
 ) -> list[tuple[str, pd.DataFrame]]:
     """Tables of an evaluation for the terminal: titles, and frames of texts.
 
-    Args:
-        results: The return value of `evaluate` or `run_plan`.
-        ranking: Of `overall_ranking`; computed by default.
+    `ranking` is that of `overall_ranking`, computed by default.
     """
     results = as_results(results)
     static = static_condition(results)
