@@ -235,12 +235,13 @@ def _play(name: str, arguments: dict[str, Any]) -> None:
     import gymnasium as gym
     import numpy as np
 
-    envs = gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)
-    list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
-    envs.reset(seed=0)
-    for _ in range(4):
-        envs.step(np.arange(16))
-    envs.close()
+    from agents.rollouts import scenes_of
+
+    with closing(gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)) as envs:
+        scenes_of(envs)  # draws every one
+        envs.reset(seed=0)
+        for _ in range(4):
+            envs.step(np.arange(16))
 
 
 def _use_rest() -> None:
