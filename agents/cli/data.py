@@ -186,9 +186,7 @@ def score_tables(
     print_files({"score tables": out / "tables-*.parquet"})
 
 
-def cache(
-    clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = False,
-) -> None:
+def cache(clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = False) -> None:
     """Show what is cached between runs (scenes, networks' outputs), or clear it.
 
     Example: `ae-env cache --clear`; the folder is another one where AE_ENV_CACHE names it.

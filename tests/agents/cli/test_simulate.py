@@ -64,7 +64,8 @@ def test_settings_of_a_source_that_has_none(ae_env, tmp_path: Path) -> None:
     code, text, _ = ae_env(*command, "f/8", *given, "--source-aperture", 8)
     assert (code, "source ISO 400, 1/64 s, f/8" in text) == (0, True)
     assert read_raw("out.dng").data.mean() == pytest.approx(0.25 / 4, rel=0.02)  # at ISO 400 it was
-    assert Image.open("a.png").size == (40, 120)
+    with Image.open("a.png") as picture:
+        assert picture.size == (40, 120)
     code, _, error = ae_env(*command, 8, *given)
     assert (code, "--source-aperture, or none" in error) == (2, True)
 
