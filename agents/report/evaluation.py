@@ -441,7 +441,7 @@ def fill(template: str, **values: Any) -> str:
 @cache
 def _templates() -> jinja2.Environment:
     folder = jinja2.FileSystemLoader(Path(__file__).parent)
-    options = {"trim_blocks": True, "keep_trailing_newline": True}
+    options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True}
     found = jinja2.Environment(loader=folder, undefined=jinja2.StrictUndefined, **options)
     found.filters |= {"md": escape, "code": code, "table": to_markdown, "wide": _wide}
     found.globals["code_block"] = code_block

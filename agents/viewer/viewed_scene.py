@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache, partial
 from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
@@ -303,7 +304,7 @@ class ViewedScene:
         """Writes the full frame at the settings of `view`, at the sensor's resolution."""
         with self._lock:
             defocus = view.defocus * self.scene.light.shape[1] / SCORED_PIXELS
-            moves = {"image_speed": view.speed, "defocus": defocus}
+            moves: dict[str, Any] = {"image_speed": view.speed, "defocus": defocus}
             prepared = self._prepare(self.scene)
             raw = self._simulator.simulate(prepared, view.settings, **moves)
         write_dng(path, raw)
