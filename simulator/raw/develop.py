@@ -166,12 +166,10 @@ def _decoded(encoded: torch.Tensor) -> torch.Tensor:
 def _plane_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:
     """Gains of the four planes, the smallest 1, as (B, 4, 1, 1)."""
     gains = torch.as_tensor(white_balance, dtype=torch.float32, device=images.device)
-    if gains.shape not in ((3,), (len(images), 3)):
-        raise ValueError(
-            f"`white_balance` (shape {tuple(gains.shape)}) must be (3,) or ({len(images)}, 3)"
-        )
-    if not bool((torch.isfinite(gains) & (gains > 0)).all()):
-        raise ValueError(f"`white_balance` (={gains.tolist()}) must be positive and finite")
+    positive = bool((torch.isfinite(gains) & (gains > 0)).all())
+    if gains.shape not in ((3,), (len(images), 3)) or not positive:
+        rule = f"must be (3,) or ({len(images)}, 3), positive and finite"
+        raise ValueError(f"`white_balance` (={gains.tolist()}) {rule}")
     gains = (gains / gains.amin(dim=-1, keepdim=True)).clamp_(max=_LARGEST_GAIN)
     return gains[..., [0, 1, 1, 2]].expand(len(images), 4)[..., None, None]
 
@@ -179,10 +177,9 @@ def _plane_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:
 def _balance(images: torch.Tensor, gains: torch.Tensor) -> torch.Tensor:
     """White-balanced packed raws (B, 4, H, W), their highlights clipped to white.
 
-    The smallest gain is 1, so a saturated pixel reaches at least 1 in every channel; then
-    everything is clipped at 1. Without that clip the gains would turn saturated areas magenta.
-    Negative values stay: clipping them here would lift the black level of noisy shadows. No sensor
-    goes below -1; the bound keeps infinities out of the sums that follow.
+    The smallest gain is 1, so a saturated pixel reaches at least 1 in every channel. Without the
+    clip the gains would turn saturated areas magenta. Negative values stay: clipping them here
+    would lift the black level of noisy shadows; the bound keeps infinities out of what follows.
     """
     return torch.mul(images, gains).clamp_(-1.0, 1.0)
 
@@ -207,8 +204,6 @@ def srgb_from_camera(colour_matrix: Matrix) -> torch.Tensor:
     So (1, 1, 1) maps to (1, 1, 1). This is what dcraw's ``cam_xyz_coeff`` does, and what the DNG
     specification 1.4, chapter 6, does for a scene lit by the matrix's own illuminant.
 
-    Raises:
-        ValueError: If `colour_matrix` is not 3 x 3 and finite, or has no such inverse.
     """
     matrix = torch.as_tensor(colour_matrix, dtype=torch.float64)
     if matrix.shape != (3, 3) or not bool(torch.isfinite(matrix).all()):
@@ -221,11 +216,10 @@ def srgb_from_camera(colour_matrix: Matrix) -> torch.Tensor:
 def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
     camera_from_srgb = np.array(rows) @ np.array(XYZ_FROM_SRGB)
     white = camera_from_srgb.sum(axis=1, keepdims=True)
-    if not (white > 0).all():
-        raise ValueError(f"`colour_matrix` (={rows}) must see white in every channel")
+    if not (white > 0).all() or np.linalg.cond(camera_from_srgb / white) > 1e6:
+        rule = "must see white in every channel, and be invertible"
+        raise ValueError(f"`colour_matrix` (={rows}) {rule}")
     camera_from_srgb /= white
-    if np.linalg.cond(camera_from_srgb) > 1e6:
-        raise ValueError(f"`colour_matrix` (={rows}) must be invertible")
     inverse: list[list[float]] = np.linalg.inv(camera_from_srgb).tolist()
     return inverse
 
@@ -233,11 +227,9 @@ def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
 def apply_tone(linear: torch.Tensor, tone: str) -> torch.Tensor:
     """The tone curve on linear light in [0, 1]; monotone, 0 to 0 and 1 to 1.
 
-    ``"photographic"`` is Schlick's rational curve ``p x / ((p - 1) x + 1)`` with p = 1.618, which
-    maps 0.119 to 0.18. Its slope falls from p at black to 1 / p at white.
-
-    Source: C. Schlick, "Quantization techniques for visualization of high dynamic range pictures",
-    Eurographics Workshop on Rendering 1994 (uniform rational quantization).
+    ``"photographic"`` is the rational curve ``p x / ((p - 1) x + 1)`` with p = 1.618, which maps
+    0.119 to 0.18 (C. Schlick, "Quantization techniques for visualization of high dynamic range
+    pictures", Eurographics Workshop on Rendering 1994). Its slope falls from p to 1 / p at white.
     """
     if tone == "linear":
         return linear
@@ -263,8 +255,7 @@ def srgb_encode(linear: torch.Tensor) -> torch.Tensor:
 def demosaic_half(packed: torch.Tensor) -> torch.Tensor:
     """RGB (B, 3, H, W) at half the sensor's resolution: R, the mean of both greens, B of each tile.
 
-    Nothing is interpolated, so noise stays white and no artefact can be mistaken for detail; R and
-    B lie half a packed pixel apart, which nobody sees at this size.
+    Nothing is interpolated, so noise stays white and no artefact can be mistaken for detail.
 
     >>> demosaic_half(torch.tensor([0.5, 0.2, 0.4, 0.1]).reshape(1, 4, 1, 1)).flatten()
     tensor([0.5000, 0.3000, 0.1000])
@@ -285,10 +276,8 @@ def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tens
     mirrored about its last pixel, so every colour stays on its own rows and columns. The result may
     overshoot the input's range at edges.
 
-    Args:
-        packed: (B, 4, H, W), planes R, G1, G2, B, H, W >= 2, floating point, any range. White
-            balance it first: the filters take the planes' detail to be alike.
-        cfa: Where in the 2 x 2 tile each plane lies.
+    `packed` (B, 4, H, W), H, W >= 2, has any range. White balance it first: the filters take the
+    planes' detail to be alike.
 
     Source: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
     Bayer-patterned color images", ICASSP 2004, figure 2.

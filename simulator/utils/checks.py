@@ -52,12 +52,7 @@ def check_flag(name: str, value: Any) -> None:
 def check_integer(
     name: str, value: Any, low: int, high: int | None = None, *, more: str = ""
 ) -> int:
-    """`value` as an int.
-
-    Raises:
-        ValueError: Unless it is an integer (no bool, no float) from `low` to `high`; `more` ends
-            the message.
-    """
+    """`value` as an int; a `ValueError`, which `more` ends, unless it is one in [`low`, `high`]."""
     if isinstance(value, Integral) and not isinstance(value, bool):
         number = int(value)
         if number >= low and (high is None or number <= high):
@@ -67,12 +62,7 @@ def check_integer(
 
 
 def check_number(name: str, value: Any, low: float, high: float, *, more: str = "") -> float:
-    """`value` as a float.
-
-    Raises:
-        ValueError: Unless it is a number (no bool, no text) from `low` to `high`, which NaN is not;
-            `more` ends the message.
-    """
+    """`value` as a float; a `ValueError`, which `more` ends, unless it is in [`low`, `high`]."""
     number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if low <= number <= high:
         return float(number)
@@ -80,9 +70,5 @@ def check_number(name: str, value: Any, low: float, high: float, *, more: str = 
 
 
 def check_seed(seed: Any, name: str = "seed") -> int | None:
-    """`seed` as an int, or None.
-
-    Raises:
-        ValueError: Unless it is an integer >= 0 or None.
-    """
+    """`seed` as an int >= 0, or None; a `ValueError` if it is neither."""
     return None if seed is None else check_integer(name, seed, 0)

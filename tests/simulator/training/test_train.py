@@ -35,12 +35,12 @@ from simulator.training.train import (
     SimulatorConfig,
     StageConfig,
     calibrate,
-    load_config,
     make_accelerator,
     train_and_save,
     train_stage,
     validate,
 )
+from simulator.utils.config_file import load_yaml
 from tests.simulator.training.scenes import scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
@@ -323,12 +323,12 @@ CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "simulator"
 
 def load_text(folder: Path, text: str) -> SimulatorConfig:
     (folder / "a.yaml").write_text(text)
-    return load_config(folder / "a.yaml")
+    return load_yaml(folder / "a.yaml", SimulatorConfig)
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda f: f.name)
 def test_shipped_configurations_are_valid(file):
-    assert load_config(file).preset == file.stem
+    assert load_yaml(file, SimulatorConfig).preset == file.stem
 
 
 @pytest.mark.parametrize(
