@@ -96,10 +96,9 @@ class ExposureAugmentation:
         for name, (low, high) in bounds.items():
             object.__setattr__(self, name, _check_range(name, getattr(self, name), low, high))
         named = isinstance(self.modules, Iterable) and not isinstance(self.modules, str)
-        modules = tuple(self.modules) if named else (None,)
-        if any(name not in MODULES for name in modules):
+        if not named or not set(self.modules) <= set(MODULES):
             raise ValueError(f"`modules` (={self.modules!r}) must be some of {list(MODULES)}")
-        object.__setattr__(self, "modules", modules)
+        object.__setattr__(self, "modules", tuple(self.modules))
 
     @property
     def profile(self) -> CameraProfile:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from simulator.camera import BayerPattern
 from simulator.raw.image import RawImage, check_packed
@@ -287,7 +288,7 @@ def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tens
     mosaic = packed.new_empty(packed.shape[0], 2 * height, 2 * width)
     for plane, (row, column) in enumerate(offsets):
         mosaic[:, row::2, column::2] = packed[:, plane]
-    padded = _mirror(_mirror(mosaic, 1), 2)
+    padded = F.pad(mosaic[:, None], (2, 2, 2, 2), mode="reflect")[:, 0]
 
     rgb = packed.new_empty(packed.shape[0], 3, 2 * height, 2 * width)
     for plane, (row, column) in enumerate(offsets):
@@ -329,14 +330,6 @@ def _neighbours(padded: torch.Tensor, row: int, column: int) -> tuple[torch.Tens
         at(-2, 0) + at(2, 0),
         (at(-1, -1) + at(-1, 1)) + (at(1, -1) + at(1, 1)),
     )
-
-
-def _mirror(mosaic: torch.Tensor, dim: int) -> torch.Tensor:
-    """`mosaic` with two more pixels at both ends of `dim`, mirrored about the last pixel."""
-    size = mosaic.shape[dim]
-    index = torch.arange(-2, size + 2, device=mosaic.device).abs()
-    index = torch.where(index < size, index, 2 * (size - 1) - index)
-    return mosaic.index_select(dim, index)
 
 
 # -- clipped highlights ---------------------------------------------------------------------------

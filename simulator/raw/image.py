@@ -160,8 +160,7 @@ def _tile(camera: CameraProfile) -> np.ndarray:
 def new_frame(like: torch.Tensor) -> torch.Tensor:
     """Uninitialised float32 memory for a frame of the shape of `like`.
 
-    For large arrays NumPy asks the system for huge pages, which torch does not: the first write of
-    a full frame then takes a quarter of the time.
+    NumPy's has huge pages, unlike torch's: the first write takes a quarter of the time.
     """
     if like.device.type != "cpu":
         return torch.empty(like.shape, device=like.device)

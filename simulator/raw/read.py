@@ -197,9 +197,8 @@ def _check_structure(directories: Sequence[Directory], known_kind: bool, size: i
     """Raises unless a file of `size` bytes can be a whole Bayer raw, as its structure tells."""
     if not known_kind:
         raise RawFileError(
-            "must be a camera raw that LibRaw reads, but names no camera: it is a file of another "
-            "kind, truncated or damaged; read a bare array with numpy.fromfile and "
-            "RawImage.from_mosaic"
+            "must be a camera raw that LibRaw reads, but names no camera: another kind of file, "
+            "truncated or damaged; for bare arrays see numpy.fromfile and RawImage.from_mosaic"
         )
     lost = missing_bytes(directories, size)
     if lost:

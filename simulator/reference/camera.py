@@ -66,10 +66,6 @@ def sample_mosaic(light: Tensor, cfa: BayerPattern = BayerPattern.RGGB) -> Tenso
     """The planes R, G1, G2, B (4, H, W) that photosites behind colour filters take of `light`.
 
     `light` is (3, 2H, 2W) red, green and blue at every photosite; a last odd row or column is cut.
-
-    >>> ramp = torch.arange(16.0).reshape(1, 4, 4).expand(3, 4, 4)
-    >>> sample_mosaic(ramp)[:, 0, 0].tolist()
-    [0.0, 1.0, 4.0, 5.0]
     """
     height, width = (n // 2 * 2 for n in light.shape[-2:])
     planes = [
@@ -208,7 +204,7 @@ class ReferenceCamera:
 
     Args:
         camera: Sensor, with a noise calibration and, for scenes with depth, a pixel pitch.
-        body: Hidden error of this body.
+        body: Its hidden error.
         box_factor: Samples k that are averaged per side and plane after they were recorded, each
             with noise of its own: captures then have H // k x W // k pixels, their values whole
             multiples of 1/k^2 digital numbers.

@@ -211,13 +211,13 @@ def _capture(
     camera: CameraProfile,
     developing: Balance | None,
 ) -> PackedCapture:
-    values = {}
+    values = []
     for name in ("iso", "time", "aperture"):
         try:
-            values[name] = float(row[name])
+            values.append(float(row[name]))
         except ValueError:
             raise ValueError(f"`{name}` (={row[name]!r}) must be a number") from None
-    settings = CameraSettings.from_exif(values["iso"], values["time"], values["aperture"])
+    settings = CameraSettings.from_exif(*values)
     gains, noise = _numbers(row.get("wb", "")), _numbers(row.get("noiseprofile", ""))
     balance = (gains[0] / gains[1], 1.0, gains[2] / gains[1]) if _positive(gains) else developing
     stem = f"{path.stem}.npy"

@@ -310,7 +310,7 @@ def reference_scenes(
         number: Procedural groups, one scene each; the first are the same whatever `number` is.
         size: Height and width [packed pixels], half as many as photosites; pictures that are
             smaller keep their size, and are left out below 128 and below `size`, which is logged.
-        data: Folder of real files (see docs/networks.md); `FileNotFoundError` if it is not there.
+        data: Folder of real files (see docs/networks.md).
         seed: Seed of the procedural groups; part of their names.
     """
     check_word("split", split, tuple(FIRST_INDEX))

@@ -219,16 +219,9 @@ def train_and_save(
 ) -> Path:
     """Trains the stages of `config`, and returns the file of the weights, a model card beside it.
 
-    A stage that is done or half done resumes from its checkpoint.
-
-    Args:
-        config: The training.
-        path: File name of the weights; checkpoints and logs go into its folder.
-        command: The command line that does it again, for the card.
-        device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
-        tensorboard: Whether to log to ``tensorboard`` in that folder.
-        make_scenes, make_pictures: Give the scenes of a split, and its noise stage's pictures.
-        progress: Called while scenes are rendered and every few steps.
+    A stage that is done or half done resumes from its checkpoint. Checkpoints and logs (in
+    ``tensorboard``) go into the folder of `path`; `command`, the command line that does it again,
+    into the card. Several GPUs or processes run it through ``accelerate launch``.
     """
     folder = path.parent
     accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
@@ -306,11 +299,9 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
     # stay in force, or be refused.
     AcceleratorState._reset_state(reset_partial_state=True)
     precision = {"float32": "no", "bfloat16": "bf16", "float16": "fp16"}[config.precision]
+    to_logs: dict[str, Any] = {"log_with": "tensorboard", "project_dir": str(logs)}
     accelerator = Accelerator(
-        cpu=device == "cpu",
-        mixed_precision=precision,
-        log_with=None if logs is None else "tensorboard",
-        project_dir=None if logs is None else str(logs),
+        cpu=device == "cpu", mixed_precision=precision, **(to_logs if logs else {})
     )
     if precision == "bf16":
         check_bfloat16(accelerator.device)

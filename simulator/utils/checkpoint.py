@@ -32,7 +32,7 @@ class Checkpoint:
         path: The file; None writes and reads nothing.
         identity: JSON value that says what is trained and how. A checkpoint of another training, or
             of another version of this package, is not resumed but replaced.
-        state: Called for the state to write: tensors, plain values, and dicts and lists of them.
+        state: Gives the state to write: tensors, plain values, and dicts and lists of them.
         writes: False in the processes of a distributed training that only read.
     """
 

@@ -197,19 +197,11 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     """Commit of the checkout that this package runs from; None where there is no checkout."""
     root = Path(__file__).resolve().parents[2]
-    top = _git(root, "rev-parse", "--show-toplevel")
-    # An installed copy may lie inside somebody else's repository.
-    if top is None or Path(top).resolve() != root:
+    if not (root / ".git").exists():  # an installed copy may lie in somebody else's repository
         return None
-    wanted = ("--always", "--abbrev=40", "--exclude=*", "--dirty=+changes")
-    return _git(root, "describe", *wanted)
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes"]
     try:
-        result = subprocess.run(
-            ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        text = subprocess.run(command, cwd=root, capture_output=True, timeout=10, check=True).stdout
+        return text.decode().strip()
+    except (OSError, subprocess.SubprocessError):
         return None
-    return result.stdout.strip() if result.returncode == 0 else None
