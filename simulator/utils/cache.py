@@ -73,12 +73,6 @@ class LruCache(Generic[Value]):
     """The most recently used values in memory; safe to share between threads.
 
     They have at most `max_bytes` together; a larger value is not stored. A pickled copy is empty.
-
-    >>> cache = LruCache(max_bytes=2)
-    >>> for name in "abc":
-    ...     cache.put(name, name.upper(), 1)
-    >>> cache.get("a"), cache.get("c"), len(cache), cache.nbytes
-    (None, 'C', 2, 2)
     """
 
     def __init__(self, max_bytes: int) -> None:

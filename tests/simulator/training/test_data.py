@@ -118,8 +118,8 @@ def test_everything_of_a_pair_shows_the_same_crop():
     assert not torch.equal(far[0], far[1])
 
 
-def test_settings_of_a_pair():
-    batch = pairs(DARK, LIGHT).batch(0, 8, 16)
+def test_settings_of_a_pair_and_defocus_at_the_sources_aperture():
+    batch = pairs(DARK, LIGHT).batch(0, 8, 32)
     stop = 2**2.5  # f/5.6
     forward = [6, -11, 2.5, 0, -4, 2]
     brightens = batch.ratio > 1
@@ -130,11 +130,7 @@ def test_settings_of_a_pair():
         assert float(batch.ratio[i]) == pytest.approx(4.0 if brighter else 0.25)
         stops = float(batch.f_source[i]), float(batch.f_target[i])
         assert stops == pytest.approx((stop, 4.0) if brighter else (4.0, stop))
-
-
-def test_defocus_is_the_thin_lens_at_the_sources_aperture():
-    """f^2 / N (1/s - 1/z) / (1 - f/s), in packed pixels of 2 x 5.9 micrometres or so."""
-    batch = pairs(DARK, LIGHT).batch(0, 8, 32)
+    # Defocus is f^2 / N (1/s - 1/z) / (1 - f/s), in packed pixels of 2 x 5.9 micrometres or so.
     blur = 0.035**2 / batch.f_source * (1 / 2 - 1 / 8) / (1 - 0.035 / 2)
     expected = blur / (2e-6 * Z6.pixel_pitch_um)
     np.testing.assert_allclose(batch.defocus.amax((1, 2)), expected, rtol=1e-4)
@@ -290,9 +286,7 @@ def test_exposure_is_the_mean_error_of_what_is_not_over_exposed():
     baseline = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
     values = baseline(batch(noise=False))  # source 0.2, compared with the sample, 0.41
     assert values["loss"].item() == pytest.approx(0.21, rel=1e-5)
-
-
-def test_the_noise_goes_with_the_exposure():
+    # The noise goes with the exposure.
     module, data = ExposureModule(), batch()
     module.load_state_dict({"w": torch.tensor(1.5), "b": torch.full((4,), 0.1)})
     exposed, shot, read = expose(module, data)

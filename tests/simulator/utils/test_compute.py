@@ -18,7 +18,7 @@ from simulator.networks.aperture_module import DefocusMap
 from simulator.networks.noise_module import NoiseModule
 from simulator.utils import compute as jit
 from simulator.utils.compute import kernel, parallel_ranges
-from simulator.utils.tiles import in_tiles, make_tiles, varying
+from simulator.utils.tiles import in_tiles, varying
 
 
 def add(a: int, b: int) -> int:
@@ -194,21 +194,6 @@ def test_the_halo_covers_what_the_networks_see(size):
     tile = (..., *2 * [slice(top - halo, bottom + halo)])
     alone = network(image[tile])[..., halo:-halo, halo:-halo]
     torch.testing.assert_close(alone, found[0], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
-def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density):
-    needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
-    tiles = make_tiles(333, 270, halo=12, tile=128, needed=needed)
-    count = torch.zeros(333, 270)
-    for each in tiles:
-        count[each.inner] += 1
-        assert each.top % 4 == each.left % 4 == 0
-        assert count[each.outer][each.core].shape == count[each.inner].shape
-    assert bool((count[needed] == 1).all())
-    assert bool((count <= 1).all())
-    whole = make_tiles(333, 270, halo=12, tile=128)
-    assert sum(t.area for t in tiles) <= sum(t.area for t in whole)
 
 
 def test_constant_parts_do_not_vary():

@@ -1,6 +1,5 @@
 """What is kept on a disk: files, results, configurations, a cache, the state of a training."""
 
-import datetime
 import errno
 import json
 import os
@@ -88,8 +87,6 @@ def test_meta_says_where_a_number_comes_from():
     assert (meta["command"], meta["seed"]) == ("ae-env bench throughput", 3)
     assert meta["machine"]["threads"] == torch.get_num_threads()
     assert meta["versions"]["torch"] == version("torch")
-    age = datetime.datetime.now(datetime.UTC) - datetime.datetime.fromisoformat(meta["date"])
-    assert abs(age.total_seconds()) < 60
     json.dumps(meta)
 
     def git(*arguments):
@@ -208,15 +205,13 @@ def test_the_variable_names_the_folder(monkeypatch, tmp_path):
             cache(-1)
 
 
-def test_keys_depend_on_the_kind_the_parts_and_the_version(monkeypatch):
+def test_what_keys_and_digests_depend_on(monkeypatch):
     assert cache_key("k", {"a": 1, "b": [2]}) == cache_key("k", {"b": [2], "a": 1})
     keys = {cache_key("k", parts) for parts in ({"a": 1}, {"a": 2}, {"b": 1}, {"a": [1]})}
     keys.add(cache_key("l", {"a": 1}))
     monkeypatch.setattr(cache_module, "__version__", "99.0")
     assert len(keys | {cache_key("k", {"a": 1})}) == 6
-
-
-def test_digest_sees_content_and_not_layout():
+    # A digest sees content and not layout.
     light = torch.rand(2, 4, 6, 8)
     digest = content_digest({"light": light})
     for same in (light.to(memory_format=torch.channels_last), light.clone().requires_grad_()):
