@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from torch.nn.functional import pad
 
 from ae_env.env import AutoExposureBase, AutoExposureEnv
-from ae_env.episodes.core import Task
+from ae_env.episodes.core import FrameBatch, Task
 from ae_env.episodes.state import Episodes
 from ae_env.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from ae_env.options import EnvArguments, takes_env_arguments
@@ -25,7 +25,6 @@ from ae_env.registration import TASKS
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.vector_env import AutoExposureVectorEnv
-from simulator.capture.batch import FrameStatistics
 from simulator.capture.prepared_scene import Layout
 from simulator.optics.motion import Taps, path_blur_apart
 from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
@@ -251,19 +250,13 @@ class ExposureBracket(Task):
         """(K,) bool: no frame was taken, or the last."""
         return ~takes | (self._count[env_indices] == self.max_frames)
 
-    def measure(
-        self,
-        env_indices: np.ndarray,
-        frames: FrameStatistics,
-        outputs: Mapping[str, np.ndarray],
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
+    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
         """Merges the frames that were taken: what that adds to the quality (B,)."""
+        env_indices = frames.env_indices
         before = self._quality[env_indices].copy()
         fresh = np.flatnonzero(self._fresh[env_indices])
         if len(fresh):
-            self._add_frames(env_indices[fresh], outputs["numbers"][fresh])
+            self._add_frames(env_indices[fresh], frames.outputs["numbers"][fresh])
         return {"gain": self._quality[env_indices] - before}
 
     def reward(

@@ -63,6 +63,25 @@ class Frames:
     raw: np.ndarray
 
 
+@dataclass(frozen=True)
+class FrameBatch:
+    """Frames that were just recorded, of B environments.
+
+    Args:
+        env_indices: (B,) of the environments.
+        statistics: Of the frames.
+        outputs: The frames (B, 4, R, R), by the names of `Task.outputs`.
+        gains: (B,) light relative to the scenes' own.
+        rows: (B, R) light of each row relative to that, or None; see `Captures`.
+    """
+
+    env_indices: np.ndarray
+    statistics: FrameStatistics
+    outputs: Mapping[str, np.ndarray]
+    gains: np.ndarray
+    rows: np.ndarray | None
+
+
 class Task:
     """What an action does and what a frame is worth, as functions of running episodes.
 
@@ -122,23 +141,8 @@ class Task:
         """What is observed beside the latest frame, (B, ...) by name."""
         return {}
 
-    def measure(
-        self,
-        env_indices: np.ndarray,
-        frames: FrameStatistics,
-        outputs: Mapping[str, np.ndarray],
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
-        """Columns (B,) that `reward` takes, from the frames just recorded.
-
-        Args:
-            env_indices: (B,) of the environments.
-            frames: Statistics of their frames.
-            outputs: Their frames (B, 4, R, R), by the names of `outputs`.
-            gains: (B,) light relative to the scenes' own.
-            rows: (B, R) light of each row relative to that, or None; see `Captures`.
-        """
+    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
+        """Columns (B,) that `reward` takes, from the frames just recorded."""
         raise NotImplementedError
 
     def reward(
@@ -358,7 +362,7 @@ class EpisodeCore:
         for name in self.task.outputs:
             if name not in outputs:
                 outputs[name] = np.empty(raw.shape, _DTYPES[name])
-        frames = self._captures.record(
+        found = self._captures.record(
             episodes.light_index[env_indices],
             episodes.state[env_indices],
             episodes.noise_seed[env_indices],
@@ -367,15 +371,15 @@ class EpisodeCore:
             **outputs,
         )
         columns = {
-            "clipped_high": frames.clipped_high,
-            "clipped_low": frames.clipped_low,
-            "excess_noise": frames.excess_variance,
-            "predicted_error": frames.predicted_error,
-            "modules": frames.modules,
+            "clipped_high": found.clipped_high,
+            "clipped_low": found.clipped_low,
+            "excess_noise": found.excess_variance,
+            "predicted_error": found.predicted_error,
+            "modules": found.modules,
         }
         if self.options.sensors:
-            columns["sensor_normals"] = frames.sensor_normals(2)
-        columns |= self.task.measure(env_indices, frames, outputs, gains, rows)
+            columns["sensor_normals"] = found.sensor_normals(2)
+        columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows))
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         return columns

@@ -145,7 +145,19 @@ def _inside(height: int, width: int) -> int:
     return max(1, height - 2 * _PATCH) * max(1, width - 2 * _PATCH)
 
 
-class Keypoints:
+class _OrbScorer:
+    """Base of scorers by ORB keypoints."""
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = "extra cv"
+    version = 1
+
+    def __init__(self) -> None:
+        opencv()  # raises now, not at the first score
+
+
+class Keypoints(_OrbScorer):
     """Number of ORB keypoints: 1 - exp(-n / n0), n0 = 15 per 1000 pixels inside ORB's border.
 
     Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV 2011, in OpenCV with its FAST
@@ -157,14 +169,6 @@ class Keypoints:
         ImportError: If OpenCV is not installed.
     """
 
-    domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
-    needs = "extra cv"
-    version = 1
-
-    def __init__(self) -> None:
-        opencv()
-
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of sRGB `images` (B, 3, H, W)."""
         assert images is not None
@@ -175,7 +179,7 @@ class Keypoints:
         return 1.0 - torch.exp(-torch.tensor(counts, dtype=torch.float64) / typical)
 
 
-class Matches:
+class Matches(_OrbScorer):
     """Share of a well-exposed, noise-free reference's ORB keypoints that are found again.
 
     The reference is the scene's light at the right exposure (``captures.proper_ev``), without noise
@@ -188,14 +192,6 @@ class Matches:
     Raises:
         ImportError: If OpenCV is not installed.
     """
-
-    domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
-    needs = "extra cv"
-    version = 1
-
-    def __init__(self) -> None:
-        opencv()
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of sRGB `images` (B, 3, H, W)."""
