@@ -55,9 +55,6 @@ class AutoExposure(Task):
         scorer: Rates the frames.
         transitions: Light and exposures behind frames, `CaptureBatch.transitions`, where parts that
             are measured on frames are replaced by their expectation; else None.
-
-    Attributes:
-        tables: Where expectations of all states are worked out.
     """
 
     def __init__(
@@ -314,16 +311,12 @@ class AutoExposureBase(SpecProperty):
 
     @property
     def scene_ids(self) -> tuple[str, ...]:
-        """Names of all scenes, of sequences of all frames, by ``info["scene_id"]`` of a vector
-        environment.
-        """
+        """Names of all scenes (of sequences: frames), by a vector environment's ``scene_id``."""
         return self.core.scene_ids
 
     @property
     def module_names(self) -> tuple[str, ...]:
-        """Steps of the simulator, joined by ``"+"``, by ``info["modules"]`` of a vector
-        environment.
-        """
+        """Steps of the simulator, joined by ``"+"``, by a vector environment's ``modules``."""
         return (*MODULES, RECORDED)
 
     @property
@@ -332,7 +325,7 @@ class AutoExposureBase(SpecProperty):
         return self.core.options.delays
 
     def episode(self, env_index: int = 0) -> Episode:
-        """The drawn values of an environment's episode, and its current frame and state."""
+        """What was drawn for an environment's episode, and its current frame and state."""
         return self.core.episode(env_index)
 
     def scene(self, env_index: int = 0) -> Scene:
@@ -510,21 +503,23 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         chosen = check_options(options)
         super().reset(seed=check_seed(seed))
         self.core.begin(_FIRST, [self.np_random], [chosen])
-        self._last = self.core.observe(_FIRST)
-        return _first(self._last.observation), self.info_of(self._last.info, 0)
+        return self._observe()
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
         ended = self.core.transition(_FIRST, check_actions("action", action, ())[None])
+        observation, info = self._observe()
+        assert self._last is not None
+        return observation, float(self._last.reward[0]), bool(ended[0]), False, info
+
+    def _observe(self) -> tuple[Observation, dict[str, Any]]:
         self._last = self.core.observe(_FIRST)
-        info = self.info_of(self._last.info, 0)
-        reward = float(self._last.reward[0])
-        return _first(self._last.observation), reward, bool(ended[0]), False, info
+        observation = {name: values[0] for name, values in self._last.observation.items()}
+        return observation, self.info_of(self._last.info, 0)
 
     def action_masks(self) -> np.ndarray:
         """(S,) bool: states that the scene allows."""
-        mask: np.ndarray = self.core.action_masks(_FIRST)[0]
-        return mask
+        return np.asarray(self.core.action_masks(_FIRST)[0])
 
     def expected_scores(self) -> np.ndarray:
         """(S,) float64: expectation over noise of every state's score in the current frame."""
@@ -537,10 +532,6 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         """
         pictures = self._pictures(1)
         return None if pictures is None else pictures[0]
-
-
-def _first(observation: Observation) -> Observation:
-    return {name: values[0] for name, values in observation.items()}
 
 
 def _row(columns: dict[str, Any], row: int) -> dict[str, Any]:

@@ -132,9 +132,7 @@ class EnvOptions:
         if self.simulator is not None:
             check_weights(self.simulator)
         if not isinstance(self.costs, Mapping):
-            raise ValueError(
-                f"`costs` (={self.costs!r}) must map names of {list(COSTS)} to weights"
-            )
+            raise ValueError(f"`costs` (={self.costs!r}) must map some of {COSTS} to weights")
         for name, weight in self.costs.items():
             check_word("costs", name, COSTS)
             check_number(f"costs[{name!r}]", weight, 0.0, MAX_COST)
@@ -168,11 +166,7 @@ class EnvOptions:
 
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
-        """Options from the entries of a file or another mapping.
-
-        Raises:
-            ValueError: If one is unknown; the message proposes the nearest name.
-        """
+        """Options from a mapping; a `ValueError` for an unknown one proposes the nearest name."""
         known = [f.name for f in fields(cls)]
         for name in kwargs:
             if name not in known:
@@ -250,10 +244,10 @@ class EnvOptions:
 def takes_env_arguments(
     without: Collection[str] = (), **defaults: Any
 ) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Decorates a constructor that passes `EnvArguments` on.
+    """Decorates a constructor that passes `EnvArguments` on: its signature shows all of them.
 
-    Its signature shows all of them. An unknown one stays Python's own `TypeError` with its wording,
-    which Gymnasium's consumers look for; the message proposes the nearest name.
+    An unknown one stays Python's own `TypeError` with its wording, which Gymnasium's consumers look
+    for; the message proposes the nearest name.
 
     Args:
         without: Arguments that the task does not have.
@@ -292,11 +286,7 @@ def takes_env_arguments(
 
 
 def checked_delay(delay: Any) -> int | dict[str, int]:
-    """`delay` with Python's integers; a mapping of equal ones, of all controls, as one.
-
-    Raises:
-        ValueError: If it is neither, or names no control.
-    """
+    """`delay` with Python's integers, one of all controls where they are equal."""
     if not isinstance(delay, Mapping):
         more = f" frames, or a mapping of them by {list(CONTROLS)}"
         return check_integer("delay", delay, 0, MAX_DELAY, more=more)

@@ -47,11 +47,7 @@ class InProcessSpec(EnvSpec):
     """Spec of an environment with an argument, such as a callable, that JSON cannot hold."""
 
     def to_json(self) -> str:
-        """Raises, and names the argument.
-
-        Raises:
-            ValueError: Always.
-        """
+        """Raises a `ValueError` that names the argument."""
         for name, value in self.kwargs.items():
             if not _is_json(value):
                 raise ValueError(

@@ -137,20 +137,10 @@ class _Truth:
 class ExposureBracket(Task):
     """Merges the frames of an episode, and rewards what each adds to the quality.
 
-    The frame of the reset is the viewfinder's, metered and not merged. The camera's shake between
-    frames is taken out, as bursts are aligned before they are merged; a subject that moves on its
-    own is elsewhere in each frame. The scorer, costs, lighting and delay of the options are not
-    used.
-
-    Args:
-        episodes: The episodes, with their scenes and options.
-        unused: What else a task is given.
-        budget: Time that all frames of an episode may take together [s].
-        max_frames: Frames of an episode at most.
+    See `ExposureBracketEnv`, which has the limits. What else a task is given is not used.
 
     Attributes:
-        num_actions: The states, and to stop.
-        stop: The action that ends an episode.
+        stop: The action that ends an episode, behind those of the states.
 
     Raises:
         ValueError: If the scenes are recorded.
@@ -182,15 +172,12 @@ class ExposureBracket(Task):
         self._truths: dict[int, _Truth] = {}
         self._metered: dict[int, int] = {}  # state, by scene
         self._times = np.array([state.exposure_time for state in grid])
-        black, span = np.array(camera.black_level), np.array(camera.span)
-        self._black, self._span = (
-            torch.from_numpy(a.astype(np.float32))[:, None, None] for a in (black, span)
-        )
+        levels = torch.tensor([camera.black_level, camera.span], dtype=torch.float32)
+        self._black, self._span = levels[:, :, None, None]
 
     def columns(self) -> dict[str, np.ndarray]:
         """The frames taken, and what they are worth, n long each."""
-        mine = {name: value for name, value in vars(self).items() if name != "_times"}
-        return {name: value for name, value in mine.items() if isinstance(value, np.ndarray)}
+        return {n: v for n, v in vars(self).items() if isinstance(v, np.ndarray) and n != "_times"}
 
     def spaces(self) -> dict[str, gym.Space[Any]]:
         """``bracket`` is observed beside the latest frame."""
@@ -206,24 +193,20 @@ class ExposureBracket(Task):
     def initial(self, env_indices: np.ndarray, options: Sequence[Mapping[str, Any]] | None) -> None:
         """Shows the viewfinder's frame at the metered state, or at the one asked for."""
         self._left[env_indices] = self.budget
-        for zeroed in (self._gains, self._clock, self._middle, self._first_middle, self._count):
-            zeroed[env_indices] = 0
-        for zeroed in (self._fresh, self._quality, self._error):
-            zeroed[env_indices] = 0
+        zeroed = self._gains, self._clock, self._middle, self._first_middle, self._count
+        for values in (*zeroed, self._fresh, self._quality, self._error):
+            values[env_indices] = 0
         for full in (self._unseen, self._white, self._noisy):
             full[env_indices] = 1.0
         for row, env_index in enumerate(env_indices.tolist()):
             if options is None or options[row].get("state") is None:
                 scene = self.episodes.scene.item(env_index)
                 if scene not in self._metered:
-                    self._metered[scene] = self._metered_state(self.episodes.scenes[scene])
+                    shown = self.episodes.scenes[scene]
+                    stops = math.log2(mean_anchor(shown.clean_light[1:3].mean(dim=0)))
+                    ev100 = -shown.reference.log2_exposure - stops
+                    self._metered[scene] = self.episodes.grid.nearest(ev100)
                 self.episodes.state[env_index] = self._metered[scene]
-
-    def _metered_state(self, scene: Scene) -> int:
-        """The state nearest to what an average meter reads."""
-        green = scene.clean_light[1:3].mean(dim=0)
-        ev100 = -scene.reference.log2_exposure - math.log2(mean_anchor(green))
-        return self.episodes.grid.nearest(ev100)
 
     # -- step ---------------------------------------------------------------------------------
 

@@ -1,8 +1,4 @@
-"""`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list.
-
-Flickering light (mains, dimmed LEDs, screens) changes within a frame, too: a rolling shutter makes
-bands of it.
-"""
+"""`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
-from simulator.utils.checks import check_integer, check_number, check_word
+from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
@@ -25,10 +21,8 @@ MAX_FRAMES = 2**20
 #: Depth of a lamp on the mains, where none is given.
 MAINS_DEPTH = 0.8
 #: Precision of the light of a row, relative to the lamp's long-term mean: smaller differences are
-#: rounding errors of float64.
-_RESOLUTION = 1e-12
-#: Least light of a row: its logarithm must be finite.
-_DARKEST = 2.0**-MAX_STOPS
+#: rounding errors of float64. The least light, whose logarithm must be finite.
+_RESOLUTION, _DARKEST = 1e-12, 2.0**-MAX_STOPS
 #: The lamp's clock restarts after this time [s]: beyond it, float64 does not resolve a period.
 _CLOCK = 1e8
 
@@ -118,13 +112,7 @@ class Lighting:
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure, row by row.
-
-        Args:
-            frame: See `gain`.
-            exposure_time: See `gain`.
-            phase: See `gain`.
-            shutter: How the frame is read.
+        """Light of an exposure as of `gain`, row by row of a frame that `shutter` reads.
 
         Returns:
             Mean relative light of the frame, and (rows,) float64 that of each row relative to this
@@ -147,14 +135,14 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     """
     if isinstance(spec, Lighting):
         return spec
-    if not isinstance(spec, str | Mapping):
+    options: dict[str, Any] = {"kind": spec} if isinstance(spec, str) else {}
+    if isinstance(spec, Mapping):
+        options = dict(spec)
+    if "kind" not in options:
         raise ValueError(
             f"`lighting` (={spec!r}) must be one of {sorted(KINDS)}, a mapping with a 'kind' of "
             "them, or a Lighting"
         )
-    options = {"kind": spec} if isinstance(spec, str) else dict(spec)
-    if "kind" not in options:
-        raise ValueError(f"`lighting` (={spec!r}) needs a 'kind', one of {sorted(KINDS)}")
     name = options.pop("kind")
     check_word("lighting", name, tuple(sorted(KINDS)))
     kind = KINDS[name]
@@ -257,10 +245,8 @@ class ScheduleLighting(Lighting):
     """The light changes by `ev[n]` stops in frame n, relative to the scene's; the last one holds.
 
     Args:
-        ev: One number per frame, within +- `MAX_STOPS`: a list, a tuple or a one-dimensional
-            array.
-        file: In place of `ev`, a text file with one number per line, or a CSV with a column
-            ``ev``.
+        ev: One number per frame, within +- `MAX_STOPS`: a list, tuple or one-dimensional array.
+        file: In place of `ev`, a text file with one number per line, or a CSV with a column ``ev``.
 
     >>> ScheduleLighting(ev=[0, -1, 2]).gain(7, 0.01, 0.0)
     4.0
@@ -294,22 +280,15 @@ class ScheduleLighting(Lighting):
 
 
 def _numbers(ev: Any) -> list[Any]:
-    if isinstance(ev, np.ndarray) and ev.ndim == 1:
-        return list(ev)
-    if isinstance(ev, Sequence) and not isinstance(ev, str | bytes):
+    is_list = isinstance(ev, Sequence) and not isinstance(ev, str | bytes)
+    if is_list or (isinstance(ev, np.ndarray) and ev.ndim == 1):
         return list(ev)
     raise ValueError(f"`lighting['ev']` (={ev!r}) must be a list of numbers, one per frame")
 
 
 def _read(file: Any) -> list[float]:
-    """The numbers of a file.
-
-    Raises:
-        ValueError: If it cannot be read, or a row holds no finite number.
-    """
     rule = f"`lighting['file']` (={str(file)!r})"
-    if not isinstance(file, str | Path):
-        raise ValueError(f"{rule} must be a path")
+    check_type("lighting['file']", file, str, Path)
     try:
         text = Path(file).expanduser().read_text(encoding="utf-8-sig")
         rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
@@ -365,7 +344,7 @@ class FlickerLighting(Lighting):
     frame_rate: float = 30.0
 
     def lamp(self, phase: float) -> Lamp:
-        """The part of the light that flickers, with `phase` as of `gain`."""
+        """The part of the light that flickers, at a `phase` as of `gain`."""
         if self.duty is None:
             return MainsLamp(frequency=self.frequency, phase=phase)
         return PulsedLamp(frequency=self.frequency, duty=self.duty, phase=phase)

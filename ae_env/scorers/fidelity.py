@@ -49,9 +49,8 @@ class Fidelity:
     depends_on: DependsOn = "image"
     version = 1
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         first, which = distinct_references(captures)
         ideal = [_lab(picture) for picture in reference_pictures(captures, first)]
         scores = [
@@ -80,12 +79,7 @@ def _lab(picture: torch.Tensor) -> np.ndarray:
 
 
 def reference_pictures(captures: Captures, which: list[int]) -> torch.Tensor:
-    """sRGB (N, 3, H, W) of the captures' scenes at the right exposure, without noise and blur.
-
-    Args:
-        captures: The captures.
-        which: Indices of N of them.
-    """
+    """sRGB (N, 3, H, W) of N captures' scenes at the right exposure, without noise and blur."""
     ratio = captures.ratio * torch.exp2(captures.ev100 - captures.proper_ev)
     light = captures.scene_light[which] * ratio[which].to(captures.scene_light)[:, None, None, None]
     return developed(
@@ -126,8 +120,7 @@ def opencv() -> Any:
     return cv2
 
 
-def luma_bytes(images: torch.Tensor) -> np.ndarray:
-    """Luma (B, H, W) uint8 of sRGB pictures (B, 3, H, W) in [0, 1]."""
+def _luma_bytes(images: torch.Tensor) -> np.ndarray:
     return luma_of(images).clamp(0.0, 1.0).mul(255.0).round().to("cpu", torch.uint8).numpy()
 
 
@@ -146,7 +139,7 @@ def _inside(height: int, width: int) -> int:
 
 
 class _OrbScorer:
-    """Base of scorers by ORB keypoints."""
+    """Base of scorers by ORB keypoints; an `ImportError` where OpenCV is not installed."""
 
     domain: Domain = "srgb"
     depends_on: DependsOn = "image"
@@ -164,17 +157,13 @@ class Keypoints(_OrbScorer):
     threshold of 20 of 255, patches and a border of 15 pixels, and at most 60 keypoints per 1000
     pixels. A frame of 30 pixels a side or less has none. ORB takes strong noise for corners: pair
     it with ``noise``, or use ``matches``.
-
-    Raises:
-        ImportError: If OpenCV is not installed.
     """
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         height, width = images.shape[2:]
         orb = _detector(height, width)
-        counts = [len(orb.detect(picture, None)) for picture in luma_bytes(images)]
+        counts = [len(orb.detect(picture, None)) for picture in _luma_bytes(images)]
         typical = _inside(height, width) * TYPICAL_PER_1000 / 1000.0
         return 1.0 - torch.exp(-torch.tensor(counts, dtype=torch.float64) / typical)
 
@@ -188,14 +177,10 @@ class Matches(_OrbScorer):
     scene from the same place, so a match is an inlier where its two ends lie within 1/64 of the
     picture's height: the true transform is the identity and need not be estimated by RANSAC.
     Without a keypoint in the reference the score is 0 in every state.
-
-    Raises:
-        ImportError: If OpenCV is not installed.
     """
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         cv2 = opencv()
         height, width = images.shape[2:]
         orb = _detector(height, width, MOST_MATCHED)
@@ -203,10 +188,10 @@ class Matches(_OrbScorer):
         first, which = distinct_references(captures)
         references = [
             orb.detectAndCompute(picture, None)
-            for picture in luma_bytes(reference_pictures(captures, first))
+            for picture in _luma_bytes(reference_pictures(captures, first))
         ]
         scores = []
-        for picture, reference in zip(luma_bytes(images), which, strict=True):
+        for picture, reference in zip(_luma_bytes(images), which, strict=True):
             points, descriptors = orb.detectAndCompute(picture, None)
             known, wanted = references[reference]
             if descriptors is None or wanted is None:

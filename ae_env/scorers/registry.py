@@ -63,9 +63,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
 
 
 def register_scorer(name: str) -> Callable[[Factory], Factory]:
-    """Class decorator that makes a scorer known as `name`.
-
-    Registering the same class again (a notebook cell run twice) replaces it.
+    """Class decorator that makes a scorer known as `name`; the latest one counts (notebooks).
 
     Raises:
         ValueError: If `name` is not an identifier or belongs to a built-in scorer.
@@ -108,13 +106,7 @@ def scorer_entry_points() -> list[EntryPoint]:
     return list(entry_points(group=ENTRY_POINT_GROUP))
 
 
-def registered_scorer(name: str) -> Callable[[], Any] | None:
-    """The class that is registered as `name`, or None."""
-    return _REGISTRY.get(name)
-
-
 def _find_scorer(name: str) -> Any:
-    """The scorer of a name; `CompositeScorer` checks that it is one."""
     factory = _REGISTRY.get(name)
     if factory is not None:
         # The errors of this package's own scorers are clear already.
@@ -133,10 +125,9 @@ def _find_scorer(name: str) -> Any:
     if attribute:
         return _instantiate(name, load_attribute(name, rule))
     known = list_scorers()
-    hint = did_you_mean(name, known)
     raise ValueError(
-        f"`scorer` (={name!r}) must be one of {known}, 'package.module:name', 'my_file.py:name' "
-        f"or 'pyiqa:metric'{hint}"
+        f"{rule} must be one of {known}, 'package.module:name', 'my_file.py:name' or "
+        f"'pyiqa:metric'{did_you_mean(name, known)}"
     )
 
 
@@ -155,15 +146,12 @@ def _instantiate(name: str, found: Any) -> Any:
 
 
 def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
-    """A scorer from a name, a mapping of names to weights, or a callable.
+    """A scorer, of one part or more, from a name, a mapping of names to weights, or a callable.
 
     Args:
         spec: A registered name, ``"package.module:name"``, ``"path/to/my_file.py:name"``,
             ``"pyiqa:metric"``, a mapping such as ``{"noise": 0.5, "my_file.py:MyScore": 0.5}``
             (weighted mean), or a callable ``(images, captures) -> (B,)``.
-
-    Returns:
-        A composite of one or more parts.
 
     Raises:
         ValueError: If a name is unknown (the nearest is proposed) or cannot be loaded (the cause is
@@ -188,15 +176,14 @@ def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
 
 
 def _weighted_mean(spec: Mapping[str, float]) -> CompositeScorer:
-    rule = f"`scorer` (={dict(spec)!r}) must map"
-    if not spec or not all(isinstance(name, str) for name in spec):
-        raise ValueError(f"{rule} one name or more to weights, as {{'noise': 0.5}} does")
-    for weight in spec.values():
-        known = isinstance(weight, Real) and not isinstance(weight, bool)
-        if not (known and 0 < weight < math.inf):
-            raise ValueError(f"{rule} names to weights, which must all be > 0 and finite")
-    if len({_short(name) for name in spec}) < len(spec):
-        raise ValueError(f"{rule} names that differ behind the colon, too")
+    names = [_short(name) for name in spec if isinstance(name, str)]
+    weights = [weight for weight in spec.values() if isinstance(weight, Real)]
+    fit = all(0 < w < math.inf and not isinstance(w, bool) for w in weights)
+    if not (spec and fit and len(spec) == len(set(names)) == len(weights)):
+        raise ValueError(
+            f"`scorer` (={dict(spec)!r}) must map one name or more, which differ behind the colon, "
+            "to weights > 0 and finite, as {'noise': 0.5} does"
+        )
     parts = {_short(name): _find_scorer(name) for name in spec}
     return CompositeScorer(parts, {_short(name): float(w) for name, w in spec.items()})
 
@@ -267,7 +254,7 @@ def describe_scorers() -> list[ScorerRow]:
     points = {point.name: point for point in reversed(scorer_entry_points())}
     rows = []
     for name in list_scorers():
-        factory = registered_scorer(name)
+        factory = _REGISTRY.get(name)
         if factory is None:
             point = points[name]
             package = point.dist.name if point.dist is not None else point.module.partition(".")[0]
@@ -288,7 +275,6 @@ def describe_scorers() -> list[ScorerRow]:
 
 
 def _made(name: str) -> Any:
-    """The scorer of that name, without the composite that `make_scorer` puts around one."""
     scorer = make_scorer(name)
     parts = list(scorer.parts.values())
     return parts[0] if len(parts) == 1 and list(scorer.parts) == [name] else scorer

@@ -1,9 +1,8 @@
 """Expected scores of every exposure state of a scene.
 
-``q(s)`` is the expectation, over noise, of the score of a capture at state s. Where a part of the
-scorer has that in closed form it is used (of the terms that are measured on frames, to the first
-order: see `ae_env.scorers.terms`); other parts are averaged over common noise seeds, with
-their standard error.
+``q(s)`` is the expectation, over noise, of the score of a capture at state s. Parts of the scorer
+that have it in closed form (to the first order those that are measured on frames, see
+`ae_env.scorers.terms`) use it; other parts are averaged over common noise seeds.
 """
 
 from __future__ import annotations
@@ -59,10 +58,9 @@ class ScoreTable:
 
     @cached_property
     def oracle(self) -> int:
-        """The best state that is allowed; ties go to the lower index, that is the lower ISO.
+        """The best allowed state; of those within `TIE` of it, the one of the lowest index and ISO.
 
-        States of equal exposure score alike but for the rounding of their settings: a tie is
-        whatever comes within `TIE` of the best.
+        States of equal exposure score alike but for the rounding of their settings.
         """
         mean = self.mean if self.allowed is None else np.where(self.allowed, self.mean, -np.inf)
         return int(np.argmax(mean >= mean.max() - TIE))
@@ -115,9 +113,7 @@ class ScoreTables:
 
         Args:
             scene: The scene.
-            speed: See `prepare_scene`.
-            defocus: See `prepare_scene`.
-            movement: See `prepare_scene`.
+            speed, defocus, movement: See `prepare_scene`.
             gain: Light relative to the scene's own; (S,) where it depends on the state, as in
                 flickering light.
             row_gain: (S, H) light of each row relative to that, see `Captures`.
@@ -156,12 +152,9 @@ class ScoreTables:
     def _recorded_table(
         self, scene: Scene, prepared: PreparedScene, parts: dict[str, np.ndarray]
     ) -> ScoreTable:
-        """Scores of the captures that there are; 0 where there is none.
+        """Scores of the captures that there are, `Scene.recorded`; 0 where there is none.
 
-        Args:
-            scene: With `Scene.recorded`.
-            prepared: Its merged light.
-            parts: Scores of the parts that look at no frame.
+        `prepared` is their merged light, `parts` have the scores of those that look at no frame.
         """
         frames, allowed = scene.recorded, scene.allowed
         assert frames is not None

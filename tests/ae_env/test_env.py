@@ -138,16 +138,6 @@ def test_costs_are_subtracted_and_shown() -> None:
         before = mean
 
 
-def test_oracle_and_regret_agree_with_the_expected_scores() -> None:
-    env = make_env(with_oracle=True)
-    for seed in range(3):
-        env.reset(seed=seed)
-        info = env.step(30)[4]
-        scores = env.unwrapped.expected_scores()
-        assert scores[info["oracle_state"]] == pytest.approx(scores.max(), abs=1e-7)
-        assert info["regret"] == pytest.approx(scores.max() - scores[30])
-
-
 def test_clipped_fractions_are_those_of_the_frame() -> None:
     env = make_env(observation="linear")
     for state in (0, 63):  # the darkest but for ISO and aperture, and the brightest

@@ -15,7 +15,7 @@ from ae_env.observation import decode_observation
 from ae_env.rendering import _Sheet
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
-from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from ae_env.scorers.score_table import ScoreTables
 from simulator import develop, get_camera
 from tests.ae_env.environments import make_env
 from tests.ae_env.scorer_images import make_scene
@@ -53,25 +53,6 @@ def test_frame_is_the_developed_capture_enlarged(kind: str) -> None:
     above_the_caption = slice(2, 200, 4)
     difference = picture[above_the_caption, 2::4].astype(int) - expected[: 200 // 4]
     assert np.abs(difference).max() <= 1
-
-
-def _layout(grid: ExposureGrid) -> _Sheet:
-    table = ScoreTable(np.linspace(0, 1, len(grid)), np.zeros(len(grid)), {})
-    return _Sheet(grid, table, [Image.new("RGB", (64, 64))] * len(grid), {})
-
-
-def test_time_grows_to_the_right_and_f_number_downwards_in_a_panel_per_iso() -> None:
-    grid = ExposureGrid.default()
-    sheet = _layout(grid)
-    width, height = sheet.thumb
-    for state in range(64):
-        iso, time, aperture = grid.controls(state)
-        x, y = sheet.corner(state)
-        left, top = sheet.panel_corner(*divmod(int(iso), 2))
-        assert (x - left, y - top) == (int(time) * (width + 4), int(aperture) * (height + 4))
-    corners = np.array([sheet.corner(s) for s in range(64)])
-    apart = np.abs(corners[:, None] - corners[None]).max(-1) >= min(width, height)
-    assert (apart | np.eye(64, dtype=bool)).all()  # no picture covers another
 
 
 def test_paths_are_drawn_in_their_own_colours() -> None:
@@ -113,9 +94,12 @@ def test_border_shows_the_score_and_the_oracle_is_framed() -> None:
     assert image.mode == "RGB"
     np.testing.assert_array_equal(sheet, np.asarray(contact_sheet(scene, grid=SMALL, seed=3)))
     table = ScoreTables(SMALL, CAMERA, make_scorer("balanced")).table(scene)
-    layout = _layout(SMALL)
-    for state in range(8):
-        x, y = layout.corner(state)
+    # Private: where each state's picture is.
+    layout = _Sheet(SMALL, table, [Image.new("RGB", (64, 64))] * 8, {})
+    corners = np.array([layout.corner(state) for state in range(8)])
+    apart = np.abs(corners[:, None] - corners[None]).max(-1) >= min(layout.thumb)
+    assert (apart | np.eye(8, dtype=bool)).all()  # no picture covers another
+    for state, (x, y) in enumerate(corners):
         assert (sheet[y - 1, x + 40].min() > 200) == (state == table.oracle)
         if state != table.oracle:
             expected = colormaps["viridis"](table.mean[state] / table.mean.max(), bytes=True)[:3]

@@ -23,8 +23,9 @@ RICH = {"with_oracle": True, "observation": "linear", "lighting": "sine", "delay
 RICH["costs"] = {"flicker": 0.1, "switch": 0.1}
 
 
-@pytest.mark.parametrize("mode", [mode.name for mode in AutoresetMode])
-@pytest.mark.parametrize("extra", [{}, RICH])
+@pytest.mark.parametrize(
+    ("mode", "extra"), [(mode.name, RICH) for mode in AutoresetMode] + [("SAME_STEP", {})]
+)
 def test_parity_with_sync_vector_env(mode: str, extra: dict[str, Any]) -> None:
     check_parity(11, 9, mode, max_episode_steps=3, **extra)
 
@@ -135,7 +136,7 @@ def test_workers_that_are_forked_from_a_process_with_environments(tmp_path: Path
     code = (
         "import gymnasium as gym\n"
         "envs = gym.make_vec('ae_env:ae_env/AutoExposure-v0', num_envs=2,"
-        " vectorization_mode='async', scenes='bundled:snow')\n"
+        " vectorization_mode='async', scenes='bundled:snow', split='test', resolution=36)\n"
         "envs.reset(seed=0)\n"
         "print(envs.step([3, 40])[1].shape)\n"
         "envs.close()\n"
@@ -143,9 +144,7 @@ def test_workers_that_are_forked_from_a_process_with_environments(tmp_path: Path
     variables = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
     variables["AE_ENV_CACHE"] = str(tmp_path)
     command = [sys.executable, "-c", code]
-    done = subprocess.run(
-        command, env=variables, capture_output=True, text=True, timeout=300, check=False
-    )
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout) == (0, "(2,)\n"), done.stderr
 
 

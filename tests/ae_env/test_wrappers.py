@@ -97,16 +97,13 @@ def test_odd_actions_and_other_environments_are_refused(single: type, vector: ty
     one, many = single(make_env()), vector(make_envs())
     one.reset(seed=0)
     many.reset(seed=0)
-    odd = [None, True, "x", {}, object(), b"x", 1, [1, 1], [1, 1, math.nan], [1, 1, "x"]]
-    odd += [[1, 1, None], [1, 1, math.inf], [[1], [1, 1]], np.ones(3, bool), np.ones(3, complex)]
-    if single is not ContinuousActions:
-        odd += [[0, 0, -1], [0, 0, 4], [0, 0, 10**30], np.ones(3)]
+    odd = [None, "x", 1, [1, 1], [1, 1, math.nan], [1, 1, "x"], [[1], [1, 1]], [True] * 3]
+    odd += [[1, 1, 1j]] if single is ContinuousActions else [[0, 0, -1], [0, 0, 4], [0.0] * 3]
     for action in odd:
         with pytest.raises(ValueError, match="`action`"):
             one.action(action)
-        rows = [[1, 1, 1], [1, 1, 1], action]
         with pytest.raises(ValueError, match="`action`"):
-            many.actions(rows if not isinstance(action, np.ndarray) else np.stack([action] * 3))
+            many.actions([action] * 3)
     for make, message in (
         (lambda: single(gym.make("CartPole-v1")), "`env`"),
         (lambda: single(one), "wrapped already"),

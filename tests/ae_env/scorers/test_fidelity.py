@@ -58,22 +58,6 @@ def test_what_a_camera_does_costs():
     assert scorer.parts["fidelity"](1.0 - pictures[:1], make_captures(scene, [state]))[0] < 0.3
 
 
-def test_the_right_exposure_wins_and_noise_is_seen():
-    """Through the simulator: of whole stops the right one scores best, low ISO above high."""
-    scene = random_scene(illuminance=1000.0)
-    proper = math.log2(1000 / 2.5)
-    times = [2.0 ** -(proper - 4 + stop) for stop in (-4, -2, 0, 2, 4)]
-    states = [CameraSettings(100, t, 4) for t in times]
-    states.append(CameraSettings(6400, times[2] / 64, 4))
-    captures = make_captures(scene, states)
-    frames = scene.prepared.expose(states, seed=0).clamp(0.0, 1.0)
-    scores = make_scorer("fidelity")(frames, captures).tolist()
-    assert np.argmax(scores) == 2
-    assert scores[2] > scores[1] > scores[0]
-    assert scores[2] > scores[3] > scores[4]
-    assert scores[5] < scores[2] - 0.02
-
-
 EV = incident_ev100(1000.0)
 needs_opencv = pytest.mark.skipif(find_spec("cv2") is None, reason="needs the extra cv")
 
@@ -127,7 +111,7 @@ def test_each_capture_is_compared_with_its_own_scene() -> None:
 
 @needs_opencv
 @pytest.mark.parametrize("name", ["keypoints", "matches"])
-@pytest.mark.parametrize("size", [(1, 1), (2, 31), (37, 64), (65, 41)])
+@pytest.mark.parametrize("size", [(1, 1), (37, 64)])
 def test_any_frame_is_scored(name: str, size: tuple[int, int]) -> None:
     light = np.full(size, 0.1)
     captures = make_captures(_scene(light), [GRID[20]] * 3)
