@@ -74,10 +74,10 @@ class CameraProfile:
     bit_depth: int
     make: str = "unknown"
     model: str = "unknown"
-    nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict)
-    read_noise_by_iso: Mapping[float, ReadNoise] = field(default_factory=dict)
-    segments: tuple[float, ...] = ()
-    colour_matrix: tuple[tuple[float, float, float], ...] | None = None
+    nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict, hash=False)
+    read_noise_by_iso: Mapping[float, ReadNoise] = field(default_factory=dict, hash=False)
+    segments: tuple[float, ...] = field(default=(), hash=False)
+    colour_matrix: tuple[tuple[float, float, float], ...] | None = field(default=None, hash=False)
     colour_matrix_source: str = ""
     pixel_pitch_um: float | None = None
     row_time: float = 0.0
@@ -198,9 +198,6 @@ class CameraProfile:
     def with_nlf(self, iso: float, nlf: NoiseLevelFunction) -> CameraProfile:
         """This camera with its noise calibrated by one measurement at `iso`."""
         return replace(self, nlf_by_iso={float(iso): nlf}, segments=(), source=nlf.source)
-
-    def __hash__(self) -> int:
-        return hash((self.name, self.cfa, self.black_level, self.white_level))
 
 
 def _check_iso(iso: float) -> None:

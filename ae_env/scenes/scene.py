@@ -19,7 +19,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
-from simulator.settings import CameraSettings, incident_ev100
+from simulator.settings import LUX_AT_EV0, CameraSettings
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
@@ -171,7 +171,7 @@ class Scene:
         white, as a meter on the sensor sees it) is 0.12.
         """
         if self.illuminance is not None:
-            return incident_ev100(self.illuminance)
+            return math.log2(self.illuminance / LUX_AT_EV0)  # `incident_ev100`, checked before
         green = self.light[1:3].mean(dim=0)
         return -self.reference.log2_exposure - math.log2(mean_anchor(green))
 

@@ -252,9 +252,6 @@ class CaptureBatch:
             # Scenes that are shown several times share their light, but not what is blurred of it.
             light = scene.blurred_light.copy(pool=self._pool)
             scene = self._scenes[index] = scene.changed(blurred_light=light)
-            if len(scene.targets) < len(self.states):  # else another episode asked for them
-                for settings in self.states:
-                    scene.targets[settings]
         return scene
 
     # -- planning -----------------------------------------------------------------------------

@@ -20,7 +20,6 @@ from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.exposure import (
     DEFAULT_TOLERANCE,
     Exposure,
-    Targets,
     check_tolerance,
     decide,
     disc_px,
@@ -220,7 +219,6 @@ class PreparedScene:
     layout: Layout | None = None
     tolerance: float = DEFAULT_TOLERANCE
     blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
-    targets: Targets = field(init=False)
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
@@ -250,8 +248,6 @@ class PreparedScene:
                 f"width of `light`, {tuple(self.light.shape[-2:])}"
             )
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
-        targets = Targets(self.reference, self.camera, self.box_factor)
-        object.__setattr__(self, "targets", targets)
 
     def changed(self, **values: Any) -> PreparedScene:
         """A copy of the same light and camera with other values, which are known to be right.
