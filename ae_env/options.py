@@ -100,14 +100,12 @@ class EnvOptions:
             object.__setattr__(self, "costs", {})
         if isinstance(self.scenes, str) and not self.scenes:
             raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
-        check_word("split", self.split, get_args(Split))
-        check_word("observation", self.observation, get_args(ObservationKind))
-        check_word("crop", self.crop, get_args(Crop))
-        check_word("reward", self.reward, get_args(Reward))
-        check_word("source", self.source, get_args(Source))
+        kinds = {"split": Split, "observation": ObservationKind, "crop": Crop}
+        for name, kind in (kinds | {"reward": Reward, "source": Source}).items():
+            check_word(name, getattr(self, name), get_args(kind))
         check_word("noise", self.noise, get_args(Noise), True, False)  # True is "bank"
-        check_flag("sensors", self.sensors)
-        check_flag("with_oracle", self.with_oracle)
+        for name in ("sensors", "with_oracle"):
+            check_flag(name, getattr(self, name))
         check_tolerance(self.tolerance)
         why = ": the default CNNs of RL libraries take no smaller image"
         resolution = check_integer("resolution", self.resolution, MIN_RESOLUTION, 4096, more=why)
@@ -141,13 +139,8 @@ class EnvOptions:
 
     def _check_recorded(self) -> None:
         """Real captures have the light, the motion and the noise that they have."""
-        defaults = {
-            "motion": ("random", "none"),
-            "depth": ("random", "far"),
-            "lighting": ("static",),
-            "noise": (True,),
-            "source": ("light",),
-        }
+        defaults: dict[str, tuple[Any, ...]] = {"lighting": ("static",), "source": ("light",)}
+        defaults |= {"motion": ("random", "none"), "depth": ("random", "far"), "noise": (True,)}
         for name, allowed in defaults.items():
             value = getattr(self, name)
             if not any(value is word or value == word for word in allowed):

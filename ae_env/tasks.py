@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from torch.nn.functional import pad
+from scipy import ndimage
 
 from ae_env.env import AutoExposureBase, AutoExposureEnv
 from ae_env.episodes.core import FrameBatch, Task
@@ -344,7 +344,7 @@ def displaced(scene: Scene, rows: int, columns: int) -> Scene:
     if layout is None or layout.subject is None:
         return scene
     there = Taps(np.full(4, -rows), np.full(4, -columns), _STAY.weights)
-    mask = _shifted(layout.mask, rows, columns)
+    mask = torch.from_numpy(ndimage.shift(layout.mask.numpy(), (0, rows, columns), order=0))
     behind = layout.behind
 
     def moved(planes: torch.Tensor) -> torch.Tensor:
@@ -359,20 +359,10 @@ def displaced(scene: Scene, rows: int, columns: int) -> Scene:
     return replace(scene, light=moved(scene.light), denoised=denoised, layout=new)
 
 
-def _shifted(planes: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
-    """`planes` (P, H, W) further down and right, 0 where nothing comes from."""
-    height, width = planes.shape[1:]
-    # Padded on the side where nothing comes from, cut off on the other.
-    grown = pad(planes, (max(columns, 0), max(-columns, 0), max(rows, 0), max(-rows, 0)))
-    return grown[:, max(-rows, 0) :, max(-columns, 0) :][:, :height, :width]
-
-
 class _Bracket(AutoExposureBase):
     """The limits that both environments of the bracket task add."""
 
-    #: Time that all frames of an episode may take together [s].
     budget: float
-    #: Frames of an episode at most.
     max_frames: int
 
     def _set_limits(self, budget: float, max_frames: int) -> None:
@@ -488,8 +478,7 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
 class ExposureBracketVectorEnv(_Bracket, AutoExposureVectorEnv):
     """`num_envs` episodes of `ExposureBracketEnv`, photographed in batches.
 
-    All other arguments are those of `AutoExposureVectorEnv`, but for those that the task does not
-    have.
+    All other arguments are those of `AutoExposureVectorEnv` that the task has.
     """
 
     @takes_env_arguments(WITHOUT, **BRACKET)

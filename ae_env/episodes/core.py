@@ -88,9 +88,6 @@ class Task:
     Here every action takes a frame, moves nothing else, and no episode ends by itself; a task gives
     at least `measure`, `reward` and `score_table`.
 
-    Args:
-        episodes: The episodes, with their scenes and options.
-
     Attributes:
         num_actions: Number of actions; those below the number of states take a frame there.
         outputs: Outputs of `FrameSource.record` that `measure` reads.
@@ -225,7 +222,6 @@ class EpisodeCore:
         return _restored(*self._restorable(self.scenes))
 
     def _restorable(self, scenes: Sequence[Scene] | None) -> tuple[Any, ...]:
-        """Arguments of `_restored`, which copies the columns."""
         arguments = self.options, len(self.episodes.begun), self._make_task, scenes
         return arguments, self.episodes.columns(), self.task.columns()
 
@@ -290,11 +286,7 @@ class EpisodeCore:
     # -- step ---------------------------------------------------------------------------------
 
     def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Advances the episodes of `env_indices` (K,) by one frame.
-
-        Args:
-            env_indices: Whose turn it is.
-            actions: (K,) their actions, integers; applied after the delay.
+        """Advances the episodes of `env_indices` (K,) by one frame, each with its action.
 
         Returns:
             (K,) bool, which episodes have ended with it.
@@ -427,11 +419,7 @@ class EpisodeCore:
 
 
 def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """`actions` as an array.
-
-    Raises:
-        ValueError: Unless they are integers of `shape`, () for a single one.
-    """
+    """`actions` as an array; a `ValueError` unless they are integers of `shape`, () for one."""
     try:
         array = np.asarray(actions)
     except ValueError:  # rows of different lengths

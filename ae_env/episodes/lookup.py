@@ -17,8 +17,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
-RECORDED = "recorded"
-_MODULE = len(MODULES)
+RECORDED, _MODULE = "recorded", len(MODULES)
 #: Signal up to which a sample counts as clipped low.
 _LOW = 2.0**-10
 

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from ae_env.scorers import defects, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
-from ae_env.scorers.terms import CompositeScorer
+from ae_env.scorers.terms import CompositeScorer, check_part
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
@@ -228,16 +228,16 @@ def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
 
 @dataclass(frozen=True)
 class ScorerRow:
-    """One scorer.
+    """One scorer; a field is empty where it is unknown, or there is nothing to say.
 
     Args:
         name: The name that `make_scorer` takes.
-        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``; empty if unknown.
-        depends_on: ``"image"``, ``"light"`` or ``"blur"``; empty if unknown.
-        needs: File or package that does not come with this one; empty if it needs none.
+        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``.
+        depends_on: ``"image"``, ``"light"`` or ``"blur"``.
+        needs: File or package that does not come with this one.
         summary: First line of its docstring.
         package: The package that it comes from.
-        error: Why it cannot be loaded; empty if it can, or if only what it needs is missing.
+        error: Why it cannot be loaded, unless only what it needs is missing.
     """
 
     name: str
@@ -263,7 +263,8 @@ def describe_scorers() -> list[ScorerRow]:
         needs = getattr(factory, "needs", "")
         try:
             # Where a file may be missing, the class says everything.
-            found = factory if needs else _made(name)
+            found = factory if needs else _find_scorer(name)
+            check_part(name, found)
             rows.append(_row(name, found, package))
         except (Exception, SystemExit) as error:
             cause: BaseException = error
@@ -272,12 +273,6 @@ def describe_scorers() -> list[ScorerRow]:
             line = " ".join(f"{type(cause).__name__}: {cause}".split())
             rows.append(ScorerRow(name, package=package, error=line))
     return rows
-
-
-def _made(name: str) -> Any:
-    scorer = make_scorer(name)
-    parts = list(scorer.parts.values())
-    return parts[0] if len(parts) == 1 and list(scorer.parts) == [name] else scorer
 
 
 def _row(name: str, found: Any, package: str) -> ScorerRow:

@@ -61,7 +61,7 @@ class CompositeScorer:
         if not all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values()):
             raise ValueError(f"`weights` (={weights}) must all be > 0, and finite numbers")
         for name, part in parts.items():
-            _check_part(name, part)
+            check_part(name, part)
         total = sum(weights.values())
         self.parts = dict(parts)
         self.weights = {name: weight / total for name, weight in weights.items()}
@@ -97,7 +97,8 @@ class CompositeScorer:
 
         The images are developed to sRGB only if a part asks for it.
         """
-        views, scores = {"raw": images}, {}
+        views: dict[str, torch.Tensor | None] = {"raw": images}
+        scores = {}
         for name in self.names(*kinds):
             part = self.parts[name]
             view: torch.Tensor | None = None
@@ -150,7 +151,8 @@ def developed(
     return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
 
 
-def _check_part(name: str, part: Any) -> None:
+def check_part(name: str, part: Any) -> None:
+    """Raises a `ValueError` unless `part`, which is called `name`, is a scorer."""
     if not callable(part):
         raise ValueError(f"`scorer` (={name!r}) must be callable, got {type(part).__name__}")
     for attribute, known, value in (
