@@ -519,7 +519,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     def action_masks(self) -> np.ndarray:
         """(S,) bool: states that the scene allows."""
-        return np.asarray(self.core.action_masks(_FIRST)[0])
+        return np.asarray(self.core.task.allowed(_FIRST)[0])
 
     def expected_scores(self) -> np.ndarray:
         """(S,) float64: expectation over noise of every state's score in the current frame."""

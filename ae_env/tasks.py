@@ -21,7 +21,6 @@ from ae_env.episodes.core import FrameBatch, Task
 from ae_env.episodes.state import Episodes
 from ae_env.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from ae_env.options import EnvArguments, takes_env_arguments
-from ae_env.registration import TASKS
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.vector_env import AutoExposureVectorEnv
@@ -103,9 +102,7 @@ class AutoExposureVideoVectorEnv(AutoExposureVectorEnv):
     All arguments are those of `AutoExposureVectorEnv`, with the defaults of the task.
     """
 
-    __init__ = takes_env_arguments(
-        max_episode_steps=TASKS["ae_env/AutoExposureVideo-v0"][2], **VIDEO
-    )(AutoExposureVectorEnv.__init__)
+    __init__ = takes_env_arguments(max_episode_steps=96, **VIDEO)(AutoExposureVectorEnv.__init__)
 
 
 # -- brackets -------------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ class AutoExposureVectorEnv(
 
     def action_masks(self) -> np.ndarray:
         """(N, S) bool: states that the scene of each environment allows."""
-        return self.core.action_masks(self._all)
+        return self.core.task.allowed(self._all)
 
     def expected_scores(self) -> np.ndarray:
         """(N, S) float64: expected score of every state in the current frame of each episode."""

@@ -259,10 +259,6 @@ class EpisodeCore:
             spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         return gym.spaces.Dict(spaces | self.task.spaces())
 
-    def action_masks(self, env_indices: np.ndarray) -> np.ndarray:
-        """(B, A) bool: actions that the episodes allow; all of them before the first reset."""
-        return self.task.allowed(env_indices)
-
     # -- reset --------------------------------------------------------------------------------
 
     def begin(

@@ -107,7 +107,11 @@ class Lighting:
             exposure_time: Time the shutter is open [s].
             phase: The episode's own phase, in [0, 1).
         """
-        return 1.0
+        return float(2.0 ** self._stops(frame, phase))
+
+    def _stops(self, frame: int, phase: float) -> float:
+        """Change of a frame's light from the scene's [EV]."""
+        return 0.0
 
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
@@ -162,9 +166,8 @@ class StepLighting(Lighting):
     stops: float = -4.0
     at: int = 4
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        return float(2.0**self.stops) if frame >= self.at else 1.0
+    def _stops(self, frame: int, phase: float) -> float:
+        return self.stops if frame >= self.at else 0.0
 
 
 @dataclass(frozen=True)
@@ -175,10 +178,8 @@ class RampLighting(Lighting):
     stops: float = -4.0
     stops_per_frame: float = 0.5
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        change = min(abs(self.stops), self.stops_per_frame * frame)
-        return float(2.0 ** math.copysign(change, self.stops))
+    def _stops(self, frame: int, phase: float) -> float:
+        return math.copysign(min(abs(self.stops), self.stops_per_frame * frame), self.stops)
 
 
 @dataclass(frozen=True)
@@ -189,10 +190,8 @@ class SineLighting(Lighting):
     stops: float = 2.0
     period: float = 16.0
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        turn = frame / self.period + phase
-        return float(2.0 ** (self.stops * math.sin(2.0 * math.pi * turn)))
+    def _stops(self, frame: int, phase: float) -> float:
+        return self.stops * math.sin(2.0 * math.pi * (frame / self.period + phase))
 
 
 @dataclass(frozen=True)
@@ -210,10 +209,9 @@ class TunnelLighting(Lighting):
     leave: int = 10
     edge: int = 2
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
+    def _stops(self, frame: int, phase: float) -> float:
         inside, outside = self._share(frame - self.enter), self._share(frame - self.leave)
-        return float(2.0 ** (self.stops * (inside - outside)))
+        return self.stops * (inside - outside)
 
     def _share(self, frames: int) -> float:
         """Share of a change that has happened `frames` after its start."""
@@ -232,9 +230,8 @@ class LensCapLighting(Lighting):
     on: int = 2
     off: int = 5
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        return 2.0**self.stops if self.on <= frame < self.off else 1.0
+    def _stops(self, frame: int, phase: float) -> float:
+        return self.stops if self.on <= frame < self.off else 0.0
 
 
 # -- by a list of the user's -----------------------------------------------------------------------
@@ -273,10 +270,9 @@ class ScheduleLighting(Lighting):
         )
         object.__setattr__(self, "ev", checked)
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
+    def _stops(self, frame: int, phase: float) -> float:
         assert self.ev is not None
-        return float(2.0 ** self.ev[min(frame, len(self.ev) - 1)])
+        return float(self.ev[min(frame, len(self.ev) - 1)])
 
 
 def _numbers(ev: Any) -> list[Any]:

@@ -177,10 +177,8 @@ def asset_views(
     The light is sampled at the pitch of the photosites, 2 x `size` a side. Where a map has fewer
     pixels in a view, it is smooth at that pitch; averaged to half of them or less it is not.
     """
-    path = asset.path
-    if path is None:
-        raise FileNotFoundError(f"`asset` (={asset.name!r}) must be there: ae-env scenes download")
-    panorama = read_radiance(path)
+    assert asset.path is not None  # as `split_assets` makes sure
+    panorama = read_radiance(asset.path)
     # Light is summed over cells of a few pixels.
     height, width = (n // _CELL for n in panorama.shape[1:])
     cells = panorama[:, : height * _CELL, : width * _CELL]

@@ -21,7 +21,7 @@ from torch.nn.utils import fuse_conv_bn_eval
 from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.utils.user_files import UserCodeError
 from simulator.utils.cache import cache_dir
-from simulator.utils.checks import check_integer
+from simulator.utils.checks import check_integer, check_type
 
 
 def find_model_file(
@@ -299,8 +299,7 @@ class Classifier:
             self._model: Network | tuple[str, str] = model
             self.size = size or DEFAULT_SIZE
             return
-        if not isinstance(model, str | os.PathLike | None):
-            raise ValueError(f"`model` (={model!r}) must be an ONNX file, a callable or None")
+        check_type("model", model, str, os.PathLike, None)
         how = "an ONNX file of one input (B, 3, S, S) and an output (B, classes)"
         self._model = find_model_file("classifier", model, VARIABLE, "classifier.onnx", how=how)
         self.batch, own_size = _input_shape(*self._model)

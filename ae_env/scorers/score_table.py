@@ -7,13 +7,11 @@ that have it in closed form (to the first order those that are measured on frame
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
@@ -26,7 +24,6 @@ from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.optics.motion import ALONG_ROWS, Movement
-from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
 
 #: Memory for the blurred light of one table [byte].
@@ -212,21 +209,14 @@ class ScoreTables:
         for part in slices(len(self.states), CHUNK):
             states, rows = self.states[part], None if row_gain is None else row_gain[part]
             light: Any = {"gain": gains[part], "row_gain": rows}
-            captures = terms.captures.describe(scene, prepared, part, gain, row_gain)
-            scored = [
-                terms.torch_scores(images, captures, "image")
-                for images in self._images(prepared, states, **light)
-            ]
+            captures, scored = terms.captures.describe(scene, prepared, part, gain, row_gain), []
+            for seed in range(self.noise_seeds):
+                if self.noise:
+                    images = prepared.expose(states, seed=seed, **light)
+                else:
+                    images = clip_and_quantise(
+                        prepared.expected_sweep(states, **light), self.camera
+                    )
+                scored.append(terms.torch_scores(images.clamp_(0.0, 1.0), captures, "image"))
             chunks.append({name: np.stack([s[name] for s in scored]) for name in scored[0]})
         return {name: np.concatenate([c[name] for c in chunks], axis=1) for name in chunks[0]}
-
-    def _images(
-        self, prepared: PreparedScene, states: Sequence[CameraSettings], **light: Any
-    ) -> Iterable[torch.Tensor]:
-        """Captures (S, 4, H, W) in [0, 1] of `states`, one of each for every noise seed."""
-        if not self.noise:
-            signals = prepared.expected_sweep(states, **light)
-            yield clip_and_quantise(signals, self.camera).clamp_(0.0, 1.0)
-            return
-        for seed in range(self.noise_seeds):
-            yield prepared.expose(states, seed=seed, **light).clamp_(0.0, 1.0)

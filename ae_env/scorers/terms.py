@@ -56,10 +56,10 @@ class CompositeScorer:
         self, parts: Mapping[str, Scorer], weights: Mapping[str, float] | None = None
     ) -> None:
         weights = dict.fromkeys(parts, 1.0) if weights is None else dict(weights)
-        if not parts or set(weights) != set(parts):
-            raise ValueError(f"`weights` (={weights}) must name exactly the parts {list(parts)}")
-        if not all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values()):
-            raise ValueError(f"`weights` (={weights}) must all be > 0, and finite numbers")
+        fit = all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values())
+        if not (parts and fit and set(weights) == set(parts)):
+            rule = f"must give each of the parts {list(parts)} a finite number > 0"
+            raise ValueError(f"`weights` (={weights}) {rule}")
         for name, part in parts.items():
             check_part(name, part)
         total = sum(weights.values())
