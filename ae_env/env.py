@@ -48,13 +48,8 @@ class AutoExposure(Task):
     """Scores each frame, takes the costs off, and compares it with the oracle.
 
     Parts of the score that look at no frame are cached in static light, and so are expectations.
-
-    Args:
-        episodes: The episodes, with their scenes and options.
-        captures: What records their frames.
-        scorer: Rates the frames.
-        transitions: Light and exposures behind frames, `CaptureBatch.transitions`, where parts that
-            are measured on frames are replaced by their expectation; else None.
+    With `transitions` (`CaptureBatch.transitions`), parts that are measured on frames are replaced
+    by their expectation.
     """
 
     def __init__(
@@ -175,8 +170,6 @@ class AutoExposure(Task):
             table = self.tables.table(scene, gain=gain, row_gain=rows, prepared=prepared)
             self._tables.put(key, table, table.nbytes)
         return table
-
-    # -- scores of captures -------------------------------------------------------------------
 
     def _score(self, frames: FrameBatch) -> dict[str, np.ndarray]:
         """Scores (B,) of the captures by part."""

@@ -26,12 +26,9 @@ from simulator.utils.checks import check_type
 
 #: Least side of a rendered frame [pixel].
 FRAME_PIXELS = 256
-#: A contact sheet of more states than this would be unreadable.
-MAX_SHEET_STATES = 256
-#: Height of one picture on the contact sheet [pixel].
-THUMB_PIXELS = 104
-#: Height that scenes are averaged to for it [packed pixel].
-CAPTURE_PIXELS = 192
+#: A contact sheet of more states would be unreadable. Height of one picture on it [pixel], and that
+#: which scenes are averaged to for it [packed pixel].
+MAX_SHEET_STATES, THUMB_PIXELS, CAPTURE_PIXELS = 256, 104, 192
 #: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
 PATH_COLOURS = ("#D55E00", "#56B4E9", "#FFFFFF", "#CC79A7", "#009E73", "#0072B2", "#E69F00")
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
@@ -89,9 +86,6 @@ def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
 
 def _font(size: int) -> Any:
     return ImageFont.load_default(size)
-
-
-# -- the contact sheet ----------------------------------------------------------------------------
 
 
 def contact_sheet(

@@ -205,8 +205,6 @@ class ExposureBracket(Task):
                     self._metered[scene] = self.episodes.grid.nearest(ev100)
                 self.episodes.state[env_index] = self._metered[scene]
 
-    # -- step ---------------------------------------------------------------------------------
-
     def transition(
         self, env_indices: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -165,16 +165,11 @@ MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | N
 
 
 class EpisodeCore:
-    """Scenes, grid, camera and task, and the episodes that run on them.
+    """Scenes, grid, camera and task, and the episodes that run on them, `num_envs` side by side.
 
     A pickle holds its arguments and where the episodes are; scenes are loaded, and everything else
-    is worked out again, where it is unpickled.
-
-    Args:
-        options: The environment's arguments.
-        num_envs: Number of episodes side by side.
-        make_task: Makes the task; it must pickle.
-        scenes: Those of `options` where they are loaded already.
+    is worked out again, where it is unpickled. `make_task` must pickle; `scenes` are those of
+    `options` where they are loaded already.
     """
 
     def __init__(
@@ -236,8 +231,6 @@ class EpisodeCore:
         as_recorded_and_denoised = 1 + any(s.denoised is not None for s in scenes)
         return as_recorded_and_denoised * apertures + 1
 
-    # -- spaces -------------------------------------------------------------------------------
-
     def observation_space(self) -> gym.spaces.Dict:
         """Space of one episode's observation."""
         kind, size = self.options.observation, (self.options.resolution,) * 2
@@ -259,8 +252,6 @@ class EpisodeCore:
             spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         return gym.spaces.Dict(spaces | self.task.spaces())
 
-    # -- reset --------------------------------------------------------------------------------
-
     def begin(
         self,
         env_indices: np.ndarray,
@@ -278,8 +269,6 @@ class EpisodeCore:
         lights = len(self.scenes) + env_indices
         self._captures.forget(lights)
         self.task.forget(lights)
-
-    # -- step ---------------------------------------------------------------------------------
 
     def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Advances the episodes of `env_indices` (K,) by one frame, each with its action.

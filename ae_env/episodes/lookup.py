@@ -25,10 +25,7 @@ _LOW = 2.0**-10
 class LookupBatch:
     """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
 
-    Args:
-        scenes: Scenes with `Scene.recorded`.
-        prepared: Function that returns the merged light of a scene's index.
-        camera: The body.
+    The scenes have `Scene.recorded`; `prepared` returns the merged light of one by its index.
     """
 
     def __init__(

@@ -190,8 +190,6 @@ class Episodes:
             self.box_factor[index] = scene.box_factor
             self._known[index] = True
 
-    # -- drawing ------------------------------------------------------------------------------
-
     def draw(
         self,
         rngs: Sequence[np.random.Generator],
@@ -261,8 +259,6 @@ class Episodes:
             most = limits[name] - 1
             found[name] = check_integer(f"options[{name!r}]", value, 0, most, more=rule)
         return found
-
-    # -- running ------------------------------------------------------------------------------
 
     def begin(self, env_indices: np.ndarray, drawn: Mapping[str, np.ndarray]) -> None:
         """Puts the episodes `drawn`, columns of `Episode`, into `env_indices`."""

@@ -234,9 +234,6 @@ class LensCapLighting(Lighting):
         return self.stops if self.on <= frame < self.off else 0.0
 
 
-# -- by a list of the user's -----------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ScheduleLighting(Lighting):
     """The light changes by `ev[n]` stops in frame n, relative to the scene's; the last one holds.
@@ -306,9 +303,6 @@ def _read(file: Any) -> list[float]:
         if not math.isfinite(values[-1]):
             raise ValueError(f"{rule}, row {number} (={cell!r}), must be a number of stops")
     return values
-
-
-# -- faster than frames ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

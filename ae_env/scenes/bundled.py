@@ -103,9 +103,6 @@ def bundled_scenes(
     return DrawnScenes(f"the bundled scenes ({request.split})", groups, key_of_all)
 
 
-# -- drawing --------------------------------------------------------------------------------------
-
-
 class SceneGroup(NamedTuple):
     """Names of scenes that are drawn together, and what draws them, always the same ones."""
 
@@ -204,9 +201,6 @@ def _scene(drawing: Drawing, request: SceneRequest, **facts: Any) -> Scene:
 def add_layout(scene: Scene) -> Scene:
     """The scene with a procedural layout, which its name decides (`draw_layout`)."""
     return replace(scene, layout=draw_layout(scene.scene_id, *scene.light.shape[1:]))
-
-
-# -- the cache ------------------------------------------------------------------------------------
 
 
 def cached_scenes(

@@ -105,9 +105,6 @@ class FolderOptions:
 NOTHING_KNOWN = FolderOptions()
 
 
-# -- scenes ---------------------------------------------------------------------------------------
-
-
 def folder_scenes(
     spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
@@ -182,9 +179,6 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
     return first, first + np.repeat(lengths, lengths) - 1
 
 
-# -- files ----------------------------------------------------------------------------------------
-
-
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     """The raws and radiance maps that `spec` names as of `folder_scenes`, in natural order.
 
@@ -238,9 +232,6 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 def _is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
-
-
-# -- reading --------------------------------------------------------------------------------------
 
 
 def _read_files(

@@ -211,12 +211,8 @@ def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
     """Illuminance that a panorama casts on a surface, in units of its luminance times steradian.
 
     What an incident-light meter reads that is held before the subject and faces the camera: turned
-    against the view. A white diffuse surface there has a luminance of it over pi.
-
-    Args:
-        panorama: See `simulator.radiance.maps.perspective`.
-        azimuth, pitch: Longitude and latitude that the surface faces [degrees]; a pitch of 90 is
-            level ground.
+    against the view. A white diffuse surface there has a luminance of it over pi. `azimuth` and
+    `pitch` [degrees] are what the surface faces; a pitch of 90 is level ground.
     """
     height, width = panorama.shape[1:]
     longitude = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * math.pi

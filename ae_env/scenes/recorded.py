@@ -144,9 +144,6 @@ class RecordedOptions:
         return self._body or replace(default, colour_matrix=None, colour_matrix_source="")
 
 
-# -- scenes ---------------------------------------------------------------------------------------
-
-
 def recorded_scenes(
     options: RecordedOptions, request: SceneRequest, grid: ExposureGrid
 ) -> list[Scene]:
@@ -226,12 +223,8 @@ def merged_scene(
 ) -> Scene:
     """A scene of real captures, with the light that they tell together.
 
-    Args:
-        name: Its name, and its source group.
-        raws: Captures with their state of `grid`; one at a time is held.
-        grid: The states.
-        camera: The body, with the noise of its ISO speeds.
-        resize: Brings each capture to its size, before they are merged.
+    `raws` are captures with their state of `grid`, of which one at a time is held; `camera` has the
+    noise of its ISO speeds; `resize` brings each capture to its size, before they are merged.
     """
     frames: dict[int, Scene] = {}
     for state, raw in raws:
@@ -302,12 +295,10 @@ class RecordedFile:
     """One real capture.
 
     Args:
-        path: Its file.
-        settings: Settings that it was taken at.
+        path, settings: Its file, and the settings that it was taken at.
         scene: Name of what it shows, of a frame of video with the frame's number.
         group: Source group: what it shows whatever the light.
-        sequence: The video that it is a frame of; empty for a still scene.
-        frame: Its number in that video.
+        sequence, frame: The video that it is a frame of, empty for a still scene, and which.
     """
 
     path: Path
@@ -486,9 +477,6 @@ def _in_file(path: Path) -> dict[str, float]:
     values = {what: tags.get(tag) for what, tag in zip(_SETTINGS, names, strict=True)}
     numbers = {n: v[0] if isinstance(v, tuple) else v for n, v in values.items() if v}
     return {name: float(value) for name, value in numbers.items() if float(value) > 0}
-
-
-# -- the grid that files make ---------------------------------------------------------------------
 
 
 def recorded_grid(files: Sequence[RecordedFile]) -> ExposureGrid:

@@ -455,11 +455,8 @@ class SceneSet(Sequence[Scene]):
 class SceneRequest:
     """The split, the camera and the size that scenes are loaded for.
 
-    Args:
-        split: ``"train"``, ``"test"`` or ``"all"``.
-        camera: Camera in whose colours light is stated, unless a raw brings its own.
-        resolution, crop: See `Scene.resized`.
-        resize: Brings each scene to that size, as `Scene.resized` does.
+    `camera` is that in whose colours light is stated, unless a raw brings its own; `resize` brings
+    each scene to `resolution` and `crop`, as `Scene.resized` does.
     """
 
     split: Split

@@ -194,9 +194,6 @@ def source_noises(
     return found
 
 
-# -- descriptions ---------------------------------------------------------------------------------
-
-
 def describe_captures(
     scenes: Sequence[Scene],
     settings: Sequence[CameraSettings],
@@ -299,11 +296,7 @@ def _stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlu
 class SceneCaptures:
     """Describes captures of a scene at the states of a grid, of which it knows all that it can.
 
-    Args:
-        camera: The body.
-        states: The settings of the S states.
-        noisy: Whether captures have noise.
-        copies: Whether scorers get a copy of the light.
+    Scorers get a copy of the light with `copies`; for `noisy` see `Captures`.
     """
 
     def __init__(

@@ -201,9 +201,6 @@ def mapped(name: str, sign: torch.Tensor) -> torch.Tensor:
     return y[right - 1] + share * (y[right] - y[right - 1])
 
 
-# -- scorers --------------------------------------------------------------------------------------
-
-
 class _Analytic:
     """1 - |severity| of one defect."""
 

@@ -270,9 +270,6 @@ def shin_noise(luma: torch.Tensor) -> torch.Tensor:
     return torch.where(number < 1e-4 * samples, immerkaer_sigma(luma), masked)
 
 
-# -- scorers of detail and noise ------------------------------------------------------------------
-
-
 class Shim:
     """Shim's gradient information (2014), weak gradients included: `shim_gradient` as it is."""
 

@@ -223,9 +223,6 @@ def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
             yield from _nested(part, (*path, name))
 
 
-# -- the rows of ``ae-env scorers`` ---------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ScorerRow:
     """One scorer; a field is empty where it is unknown, or there is nothing to say.

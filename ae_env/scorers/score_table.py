@@ -67,9 +67,7 @@ class ScoreTables:
     """Score tables of scenes under one scorer, camera and grid.
 
     Args:
-        grid: The states.
-        camera: The body that takes the captures.
-        scorer: The scorer that rates them.
+        grid, camera, scorer: The states, the body that takes the captures, and what rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
         tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.

@@ -64,13 +64,7 @@ _jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
 
 
 class TermScores:
-    """Scores of one scorer at the states of a grid, part by part.
-
-    Args:
-        scorer: The scorer.
-        camera: The body that takes the captures.
-        states: The settings of the S states.
-        noise: Whether captures are noisy.
+    """Scores of one scorer at the states of a grid, part by part; see `ScoreTables`.
 
     Attributes:
         parts: Parts that are made of the terms of `ae_env.scorers.terms` alone, composites
@@ -215,13 +209,10 @@ class TermScores:
         box_factors: np.ndarray,
         row_gain: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Expectation (B, 3) of `measured` over the noise that the transitions add.
+        """Expectation (B, 3) of `measured` over the noise that the transitions (B,) add.
 
-        Args:
-            transitions: Light and exposures.
-            states: (B,) of the frames.
-            box_factors: (B,) sensor pixels averaged per side into one of the frame.
-            row_gain: (B, H) light of each row relative to the frame's, or None.
+        `box_factors` (B,) sensor pixels per side are averaged into one of the frame; `row_gain`
+        (B, H) is the light of each row relative to the frame's.
         """
         table = transitions.before_rounding(self.camera).averaged_table()
         source_noise = table[:, 3:] * np.square(box_factors)[:, None, None]
@@ -310,9 +301,6 @@ def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarra
         return np.asarray(part(None, captures).numpy())
     values = means[:, column]
     return np.asarray(np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0))
-
-
-# -- kernels --------------------------------------------------------------------------------------
 
 
 @_jit

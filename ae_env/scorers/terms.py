@@ -25,12 +25,11 @@ from simulator.raw.develop import develop
 
 logger = logging.getLogger(__name__)
 
-#: A user's scorer that takes longer than this for one batch is named in the log, once [s].
-SLOW_SECONDS = 5.0
 #: Scores may be this far outside [0, 1] by rounding.
 ROUNDING = 1e-6
-#: Names of the scorers that were found to be slow in this process.
-_slow: set[str] = set()
+#: A user's scorer that takes longer than this for one batch is named in the log, once [s].
+SLOW_SECONDS = 5.0
+_slow: set[str] = set()  # those that were found in this process
 
 
 def depends_on(scorer: Scorer) -> DependsOn:

@@ -18,8 +18,6 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NumpyToTorch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
@@ -32,7 +30,6 @@ from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from tests.ae_env.environments import assert_equal, assert_same, check_parity, make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
-from tests.strategies import SEEDS
 
 
 def _frames(env: Any) -> list[tuple[np.ndarray, ...]]:
@@ -270,25 +267,13 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> Non
     assert info["regret"] == pytest.approx(q.max() - q[18], abs=1e-6)
 
 
-def test_steady_rows_among_banded_ones_are_as_in_steady_light() -> None:
-    """1/50 s beside 1/1000 s, in one batch."""
-    grid = {"isos": [100, 400], "exposure_times": [0.001, 0.02], "f_numbers": [4, 8]}
-    arguments = {"scenes": [_grey()], "resolution": 40, "grid": grid}
-    envs, plain = (make_envs(2, lighting=light, **arguments) for light in ("flicker", "static"))
-    for made in (envs, plain):
-        made.reset(seed=3)
-    first, second = envs.step(np.array([0, 2])), plain.step(np.array([0, 2]))
-    np.testing.assert_array_equal(first[0]["raw"][1], second[0]["raw"][1])
-    assert (first[0]["raw"][0] != second[0]["raw"][0]).mean() > 0.3
-    assert first[1][1] == pytest.approx(second[1][1], abs=1e-6)
-
-
 RICH = {"with_oracle": True, "observation": "linear", "lighting": "sine", "delay": 1}
 RICH["costs"] = {"flicker": 0.1, "switch": 0.1}
 
 
 @pytest.mark.parametrize(
-    ("mode", "extra"), [(mode.name, RICH) for mode in AutoresetMode] + [("SAME_STEP", {})]
+    ("mode", "extra"),
+    [(mode.name, RICH) for mode in AutoresetMode] + [("SAME_STEP", {"noise": "exact"})],
 )
 def test_parity_with_sync_vector_env(mode: str, extra: dict[str, Any]) -> None:
     check_parity(11, 9, mode, max_episode_steps=3, **extra)
@@ -308,10 +293,9 @@ def test_parity_in_every_light(lighting: Any) -> None:
     check_parity(5, 4, max_episode_steps=3, delay=2, **extra)
 
 
-@pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
-def test_delayed_settings_meet_the_light_of_their_frame(lighting: Any) -> None:
+def test_delayed_settings_meet_the_light_of_their_frame() -> None:
     """The light of a frame does not wait; `info` and the score are of the settings in force."""
-    extra = {"lighting": lighting, "motion": "none", "depth": "far", "max_episode_steps": None}
+    extra = {"lighting": "sine", "motion": "none", "depth": "far", "max_episode_steps": None}
     delayed, direct = make_envs(delay=3, **extra), make_envs(**extra)
     start = np.array([3, 20, 41])
     for envs in (delayed, direct):
@@ -425,38 +409,3 @@ def test_memory_stays_flat() -> None:
         if step in (50, 199):
             pages.append(int(STATM.read_text().split()[1]))
     assert 4096 * (pages[1] - pages[0]) < 6 * 2**20
-
-
-def _episodes(seeds: list[int], actions: np.ndarray, **arguments: Any) -> list[Any]:
-    """Of each seed's episode what all of its frames show: raws, rewards and states."""
-    envs = make_envs(len(seeds), **arguments)
-    observation, info = envs.reset(seed=seeds)
-    frames = [(*observation.values(), info["state"], info["excess_noise"])]
-    for action in actions:
-        observation, reward, _, _, info = envs.step(action)
-        frames.append((*observation.values(), reward, info["state"], info["clipped_high"]))
-    ones = [slice(i, i + 1) for i in range(len(seeds))]
-    return [[[column[one] for column in frame] for frame in frames] for one in ones]
-
-
-@settings(max_examples=8)
-@given(
-    st.lists(SEEDS, min_size=2, max_size=5, unique=True),
-    SEEDS,
-    st.randoms(use_true_random=False),
-    st.sampled_from(["uint8", "linear", "dn"]),
-    st.sampled_from(["static", "sine"]),
-    st.sampled_from([True, "exact", False]),
-)
-def test_episodes_do_not_depend_on_their_index(seeds, seed, random, observation, lighting, noise):
-    """A permutation of the seeds permutes the episodes, which are also those of one alone."""
-    arguments = {"observation": observation, "lighting": lighting, "noise": noise}
-    actions = np.random.default_rng(seed).integers(0, 64, (10, len(seeds)))  # beyond one episode
-    order = random.sample(range(len(seeds)), len(seeds))
-    first = _episodes(seeds, actions, **arguments)
-    permuted = _episodes([seeds[i] for i in order], actions[:, order], **arguments)
-    assert_same([first[i] for i in order], permuted)
-    assert_same(first[:1], _episodes(seeds[:1], actions[:, :1], **arguments))
-    if noise:
-        shown = {tuple(frame[0].tobytes() for frame in frames) for frames in first}
-        assert len(shown) == len(seeds)

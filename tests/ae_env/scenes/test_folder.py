@@ -15,7 +15,7 @@ from ae_env.scenes.folder import Shot, group_shots, radiance_scenes, sequence_bo
 from ae_env.scenes.scene import SceneRequest
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 from simulator.radiance.maps import assumed_ev100, perspective, read_radiance
-from tests.ae_env.environments import check_parity, make_env
+from tests.ae_env.environments import make_env
 from tests.ae_env.scene_files import load, write_exr, write_hdr
 
 CAMERA = get_camera("nikon_z6")
@@ -45,11 +45,8 @@ def test_bad_files_stop_or_are_skipped_with_a_reason(tmp_path, caplog):
     (line,) = (r.getMessage() for r in caplog.records if "skipped" in r.getMessage())
     assert "8 of 11 scene files skipped" in line
     assert line.endswith("and 3 more)")
-    for file in tmp_path.glob("[!b]*"):
-        file.unlink()
-    (tmp_path / "black.dng").unlink()
     with pytest.raises(ValueError, match=r"7 of 7 scene files skipped \(bad0\.dng: "):
-        load(tmp_path, on_error="skip")
+        load(tmp_path / "bad*", on_error="skip")
     with pytest.raises(ValueError, match=r"bad1\.dng") as caught:
         load(bad[1])
     assert "skip" not in str(caught.value)  # which would not help with one file
@@ -184,11 +181,6 @@ def test_scores_are_those_of_the_frame(recorded: Path) -> None:
     assert env.core.scenes[2].scene_id == after[4]["scene_id"] == "IMG_10"
     assert after[1] == pytest.approx(scores[0], abs=1e-9)
     assert before[0] > scores[0]
-
-
-def test_many_at_once_are_as_single_ones(recorded: Path) -> None:
-    arguments = {"scenes": {"sequence": str(recorded)}, "with_oracle": True, "delay": 1}
-    check_parity(8, 4, max_episode_steps=4, lighting="flicker", **arguments, **ARGUMENTS, **STILL)
 
 
 def test_large_folder_is_split_by_group(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -399,7 +391,7 @@ def test_real_maps_load(data_dir: Path) -> None:
         assert 1.0 < scene.ev100 < 15.0
 
 
-def test_lying_and_cut_exr_files(tmp_path: Path) -> None:
+def test_lying_exr_files(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     write_exr(path, np.random.default_rng(0).random((32, 64)))
     whole = path.read_bytes()

@@ -16,8 +16,6 @@ from skimage.color import rgb2xyz
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
-from ae_env.scorers import make_scorer
-from ae_env.scorers.score_table import ScoreTables
 from simulator import (
     CameraSettings,
     CameraSimulator,
@@ -322,20 +320,6 @@ def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
     assert made(noisy, simulator=weights, tolerance=1e6)[0] == left  # no network is needed
 
 
-def test_denoised_light_is_scored_where_it_is_taken() -> None:
-    """Where a target is cleaner than the source, it is the denoised light's score."""
-    noisy = replace(flat_scene(0.2, denoised=0.1), nlf=CAMERA.nlf(6400))
-    tables = ScoreTables(ExposureGrid.default(), CAMERA, make_scorer("balanced"))
-    without, found = tables.table(flat_scene(0.1)).parts, tables.table(noisy).parts
-    state = 9  # ISO 100, 1/15 s, f/5.6: denoised
-    for name in ("highlights", "shadows", "noise"):
-        assert found[name][state] == pytest.approx(without[name][state], abs=1e-5)
-    raw = tables.table(replace(noisy, denoised=None)).parts
-    assert raw["noise"][state] < found["noise"][state] - 0.1
-    mapped = replace(noisy, denoised=None, defocus_map=torch.ones(40, 40))
-    assert tables.table(mapped).parts["sharpness"][0] < raw["sharpness"][0]
-
-
 def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
     """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
     light = torch.zeros(4, 80, 80)
@@ -374,22 +358,6 @@ def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:
     native = networks.resized(scene, 16, "native")
     torch.testing.assert_close(native.defocus_map, whole[118:134, 114:130], rtol=1e-3, atol=1e-4)
     assert float(whole.std()) > 1e-3
-
-
-def test_maps_are_kept_and_made_again_where_damaged(weights, tmp_path, monkeypatch, caplog):
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    scene = noisy_scene()
-    first = SceneNetworks(weights).resized(scene, 40).defocus_map
-    (file,) = (tmp_path / "defocus_maps").iterdir()
-    for damage in (False, True):
-        if damage:
-            file.write_bytes(b"damaged")
-        torch.testing.assert_close(
-            SceneNetworks(weights).resized(scene, 40).defocus_map, first, rtol=0, atol=0
-        )
-        assert ("damaged" in caplog.text) == damage
-    SceneNetworks(weights).resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
-    assert len(list(file.parent.iterdir())) == 2
 
 
 def test_it_is_metered_by_its_mean_and_drawn_by_name_and_seed():

@@ -162,15 +162,11 @@ def _score(name: str, images: torch.Tensor) -> list[float]:
     return next(iter(make_scorer(name).parts.values()))(images, None).tolist()
 
 
-def _encoded(linear: float) -> float:
-    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
-
-
 @pytest.mark.parametrize(
     ("linear", "score"), [(0.18, 1.0), (0.36, 0.5), (0.09, 0.5), (0.0018, 0.01), (1.0, 0.18)]
 )
 def test_mid_grey_is_halved_by_every_stop(linear: float, score: float) -> None:
-    picture = torch.full((1, 3, 4, 5), _encoded(linear))
+    picture = srgb_encode(torch.full((1, 3, 4, 5), linear))
     assert _score("mid_grey", picture) == pytest.approx([score], rel=1e-4)
 
 
