@@ -32,7 +32,7 @@ from ae_env.scorers.score_table import ScoreTable
 from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Noise, Transitions
+from simulator.capture.sensor import Noise, Transitions, single_normals
 from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
@@ -355,7 +355,7 @@ class EpisodeCore:
             "modules": found.modules,
         }
         if self.options.sensors:
-            columns["sensor_normals"] = found.sensor_normals(2)
+            columns["sensor_normals"] = single_normals(found.keys, 2)
         columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows))
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
