@@ -22,7 +22,7 @@ from simulator.camera import BayerPattern, CameraProfile
 from simulator.capture.exposure import SIGNAL_LIMIT
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.generator import noise_generator
-from simulator.noise.noise_level_function import nlf_tensors
+from simulator.noise.noise_level_function import plane_tensor
 from simulator.optics.flicker_integral import Lamp
 from simulator.optics.motion import motion_blur
 from simulator.optics.thin_lens import Lens, defocus
@@ -298,7 +298,8 @@ class ReferenceCamera:
         The variance of a sample is that of the camera's noise level function: the noise of the
         rounding to whole numbers is part of the calibrated read noise, and is not counted twice.
         """
-        shot, read = nlf_tensors(self.camera.nlf(iso), signal.device)
+        nlf = self.camera.nlf(iso)
+        shot, read = (plane_tensor(values, signal.device) for values in (nlf.shot, nlf.read))
         black, well = self._black_offset(signal), self._well(signal, iso)
         # Light far above a full well fills it in any case; its photon count would overflow.
         light = torch.minimum((signal - black).clamp(min=0.0), 2.0 * well)
