@@ -31,7 +31,7 @@ def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -
 
 
 def check_type(name: str, value: Any, *kinds: type | None) -> None:
-    """Raises a `ValueError` unless `value` is of one of the types `kinds`, which None may be, too."""
+    """Raises a `ValueError` unless `value` is of one of the types `kinds`, which None may be."""
     known = tuple(type(None) if kind is None else kind for kind in kinds)
     if not isinstance(value, known):
         rule = " or ".join("None" if kind is None else kind.__name__ for kind in kinds)
