@@ -82,9 +82,10 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from ae_env.utils.user_files import find_config
-    from simulator.training.train import first_modules, load_config, train_and_save
+    from simulator.training.train import SimulatorConfig, first_modules, train_and_save
+    from simulator.utils.config_file import load_yaml
 
-    training = load_config(find_config(config))
+    training = load_yaml(find_config(config), SimulatorConfig)
     if seed is not None:
         training = training.model_copy(update={"seed": seed})
     if training.start is not None:

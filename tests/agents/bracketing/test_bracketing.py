@@ -22,7 +22,7 @@ from agents.bracketing.policies import (
     describe,
     run_brackets,
 )
-from agents.policy import Policy, PolicyContext
+from agents.policy import BracketLimits, Policy, PolicyContext
 from agents.policy_names import make_policy
 from simulator.camera import get_camera
 from tests.ae_env.environments import SMALL
@@ -30,6 +30,7 @@ from tests.ae_env.environments import SMALL
 ID = "ae_env/ExposureBracket-v0"
 CAMERA = get_camera("nikon_z6")
 GRID = ExposureGrid((100, 1600), (1 / 1000, 1 / 60, 1 / 4), (4,))
+LIMITS = BracketLimits(budget=0.3, max_frames=2, box_factor=4)
 
 
 def make_envs(count: int = 4, **arguments: Any) -> gym.vector.VectorEnv:
@@ -44,7 +45,7 @@ def context() -> PolicyContext:
 
 def test_every_schedule_that_fits_is_there_once() -> None:
     """By hand, each pair and each single state whose time is at most 0.3 s."""
-    schedules = Schedules(GRID, CAMERA, 0.3, 2, 4)
+    schedules = Schedules(GRID, CAMERA, LIMITS)
     times = [1 / 1000, 1 / 60, 1 / 4] * 2
     expected = [(-1, -1)] + [(s, -1) for s in range(6)]
     for pair in itertools.combinations_with_replacement(range(6), 2):
@@ -61,7 +62,7 @@ def test_every_schedule_that_fits_is_there_once() -> None:
 
 def test_expected_errors_are_those_of_merged_frames() -> None:
     """Against the environment's own merging of 10,000 noisy samples in four lights."""
-    schedules = Schedules(GRID, CAMERA, 0.3, 2, 4)
+    schedules = Schedules(GRID, CAMERA, LIMITS)
     reference, floor = 6.0, -6.0
     generator = torch.Generator().manual_seed(1)
     for states in ((0, -1), (1, 3), (2, 3)):
