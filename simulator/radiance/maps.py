@@ -38,9 +38,8 @@ def read_radiance(path: str | Path) -> np.ndarray:
     Values that are not light are repaired, and the repair is logged: NaN and negative values
     (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
 
-    Args:
-        path: The file. Its primaries are taken to be sRGB's, as those files usually have; alpha and
-            further channels are ignored; a file with luminance only is grey.
+    Its primaries are taken to be sRGB's, as those files usually have; alpha and further channels
+    are ignored; a file with luminance only is grey.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -143,14 +142,9 @@ def perspective(
     """A pin-hole view (3, size, size) into an equirectangular panorama (gnomonic).
 
     Sampled bilinearly at least as densely as the panorama has pixels, then box-averaged, so that
-    small lamps keep their energy.
-
-    Args:
-        panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
-            latitudes from +90 degrees.
-        azimuth, pitch: Longitude and latitude of the view's middle [degrees].
-        size: Height and width of the view [pixels].
-        field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
+    small lamps keep their energy. Columns of `panorama`, (3, H, W) with W = 2 H, are longitudes
+    from -180 degrees, rows latitudes from +90 degrees; `azimuth` and `pitch` are those of the
+    view's middle. `field_of_view` is horizontal and vertical, in (0, 150] degrees.
     """
     half = math.tan(math.radians(field_of_view) / 2.0)
     per_radian = panorama.shape[2] / (2.0 * math.pi)
@@ -163,10 +157,8 @@ def perspective(
     latitude = np.arctan2(up, np.hypot(forward, right))
     column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
     row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
-    view = _bilinear(panorama, row, column)
-    return np.asarray(
-        view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
-    )
+    view = _bilinear(panorama, row, column).reshape(3, size, dense, size, dense)
+    return np.asarray(view.mean(axis=(2, 4)).astype(np.float32))
 
 
 def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -246,16 +238,13 @@ def _read_exr(path: Path) -> np.ndarray:
     except (RuntimeError, ValueError) as error:
         if "radiance map" in str(error):
             raise
-        raise ValueError(
-            f"radiance map {str(path)!r} must be a complete OpenEXR file, but OpenEXR says: {error}"
-        ) from error
+        rule = f"must be a complete OpenEXR file, but OpenEXR says: {error}"
+        raise ValueError(f"radiance map {str(path)!r} {rule}") from error
     names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
     planes = [np.asarray(channels[n], np.float32) for n in names if n in channels]
     if len(planes) != 3 or len({p.shape for p in planes}) != 1:
-        raise ValueError(
-            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G and B of the "
-            "same size, or Y"
-        )
+        rule = f"(channels {sorted(channels)}) must have R, G and B of the same size, or Y"
+        raise ValueError(f"radiance map {str(path)!r} {rule}")
     return np.stack(planes)
 
 

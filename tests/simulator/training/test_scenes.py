@@ -41,17 +41,23 @@ def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
     return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
 
 
-def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
-    groups = [{s.group for s in scenes[split]} for split in SPLITS]
+def assert_no_group_is_shared(made: dict[str, list]) -> None:
+    groups = [{each.group for each in own} for own in made.values()]
     assert all(groups)
     assert sum(map(len, groups)) == len(set().union(*groups))
-    ids = [s.scene_id for split in SPLITS for s in scenes[split]]
-    assert len(ids) == len(set(ids))
+    names = [getattr(e, "scene_id", None) or e.name for own in made.values() for e in own]
+    assert len(set(names)) == len(names)
+
+
+def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
+    assert_no_group_is_shared(scenes)
     fewer = reference_scenes("test", CAMERA, number=5, size=48)[:5]
     for scene, again in zip(scenes["test"], fewer, strict=False):
         assert (scene.scene_id, scene.lens) == (again.scene_id, again.lens)
         for field in ("light", "depth"):
             torch.testing.assert_close(getattr(again, field), getattr(scene, field), rtol=0, atol=0)
+    with pytest.raises(ValueError, match="`split`"):
+        reference_scenes("trian", CAMERA)
     other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
     assert other.group != fewer[0].group
     assert not torch.equal(other.light, fewer[0].light)
@@ -93,9 +99,7 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
     assert {s.group for s in views} == {"city"}
     for view in views:
         assert (view.depth, view.size, view.light.shape) == (None, (64, 64), (3, 128, 128))
-        assert f"{view.illuminance:g} lux assumed" in view.source
         assert view.reference.log2_exposure == pytest.approx(-np.log2(view.illuminance / 2.5))
-        assert bool(view.sampled and view.in_focus)
     # A quarter of the circle each, its pixels as they are: every one looks the same here.
     assert len({float(v.light.sum()) for v in views}) == 1
     with pytest.raises(FileNotFoundError, match="`data`"):
@@ -103,17 +107,13 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
 
 
 @pytest.mark.real_data
-def test_real_pictures_share_no_group_between_splits(data_dir: Path) -> None:
-    made = {s: reference_scenes(s, CAMERA, number=0, size=128, data=data_dir) for s in SPLITS}
-    for split, scenes in made.items():
-        scenes += mosaic_scenes(split, CAMERA, data_dir, size=128)
-    groups = [{s.group for s in made[split]} for split in SPLITS]
-    assert len(groups[2]) >= 25
-    assert sum(map(len, groups)) == len(set().union(*groups))
-    assert all(s.sampled and s.size == (128, 128) for scenes in made.values() for s in scenes)
-    names = [{s.scene_id for s in scenes} for scenes in made.values()]
-    assert "CRW_0112" in names[0]
-    assert {"CRW_0117", "CRW_0119", "chelsea"} <= names[2]
+def test_real_pictures_become_scenes(data_dir: Path) -> None:
+    """Of the smallest split; that no two share a group, small files show below."""
+    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
+    assert {s.kind for s in made} == {"photograph", "radiance"}
+    mosaics = list(mosaic_scenes("test", CAMERA, data_dir, size=128))
+    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
+    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
 
 
 def test_motorcycle_has_the_depth_of_its_calibration() -> None:
@@ -131,15 +131,6 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     np.testing.assert_allclose(front.depth.numpy()[known], depth[:500, :740][known], rtol=1e-5)
     assert 1.8 < front.depth.min() < front.depth.max() < 6.0
     assert bool((front.light >= 0).all())
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("split", "trian"), ("number", -1), ("size", 8), ("seed", -1)]
-)
-def test_errors_name_the_argument(field: str, value: object) -> None:
-    arguments = {"split": "train", "number": 1, "size": 32, "seed": 0} | {field: value}
-    with pytest.raises(ValueError, match=f"`{field}` "):
-        reference_scenes(arguments.pop("split"), CAMERA, **arguments)
 
 
 @pytest.mark.real_data
@@ -190,13 +181,6 @@ def the_only(folder: Path, name: str) -> DetailPicture:
     return found
 
 
-def assert_no_group_is_shared(pictures: dict[str, list[DetailPicture]]) -> None:
-    groups = [{p.group for p in own} for own in pictures.values()]
-    assert len(set.union(*groups)) == sum(map(len, groups))
-    names = [p.name for own in pictures.values() for p in own]
-    assert len(set(names)) == len(names)
-
-
 def test_groups_of_files_stay_together(tmp_path: Path) -> None:
     """Three photographs of each of 20 series, which a table names; and two known maps."""
     (tmp_path / "photo_pool").mkdir()
@@ -210,7 +194,6 @@ def test_groups_of_files_stay_together(tmp_path: Path) -> None:
     pictures = by_split(tmp_path)
     assert_no_group_is_shared(pictures)
     found = [p for own in pictures.values() for p in own if p.kind == "photograph"]
-    assert len(found) == 60
     assert {p.group for p in found} == {f"series{i}" for i in range(20)}
     assert len({p.group for p in pictures["train"]}) > len({p.group for p in pictures["test"]}) > 1
     assert [p.name for p in pictures["train"] if p.kind == "radiance"] == ["bridge"]
@@ -263,27 +246,10 @@ def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptu
     for own in drawn.values():
         assert [p.kind for p in own] == ["leaves"] * 8 + ["chart"] * 8 + ["smooth"] * 8
         for each in own:
-            assert each.light.shape == (3, 64, 64)
-            assert each.light.dtype == torch.float32
+            assert (each.light.shape, each.light.dtype) == ((3, 64, 64), torch.float32)
             assert bool(((each.light >= 0) & each.light.isfinite()).all())
     again, other = (detail_pictures("train", data=None, drawn=8, seed=s) for s in (0, 1))
     for first, same, new in zip(drawn["train"], again, other, strict=True):
         assert torch.equal(first.light, same.light)
         assert not torch.equal(first.light, new.light)
         assert first.group != new.group
-    with pytest.raises(ValueError, match=r"`split` \(='tests'\)"):
-        detail_pictures("tests", data=None)
-
-
-@pytest.mark.real_data
-def test_recorded_mosaics_of_one_subject_are_on_one_side(data_dir: Path) -> None:
-    drawn = {s: list(pictures.recorded_mosaics(data_dir, s)) for s in SPLITS}
-    assert_no_group_is_shared(drawn)
-    found = {p.name: (split, p) for split, own in drawn.items() for p in own}
-    assert [found[f"CRW_{n}"][0] for n in ("0101", "0112", "0117", "0119")] == 2 * ["train"] + 2 * [
-        "test"
-    ]
-    for _, each in found.values():
-        assert each.light.shape[0] == 4
-        assert 0 < each.nlf.shot[1] < 1e-3
-        assert -0.1 < float(each.light.min()) <= float(each.light.max()) < 1.5
