@@ -146,10 +146,8 @@ def export(
     seen, grid = card["context"], trained_grid(card)
     states = {n: list(getattr(grid, n)) for n in ("isos", "exposure_times", "f_numbers")}
     options = {"resolution": seen["resolution"][-1], "sensors": seen["sensors"], "grid": states}
-    envs = gym.make_vec(
-        "ae_env:ae_env/AutoExposure-v0", num_envs=1, scenes="bundled:small", **options
-    )
-    with contextlib.closing(envs):
+    task = "ae_env:ae_env/AutoExposure-v0"
+    with contextlib.closing(gym.make_vec(task, scenes="bundled:small", **options)) as envs:
         agent = make_policy(name, PolicyContext.from_envs(envs))
     file = export_agent(agent, out)
     controller = Controller(file)

@@ -83,14 +83,6 @@ def test_what_is_before_the_focus_spreads_over_what_is_sharp(simulator) -> None:
     np.testing.assert_allclose(profile[-8:], 0.8, rtol=1e-6)
 
 
-def test_the_source_s_own_aperture_changes_nothing(simulator) -> None:
-    light = torch.rand(4, 32, 40, generator=torch.Generator().manual_seed(0)) * 0.5
-    depth = np.full((32, 40), 9.0)
-    out = refocus(make_raw(light), 5.6, depth=depth, lens=LENS, simulator=simulator)
-    assert out.data.equal(light)
-    assert out.settings == SETTINGS
-
-
 def test_what_is_blurred_has_the_noise_of_the_sensor(simulator) -> None:
     raw = RawImage(torch.full((4, 128, 128), 0.2), CameraSettings(6400, 1 / 64, 5.6), CAMERA)
     depth = np.full((128, 128), 9.0)
@@ -100,12 +92,16 @@ def test_what_is_blurred_has_the_noise_of_the_sensor(simulator) -> None:
     np.testing.assert_allclose(out.data.var(dim=(1, 2)), expected, rtol=0.05)
 
 
-def test_a_sharp_picture_of_unknown_depth_stays_as_it_is() -> None:
-    rng = torch.Generator().manual_seed(0)
-    light = (torch.rand(4, 96, 96, generator=rng) * 0.5).round(decimals=1) + 0.05
-    out = refocus(make_raw(light), 1.4, simulator=CameraSimulator.from_pretrained(device="cpu"))
-    assert out.metadata["depth"] == "estimated"
-    assert out.data.equal(light)
+def test_the_source_s_own_aperture_and_a_sharp_picture_change_nothing(simulator) -> None:
+    light = (torch.rand(4, 64, 64) * 0.5).round(decimals=1) + 0.05
+    depth = np.full((64, 64), 9.0)
+    same = refocus(make_raw(light), 5.6, depth=depth, lens=LENS, simulator=simulator)
+    assert (same.settings, same.metadata["depth"]) == (SETTINGS, "given")
+    networks = CameraSimulator.from_pretrained(device="cpu")
+    sharp = refocus(make_raw(light), 1.4, simulator=networks)
+    assert sharp.metadata["depth"] == "estimated"
+    assert same.data.equal(light)
+    assert sharp.data.equal(light)
 
 
 @pytest.mark.parametrize(
@@ -118,16 +114,15 @@ def test_a_sharp_picture_of_unknown_depth_stays_as_it_is() -> None:
         ({"depth": np.ones((40, 32)), "lens": LENS}, "depth"),
         ({"depth": np.full((32, 40), 0.04), "lens": LENS}, "depth"),
         ({"depth": np.full((32, 40), np.nan), "lens": LENS}, "depth"),
-        ({"camera": replace(CAMERA, pixel_pitch_um=None)}, "raw"),
+        ({"depth": np.full((32, 40), 9.0), "lens": LENS, "pitch": None}, "raw"),
     ],
 )
 def test_bad_arguments(simulator, arguments, named: str) -> None:
-    raw = make_raw(torch.full((4, 32, 40), 0.1))
-    if "camera" in arguments:
-        raw = replace(raw, camera=arguments["camera"])
-        arguments = {"depth": np.full((32, 40), 9.0), "lens": LENS}
+    given = {"f_number": 1.4, "simulator": simulator, **arguments}
+    camera = replace(CAMERA, pixel_pitch_um=given.pop("pitch", 5.0))
+    raw = replace(make_raw(torch.full((4, 32, 40), 0.1)), camera=camera)
     with pytest.raises(ValueError, match=f"`{named}`"):
-        refocus(raw, **{"f_number": 1.4, "simulator": simulator, **arguments})
+        refocus(raw, **given)
 
 
 # -- depth maps -----------------------------------------------------------------------------------

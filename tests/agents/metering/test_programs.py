@@ -169,11 +169,9 @@ def _samples(count=600, seed=0):
 
 def test_a_linear_surface_is_reproduced_away_from_the_data_edge():
     rng = np.random.default_rng(1)
-    features = rng.uniform(-2, 2, (4000, 2))
-    scores = np.stack([0.3 + 0.1 * features[:, 0], 0.5 - 0.05 * features[:, 1]], axis=1)
+    features, query = rng.uniform(-2, 2, (4000, 2)), rng.uniform(-1.5, 1.5, (50, 2))
+    scores, expected = (np.array([0.3, 0.5]) + x * [0.1, -0.05] for x in (features, query))
     model = ScoreRegression(features, scores, np.array([0.4, 0.4]))
-    query = rng.uniform(-1.5, 1.5, (50, 2))
-    expected = np.stack([0.3 + 0.1 * query[:, 0], 0.5 - 0.05 * query[:, 1]], axis=1)
     np.testing.assert_allclose(model.predict(query), expected, atol=0.01)
 
 
