@@ -22,24 +22,17 @@ from agents.learning.regression import observation_tensors
 from agents.metering.reading import Reading
 
 
-def space(size: int, *, sensors: bool = True, dtype: type = np.uint8) -> gym.spaces.Dict:
-    spaces: dict[str, gym.Space] = {
-        "raw": gym.spaces.Box(0, 255, (4, size, size), dtype),
-        "settings": gym.spaces.Box(-1, 1, (3,), np.float32),
-    }
-    if sensors:
-        spaces["sensors"] = gym.spaces.Box(-1, 1, (2,), np.float32)
-    return gym.spaces.Dict(spaces)
-
-
 def test_shapes() -> None:
-    features = ExposureFeatures(space(37, sensors=False), width=24)
+    """Without sensors, at an odd size."""
+    settings = gym.spaces.Box(-1, 1, (3,), np.float32)
+    pixels, signal = (gym.spaces.Box(0, 255, (4, 37, 37), kind) for kind in (np.uint8, np.float32))
+    features = ExposureFeatures(gym.spaces.Dict({"raw": pixels, "settings": settings}), width=24)
     values = features(torch.rand(5, 4, 37, 37), torch.zeros(5, 3), None)
     assert values.shape == (5, 24)
     values.sum().backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in features.parameters())
     with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`"):
-        ExposureFeatures(space(36, dtype=np.float32))
+        ExposureFeatures(gym.spaces.Dict({"raw": signal, "settings": settings}))
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from ae_env.observation import encode_settings
 from agents.learning.networks import NUMBERS, MeterHistory, with_history
 from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
 from agents.policy import PolicyContext
@@ -98,19 +97,16 @@ def test_shifted_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
 
 
 def test_it_holds_readings_exposures_and_what_was_asked_for(context, photograph):
-    history = MeterHistory(context, 1, 3)
-    grey, grid = np.ones((64, 64)), context.grid
+    history, grey, grid = MeterHistory(context, 1, 3), np.ones((64, 64)), context.grid
     state = grid.nearest(9.0)
-    first = history.observe(photograph(grey, 9.0, state)).reshape(3, NUMBERS)
-    shown = photograph(grey, 9.0, state)["settings"][0]
-    exposed = (9.0 - grid.ev100[state]) / 4.0
-    for row in first:  # before the first frame there was the same
-        np.testing.assert_allclose(row, [0.0, exposed / 4.0, 0.0, *shown], atol=0.02)
+    frame = photograph(grey, 9.0, state)
+    first = history.observe(frame).reshape(3, NUMBERS)
+    # Before the first frame there was the same.
+    row = [0.0, (9.0 - grid.ev100[state]) / 4.0, 0.0, *frame["settings"][0]]
+    np.testing.assert_allclose(first, [row] * 3, atol=0.02)
     history.record_action(np.array([40]))
     second = history.observe(photograph(grey, 8.0, state)).reshape(3, NUMBERS)
-    s = grid[40]
-    asked = encode_settings(np.array([s.aperture_value, s.time_value, s.speed_value]))
-    np.testing.assert_allclose(second[0, 3:], asked)
+    np.testing.assert_allclose(second[0, 3:], photograph(grey, 8.0, 40)["settings"][0])
     np.testing.assert_allclose(second[:, 0], [0.0, 0.5, 0.5], atol=0.02)  # one stop brighter before
     history.forget(np.array([True]))
     assert history.observe(photograph(grey, 5.0, state))[0, 0] == 0.0

@@ -150,9 +150,10 @@ def test_ranges_of_the_options(option, low, high):
     for value in (low - 0.1, high * 1.01, float("nan"), "half", True):
         with pytest.raises(ValueError, match=f"`{option}`"):
             ProgramOptions(**{option: value})
-    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
 
-    # Options belong to programs.
+
+def test_options_belong_to_programs():
+    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
     check_used("M", f_number=4.0, exposure_time=0.1, iso=100, weights=None)
     for program, option in (("A", "iso"), ("P", "f_number")):
         with pytest.raises(ValueError, match=f"`{option}`"):
