@@ -46,7 +46,7 @@ from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
 from simulator.radiance.light import WHITE_SIGNAL
 from simulator.radiance.maps import read_radiance
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
-from simulator.radiance.procedural import HARD_KINDS, dead_leaves, list_kinds
+from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
 from simulator.utils.cache import disk_cache
 from tests.ae_env.environments import assert_equal, make_envs
 from tests.ae_env.scorer_images import make_scene
@@ -75,10 +75,10 @@ def slope(picture: np.ndarray) -> float:
 
 def test_dead_leaves_have_the_spectrum_of_nature() -> None:
     """Field 1987, Ruderman 1997: the power of natural pictures falls about as f**-2."""
-    slopes = [slope(dead_leaves(np.random.default_rng(i), 256)[1]) for i in range(8)]
+    slopes = [slope(dead_leaves(np.random.default_rng(i), 256, LeafStyle())[1]) for i in range(8)]
     assert np.mean(slopes) == pytest.approx(-2.0, abs=0.25)
     # A value of the first release: the bundled scenes must not change.
-    picture = dead_leaves(np.random.default_rng(7), 48)
+    picture = dead_leaves(np.random.default_rng(7), 48, LeafStyle())
     mean = [0.15036413232802362, 0.16999628065968864, 0.15176365238261902]
     np.testing.assert_allclose(picture.mean(axis=(1, 2), dtype=float), mean, rtol=1e-5)
 
@@ -104,7 +104,7 @@ def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> No
     """By how many EV one on the mean of the clipped frame would expose too little."""
     errors = {
         kind: np.log2([s.light[1].clamp(max=1.0).mean() / 0.12 for s in unseen if s.kind == kind])
-        for kind in (*list_kinds(), "photograph")
+        for kind in (*KINDS, "photograph")
     }
     for kind in ("dead_leaves", "indoor", "motion", "photograph"):
         assert abs(np.median(errors[kind])) < 0.35, kind
