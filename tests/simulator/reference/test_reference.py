@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -215,7 +214,6 @@ def test_drawn_bodies():
     assert BodyError().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
     bodies = [BodyError.draw(Z6, seed) for seed in range(300)]
     assert bodies[5] == BodyError.draw(Z6, 5) != bodies[6]
-    assert pickle.loads(pickle.dumps(bodies[5])) == bodies[5]  # for workers of a data loader
     assert min(b.exposure_time(1 / 8000) for b in bodies) > 0
     assert np.std([b.shutter_delay for b in bodies]) == pytest.approx(15e-6, rel=0.2)
     assert 1.8 < np.abs([b.black_offset for b in bodies]).max() * 14512 <= 2.0

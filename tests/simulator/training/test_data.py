@@ -67,11 +67,9 @@ def test_the_target_is_clipped_as_the_camera_clips():
 
 
 def test_sequences_are_drawn_by_seed_and_index():
-    scenes = [scene("a"), scene("b")]
-    first, again, other = (draw_sequences(scenes, Z6, seed) for seed in (0, 0, 1))
+    first, again, other = (draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1))
     assert [s.settings for s in first] == [s.settings for s in again]
     assert first[1].settings != first[0].settings != other[0].settings
-    assert [s.scene.scene_id for s in first] == ["a", "b"]
     with pytest.raises(ValueError, match="`sequences`"):
         ReferencePairs([], ReferenceCamera(Z6), "aperture")
 
@@ -151,15 +149,12 @@ def flat(level: float = 0.5, side: int = 64, **named: object) -> DetailPicture:
 
 def test_a_step_gives_the_same_batch_and_another_one_another() -> None:
     pictures = [picture(3, 200, 180), picture(3, 220, 160, seed=1, kind="leaves")]
-    crops, again = (DetailCrops(pictures, [Z6, CANON], seed=3) for _ in range(2))
+    crops, again, other = (DetailCrops(pictures, [Z6, CANON], seed=s) for s in (3, 3, 4))
+    others = crops.batch(8, 3, 24), crops.batch(7, 3, 24, process=1), other.batch(7, 3, 24)
     first = crops.batch(7, 3, 24)
     assert [t.shape for t in first] == 2 * [(3, 4, 24, 24)] + 2 * [(3, 4)]
-    crops.batch(8, 3, 24)
     assert all(map(torch.equal, first, again.batch(7, 3, 24)))
-    others = crops.batch(8, 3, 24), crops.batch(7, 3, 24, process=1)
-    others += (DetailCrops(pictures, [Z6, CANON], seed=4).batch(7, 3, 24),)
-    assert not any(torch.equal(first[1], other.clean) for other in others)
-    assert bool((first[1] <= 1.0).all())
+    assert not any(torch.equal(first.clean, other.clean) for other in others)
     captures = crops.captures(2, 4, 24)
     assert all(torch.equal(part, part[:1].expand_as(part)) for part in captures[1:])
     assert not torch.equal(captures.noisy[0], captures.noisy[1])

@@ -11,11 +11,11 @@ import torch
 from PIL import Image
 
 from simulator import CameraSettings, get_camera
+from simulator.radiance.procedural import KINDS
 from simulator.reference.camera import DRAPED, ReferenceScene
 from simulator.training import scenes as pictures
 from simulator.training.data import DetailPicture
 from simulator.training.scenes import (
-    _edge_ratio,
     depth_photographs,
     detail_pictures,
     detail_split,
@@ -35,10 +35,10 @@ def scenes() -> dict[str, list[ReferenceScene]]:
     return {split: reference_scenes(split, CAMERA, number=28, size=48) for split in SPLITS}
 
 
-def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
-    """Circle of confusion at f/11 [packed pixels] by the thin-lens formula."""
+def blur(scene: ReferenceScene) -> np.ndarray:
+    """Circle of confusion at f/11 [packed pixels of 11.88 um] by the thin-lens formula."""
     f, s, z = scene.lens.focal_length, scene.lens.focus_distance, scene.depth.double().numpy()
-    return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
+    return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / 11.88e-6
 
 
 def assert_no_group_is_shared(made: dict[str, list]) -> None:
@@ -67,14 +67,9 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
     train = scenes["train"]
     kinds = [s.kind for s in train]
     assert kinds.count("depth") == 21
-    assert set(kinds) == {
-        *("depth", "photograph", "dead_leaves", "indoor", "back_light", "snow", "night"),
-        *("spot_light", "motion"),
-    }
+    assert set(kinds) == {"depth", "photograph", *KINDS}
     for scene in train:
         assert (scene.light.shape, scene.size) == ((3, 96, 96), (48, 48))
-        assert scene.light.dtype == torch.float32
-        assert bool((scene.light >= 0).all())
         assert (scene.depth is not None) == (scene.kind == "depth")
         assert 1.0 <= scene.illuminance <= 20_000.0
         # The incident-light exposure, E = 2.5 * 2**EV100, with ISO 12232's 120 for white.
@@ -123,23 +118,18 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     _, _, disparity = stereo_motorcycle()
     front, middle = depth_photographs(CAMERA)
     assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
-    assert front.group == middle.group == "motorcycle"
     assert (front.light.shape, front.size) == ((3, 500, 740), (250, 370))
     assert torch.equal(front.depth, middle.depth)
     depth = 0.193001 * 994.978 / (np.where(np.isfinite(disparity), disparity, np.nan) + 31.086)
     known = np.isfinite(depth[:500, :740])
     np.testing.assert_allclose(front.depth.numpy()[known], depth[:500, :740][known], rtol=1e-5)
     assert 1.8 < front.depth.min() < front.depth.max() < 6.0
-    assert bool((front.light >= 0).all())
 
 
 @pytest.mark.real_data
 def test_real_cones(data_dir: Path) -> None:
-    cones = depth_photographs(CAMERA, data=data_dir)[2:]
-    assert [s.scene_id for s in cones] == ["cones-front", "cones-middle"]
-    for scene in cones:
-        assert scene.size == (187, 225)
-        assert bool(torch.isfinite(scene.depth).all())
+    for scene in depth_photographs(CAMERA, data=data_dir)[2:]:
+        assert (scene.group, scene.size) == ("cones", (187, 225))
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
 
 
@@ -159,17 +149,16 @@ def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:
 
 
 def test_softness_is_that_of_edges() -> None:
-    # Edges anywhere in a pixel: 2/3 of the square lies between neighbours, 5/3 between second ones.
+    """Edges anywhere in a pixel: 2/3 of the square is between neighbours, 5/3 between second ones.
+
+    Private: the whole path would need a picture of every softness.
+    """
     rng = np.random.default_rng(0)
     edge = np.repeat(rng.uniform(1.0, 2.0, (256, 64)), 400, axis=1)  # 50 steps to a pixel
-    offset = rng.integers(0, 400, 256)
-    rows = np.stack([np.roll(r, o) for r, o in zip(edge, offset, strict=True)])
+    rows = np.stack([np.roll(r, int(rng.integers(400))) for r in edge])
     pixels = rows.reshape(256, -1, 50).mean(axis=2)
-    assert _edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
-    assert _edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
-    assert _edge_ratio(rows) == pytest.approx(0.5, abs=0.01)
-    smooth = np.exp(np.sin(np.arange(512) / 20) * 0.1)[None].repeat(4, axis=0)
-    assert _edge_ratio(smooth) == pytest.approx(0.25, abs=0.01)
+    assert pictures._edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
+    assert pictures._edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
 
 
 def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
