@@ -147,9 +147,6 @@ class Captures:
         return self.scene_light.shape[-2]
 
 
-# -- a scene in an episode ------------------------------------------------------------------------
-
-
 def prepare_scene(
     scene: Scene,
     camera: CameraProfile,
@@ -208,12 +205,10 @@ def describe_captures(
     source_noise: Sequence[NoiseLevelFunction] | None = None,
     noisy: bool = True,
 ) -> Captures:
-    """`Captures` of one state each of `scenes`, all (B,) long.
+    """`Captures` of one state each of `scenes`, all (B,) long, by one body.
 
     Args:
-        scenes: Scene of each capture.
-        settings: Settings of each capture.
-        camera: The body.
+        scenes, settings, camera: Scene and settings of each capture, and the body.
         speed, defocus: (B,) each, see `prepare_scene`.
         movements: Of each capture, see `prepare_scene`; None for along the rows.
         gain: (B,) light relative to the scenes' own.

@@ -164,9 +164,6 @@ def check_part(name: str, part: Any) -> None:
             raise ValueError(f"scorer {name!r} has `{attribute}` (={value!r}); it must be {rule}")
 
 
-# -- calling one scorer, which may be the user's own ----------------------------------------------
-
-
 def scores_of(
     name: str, scorer: Scorer, images: torch.Tensor | None, captures: Captures
 ) -> torch.Tensor:

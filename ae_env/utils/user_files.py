@@ -64,11 +64,11 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
     """The object that a Python file calls `name`, a class or a function.
 
     The file is run once, and again after it has changed. It may import modules beside it, as a
-    script may; files in different folders may have helpers of the same name.
+    script may; files in different folders may have helpers of the same name. A relative `path` is
+    looked for in the current folder, ``~`` is the home.
 
     Args:
-        path: The file; a relative one is looked for in the current folder, ``~`` is the home.
-        name: The object's name.
+        path, name: The file, and the object's name.
         argument: How errors begin, such as ``"`scorer` (='my_scorer.py:MyScore')"``.
         example: A name that the error proposes where there is none.
 
