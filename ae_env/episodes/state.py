@@ -272,8 +272,7 @@ class Episodes:
     def act(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Advances the episodes of `env_indices` by one frame, each with its action.
 
-        Returns:
-            Those of `env_indices` that show another scene now, the next of their sequence.
+        Returns those that show another scene now, the next of their sequence.
         """
         self.previous[env_indices] = self.state[env_indices]
         self.pending[env_indices, :-1] = self.pending[env_indices, 1:]

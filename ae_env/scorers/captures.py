@@ -315,8 +315,7 @@ class SceneCaptures:
     ) -> Captures:
         """Captures of some of the states, `part`, of a scene that is `prepared` as in the episode.
 
-        `gain` is the light relative to the scene's own, one or (S,), `row_gain` (S, H) that of each
-        row relative to that, see `Captures`.
+        For `gain` and `row_gain` see `ScoreTables.table`.
         """
         states, count = self.states[part], len(self.states[part])
         blur, alike = self.blur(scene, prepared, part)
@@ -346,11 +345,11 @@ class SceneCaptures:
     def blur(
         self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)
     ) -> tuple[torch.Tensor | PixelBlur, torch.Tensor]:
-        """The extents of blur that there are, of few states: the ISO blurs nothing.
+        """The extents of blur that there are, of few states: the ISO blurs nothing. See `describe`.
 
         Returns:
             (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
-            of the K each state has. The arguments are those of `describe`.
+            of the K each state has.
         """
         few, alike = np.unique(self._which[part], return_inverse=True)
         times, f_numbers = self._blurs[few].T

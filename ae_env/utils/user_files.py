@@ -169,9 +169,7 @@ def list_presets(kind: str = "env") -> list[str]:
 
 
 def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
-    """The YAML file of a preset of one `kind`, a folder of ``configs/``.
-
-    `name` is that of a preset, or the path of a ``.yaml`` file.
+    """The YAML file of a preset's name in a folder of ``configs/``, `kind`, or of its own path.
 
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.
