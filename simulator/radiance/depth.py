@@ -6,8 +6,6 @@ dead leaves of its own. Wherever several cover a pixel, the nearest is seen.
 
 Depth is drawn as the signed circle of confusion at f/11, because that is what decides how much
 such a scene can teach about defocus, and then converted to metres for a lens of 50 mm.
-
-`draw_layout` gives a picture without depth such surfaces: it draws their layout and paints nothing.
 """
 
 from __future__ import annotations

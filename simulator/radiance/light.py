@@ -25,11 +25,7 @@ DEFAULT_EV100 = 10.0
 
 
 def reference_settings(ev100: float) -> CameraSettings:
-    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`.
-
-    >>> reference_settings(10.0)
-    CameraSettings(iso=100.0, exposure_time=0.015625, f_number=4.0)
-    """
+    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`."""
     unit = CameraSettings(_REFERENCE_ISO, 1.0, _REFERENCE_F_NUMBER)
     return replace(unit, exposure_time=2.0 ** (-unit.log2_exposure - ev100))
 
@@ -104,10 +100,8 @@ def camera_light(
             reflectances); without, the scale is arbitrary.
         camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
         illuminance: Light on the subject [lux]; None where the scale is unknown.
-        ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped at
-            white, is set to 0.12.
-        illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`; decides the white
-            balance.
+        ev100: Without `illuminance`, where the mean of green, clipped at white, is set to 0.12.
+        illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`.
         sampled: Whether the pixels of `rgb`, (3, 2H, 2W), are photosites: they go through a lens
             that is sharp to about a pixel and the camera's colour filter array. Otherwise each
             becomes a packed pixel, all four planes of it at one place.

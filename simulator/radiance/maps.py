@@ -37,9 +37,8 @@ def read_radiance(path: str | Path) -> np.ndarray:
 
     Values that are not light are repaired, and the repair is logged: NaN and negative values
     (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
-
-    Its primaries are taken to be sRGB's, as those files usually have; alpha and further channels
-    are ignored; a file with luminance only is grey.
+    Primaries are taken to be sRGB's, as those files usually have; alpha and further channels are
+    ignored; a file with luminance only is grey.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -78,17 +77,10 @@ def map_views(
 
     A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
     with a field of view of 60 degrees; any other gives its central square. Both have about 256
-    packed pixels a side. Where the map has at least as many pixels there as photosites (512 x 512)
-    the views have twice as many, for a colour filter array to sample.
-
-    Args:
-        image: (3, H, W) linear light.
-        resolution: Packed pixels a side that the views are for; see `native_size`.
-        native: Whether the middle is to be cut out: then a coarser map is sampled, too, if it has
-            the photosites of that middle.
-
-    Returns:
-        The views by the ending of their names, and whether they are to be sampled.
+    packed pixels a side (`native_size`). Where the map has at least as many pixels there as
+    photosites (512 x 512) the views have twice as many, for a colour filter array to sample;
+    `native` samples a coarser map, too, if it has the photosites of a middle of `resolution`.
+    The views are by the ending of their names.
     """
     height, width = image.shape[1:]
     is_panorama = abs(width / height - 2.0) <= 0.01

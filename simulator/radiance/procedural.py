@@ -1,9 +1,8 @@
 """Seeded procedural scenes: the easy kinds and the five that fool a reflected-light meter.
 
 Every kind returns light on the reflectance scale: 1.0 is what a perfectly white surface sends
-under the stated illuminance, so that surfaces stay below 1 and lamps, sky and glints exceed it.
-The illuminance is what an incident-light meter reads where a photographer would hold it; the
-docstring of each kind says where that is.
+under the stated illuminance, which is what an incident-light meter reads where a photographer would
+hold it; the docstring of each kind says where that is.
 
 Most are dead leaves: occluding shapes of power-law size, the standard model of natural images.
 Sizes distributed as ``r**-3`` make the image scale invariant, with a power spectrum close to

@@ -202,14 +202,10 @@ class ReferenceCapture:
 class ReferenceCamera:
     """A body that photographs `ReferenceScene`.
 
-    Args:
-        camera: Sensor, with a noise calibration and, for scenes with depth, a pixel pitch.
-        body: Its hidden error.
-        box_factor: Samples k that are averaged per side and plane after they were recorded, each
-            with noise of its own: captures then have H // k x W // k pixels, their values whole
-            multiples of 1/k^2 digital numbers.
-        sensor_noise: Whether the read noise has the camera's rows and tails
-            (`CameraProfile.read_noise`); else it is normal and independent.
+    Its sensor has a noise calibration and, for scenes with depth, a pixel pitch; `box_factor` are
+    the samples k that are averaged per side and plane after they were recorded, each with noise of
+    its own: captures then have H // k x W // k pixels. With `sensor_noise` the read noise has the
+    camera's rows and tails (`CameraProfile.read_noise`); else it is normal and independent.
     """
 
     def __init__(
@@ -251,8 +247,7 @@ class ReferenceCamera:
     def blurred_light(self, scene: ReferenceScene, f_number: float) -> Tensor:
         """Light on the photosites behind the aperture `f_number`, (4, H, W).
 
-        It is at the exposure of ``scene.reference``, unclipped, without noise and not averaged: one
-        result serves every ISO and exposure time.
+        It is at the exposure of ``scene.reference``, unclipped, without noise and not averaged.
         """
         light = scene.light
         if scene.depth is not None:

@@ -98,8 +98,7 @@ FOCUS_CYCLE = (
 )
 #: The photograph of the bundled training split that validates.
 VALIDATION_PHOTOGRAPH = "coffee"
-#: Pictures that give fewer packed pixels a side than this are left out, unless smaller scenes are
-#: asked for.
+#: Fewest packed pixels a side of a picture, unless smaller scenes are asked for.
 LEAST_VIEW = 128
 #: Photographs (by file) with a blur of their own, by depth of field or motion.
 _BLURRED = {
@@ -309,9 +308,9 @@ def reference_scenes(
         camera: Camera in whose colours light is stated, and in whose pixels blur is.
         number: Procedural groups, one scene each; the first are the same whatever `number` is.
         size: Height and width [packed pixels], half as many as photosites; pictures that are
-            smaller keep their size, and are left out below 128 and below `size`, which is logged.
+            smaller keep their size, and are left out below 128 and below `size`.
         data: Folder of real files (see docs/networks.md).
-        seed: Seed of the procedural groups; part of their names.
+        seed: Of the procedural groups; part of their names.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     check_integer("number", number, 0, MOST_GROUPS)

@@ -153,13 +153,9 @@ def in_tiles(
 ) -> Tensor:
     """Apply `function` to `images` tile by tile, where it is needed.
 
-    Args:
-        function: Maps images (B, C, h, w) to one (B, D, h, w) or (B, h, w); an output pixel may
-            depend on input pixels at most `halo` away and on position only modulo 4.
-        *images: (B, C, H, W), all of one size.
-        halo, tile: Multiples of 4 [pixel]; the latter is the side of a tile.
-        needed: (H, W) bool, the pixels that need the function; by default all.
-        fallback: Values of all other pixels, of the result's shape; given with `needed`.
+    It maps images (B, C, h, w) of one size to one (B, D, h, w) or (B, h, w); an output pixel may
+    depend on input pixels at most `halo` away and on position only modulo 4. `needed` (H, W) are
+    the pixels that need the function, by default all; `fallback` has the values of all others.
     """
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)

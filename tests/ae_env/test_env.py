@@ -146,15 +146,6 @@ def test_costs_are_subtracted_and_shown() -> None:
         before = mean
 
 
-def test_clipped_fractions_are_those_of_the_frame() -> None:
-    env = make_env(observation="linear")
-    for state in (0, 63):  # the darkest but for ISO and aperture, and the brightest
-        observation, info = env.reset(seed=0, options={"state": state})
-        raw = observation["raw"]
-        assert info["clipped_high"] == pytest.approx((raw >= 1 - 1e-6).mean(), abs=1e-6)
-        assert info["clipped_low"] == pytest.approx((raw <= 2.0**-10).mean(), abs=1e-6)
-
-
 def test_motion_and_depth_can_be_switched_off() -> None:
     env = make_env(motion="none", depth="far", noise=False)
     for seed in range(4):
@@ -189,9 +180,8 @@ def test_oracle_is_spread_over_every_control(scenes: str) -> None:
         pytest.skip("needs the maps of Poly Haven (AE_ENV_DATA)")
     env = make_env(scenes=scenes, split="test", resolution=64).unwrapped
     states = []
-    for i in range(3 * len(env.scenes)):
-        wanted = [{"scene": i % len(env.scenes)}]
-        env.core.begin(np.array([0]), [np.random.default_rng(i)], wanted)
+    for i in range(len(env.scenes)):
+        env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
         states.append(env.score_table().oracle)
     for control in env.grid.controls(np.array(states)).T:
         assert np.bincount(control).max() <= 0.5 * len(states)
@@ -340,8 +330,6 @@ def test_values_that_are_fine(name: str, value: Any) -> None:
 
 
 GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
-
-
 BAD_AXES = [None, "100", [], [100, "x"], [True, 200], [NAN, 1], [2, 1], [1, 1], 100, [100, INF]]
 
 

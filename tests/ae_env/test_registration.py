@@ -164,11 +164,6 @@ def test_a_file_is_run_once_until_it_changes(tmp_path, monkeypatch):
     assert load_from_file("~/my file-1.py", "Mine", ARGUMENT) is first
     _write(file, "class Mine:\n    number = 2\n")  # in the same second, of the same length
     assert load_from_file(str(file), "Mine", ARGUMENT).number == 2
-    other = tmp_path / "folder"
-    other.mkdir()
-    twin = _write(other / "my file-1.py", "class Mine:\n    number = 3\n")
-    assert load_from_file(str(twin), "Mine", ARGUMENT).number == 3
-    assert load_from_file(str(file), "Mine", ARGUMENT).number == 2
 
 
 def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> None:

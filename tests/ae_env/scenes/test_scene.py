@@ -271,13 +271,6 @@ def noisy_scene() -> Scene:
     return Scene.from_array(data, NOISY, CAMERA, scene_id="noisy", nlf=nlf)
 
 
-def flat_scene(light: float, denoised: float | None = None) -> Scene:
-    given: dict[str, Any] = {"scene_id": "flat", "illuminance": 640.0}
-    if denoised is not None:
-        given |= {"nlf": CAMERA.nlf(NOISY.iso), "denoised": torch.full((4, 40, 40), denoised)}
-    return Scene.from_array(torch.full((4, 40, 40), light), NOISY, CAMERA, **given)
-
-
 def _state(iso: float, time: float, f_number: float) -> int:
     return ExposureGrid.default().states.index(CameraSettings(iso, time, f_number))
 
@@ -298,9 +291,8 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
 def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
     """All at ISO 100 and 1/15 s, of one picture: rewards rise as frames have less noise."""
     generator = torch.Generator().manual_seed(0)
-    picture = replace(
-        flat_scene(0.05), light=0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
-    )
+    light = 0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
+    picture = Scene.from_array(light, NOISY, CAMERA, scene_id="flat", illuminance=640.0)
     noisy = replace(picture, nlf=CAMERA.nlf(NOISY.iso))
 
     def made(scene: Scene, **arguments: Any) -> tuple[float, dict[str, float]]:

@@ -115,27 +115,21 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
             make_scorer(spec)
 
 
-class FakeMetric:
-    """A metric of pyiqa, which states its range."""
-
-    def __init__(self, mode: str, lower: bool | None, score_range: str | None) -> None:
-        self.metric_mode, self.lower_better, self.score_range = mode, lower, score_range
-
-    def __call__(self, images: torch.Tensor) -> torch.Tensor:
-        assert images.shape[1] == 3
-        return 100.0 * images.mean(dim=(1, 2, 3))[:, None]
-
-
 def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    metrics = {
-        "musiq": FakeMetric("NR", False, "~0, ~100"),
-        "niqe": FakeMetric("NR", True, "-50.0, 150"),
-        "lpips": FakeMetric("FR", True, "0, 1"),
-        "open": FakeMetric("NR", True, "0, inf"),
-        "old": FakeMetric("NR", None, None),
-    }
+    facts: dict[str, tuple[Any, ...]] = {"musiq": ("NR", False, "~0, ~100")}
+    facts |= {"niqe": ("NR", True, "-50.0, 150"), "lpips": ("FR", True, "0, 1")}
+    facts |= {"open": ("NR", True, "0, inf"), "old": ("NR", None, None)}
+
+    def create_metric(name: str, device: torch.device) -> Any:
+        def metric(images: torch.Tensor) -> torch.Tensor:
+            return 100.0 * images.mean(dim=(1, 2, 3))[:, None]
+
+        names = ("metric_mode", "lower_better", "score_range")
+        vars(metric).update(zip(names, facts[name], strict=True))
+        return metric
+
     module: Any = types.ModuleType("pyiqa")
-    module.create_metric = lambda name, device: metrics[name]
+    module.create_metric = create_metric
     monkeypatch.setitem(sys.modules, "pyiqa", module)
     images = torch.tensor([0.0, 0.25, 1.0])[:, None, None, None].expand(3, 3, 4, 4)
     higher = make_scorer("pyiqa:musiq")
