@@ -134,7 +134,10 @@ def test_bad_values_are_named(name: str, value: object) -> None:
 
 @pytest.mark.parametrize(
     ("exposure_time", "text"),
-    [(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.5, "1/2 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+    [
+        *[(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.3, "1/3.333 s"), (0.4, "0.4 s")],
+        *[(0.5, "1/2 s"), (0.6, "0.6 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+    ],
 )
 def test_format(exposure_time: float, text: str) -> None:
     assert format_exposure_time(exposure_time) == text

@@ -76,6 +76,11 @@ def test_arithmetic() -> None:
     assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
     assert nlf.scaled(1 / 16).read == pytest.approx((2.5e-9, 1.875e-9, 1.875e-9, 1.25e-9))
     assert ZERO.is_zero
+    assert not nlf.extrapolated
+    for stops in (2.0, -1.0):  # whatever is done with it
+        beyond = replace(nlf, extrapolation=stops)
+        made = beyond, beyond.exposed(8), beyond.scaled(0.5), beyond.at_least(ZERO)
+        assert [(n.extrapolation, n.extrapolated) for n in made] == [(stops, True)] * 4
     assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
     most = NoiseLevelFunction((1.0,) * 4, (1.0,) * 4).exposed(1e30)
     assert (most.shot, most.read) == ((1e24,) * 4, (1e24,) * 4)
