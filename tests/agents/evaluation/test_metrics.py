@@ -56,6 +56,8 @@ def test_ev_error_is_to_the_nearest_state_that_is_good_enough():
 def test_frames_to_converge(errors, frames, converged):
     found = metrics.frames_to_converge(np.array(errors, float))
     assert (int(found[0]), bool(found[1])) == (frames, converged)
+    found = metrics.frames_to_converge(np.array([1.0, 0.5, 0.5]), tolerance=0.5)
+    assert int(found[0]) == 2  # the largest error that counts
 
 
 @pytest.mark.parametrize(
@@ -140,8 +142,10 @@ def test_flicker_counts_frames_of_the_same_light_only():
 def test_jumps_are_the_mean_change_of_successive_frames():
     means = np.array([[0.1, 0.3, 0.2], [0.5, 0.5, 0.5]])
     np.testing.assert_allclose(metrics.jump(means), [0.15, 0.0])
+    assert metrics.jump(means[0]) == pytest.approx(0.15)
     np.testing.assert_allclose(metrics.jump(means[:, :2]), [0.2, 0.0])
-    assert metrics.jump(means[:, :1]).tolist() == [0.0, 0.0]  # one frame alone never jumps
+    for alone in (means[:, :1], means[0, :1]):  # one frame never jumps
+        assert metrics.jump(alone).tolist() == np.zeros(alone.shape[:-1]).tolist()
 
 
 def test_delayed_states_are_the_start_until_the_first_is_in_effect_and_groups_count_alike():
