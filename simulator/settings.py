@@ -1,7 +1,4 @@
-"""Camera settings and the photographic arithmetic between them.
-
-Everything is computed in log2 and float64; callers cast last.
-"""
+"""Camera settings and the photographic arithmetic between them, in log2 and float64."""
 
 from __future__ import annotations
 

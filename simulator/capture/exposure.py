@@ -48,11 +48,7 @@ _STREAK_TO_DISC = 4.0 / 3.0
 
 
 def check_tolerance(tolerance: float) -> float:
-    """`tolerance` as a float.
-
-    Raises:
-        ValueError: Unless it is a finite number >= 0.
-    """
+    """`tolerance` as a float; a `ValueError` unless it is a finite number >= 0."""
     return check_number("tolerance", tolerance, 0.0, sys.float_info.max)
 
 
@@ -226,10 +222,8 @@ def decide(
 
 
 def _motion(scene: PreparedScene, time: float) -> tuple[float, Path | None, Path | None]:
-    """Length of the longest path in an exposure [pixel], and both paths.
-
-    That of the background is None for a streak along the rows, that of the subject where it does
-    not move on its own.
+    """Length of the longest path in an exposure [pixel]; the background's, None for a streak along
+    the rows; and the subject's, None where it does not move on its own.
     """
     layout, movement, height = scene.layout, scene.movement, scene.light.shape[-2]
     apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0

@@ -299,11 +299,13 @@ class PreparedScene:
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
+        excess_noise, lacks_noise = noise_balance(light, exposure)
         return SimulationPlan(
             settings=settings,
             exposure=exposure,
             errors=predict_errors(self, settings, exposure),
-            balance=noise_balance(light, exposure),
+            excess_noise=excess_noise,
+            lacks_noise=lacks_noise,
             clipped_source=self.saturated_share,
             tolerance=self.tolerance,
             samples=self.light.numel(),
@@ -371,8 +373,7 @@ class PreparedScene:
         """
         exposure = self.exposure(settings)
         (frame,) = self.expose([settings], seed=seed, noise=noise)
-        balance = noise_balance(self.blurred_light.blurred(exposure), exposure)
-        return frame, balance.relative_excess_variance
+        return frame, noise_balance(self.blurred_light.blurred(exposure), exposure)[0]
 
     def expose(
         self,
