@@ -207,7 +207,8 @@ class CaptureBatch:
         read_noise = None
         if self.noise == "sensor":
             pairs = zip(indices.tolist(), states.tolist(), strict=True)
-            read_noise = [self.prepared_scene(i).read_noise(self.states[s]) for i, s in pairs]
+            boxes = [(self.states[s].iso, self.prepared_scene(i).box_factor) for i, s in pairs]
+            read_noise = [self.camera.read_noise(iso, box) for iso, box in boxes]
         counts = record(
             transitions,
             self.camera,

@@ -67,12 +67,7 @@ class ApertureBlur(ABC):
         return self._extents[f_number]
 
     def opened(self, f_number: float, denoised: DenoisedLight | None = None) -> Tensor:
-        """Light (4, H, W) at the wider aperture, at unchanged exposure.
-
-        Args:
-            f_number: Effective f-number wanted, smaller than the source's.
-            denoised: The noise-reduced light that is opened; None for the light as recorded.
-        """
+        """Light (4, H, W) at a wider aperture, of `denoised` or as recorded, equally exposed."""
         key = f_number, None if self.needs_denoised else denoised
         result = self._opened.get(key)
         if result is None:
@@ -105,7 +100,6 @@ class MapApertureBlur(ApertureBlur):
         light: (4, H, W) as recorded.
         diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or a function that
             estimates it, called when an aperture first opens.
-        f_number, everywhere: See `ApertureBlur`.
     """
 
     def __init__(
@@ -265,15 +259,7 @@ class BlurredLight:
 
     def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
-        copied = BlurredLight(
-            self.light,
-            self.denoised_lights,
-            self.residuals.nlf,
-            self.aperture_blur,
-            statistics=self.statistics,
-            cache_bytes=cache_bytes,
-            pool=pool,
-        )
+        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes, pool)
         copied.residuals = self.residuals
         return copied
 

@@ -1,11 +1,10 @@
 """Statistics of a light, from which the errors of a capture are predicted.
 
-Errors are those of `simulator.capture.plan.SimulationPlan`. `LightStatistics` predicts what steps
-that are left out make, `ResidualStatistics` what a denoising network makes: the noise that it
-leaves, and the detail that it takes for noise. Both are, in units of the noise, functions of how
-well noise and detail can be told apart: of the error that the best linear filter would make. They
-are measured once for each network, on pictures that it was not trained on, and are part of its
-weights' card.
+`LightStatistics` predicts the errors of steps that are left out, `ResidualStatistics` those of a
+denoising network: the noise that it leaves, and the detail that it takes for noise. Both are, in
+units of the noise, functions of how well noise and detail can be told apart: of the error that the
+best linear filter would make. They are measured once for each network, on pictures that it was not
+trained on, and are part of its weights' card.
 """
 
 from __future__ import annotations
@@ -122,10 +121,8 @@ def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ig
     """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
     total = 0.0
     for plane in range(share.shape[0]):
-        source_shot, source_read = (
-            source[0, plane] * ratio * ratio,
-            source[1, plane] * ratio * ratio,
-        )
+        source_shot = source[0, plane] * ratio * ratio
+        source_read = source[1, plane] * ratio * ratio
         shot, read = target[0, plane] * ratio, target[1, plane]
         for edge in range(2):
             light, shares = edges[edge, plane], share[plane]
@@ -210,12 +207,7 @@ class LightStatistics:
         return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
 
     def blur_change(
-        self,
-        ratio: float,
-        source: NoiseLevelFunction,
-        target: NoiseLevelFunction,
-        *,
-        noise: bool = True,
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction, *, noise: bool
     ) -> float:
         """What a disc of one pixel changes, in units of the target's noise; other than in
         `curvature` estimated, not bounded: the noise of the light itself is taken out.
@@ -436,11 +428,8 @@ class ResidualStatistics:
     """Predicts the errors of networks on one recorded light, for any target.
 
     Each value is computed when it is first needed; the first answer takes a pass over the pixels
-    (over some rows of blocks, where the frame is large), later ones a few microseconds.
-
-    Args:
-        light: (4, H, W) as recorded.
-        nlf: Its noise.
+    (over some rows of blocks, where the frame is large), later ones a few microseconds. `nlf` is
+    the noise of `light` (4, H, W) as recorded.
     """
 
     def __init__(self, light: torch.Tensor, nlf: NoiseLevelFunction) -> None:
@@ -513,8 +502,7 @@ def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
 class DenoisedLight:
     """Light with its noise removed by a noise module.
 
-    A network is the most expensive step there is, and many transitions need none: it runs when
-    `light` is first read, and only then.
+    The network, the most expensive step there is, runs when `light` is first read.
 
     Args:
         light: (4, H, W) float32, or a function that works it out.

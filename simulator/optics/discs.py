@@ -418,10 +418,7 @@ class DiscBank:
 
 
 def _frame_of(diameter: Tensor) -> Tensor | None:
-    """The diameters as one frame (H, W) that the kernels take; None if they are not.
-
-    Nothing is learnt through the kernels: a gradient takes the other way.
-    """
+    """The diameters as one frame (H, W) for the kernels, which pass no gradient; else None."""
     learns = diameter.requires_grad and torch.is_grad_enabled()
     frame = diameter.detach()
     if learns or not has_kernels(frame) or frame.ndim < 2 or frame.numel() == 0:
@@ -469,12 +466,9 @@ def _kernel_products() -> np.ndarray:
     kernels = [disc_kernel(d) for d in DIAMETERS]
     products = np.zeros((len(kernels), len(kernels)))
     for i, disc in enumerate(kernels):
-        products[i, i] = (disc**2).sum()
-        if i + 1 < len(kernels):
-            larger = kernels[i + 1]
-            margin = (larger.shape[0] - disc.shape[0]) // 2
-            inner = larger[margin : margin + disc.shape[0], margin : margin + disc.shape[0]]
-            products[i, i + 1] = (disc * inner).sum()
+        for j, other in enumerate(kernels[i : i + 2]):
+            inner = slice((len(other) - len(disc)) // 2, (len(other) + len(disc)) // 2)
+            products[i, i + j] = (disc * other[inner, inner]).sum()
     return products
 
 
@@ -616,17 +610,10 @@ def _sum_products(correlations, rows, columns, weights, products):  # type: igno
 
 
 def box_mean(x: Tensor, window: int) -> Tensor:
-    """Mean over `window` x `window` pixels, borders repeated.
+    """Mean of `x` (B, C, H, W) over `window` x `window` pixels, an odd number, borders repeated.
 
     Sums over 1, 2, 4, 8 ... pixels are doubled from one another: a few additions of whole images
     where pooling would read every pixel `window` times.
-
-    Args:
-        x: (B, C, H, W).
-        window: Odd side of the window [pixel].
-
-    Returns:
-        (B, C, H, W).
     """
     height, width = x.shape[-2:]
     padded = F.pad(x, (window // 2,) * 4, mode="replicate")

@@ -11,6 +11,7 @@ aperture, it sees past an edge, and the surface behind it is continued under the
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -19,6 +20,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from simulator.optics.discs import disc_blur, disc_kernel
+from simulator.utils.checks import check_number
 
 _Length = TypeVar("_Length", float, np.ndarray, torch.Tensor)
 
@@ -47,8 +49,7 @@ class Lens:
     focus_distance: float = math.inf
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.focal_length < math.inf:
-            raise ValueError(f"`focal_length` (={self.focal_length!r}) must be finite and > 0")
+        check_number("focal_length", self.focal_length, sys.float_info.min, sys.float_info.max)
         if not self.focus_distance > self.focal_length:
             raise ValueError(
                 f"`focus_distance` (={self.focus_distance!r}) must be above `focal_length` "
