@@ -492,7 +492,7 @@ class CameraSimulator:
                 )
                 opened = aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        lights = BlurredLight(opened[0], (), at_target.source, None)
+        lights = BlurredLight(opened[0], at_target.source, None)
         light = exposed_light(lights.blurred(at_target), at_target)
         capture = torch.empty_like(light)[None]
         record(Transitions.of([light], [at_target]), prepared.camera, keys=keys, signals=capture)

@@ -141,11 +141,6 @@ class MapApertureBlur(ApertureBlur):
     def _added(self, diameter: Tensor, f_number: float) -> Tensor:
         return discs.added_blur(diameter, self.f_number, f_number)
 
-    @functools.cached_property
-    def _tiles(self) -> list[Tile]:
-        """The parts of the frame that are out of focus."""
-        return make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
-
     def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:
         light = self._recorded if denoised is None else denoised.light
 
@@ -155,7 +150,7 @@ class MapApertureBlur(ApertureBlur):
             cache = self._banks if self.diameter.numel() <= TILE**2 else {}
             return _bank(cache, (tile, denoised), light[tile.outer]).blurred(added)[tile.core]
 
-        tiles = self._tiles
+        tiles = make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
         if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
             return blurred(tiles[0])
         result = light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT)
@@ -223,7 +218,6 @@ class BlurredLight:
 
     Args:
         light: (4, H, W) as recorded.
-        denoised_lights: The same with little noise, by each network.
         nlf: Noise of `light`.
         aperture_blur: Blur that wider apertures add, or None.
         statistics: Statistics of `light`, where they are at hand.
@@ -234,15 +228,13 @@ class BlurredLight:
     def __init__(
         self,
         light: Tensor,
-        denoised_lights: tuple[DenoisedLight, ...],
         nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
         cache_bytes: int = CACHE_BYTES,
         pool: Pool | None = None,
     ) -> None:
-        self.light, self.denoised_lights = light, denoised_lights
-        self.aperture_blur = aperture_blur
+        self.light, self.aperture_blur = light, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
         self._cache_bytes = cache_bytes
@@ -254,8 +246,8 @@ class BlurredLight:
 
     @property
     def known(self) -> tuple[Any, ...]:
-        """All that is known of the light: the arguments between it and the statistics."""
-        return self.denoised_lights, self.residuals.nlf, self.aperture_blur
+        """Its noise and its aperture blur."""
+        return self.residuals.nlf, self.aperture_blur
 
     def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
@@ -305,13 +297,10 @@ class BlurredLight:
     # -- batches ------------------------------------------------------------------------------
 
     def begin(self, exposure: Exposure) -> tuple[Tensor, Blur | Callable[[], None] | None]:
-        """The light (4, H, W) with every blur of `exposure`, valid until the next call.
+        """The light (4, H, W) with every blur of `exposure`, valid until the next call; and the
+        blur or the function that fills it, None where that was done before.
 
         The latest light is cached, because an agent that has settled repeats its state.
-
-        Returns:
-            The light, and the blur (`simulator.optics.discs.blur_many`) or the function that fills
-            it; None where that was done before.
         """
         if self._latest is not None and self._latest[0] == exposure.blur:
             return self._latest[1], None

@@ -222,21 +222,21 @@ class PreparedScene:
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
-        known = self.denoised_lights, self.nlf, self.aperture_blur
-        same_light = cached is not None and cached.light is self.light
-        if cached is None or not same_light or cached.known != known:
-            if not same_light:  # a copy's light was checked before
-                object.__setattr__(self, "light", check_packed("light", self.light))
-            for denoised in self.denoised_lights:
-                check_type("denoised_lights", denoised, DenoisedLight)
-                if denoised.shape not in (None, self.light.shape):
-                    raise ValueError(
-                        f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
-                        f"`light`, {tuple(self.light.shape)}"
-                    )
-            statistics = cached.statistics if cached is not None and same_light else None
-            lights = BlurredLight(self.light, *known, statistics)
+        if cached is not None and cached.light is not self.light:
+            cached = None
+        if cached is None:  # else the light was checked before
+            object.__setattr__(self, "light", check_packed("light", self.light))
+        if cached is None or cached.known != (self.nlf, self.aperture_blur):
+            statistics = None if cached is None else cached.statistics
+            lights = BlurredLight(self.light, self.nlf, self.aperture_blur, statistics)
             object.__setattr__(self, "blurred_light", lights)
+        for denoised in self.denoised_lights:
+            check_type("denoised_lights", denoised, DenoisedLight)
+            if denoised.shape not in (None, self.light.shape):
+                raise ValueError(
+                    f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
+                    f"`light`, {tuple(self.light.shape)}"
+                )
         unit = " frame heights per second"
         check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
         check_number("defocus", self.defocus, 0.0, math.inf)

@@ -220,19 +220,20 @@ class LightStatistics:
         detail = np.maximum(bins.disc - _LAPLACIAN * own, 0.0)
         if noise:
             detail = np.where(ratio * (bins.light - SURE * np.sqrt(own)) > 1.0, 0.0, detail)
-        return abs(ratio) / 32.0 * _root_mean(bins.share, detail / wanted)
+        return abs(ratio) / 32.0 * math.sqrt(np.vdot(bins.share, detail / wanted))
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
         signal, wanted = self._signal(ratio, target)
-        return _root_mean(self._bins.share, signal**2 / wanted)
+        return math.sqrt(np.vdot(self._bins.share, signal**2 / wanted))
 
     def relative_noise(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
         """Root mean square of the exposed source's noise in units of the target's."""
         signal, wanted = self._signal(ratio, target)
-        return _root_mean(self._bins.share, _variance(signal, source.exposed(ratio)) / wanted)
+        relative = _variance(signal, source.exposed(ratio)) / wanted
+        return math.sqrt(np.vdot(self._bins.share, relative))
 
     def relative_excess_variance(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
@@ -304,10 +305,6 @@ def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
 def noise_numbers(nlf: NoiseLevelFunction) -> np.ndarray:
     """(2, 4) shot and read noise of the planes."""
     return np.array([nlf.shot, nlf.read])
-
-
-def _root_mean(weight: np.ndarray, square: np.ndarray) -> float:
-    return math.sqrt(float(np.vdot(weight, square)))
 
 
 # -- errors of networks -----------------------------------------------------------------------

@@ -107,8 +107,7 @@ class UNet(nn.Module):
     bilinear upsampling and concatenated skips on the way up, a last 3 x 3 convolution without
     activation; 7.85 M parameters at the default widths. ``"ncs"``: batch normalisation after each
     convolution, zero borders, a last 1 x 1 convolution; 13.4 M. Use it in evaluation mode: in
-    training mode the normalisation takes its statistics from the batch. The weights are drawn from
-    torch's global generator.
+    training mode the normalisation takes its statistics from the batch.
 
     Args:
         variant: ``"paper"`` or ``"ncs"``.
@@ -309,7 +308,7 @@ class AttentionUNet(nn.Module):
     beside the image; being constant, these cancel in the first normalisation as a bias would.
     A constant image has a constant residual, which depends on the apertures only. Run it in
     float32: so many normalisations in a row multiply differences, and bfloat16's rounding grows to
-    half the residual of a new network. The weights are drawn from torch's global generator.
+    half the residual of a new network.
 
     ``"paper"``: f-numbers, bilinear upsampling, replicated borders; 8.78 M parameters at the
     default widths. ``"ncs"``: `light_of_aperture`, nearest-neighbour upsampling, zero borders;

@@ -116,13 +116,9 @@ def _transform(length, angle, first, second):  # type: ignore[no-untyped-def]
 
 @_jit()
 def draw_block(key, block, words, out):  # type: ignore[no-untyped-def]
-    """Draws the `BLOCK` normals of a block.
+    """Draws the `BLOCK` normals of a frame's block, whose number is below 2**26, into `out`.
 
-    Args:
-        key: uint64, of the frame.
-        block: Number of the block in the frame, below 2**26.
-        words: (4, BLOCK / 4) uint32 to work in.
-        out: (BLOCK,) float32.
+    `key` is a uint64; `words` (4, BLOCK / 4) uint32 is to work in.
     """
     low, high, zero = np.uint32(key), np.uint32(key >> _WORD), np.uint32(0)
     for j in range(_COUNTERS):

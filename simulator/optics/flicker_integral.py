@@ -37,14 +37,11 @@ class Lamp:
             check_number(field.name, getattr(self, field.name), *_RANGES[field.name])
 
     def mean_light(self, start: ArrayLike, exposure_time: float) -> np.ndarray:
-        """Mean light of exposures.
+        """Mean light (...) float64 of exposures, relative to the lamp's long-term mean.
 
         Args:
             start: (...) when each exposure begins [s], in [-1e9, 1e9].
             exposure_time: How long each lasts [s], in [1e-12, 1e9].
-
-        Returns:
-            (...) float64, relative to the lamp's long-term mean.
         """
         start = np.asarray(start, np.float64)
         time = check_number("exposure_time", exposure_time, _SHORTEST, _LONGEST, more=" s")
@@ -58,17 +55,14 @@ class Lamp:
     def row_light(
         self, start: float, exposure_time: float, rows: int, row_time: float, sensor_rows: int = 2
     ) -> np.ndarray:
-        """Mean light of each row of a packed raw behind a rolling shutter.
+        """Mean light (rows,) float64 of each row of a packed raw behind a rolling shutter.
 
         Args:
             start: When the first sensor row begins its exposure [s].
             exposure_time: How long each row is exposed [s].
-            rows: Rows of the packed raw.
+            rows: Their number.
             row_time: From one sensor row's begin to the next one's [s].
             sensor_rows: Sensor rows that one packed row is the mean of.
-
-        Returns:
-            (rows,) float64.
         """
         begins = start + row_time * np.arange(rows * sensor_rows)
         return self.mean_light(begins, exposure_time).reshape(rows, sensor_rows).mean(axis=1)
