@@ -435,11 +435,7 @@ class CameraSimulator:
     ) -> SimulationPlan:
         """Which steps the change to `settings` takes, why others are left out, error and cost.
 
-        Args:
-            source: A raw, a prepared scene, or a scene.
-            settings: Target settings.
-            noise: False plans the light on the sensor alone (`PreparedScene.expected`).
-            tolerance, scene: See `prepare`.
+        Without `noise`, of the light on the sensor alone; see `prepare` for the other arguments.
         """
         return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 
@@ -458,11 +454,10 @@ class CameraSimulator:
         presets ``"paper"`` and ``"ncs"`` clip to [0, 1] after the exposure, as the paper does.
 
         Args:
-            source: A raw, a prepared scene, or a scene.
+            source, scene: See `prepare`; by default the depth is unknown.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-            scene: See `prepare`; by default the depth is unknown.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.

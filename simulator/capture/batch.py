@@ -98,8 +98,7 @@ class FrameSource(Protocol):
         """Records scenes that are prepared, and fills the outputs.
 
         Args:
-            indices: (B,) of the scenes.
-            states: (B,) at which each is photographed.
+            indices, states: As they were prepared.
             seeds: (B,) integers >= 0, of the noise.
             frames: (B,) numbers that the noise of one seed differs by.
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None

@@ -164,15 +164,7 @@ def kernel_energy(motion_px: float, defocus_px: float) -> float:
 
 
 def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
-    """Defocus by a uniform disc.
-
-    Args:
-        light: (..., H, W) linear light.
-        diameter_px: Diameter of the circle of confusion, in pixels, >= 0.
-
-    Returns:
-        (..., H, W), the same dtype.
-    """
+    """Defocus of linear `light` (..., H, W) by a uniform disc of `diameter_px` >= 0 pixels."""
     weights = disc_kernel(diameter_px)
     taps = weights.shape[0]
     if taps == 1:
@@ -216,9 +208,7 @@ class Blur(NamedTuple):
 def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
     """Blurs images of one shape: as `disc_blur` and `motion_blur`, but each image on one thread.
 
-    Args:
-        blurs: The images and their blurs; (P, H, W) each where a disc is wide.
-        limit: See `simulator.optics.motion.motion_blur`.
+    Where a disc is wide, images are (P, H, W); `limit` is that of `motion_blur`.
     """
     wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
     if wide:

@@ -116,10 +116,9 @@ class PulsedLamp(Lamp):
 def _periods(
     start: np.ndarray, time: float, frequency: float, phase: float
 ) -> tuple[np.ndarray, int, float]:
-    """Where in a period exposures begin, in [0, 1), and how long they last.
+    """Where in a period exposures begin, whole periods that they last, and what is left of one.
 
-    Returns:
-        Begin; whole periods of the exposure; what is left of one, in [0, 1).
+    Begin and rest are in [0, 1).
     """
     turns, missing = _product(start, frequency)
     # Each exact: what is left of a day of periods must still tell where in one it is.

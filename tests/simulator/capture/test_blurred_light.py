@@ -13,6 +13,7 @@ from scipy.ndimage import correlate
 from torch import Tensor
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
+from simulator.capture import batch as batch_module
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.exposure import Exposure
@@ -376,6 +377,28 @@ def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -
     assert (calls[7:], len(batch._pool.free)) == ([3], 1)
     np.testing.assert_array_equal(again, first)
     np.testing.assert_array_equal(after, first)
+
+
+@pytest.mark.parametrize("stage", ["blur_many", "decide"])
+def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+    """While the light is blurred, or while the plan of a later frame is made."""
+    batch, calls = made(), []
+    photographed(batch, 0)
+    original = getattr(batch_module, stage)
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args)
+        if stage == "decide" and len(calls) < 4:
+            return original(*args, **kwargs)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch_module, stage, fail)
+        with pytest.raises(KeyboardInterrupt):
+            photographed(batch, 1)
+    for states in (1, 0):
+        expected, _ = photographed(made(), states)
+        np.testing.assert_array_equal(photographed(batch, states)[0], expected)
 
 
 def test_a_pickled_copy_works_everything_out_again() -> None:
