@@ -41,9 +41,7 @@ from simulator.networks.unet import (
     AttentionUNet,
     SkipAttention,
     UNet,
-    halve,
     instance_norm,
-    resize_to,
 )
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
@@ -291,18 +289,6 @@ def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> N
 # Presets
 
 
-@pytest.mark.parametrize(
-    ("preset", "limit"), [("nano", 100_000), ("compact", 1_000_000), ("large", 6_000_000)]
-)
-def test_sizes_of_the_family(preset: Preset, limit: int) -> None:
-    module = NoiseModule(preset)
-    assert limit / 2 < sum(p.numel() for p in module.parameters()) <= limit
-    assert module.commutes
-    assert module.residual is None
-    with pytest.raises(ValueError, match="`preset`"):
-        NoiseModule("tiny")
-
-
 def test_operations_by_hand() -> None:
     """Two per weight and place; a level has a quarter of the places of the one before."""
     convolutions = [(1, 9, 16, 16), (1, 9, 16, 4)]  # head and tail
@@ -537,15 +523,6 @@ def test_against_a_numpy_transcription() -> None:
     expected = numpy_convolution(decoded, next(layers))
     result = net(torch.from_numpy(image)[None])[0].detach().numpy()
     np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-12)
-
-
-def test_borders() -> None:
-    """Pooling keeps the last row and column; zero-padding would put a frame around flat raws."""
-    x = torch.arange(15.0).reshape(1, 1, 3, 5)
-    assert halve(x)[0, 0].tolist() == [[6, 8, 9], [11, 13, 14]]
-    assert resize_to(halve(x), x).shape == x.shape
-    residual = UNet(widths=(4, 6, 8))(torch.full((1, 8, 9, 12), 0.3))
-    assert float(residual.detach().std(dim=(2, 3)).max()) < 1e-6
 
 
 # Instance normalisation

@@ -11,8 +11,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.integrate import quad
 from scipy.ndimage import correlate
@@ -40,7 +38,6 @@ from simulator.optics.motion import (
     path_taps,
 )
 from simulator.optics.thin_lens import Lens, defocus
-from tests.strategies import log_uniform
 
 
 @pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
@@ -338,33 +335,6 @@ def test_bad_values_are_refused(make, name):
         make()
 
 
-PHASES = st.floats(0.0, 1.0)
-LAMPS = st.one_of(
-    st.builds(Lamp),
-    st.builds(MainsLamp, log_uniform(1, 1e5), st.floats(0, 1), PHASES),
-    st.builds(PulsedLamp, log_uniform(1, 1e5), log_uniform(1e-6, 1), PHASES),
-)
-
-
-@given(LAMPS, st.floats(-10, 10), log_uniform(1e-6, 10), log_uniform(1e-6, 10))
-def test_lamps_add_up_over_time(lamp, start, first, second):
-    def light(begin: float, time: float) -> float:
-        mean = float(lamp.mean_light(begin, time))
-        assert 0.0 <= mean < math.inf
-        return mean * time
-
-    parts = light(start, first) + light(start + first, second)
-    brightest = 1.0 / lamp.duty if isinstance(lamp, PulsedLamp) else 2.0
-    # A moment is known to an ulp of 16 s: so the light at both ends of a part, at its brightest.
-    bound = 8 * 2.0**-48 * brightest
-    assert parts == pytest.approx(light(start, first + second), rel=1e-12, abs=bound)
-
-
-@given(LAMPS, st.floats(-10, 10))
-def test_long_exposures_see_the_mean(lamp, start):
-    assert float(lamp.mean_light(start, 1e6)) == pytest.approx(1.0, abs=2e-6)
-
-
 # -- discs, streaks and banks of discs ------------------------------------------------------------
 BETWEEN = [0.35, 0.85, 1.2, 1.7, 2.4, 3.3, 5.0, 6.5, 9.7, 14.0, 19.0, 27.0]
 KNOTS = np.array(DIAMETERS) ** 2
@@ -414,17 +384,6 @@ def test_application_is_scipys_convolution(extent, size, dtype):
         expected = ndimage.convolve(before, weights, mode="nearest")
         np.testing.assert_allclose(found.numpy(), expected, atol=2e-6)
     np.testing.assert_array_equal(image.numpy(), before)
-
-
-@BOTH
-@pytest.mark.parametrize("extent", [0.4, 3.0, 9.0, 30.0])
-def test_a_bright_lamp_leaves_no_ringing(blur, extent):
-    image = torch.full((4, 64, 64), 1e-3)
-    image[:, 32, 32] = 1e6
-    out = blur(image, extent)
-    assert float(out.min()) >= 1e-3 * (1 - 1e-5)
-    np.testing.assert_allclose(out[:, 0, 0].numpy(), 1e-3, rtol=1e-5)
-    np.testing.assert_allclose(out.double().sum((1, 2)), [1e6] * 4, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -605,19 +564,6 @@ def test_it_is_the_blend_of_whole_frames(size, high):
     diameter.view(-1)[::7] = 0.0
     found = DiscBank(image).blurred(diameter)
     torch.testing.assert_close(found, through_torch(image, diameter), rtol=1e-6, atol=1e-6)
-
-
-def test_interpolation_is_linear_in_the_squared_diameter():
-    """Levels that are constants, by NumPy's own interpolation; only those in use are computed."""
-    diameter = uniform(3, 200, high=35.0)
-    bank = DiscBank(torch.zeros(2, 3, 200))
-    for index in range(1, len(DIAMETERS)):
-        bank._levels[index] = torch.full((2, 3, 200), float(index**2))  # stands for a blur
-    wanted = np.interp(diameter.double() ** 2, KNOTS, [float(i * i) for i in range(len(KNOTS))])
-    np.testing.assert_allclose(bank.blurred(diameter), np.stack([wanted] * 2), rtol=1e-5, atol=1e-5)
-    few = DiscBank(torch.zeros(1, 40, 600))
-    few.blurred(torch.tensor([0.3, 9.0]).repeat_interleave(20)[:, None].expand(40, 600))
-    assert sorted(few._levels) == [0, 1, *(DIAMETERS.index(d) for d in (8.0, 11.3))]
 
 
 def test_remaining_variance_is_that_of_each_pixels_kernel():
