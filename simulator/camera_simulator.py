@@ -89,11 +89,7 @@ class Stages:
 
 
 def prepared_of(source: Source, device: torch.device) -> PreparedScene:
-    """The light of `source` as it was recorded, or a prepared scene as it is, on `device`.
-
-    Raises:
-        ValueError: If `source` is neither a raw nor a prepared scene nor a scene.
-    """
+    """The light of `source` as it was recorded, or a prepared scene as it is, on `device`."""
     if isinstance(source, RawImage):
         marks, camera = source.saturated, source.camera
         if source.nlf is not None and not camera.nlf_by_iso:

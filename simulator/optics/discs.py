@@ -440,7 +440,11 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
         diameter: (..., H, W) blur diameter of each pixel [pixel].
         taps: Of a motion behind the discs; None for none.
     """
-    products = _kernel_products() if taps is None else _moved_products(taps, diameter)
+    products = _kernel_products()
+    if taps is not None:
+        count = min(int(np.searchsorted(DIAMETERS, float(diameter.max()))) + 1, len(DIAMETERS))
+        products, weights = np.zeros_like(products), taps.weights.astype(np.float64)
+        _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
     ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
     frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
     out = torch.empty(frame.shape)
@@ -476,16 +480,6 @@ def _correlations() -> np.ndarray:
             inner = slice(margin, margin + len(both))
             found[i, j, inner, inner] = both
     return found
-
-
-def _moved_products(taps: Taps, diameter: Tensor) -> np.ndarray:
-    """`_kernel_products` of discs behind which there is a motion, up to the largest `diameter`."""
-    largest = float(diameter.max())
-    count = min(int(np.searchsorted(DIAMETERS, largest)) + 1, len(DIAMETERS))
-    products = np.zeros((len(DIAMETERS), len(DIAMETERS)))
-    weights = taps.weights.astype(np.float64)
-    _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
-    return products
 
 
 # Each pixel looks up the two images around its squared diameter and interpolates between them: no
