@@ -48,6 +48,8 @@ class ApertureBlur(ABC):
 
     #: Whether it works on the noise-reduced light only.
     needs_denoised = False
+    #: Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown.
+    mean_square_diameter: float = 0.0
 
     def __init__(self, f_number: float, everywhere: bool = True) -> None:
         self.f_number, self.everywhere = f_number, everywhere
@@ -74,11 +76,6 @@ class ApertureBlur(ABC):
             result = self._open(f_number, denoised)
             self._opened.put(key, result, result.nbytes)
         return result
-
-    @property
-    def mean_square_diameter(self) -> float:
-        """Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown."""
-        return 0.0
 
     @abstractmethod
     def remaining_variance(self, f_number: float) -> Tensor | None:
@@ -131,7 +128,7 @@ class MapApertureBlur(ApertureBlur):
         return self._left[f_number]
 
     @functools.cached_property
-    def mean_square_diameter(self) -> float:
+    def mean_square_diameter(self) -> float:  # type: ignore[override]
         """See `ApertureBlur`."""
         return float(self.diameter.square().mean())
 
@@ -245,7 +242,7 @@ class BlurredLight:
         self._latest: tuple[tuple[object, ...], Tensor] | None = None  # by `Exposure.blur`
 
     @property
-    def known(self) -> tuple[Any, ...]:
+    def known(self) -> tuple[NoiseLevelFunction, ApertureBlur | None]:
         """Its noise and its aperture blur."""
         return self.residuals.nlf, self.aperture_blur
 

@@ -387,7 +387,7 @@ class Residual:
                 f"`residual` (={values!r}) must have {', '.join(_TABLES)}, of one length, finite "
                 "and >= 0, and a spread >= 1"
             )
-        return cls(*tables, spread)
+        return cls(tables[0], tables[1], tables[2], spread)
 
     def to_card(self) -> dict[str, Any]:
         """JSON values of a model card."""

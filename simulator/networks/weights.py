@@ -173,7 +173,7 @@ def _hint(name: str, known: list[str]) -> str:
 
 
 def _check_card(card: dict[str, Any], name: str | Path) -> None:
-    known = {"format": [FORMAT_VERSION], "preset": list(BUILDERS)}
+    known: dict[str, list[Any]] = {"format": [FORMAT_VERSION], "preset": list(BUILDERS)}
     wrong = [entry for entry, values in known.items() if card.get(entry) not in values]
     wrong += [] if "sha256" in card else ["sha256"]
     if wrong:

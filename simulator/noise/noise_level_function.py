@@ -71,11 +71,6 @@ class NoiseLevelFunction:
         """Whether there is no noise at all."""
         return max(*self.shot, *self.read) == 0.0
 
-    @property
-    def extrapolated(self) -> bool:
-        """Whether the ISO lies outside the calibrated table."""
-        return self.extrapolation != 0.0
-
     def scaled(self, factor: float) -> NoiseLevelFunction:
         """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
         return self._with([v * factor for v in self.shot], [v * factor for v in self.read])

@@ -172,9 +172,9 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
         quadrant, reach = _quadrant(disc_radius(diameter_px))
-        disc = (quadrant, reach, np.float32(math.inf))
+        shape = (quadrant, reach, np.float32(math.inf))
         cost = len(quadrant) ** 2
-        return by_rows(light, None, lambda a, b, i, o: _disc(a, b, height, i, *disc, o), cost)
+        return by_rows(light, None, lambda a, b, i, o: _disc(a, b, height, i, *shape, o), cost)
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
