@@ -26,7 +26,7 @@ from simulator.optics.discs import (
     kernel_energy,
     remaining_variance,
 )
-from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
+from simulator.optics.flicker_integral import Flash, Lamp, MainsLamp, PulsedLamp
 from simulator.optics.motion import (
     Movement,
     Path,
@@ -307,6 +307,20 @@ def test_pulsed_light_is_the_exact_overlap(frequency, duty, time):
         assert lamp.mean_light(start, time) == pytest.approx(exact, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])
+@pytest.mark.parametrize("decay", [1e-6, 50e-6, 1e-3])
+def test_a_flash_is_its_integral(time, decay):
+    def light(t: float) -> float:
+        return 0.02 / decay * math.exp(-(t - 0.01) / decay)
+
+    lamp = Flash(at=0.01, decay=decay, energy=0.02)
+    for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
+        begin = max(start, 0.01)
+        end = max(begin, min(start + time, begin + 60 * decay))  # then there is nothing left
+        expected = 1.0 + integral(light, begin, end) / time
+        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
+
+
 def test_rows_are_exposed_one_after_the_other():
     lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
     rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
@@ -326,7 +340,11 @@ def test_rows_are_exposed_one_after_the_other():
         (lambda: MainsLamp(phase=math.nan), "phase"),
         (lambda: PulsedLamp(duty=0.0), "duty"),
         (lambda: PulsedLamp("100"), "frequency"),
+        (lambda: Flash(decay=0.0), "decay"),
+        (lambda: Flash(energy=-1.0), "energy"),
         (lambda: Lamp().mean_light(0.0, 0.0), "exposure_time"),
+        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "rows"),
+        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "row_time"),
         (lambda: Lamp().mean_light(math.inf, 1.0), "start"),
     ],
 )
