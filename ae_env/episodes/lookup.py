@@ -17,8 +17,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
-RECORDED = "recorded"
-_MODULE = len(MODULES)
+RECORDED, _MODULE = "recorded", len(MODULES)
 #: Signal up to which a sample counts as clipped low.
 _LOW = 2.0**-10
 
@@ -26,10 +25,7 @@ _LOW = 2.0**-10
 class LookupBatch:
     """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
 
-    Args:
-        scenes: Scenes with `Scene.recorded`.
-        prepared: Function that returns the merged light of a scene's index.
-        camera: The body.
+    The scenes have `Scene.recorded`; `prepared` returns the merged light of one by its index.
     """
 
     def __init__(

@@ -197,10 +197,7 @@ class Scene:
             scene_id: Unique name.
             group: Source group; `scene_id` by default.
             nlf: Noise left in `packed`; none by default.
-            illuminance: Light on the subject [lux], if known.
-            white_balance: Gains of R, G, B.
-            kind: Sort of scene.
-            **fields: Further fields of `Scene`.
+            illuminance, white_balance, kind, **fields: See `Scene`.
 
         Raises:
             ValueError: If a value has the wrong shape or lies outside its range.
@@ -223,11 +220,8 @@ class Scene:
     def from_raw(cls, raw: RawImage, *, scene_id: str, kind: str = "raw", **fields: Any) -> Scene:
         """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
-        Args:
-            raw: The photograph; its settings become the reference.
-            scene_id: Unique name.
-            kind: Sort of scene.
-            **fields: Further arguments of `from_array`, such as an `illuminance` that was measured.
+        Its settings become the reference; `fields` are further arguments of `from_array`, such as
+        an `illuminance` that was measured.
 
         Raises:
             ValueError: If neither the raw nor its camera knows the noise.
@@ -459,11 +453,8 @@ class SceneSet(Sequence[Scene]):
 class SceneRequest:
     """The split, the camera and the size that scenes are loaded for.
 
-    Args:
-        split: ``"train"``, ``"test"`` or ``"all"``.
-        camera: Camera in whose colours light is stated, unless a raw brings its own.
-        resolution, crop: See `Scene.resized`.
-        resize: Brings each scene to that size, as `Scene.resized` does.
+    `camera` is that in whose colours light is stated, unless a raw brings its own; `resize` brings
+    each scene to `resolution` and `crop`, as `Scene.resized` does.
     """
 
     split: Split

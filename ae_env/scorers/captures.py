@@ -34,10 +34,10 @@ DependsOn = Literal["image", "light", "blur"]
 class Scorer(Protocol):
     """Rates images between 0 and 1; higher is better.
 
-    A scorer has ``domain``, ``"raw"`` or ``"srgb"``, and may have ``depends_on``, by default
+    It has ``domain``, ``"raw"`` or ``"srgb"``, and may have ``depends_on``, by default
     ``"image"``. Called with images (B, C, H, W) in [0, 1] (C = 4 for raw, 3 for sRGB) and the
-    `Captures` they come from, it returns (B,) in [0, 1]. A scorer with ``depends_on`` ``"light"``
-    or ``"blur"`` reads the captures only and is called with ``images=None``.
+    `Captures` they come from, it returns (B,) in [0, 1]. With ``depends_on`` ``"light"`` or
+    ``"blur"`` it reads the captures only and is called with ``images=None``.
     """
 
     domain: Domain
@@ -47,10 +47,7 @@ class Scorer(Protocol):
 
 
 def reads_pixels(scorer: Scorer) -> bool:
-    """Whether `scorer` looks at images or at the light of a scene; True unless it says otherwise.
-
-    Those with ``reads_pixels = False`` see the settings, the exposure and the blur only.
-    """
+    """Whether `scorer` looks at images or light: unless it has ``reads_pixels = False``."""
     return bool(getattr(scorer, "reads_pixels", True))
 
 
@@ -125,10 +122,8 @@ class Captures:
     def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
         """Variance of a native pixel's noise in the captures, at the recorded `signal`.
 
-        The camera's own at the settings, or the source's where it brought more.
-
-        Args:
-            signal: (B, 4, ...), at least 0, white is 1.
+        The camera's own at the settings, or the source's where it brought more. `signal` is
+        (B, 4, ...), at least 0, white is 1.
         """
         variance = torch.zeros_like(signal)
         if not self.noisy:
@@ -199,9 +194,6 @@ def source_noises(
     return found
 
 
-# -- descriptions ---------------------------------------------------------------------------------
-
-
 def describe_captures(
     scenes: Sequence[Scene],
     settings: Sequence[CameraSettings],
@@ -222,14 +214,12 @@ def describe_captures(
         scenes: Scene of each capture.
         settings: Settings of each capture.
         camera: The body.
-        speed: (B,) image speed [frame heights per second].
-        defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
-        movements: Directions of the motion and subjects' own, B long; None for along the rows.
+        speed, defocus: (B,) each, see `prepare_scene`.
+        movements: Of each capture, see `prepare_scene`; None for along the rows.
         gain: (B,) light relative to the scenes' own.
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
         light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
-        source_noise: See `Captures`.
-        noisy: See `Captures`.
+        source_noise, noisy: See `Captures`.
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
@@ -268,12 +258,8 @@ def layout_blur(
 ) -> PixelBlur | None:
     """Blur of S captures of a scene with a layout; None where all pixels have the same.
 
-    Args:
-        scene: The scene.
-        movement: Directions of the image's motion, and the subject's own.
-        speed: Image speed [frame heights per second].
-        numbers: (3, S) exposure times [s], diameters of the largest disc of defocus [pixel], and
-            blur that the scene brings itself [pixel].
+    `movement` and `speed` are those of `prepare_scene`; `numbers` (3, S) exposure times [s],
+    diameters of the largest disc of defocus [pixel], and blur that the scene brings itself [pixel].
     """
     layout, height, (times, discs, own) = scene.layout, scene.light.shape[-2], numbers
     if layout is None or not (discs.any() or movement.subject_speed):
@@ -310,11 +296,7 @@ def _stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlu
 class SceneCaptures:
     """Describes captures of a scene at the states of a grid, of which it knows all that it can.
 
-    Args:
-        camera: The body.
-        states: The settings of the S states.
-        noisy: Whether captures have noise.
-        copies: Whether scorers get a copy of the light.
+    Scorers get a copy of the light with `copies`; for `noisy` see `Captures`.
     """
 
     def __init__(
@@ -336,14 +318,10 @@ class SceneCaptures:
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> Captures:
-        """Captures of some of the states.
+        """Captures of some of the states, `part`, of a scene that is `prepared` as in the episode.
 
-        Args:
-            scene: The scene.
-            prepared: As it is in the episode.
-            part: Which of the states.
-            gain: Light relative to the scene's own, one or (S,).
-            row_gain: (S, H) light of each row relative to that, see `Captures`.
+        `gain` is the light relative to the scene's own, one or (S,), `row_gain` (S, H) that of each
+        row relative to that, see `Captures`.
         """
         states, count = self.states[part], len(self.states[part])
         blur, alike = self.blur(scene, prepared, part)
@@ -385,9 +363,8 @@ class SceneCaptures:
         own = [scene.own_blur(f_number) for f_number in f_numbers.tolist()]
         # In steps of a 64-pixel frame, as episodes state it: to the bit as in `describe_captures`.
         discs = (prepared.defocus * 64.0 / height) * (4.0 / f_numbers) * height / 64.0
-        found: torch.Tensor | PixelBlur | None = layout_blur(
-            scene, movement, speed, np.stack([times, discs, own])
-        )
-        if found is None:
-            found = torch.from_numpy(np.hypot(np.hypot(speed * times * height, discs), own))
-        return found, torch.from_numpy(alike)
+        found = layout_blur(scene, movement, speed, np.stack([times, discs, own]))
+        if found is not None:
+            return found, torch.from_numpy(alike)
+        blur = np.hypot(np.hypot(speed * times * height, discs), own)
+        return torch.from_numpy(blur), torch.from_numpy(alike)

@@ -167,12 +167,10 @@ def train_agent(
 def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
     import gymnasium as gym
 
-    import ae_env  # noqa: F401  (registers the environment)
-
     options = {**config.environment, "autoreset_mode": "SAME_STEP"}
     if config.max_episode_steps is not None:
         options["max_episode_steps"] = config.max_episode_steps
-    return gym.make_vec(config.task, num_envs=config.num_envs, **options)
+    return gym.make_vec(f"ae_env:{config.task}", num_envs=config.num_envs, **options)
 
 
 @contextmanager

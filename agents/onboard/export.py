@@ -27,9 +27,7 @@ class _RegressionGraph(nn.Module):
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.network = network
-        self.ranges: torch.Tensor
-        self.register_buffer("ranges", torch.tensor(SETTINGS_RANGES, dtype=torch.float32))
+        self.network: Any = network
 
     def forward(
         self, raw: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None = None
@@ -43,7 +41,7 @@ class _RegressionGraph(nn.Module):
         signal = (1.0 + PEDESTAL) * codes[:, 1:3].square() - PEDESTAL
         saturated = (signal >= WHITE_SIGNAL).float().mean(dim=(1, 2, 3))
         level = (signal.mean(dim=(1, 2, 3)).clamp(min=BLACK_SIGNAL) / TARGET_SIGNAL).log2()
-        low, high = self.ranges.unbind(dim=1)
+        low, high = self.network.features.ranges.unbind(dim=1)
         apex = low + (settings + 1.0) * 0.5 * (high - low)
         ev100 = (3.0 * apex[:, 0]).round() / 3.0 + apex[:, 1] - (apex[:, 2] - 5.0)
         return ev100 + level + SATURATED_STEP_EV * saturated
