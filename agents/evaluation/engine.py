@@ -155,12 +155,11 @@ def _plan_of(
     delay = dict(options.delay) if isinstance(options.delay, Mapping) else options.delay
     environment = {k: v for k, v in given.items() if k not in CONDITION_ARGUMENTS}
     scenes = options.scenes if isinstance(options.scenes, str) else "given scenes"
+    condition = Condition(lighting=options.lighting, delay=delay)
     return EvaluationPlan(
         name=f"{scenes}, {options.split} split",
         environment={**environment, "split": options.split},
-        conditions={
-            light_name(options.lighting): Condition(lighting=options.lighting, delay=delay)
-        },
+        conditions={light_name(options.lighting): condition},
         starts=("random",),
         frames=frames,
         seeds=tuple(seeds),

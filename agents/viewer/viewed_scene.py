@@ -291,10 +291,9 @@ class ViewedScene:
                 if settings is not None:
                     values = (settings.iso,), (settings.exposure_time,), (settings.f_number,)
                     grid = ExposureGrid(*values)
+                moves: dict[str, Any] = {"speed": view.speed, "defocus": view.defocus}
                 tables = ScoreTables(grid, self.scene.camera, self._scorer)
-                self._tables[key] = tables.table(
-                    self.scored, speed=view.speed, defocus=view.defocus
-                )
+                self._tables[key] = tables.table(self.scored, **moves)
             return self._tables[key]
 
     def write_dng(self, path: Path, view: View) -> Path:
