@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from agents.evaluation.evaluation_plan import load_plan
 from agents.evaluation.jobs import run_plan
-from agents.evaluation.plan import load_plan
 from agents.evaluation.result import overall_ranking
 from agents.learning.training import (
     AgentConfig,

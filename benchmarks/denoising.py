@@ -28,8 +28,8 @@ from benchmarks.harness import Part, Report, Row, benchmark, data_root, interval
 from simulator import CameraProfile, get_camera
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import ReferenceCamera, lens_blur, sample_mosaic
-from simulator.training.data import DetailPicture
+from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
+from simulator.training.crops import DetailPicture
 from simulator.training.scenes import detail_pictures
 
 #: Sources are photographed by both cameras in turn.

@@ -31,7 +31,7 @@ from agents.report.evaluation import cell as markdown_cell
 from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator import CameraProfile
-from simulator.reference.camera import ReferenceScene
+from simulator.reference.reference_camera import ReferenceScene
 from simulator.utils import files as result_files
 from simulator.utils.cache import Store, cache_key
 from simulator.utils.files import result_meta, write_atomically, write_results

@@ -22,7 +22,7 @@ from agents.applications.hdr import (
 from benchmarks.fidelity.models import equal_exposure, radiance_views
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, psnr, side_by_side, ssim, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 CAMERA, F_NUMBER = "nikon_z6", 8.0
 ISOS = (100, 1600, 6400)

@@ -35,7 +35,7 @@ from simulator.training.paper_dataset import (
     split_dataset,
     train_on_captures,
 )
-from simulator.training.train import SimulatorConfig
+from simulator.training.trainer import SimulatorConfig
 from simulator.utils.config_file import load_yaml
 
 #: What is trained: the paper's networks, parameter concatenation and decoupled learning.

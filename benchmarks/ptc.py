@@ -29,7 +29,7 @@ from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.settings import CameraSettings
 
 ISOS = (100.0, 800.0, 6400.0)

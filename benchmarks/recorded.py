@@ -35,7 +35,7 @@ from benchmarks.fidelity.models import radiance_views
 from benchmarks.harness import Part, Report, Row, benchmark, clipped, data_folder, psnr, table
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
 from simulator.radiance.light import MEAN_SIGNAL
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 
 CAMERA = "nikon_z6"
 #: Side of a frame [packed pixel].

@@ -29,7 +29,7 @@ from benchmarks.harness import (
 )
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.optics.discs import DiscBank, added_blur
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
 
 CAMERA, F_SOURCE = "nikon_z6", 11.0

@@ -39,7 +39,7 @@ from benchmarks.harness import Part, Report, Row, benchmark, pivot, sections, ta
 from benchmarks.isolated import median_seconds
 from simulator import CameraSettings, develop, get_camera
 from simulator.noise.generator import noise_generator
-from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
 from simulator.training.scenes import Split
 
 #: Gaps [EV] and ISOs at which every pair is taken.

@@ -22,7 +22,7 @@ from simulator import CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
 from simulator.optics.discs import DiscBank, added_blur
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
 
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].

@@ -14,7 +14,7 @@ from benchmarks.fidelity.models import equal_exposure
 from benchmarks.harness import Row, cropped, data_root, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from simulator.training.scenes import mosaic_scenes, reference_scenes
 
 ISO, F_SOURCE, F_TARGET = 100, 8.0, 4.0

@@ -22,10 +22,10 @@ from benchmarks.fidelity.models import FULL, QUICK, baseline, held_out_scenes, l
 from benchmarks.harness import Row, pivot, table
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceCapture
+from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceCapture
 from simulator.reference.sequences import Pair, select_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence
-from simulator.training.data import draw_sequences
+from simulator.training.crops import draw_sequences
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.
 CAMERAS = {"nikon_z6": 1, "canon_70d": 7}

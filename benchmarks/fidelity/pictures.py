@@ -17,7 +17,7 @@ from benchmarks.fidelity.models import equal_exposure, load_models
 from benchmarks.harness import RUNS, Row, clipped, data_root, psnr, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
 
 #: The published picture; a quick run leaves it alone.

@@ -19,8 +19,8 @@ from ae_env.scenes.polyhaven import list_assets
 from ae_env.scenes.scene import Crop, Split
 from agents.cli.console import progress_bars
 from agents.evaluation.engine import evaluate
+from agents.evaluation.evaluation_plan import groups_in_turn
 from agents.evaluation.intervals import difference_interval, score_interval
-from agents.evaluation.plan import groups_in_turn
 from agents.evaluation.result import EvaluationResult
 from agents.learning.training import (
     TrainingJob,

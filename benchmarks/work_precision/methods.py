@@ -25,7 +25,7 @@ from simulator import (
     RawImage,
     exposure_ratio,
 )
-from simulator.capture.exposure import DEFAULT_TOLERANCE
+from simulator.capture.decision import DEFAULT_TOLERANCE
 from simulator.utils.compute import computes_bfloat16
 
 Dtype = Literal["float32", "bfloat16"]

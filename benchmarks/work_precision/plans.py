@@ -43,7 +43,7 @@ from simulator import (
 from simulator.camera_simulator import Depth
 from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import Split, reference_scenes
 
 #: Height and width [packed pixel].

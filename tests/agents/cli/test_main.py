@@ -16,7 +16,7 @@ from ae_env.scorers import list_scorers
 from agents.cli import console
 from agents.cli import main as cli
 from simulator import RawImage, write_dng
-from simulator.capture.exposure import DEFAULT_TOLERANCE
+from simulator.capture.decision import DEFAULT_TOLERANCE
 
 COMMANDS = (
     *("bench", "cache", "evaluate", "export", "film", "hdr"),
