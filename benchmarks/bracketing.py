@@ -87,11 +87,10 @@ def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    sets, found = SETS if data_root() is not None else SETS[:1], []
-    given = {"seed": seed, "most": QUICK_SCENES if quick else None}
-    for scenes, budget, policy in product(sets, BUDGETS, POLICIES):
-        arguments = {"scenes": scenes, "budget": budget, "policy": policy, **given}
-        found.append(Part(f"{scenes}, {budget} s, {policy}", measure, arguments, threads=1))
+    names, found = ("scenes", "budget", "policy"), []
+    for case in product(SETS if data_root() is not None else SETS[:1], BUDGETS, POLICIES):
+        arguments = dict(zip(names, case, strict=True)) | {"most": QUICK_SCENES if quick else None}
+        found.append(Part("{}, {} s, {}".format(*case), measure, arguments, threads=1))
     return found
 
 

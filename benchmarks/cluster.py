@@ -42,7 +42,7 @@ def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
 
 def parts(seed: int, quick: bool) -> list[Part]:
     return [
-        Part(f"{on}-{n}", measure, {"on": on, "workers": n, "seed": seed, "quick": quick})
+        Part(f"{on}-{n}", measure, {"on": on, "workers": n})
         for on, n in (("local", 1), ("ray", 1), ("ray", 2))
     ]
 

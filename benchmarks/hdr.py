@@ -13,12 +13,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from agents.applications.hdr import (
-    bracket_exposures,
-    expose_and_develop,
-    fuse,
-    hdr_picture,
-)
+from agents.applications.hdr import bracket_exposures, expose_and_develop, fuse, hdr_picture
 from benchmarks.fidelity.models import equal_exposure, radiance_views
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, psnr, side_by_side, ssim, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
@@ -150,9 +145,8 @@ def _radiance_error(light: Tensor, truth: Tensor) -> float:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    given = {"seed": seed, "quick": quick}
     isos = ISOS[1:2] if quick else ISOS
-    return [Part(f"ISO {iso}", measure, {"iso": iso, **given}, threads=1) for iso in isos]
+    return [Part(f"ISO {iso}", measure, {"iso": iso}, threads=1) for iso in isos]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -162,9 +156,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     groups = frame.groupby(["iso", "range", "method"])
     means = groups[["psnr", "ssim", "radiance_ev"]].mean().assign(scenes=groups.size())
     means = means.reindex([*METHODS], level="method").reindex(["low", "high"], level="range")
-    means = means.reset_index()
-    means["label"] = means["method"].map(METHODS)
-    shown = means.to_dict("records")
+    shown = means.reset_index().assign(label=lambda f: f["method"].map(METHODS)).to_dict("records")
     lit = [row for row in shown if not np.isnan(row["radiance_ev"])]
     group, seconds = "ISO {iso} {range}", {"seconds": frame["seconds"].median()}
     tables = {

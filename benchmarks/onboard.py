@@ -125,11 +125,10 @@ def encoding(quick: bool) -> list[Row]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    found = [Part("frames", encoding, {"quick": quick}, threads=1)]
+    found = [Part("frames", encoding, threads=1)]
     for agent in AGENTS:
-        given = {"policy": agent, "seed": seed, "quick": quick}
-        found.append(Part(agent, measure, given, threads=1))
-        found.append(Part(f"smaller {agent}", smaller, given, threads=1))
+        found.append(Part(agent, measure, {"policy": agent}, threads=1))
+        found.append(Part(f"smaller {agent}", smaller, {"policy": agent}, threads=1))
     return found
 
 

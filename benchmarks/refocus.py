@@ -16,21 +16,12 @@ from torch import Tensor
 
 from agents.applications.refocus import refocus
 from benchmarks.fidelity.models import equal_exposure, weights
-from benchmarks.harness import (
-    Part,
-    Report,
-    Row,
-    benchmark,
-    clipped,
-    data_root,
-    psnr,
-    side_by_side,
-    table,
-)
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, side_by_side, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
+from simulator.utils.files import data_folder as data_root
 
 CAMERA, F_SOURCE = "nikon_z6", 11.0
 ISOS, F_NUMBERS = (100, 1600), (4.0, 2.8, 2.0, 1.4)
@@ -155,11 +146,8 @@ def picture(seed: int) -> Figure:
 
 def parts(seed: int, quick: bool) -> list[Part]:
     count = len(depth_photographs(get_camera(CAMERA), data=data_root()))
-    given = {"seed": seed, "quick": quick}
-    return [
-        Part(f"scene {number}", measure, {"number": number, **given}, threads=1)
-        for number in range(0, count, 2 if quick else 1)
-    ]
+    numbers = range(0, count, 2 if quick else 1)
+    return [Part(f"scene {n}", measure, {"number": n}, threads=1) for n in numbers]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:

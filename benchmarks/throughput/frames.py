@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import rawpy
 import torch
 from scipy.stats import linregress
@@ -57,31 +58,26 @@ def growth_parts(quick: bool) -> Iterator[Part]:
     pixels = [{"height": h, "width": w} for h, w in (PIXELS[1:4] if quick else PIXELS)]
     states = [{"count": n} for n in (STATES[:7:3] if quick else STATES)]
     curves: dict[str, tuple[Callable[..., Any], list[Any], dict[str, Any]]] = {
-        "pixels|exposure + noise": (measure_pixels, pixels, {"weights": None}),
-        "pixels|full model": (measure_pixels, pixels, {"weights": "compact"}),
-        "states|sweep, bank noise": (measure_states, states, {"noise": "bank"}),
-        "states|sweep, exact noise": (measure_states, states, {"noise": "exact"}),
+        "exposure + noise": (measure_pixels, pixels, {"weights": None}),
+        "full model": (measure_pixels, pixels, {"weights": "compact"}),
+        "sweep, bank noise": (measure_states, states, {"noise": "bank"}),
+        "sweep, exact noise": (measure_states, states, {"noise": "exact"}),
     }
-    for name, (task, points, fixed) in curves.items():
+    for curve, (task, points, fixed) in curves.items():
         for point in points:
-            label = f"growth|{name}|{'x'.join(map(str, point.values()))}"
-            yield Part(label, task, {**point, **fixed, "quick": quick}, fresh_cache=True)
+            label = f"growth|{curve}|{'x'.join(map(str, point.values()))}"
+            yield Part(label, task, {"curve": curve, **point, **fixed}, fresh_cache=True)
 
 
-def curves(results: dict[str, Any]) -> list[Row]:
-    found: dict[tuple[str, str], list[Row]] = {}
-    for label, point in results.items():
-        if label.startswith("growth|"):
-            _, against, name, _ = label.split("|")
-            found.setdefault((against, name), []).append(point)
+def curves(points: list[Row]) -> list[Row]:
     rows = []
-    for (against, name), points in found.items():
-        row: Row = {"name": name, "against": against, "points": points}
-        row["exponents"] = {
-            key: fitted_exponent([(point["x"], point[key]) for point in points], floor)
+    for (against, curve), own in pd.DataFrame(points).groupby(["against", "curve"], sort=False):
+        exponents = {
+            key: fitted_exponent(list(zip(own["x"], own[key], strict=True)), floor)
             for key, floor in (("seconds", 0.0), ("mib", MEMORY_FLOOR))
         }
-        rows.append(row)
+        row: Row = {"curve": curve, "against": against, "exponents": exponents}
+        rows.append(row | {"points": own[["x", "seconds", "mib"]].to_dict("records")})
     return rows
 
 
@@ -101,7 +97,7 @@ def fitted_exponent(points: list[tuple[float, float]], floor: float) -> list[flo
 # -- the points, each run in a process of its own --------------------------------------------------
 
 
-def measure_pixels(height: int, width: int, weights: str | None, quick: bool) -> Row:
+def measure_pixels(curve: str, height: int, width: int, weights: str | None, quick: bool) -> Row:
     """`simulate` of one raw at one state: time and memory, the raw itself included."""
     simulator, settings, depth = CameraSimulator(), CameraSettings(1600, 1 / 256, 8.0), "far"
     if weights is not None:  # to cleaner settings and a wider aperture, so that both are needed
@@ -117,10 +113,10 @@ def measure_pixels(height: int, width: int, weights: str | None, quick: bool) ->
     memory = peak_memory() - before
     while sum(seconds) < _LEAST[not quick]:
         seconds.append(timed(lambda: simulator.simulate(raw, settings, **options)))
-    return {"x": 4.0 * height * width, "seconds": float(np.median(seconds)), "mib": memory}
+    return _point("pixels", curve, 4.0 * height * width, float(np.median(seconds)), memory)
 
 
-def measure_states(count: int, noise: Any, quick: bool) -> Row:
+def measure_states(curve: str, count: int, noise: Any, quick: bool) -> Row:
     """A sweep of a clean 128 x 128 scene over `count` states: time, and memory of the frames."""
     raw, clean = noisy_raw(128, 128), NoiseLevelFunction.zero()
     prepared = PreparedScene(raw.data.clamp(min=0.0), raw.settings, raw.camera, clean)
@@ -131,7 +127,12 @@ def measure_states(count: int, noise: Any, quick: bool) -> Row:
     forget_peak()
     before = peak_memory()
     seconds = median_seconds(lambda: prepared.expose(states, noise=noise), least=_LEAST[not quick])
-    return {"x": float(count), "seconds": seconds, "mib": peak_memory() - before}
+    return _point("states", curve, float(count), seconds, peak_memory() - before)
+
+
+def _point(against: str, curve: str, x: float, seconds: float, mib: float) -> Row:
+    row: Row = {"against": against, "curve": curve, "x": x}
+    return row | {"seconds": seconds, "ms": 1e3 * seconds, "mib": mib}
 
 
 def noisy_raw(height: int, width: int) -> RawImage:
@@ -188,16 +189,6 @@ def frame_parts(quick: bool) -> Iterator[Part]:
             yield Part(f"frame|{path.name}|{case}", simulate, arguments, fresh_cache=True)
 
 
-def frame_rows(results: dict[str, Any]) -> list[Row]:
-    found = []
-    for label, row in results.items():
-        if label.startswith("frame|"):
-            _, name, case = label.split("|")
-            file = "synthetic DNG" if name.startswith("frame") else name
-            found.append({"case": case, "file": file, **row, "libraw": results[f"libraw|{name}"]})
-    return found
-
-
 def _write_foreign_dng(path: Path, height: int, width: int) -> None:
     write_dng(path, noisy_raw(height, width))
     note = SOFTWARE_NAME.encode()
@@ -231,15 +222,20 @@ def simulate(path: str, case: str, passes: int) -> Row:
             clock.append(time.perf_counter())
             seconds.append(clock[-1] - clock[0])
             megapixels = 4e-6 * raw.data[0].numel()
-            modules, peak = list(prepared.plan(settings).modules), peak_memory()
+            modules, peak = ", ".join(prepared.plan(settings).modules), peak_memory()
             del raw, prepared, result
-    row: Row = {"megapixels": megapixels, "first": seconds[1], "peak_mib": peak, "modules": modules}
+    row: Row = {"case": case, "file": _shown(path), "modules": modules}
+    row |= {"megapixels": megapixels, "first": seconds[1], "peak_mib": peak}
     row |= {"seconds": statistics.median(seconds[2:] or seconds[1:])}
-    row |= {"stages": {name: clock[i + 1] - clock[i] for i, name in enumerate(STAGES)}}
-    return row | {"networks": weights is not None}
+    return row | {"stages": {name: clock[i + 1] - clock[i] for i, name in enumerate(STAGES)}}
 
 
-def libraw(path: str) -> dict[str, float]:
+def _shown(path: str) -> str:
+    name = Path(path).name
+    return "synthetic DNG" if name.startswith("frame") else name
+
+
+def libraw(path: str) -> Row:
     """Seconds of LibRaw for the file: unpacking, writing as many bytes, developing.
 
     ``first`` is the first unpacking and writing of the process; the others are medians of those
@@ -259,6 +255,6 @@ def libraw(path: str) -> dict[str, float]:
         unpacking = [timed(unpack) for _ in range(PASSES)]
         content = os.urandom(unpack())
         writing = [timed(lambda: file.write_bytes(content)) for _ in range(PASSES)]
-    found = {"first": unpacking[0] + writing[0], "develop": timed(develop)}
-    found["unpack"] = statistics.median(unpacking[1:])
-    return found | {"write": statistics.median(writing[1:])}
+    row: Row = {"file": _shown(path), "first": unpacking[0] + writing[0], "develop": timed(develop)}
+    unpacked, written = (statistics.median(times[1:]) for times in (unpacking, writing))
+    return row | {"unpack": unpacked, "write": written}

@@ -11,9 +11,8 @@ a round in which all methods take their turn, in another order each time.
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from benchmarks.harness import (
     Row,
     benchmark,
     clipped,
-    data_root,
     psnr,
     quartiles,
     sections,
@@ -37,10 +35,11 @@ from benchmarks.harness import (
 )
 from benchmarks.isolated import CORES, ROOT, timed
 from benchmarks.work_precision import plans
-from benchmarks.work_precision.methods import DEFAULT, Method, all_methods
+from benchmarks.work_precision.methods import Method, all_methods
 from benchmarks.work_precision.plans import GRID, SIZES, Trial, trials
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage
 from simulator.noise.noise_level_function import noise_variance
+from simulator.utils.files import data_folder as data_root
 
 #: Processes among which the scenes of the plan's predictions are shared out: of the validation
 #: split, which the plan's constants were calibrated on, and of the test split.
@@ -211,13 +210,7 @@ _COLOURS = {
 _REACH = 6.0
 #: A part makes up nearly all of an error beyond this share of it; smaller errors are not sorted.
 _MOST, _LEAST, _QUANTILES = 0.9, 0.02, {"low": 0.1, "middle": 0.5, "high": 0.9}
-#: Least factor that a sweep is to be faster by, and by how much its PSNR may be lower [dB].
-TARGETS = {"paper, no repetition": (100.0, 0.0), "paper full": (200.0, 0.0)}
 
-
-_TARGET = """sweep with = {method} | at = {height} x {width} | against = {against} |
-times faster = {ratio:,.0f} | asked = {faster:g} | PSNR [dB] = {gain_db:+.2f} |
-asked at least = -{lower:g} | verdict = {verdict}"""
 _PRECISION = """method = {name:md} | type = {dtype} | ms per state = {each} ± {spread} |
 ms per sweep = {sweep} | PSNR [dB] = {psnr_db:.2f} |
 10 to 90 % = {psnr_db_10_percent:.1f} to {psnr_db_90_percent:.1f} |
@@ -237,49 +230,30 @@ times faster = {times:,.0f} | predicted error = {predicted_mean:.3f}, {predicted
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    rows: list[Row] = []
-    for own in results.values():
-        rows += own if isinstance(own, list) else [own]
+    rows = [r for own in results.values() for r in (own if isinstance(own, list) else [own])]
     precise, bounds, kinds = (
         [r for r in rows if r["part"] == part] for part in ("precision", "bound", "left_out")
     )
     tests, chosen = ([r for r in bounds if r["split"] == s] for s in ("test", "validation"))
-    targets, shown = list(_targets(precise)), []
+    shown = []
     for row in precise:
         sweep, name = row["ms_per_sweep"], row["method"]
         texts = {"each": _ms(row["ms_per_state"]), "spread": _ms(row["ms_spread"])}
         texts["sweep"] = _ms(sweep) if row["mode"] == "shared" else f"({sweep:,.0f})"
         shown.append(row | texts | {"name": f"**{name}**" if row["pareto"] else name})
     tables = {
-        "targets": table(targets, _TARGET),
         "precision": sections(shown, _SCENES, lambda own: table(own, _PRECISION)),
         "bound": sections(_by_tolerance(tests), "{kind}", lambda own: table(own, _BOUND)),
         "factors": table(_by_part(chosen), _FACTORS),
         "left-out": table(kinds, _LEFT_OUT),
     }
     figures: dict[Any, Figure] = {QUICK if meta["quick"] else HEADLINE: _headline(precise)}
-    more = {"threads": CORES, "real_files": data_root() is not None, "targets": targets}
+    more = {"threads": CORES, "real_files": data_root() is not None}
     return Report(rows, tables, meta=more, figures=figures)
 
 
 def _ms(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def _targets(rows: list[Row]) -> Iterator[Row]:
-    """Every planned sweep in float32 against the full runs, by size."""
-    rows = [row for row in rows if row["dtype"] == "float32"]
-    for row, other in itertools.product(rows, rows):
-        shared = row["tolerance"] == DEFAULT and row["mode"] == "shared"
-        if not shared or row["height"] != other["height"] or other["method"] not in TARGETS:
-            continue
-        faster, lower = TARGETS[other["method"]]
-        ratio = other["ms_per_sweep"] / row["ms_per_sweep"]
-        gain = row["psnr_db"] - other["psnr_db"]
-        target = {key: row[key] for key in ("method", "height", "width")}
-        target |= {"against": other["method"], "ratio": ratio, "gain_db": gain, "faster": faster}
-        met = ratio >= faster and gain >= -lower
-        yield target | {"lower": lower, "verdict": "reached" if met else "missed"}
 
 
 def _by_tolerance(rows: list[Row]) -> list[Row]:
@@ -362,13 +336,12 @@ def parts(seed: int, quick: bool) -> list[Part]:
     """Parts to measure; a full run first trains the networks that are missing."""
     if not quick:
         train_missing()
-    given = {"seed": seed, "quick": quick}
-    found = [Part(f"precision {size[0]}", measure, {"size": size, **given}) for size in SIZES]
+    found = [Part(f"precision {size[0]}", measure, {"size": size}) for size in SIZES]
     for split, shares in _SHARES.items():
         for share in range(1 if quick else shares):
-            arguments = {"split": split, "share": share, "shares": shares, **given}
+            arguments = {"split": split, "share": share, "shares": shares}
             found.append(Part(f"bound {split} {share}", plans.bound, arguments))
-    return found + [Part(kind, plans.left_out, {"kind": kind, **given}) for kind in plans.KINDS]
+    return found + [Part(kind, plans.left_out, {"kind": kind}) for kind in plans.KINDS]
 
 
 run = benchmark("work-precision", parts, report)

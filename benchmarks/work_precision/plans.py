@@ -194,13 +194,13 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
             for tolerance in (DEFAULT,) if position % _EVERY else TOLERANCES:
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
-                planned = _Draws(*(torch.stack(own) for own in zip(*pairs, strict=True)))
+                drawn = [torch.stack(own) for own in zip(*pairs, strict=True)]
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
                 row |= {"settings": str(settings), "tolerance": tolerance}
                 row |= {"network": plan.network, "errors": dict(plan.errors)}
                 row |= {"predicted": plan.predicted_error, "bound": plan.error_bound}
-                rows.append(row | {"measured": planned.distance(truth, wanted, shows)})
+                rows.append(row | {"measured": distance(*drawn, truth, wanted, shows)})
     return rows
 
 
@@ -238,29 +238,23 @@ def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Te
     return light, missing_variance(light, table, exposure.remaining_variance).clamp(min=0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """Captures of one scene at the same settings before their noise is drawn."""
+def distance(light: Tensor, added: Tensor, truth: Tensor, wanted: Tensor, shows: Tensor) -> float:
+    """Distance of captures to those of mean `truth` and variance `wanted`, in units of `shows`.
 
-    light: Tensor
-    added: Tensor
+    The captures are draws (N, 4, H, W) of one scene: `light` before its last noise is drawn, and
+    the variance `added` by that. Deviations are pooled over a neighbourhood.
+    """
 
-    def deviation(self) -> Tensor:
-        """(4, H, W) standard deviation of the capture, pooled over a neighbourhood."""
-        return _pooled(_variance(self.light.double()) + self.added.double().mean(dim=0)).sqrt()
+    def apart(half: slice) -> Tensor:
+        variance = _variance(light[half].double()) + added[half].double().mean(dim=0)
+        return _pooled(variance).sqrt() - _pooled(wanted).sqrt()
 
-    def distance(self, truth: Tensor, wanted: Tensor, shows: Tensor) -> float:
-        """Distance to captures of mean `truth` and variance `wanted`, in units of `shows`."""
-        count = len(self.light)
-        error = self.light.double() - truth
-        spread = _variance(error) / shows
-        means = error.mean(dim=0).square() / shows - spread / count
-        first, second = (
-            _Draws(self.light[half], self.added[half]).deviation() - _pooled(wanted).sqrt()
-            for half in (slice(0, None, 2), slice(1, None, 2))
-        )
-        square = float((means + first * second / shows).mean())
-        return max(0.0, square) ** 0.5
+    error = light.double() - truth
+    spread = _variance(error) / shows
+    means = error.mean(dim=0).square() / shows - spread / len(light)
+    product = apart(slice(0, None, 2)) * apart(slice(1, None, 2))
+    square = float((means + product / shows).mean())
+    return max(0.0, square) ** 0.5
 
 
 def _pooled(variance: Tensor) -> Tensor:

@@ -183,7 +183,7 @@ import sys
 from pathlib import Path
 from agents.cli import main
 main.CHECKOUT = Path("../checkout").resolve()
-sys.argv = ["ae-env", "bench", "convergence", "--quick", "--seed", "3", "--out", "here"]
+sys.argv = ["ae-env", "bench", "ptc", "--quick", "--seed", "3", "--out", "here"]
 main.main()
 """
 
@@ -193,7 +193,7 @@ def test_the_working_folder_does_not_matter(tmp_path: Path) -> None:
     for folder, code in (("checkout", ours), ("mine", "raise RuntimeError('not ours')")):
         (tmp_path / folder / "benchmarks").mkdir(parents=True)
         (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")
-        (tmp_path / folder / "benchmarks" / "convergence.py").write_text(code)
+        (tmp_path / folder / "benchmarks" / "ptc.py").write_text(code)
     command, packages = [sys.executable, "-c", _BENCH], str(Path(cli.__file__).parents[2])
     env = os.environ | {"PYTHONPATH": packages}
     printed = subprocess.check_output(command, cwd=tmp_path / "mine", env=env, text=True)
