@@ -65,14 +65,8 @@ def known_light(context: Any, envs: Any) -> Any:
 
 
 def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None) -> Row:
-    make: Any = partial(
-        gym.make_vec,
-        "ae_env:ae_env/ExposureBracket-v0",
-        num_envs=32,
-        scenes=scenes,
-        budget=budget,
-        autoreset_mode="DISABLED",
-    )
+    given: Any = {"scenes": scenes, "budget": budget, "autoreset_mode": "DISABLED"}
+    make: Any = partial(gym.make_vec, "ae_env:ae_env/ExposureBracket-v0", num_envs=32, **given)
     row: Row = {"scenes": scenes, "budget": budget, "policy": policy}
     with closing(make(split="test")) as envs:
         context = PolicyContext.from_envs(envs)
@@ -136,8 +130,10 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     for scenes, budget in product(SETS, BUDGETS):
         own = [row for row in rows if (row["scenes"], row["budget"]) == (scenes, budget)]
         tables[f"{scenes}-{1e3 * budget:.0f}ms"] = table(own, _COLUMNS)
-    short = [{name: value for name, value in row.items() if name != "each"} for row in rows]
-    return Report(short, tables, figures={"bracketing.png": distributions(rows)})
+    figure = distributions(rows)
+    for row in rows:
+        del row["each"]
+    return Report(rows, tables, figures={"bracketing.png": figure})
 
 
 run = benchmark("bracketing", parts, report)

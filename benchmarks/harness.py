@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from scipy.stats import bootstrap
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -137,21 +138,18 @@ def benchmark(
     """
 
     def run(out: Path, *, seed: int = 0, quick: bool = False, **options: Any) -> None:
-        shown = "".join(
-            f" {value}" if key == "folder" else f" --{key} {value}"
-            for key, value in options.items()
-        )
-        command = f"ae-env bench {name}{shown}{' --quick' * quick}"
+        words = (f" {f'--{k} ' * (k != 'folder')}{v}" for k, v in options.items())
+        command = f"ae-env bench {name}{''.join(words)}{' --quick' * quick}"
         given = {"seed": seed, "quick": quick}
         meta = result_meta(command, seed) | {"quick": quick}
         data = [v for k, v in options.items() if k != "against" and isinstance(v, Path)]
-        store, state = Store(RUNS / name), [command, seed, _checksum(), _state(data)]
+        store, state = Store(RUNS / name), [command, seed, *_state(data)]
         chosen, results = parts(seed, quick, **options), {}
         with progress_bars() as progress, progress(name) as task:
             for number, part in enumerate(chosen):
                 task(number, len(chosen), part.name)
-                taken = inspect.signature(part.task).parameters.keys() & given
-                own = {name: given[name] for name in taken}
+                taken = inspect.signature(part.task).parameters
+                own = {name: value for name, value in given.items() if name in taken}
                 part = replace(part, arguments=own | dict(part.arguments))
                 key = cache_key("parts", [*state, f"{part.name} {part.arguments}"])
                 if (found := store.get(key)) is None:
@@ -166,18 +164,13 @@ def benchmark(
     return run
 
 
-def _checksum() -> int:
-    """Of the very code and networks."""
-    files, found = (path for name in _CODE for path in (ROOT / name).rglob("*")), 0
-    for path in sorted(p for p in files if p.suffix in (".py", ".safetensors")):
-        found = zlib.crc32(path.read_bytes(), found)
-    return found
-
-
 def _state(data: Iterable[Path]) -> list[Any]:
-    """Name, size and time of every file of `data`, and in its folders."""
-    files = sorted(file for path in data for file in (path, *path.rglob("*")) if file.is_file())
-    return [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
+    """Checksum of the very code and networks; name, size and time of every file of `data`."""
+    files, checksum = (path for name in _CODE for path in (ROOT / name).rglob("*")), 0
+    for path in sorted(p for p in files if p.suffix in (".py", ".safetensors")):
+        checksum = zlib.crc32(path.read_bytes(), checksum)
+    given = sorted(file for path in data for file in (path, *path.rglob("*")) if file.is_file())
+    return [checksum, *([str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in given)]
 
 
 def write_report(report: Report, out: Path, stem: str, meta: Mapping[str, Any]) -> dict[str, Path]:
@@ -231,11 +224,7 @@ def origin(meta: Mapping[str, Any]) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """`value` with numbers of `DIGITS` significant digits; None for numbers that are not finite.
-
-    >>> rounded({"a": [1 / 3, float("nan"), 10**9], "b": True})
-    {'a': [0.333333, None, 1000000000], 'b': True}
-    """
+    """`value` with numbers of `DIGITS` significant digits; None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: rounded(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -310,10 +299,8 @@ def data_folder(name: str) -> Path:
     """
     root = data_root()
     if root is None or not (root / name).is_dir():
-        raise FileNotFoundError(
-            f"there is no folder {name!r} of real files in {root or 'AE_ENV_DATA'}: set "
-            "AE_ENV_DATA to the folder that holds it"
-        )
+        where = f"{root or 'AE_ENV_DATA'}: set AE_ENV_DATA to the folder that holds it"
+        raise FileNotFoundError(f"there is no folder {name!r} of real files in {where}")
     return root / name
 
 
@@ -321,11 +308,7 @@ def data_folder(name: str) -> Path:
 
 
 def cell(row: Row, content: Cell) -> str:
-    """Text of a cell; empty where a value of its format is missing or None.
-
-    >>> cell({"ms": 1.25, "error": None}, "{ms:.1f} ms"), cell({"error": None}, "{error:.2f}")
-    ('1.2 ms', '')
-    """
+    """Text of a cell; empty where a value of its format is missing or None."""
     return markdown_cell(row, content, missing="")
 
 
@@ -384,11 +367,10 @@ def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str])
     return "\n\n".join(f"### {name}\n\n{show(own)}" for name, own in groups.items())
 
 
-def interval(values: np.ndarray, seed: int = 0, resamples: int = 10_000) -> list[float]:
+def interval(values: np.ndarray, seed: int = 0) -> list[float]:
     """95 % bootstrap interval of the mean of `values`."""
-    drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
-    return [float(low), float(high)]
+    found = bootstrap((values,), np.mean, method="percentile", rng=seed).confidence_interval
+    return [float(found.low), float(found.high)]
 
 
 def quartiles(values: Sequence[float]) -> list[float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import pandas as pd
@@ -156,12 +155,12 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     frame = groups[["psnr", "edge_psnr"]].mean().reset_index()
     seconds = pd.DataFrame(rows).groupby(["method", "iso"])["seconds"].median()
     means: list[Row] = []
-    for method, iso in product(METHODS, sorted(set(frame["iso"]))):
-        own = frame[(frame["method"] == method) & (frame["iso"] == iso)]
-        mean: Row = {"method": METHODS[method], "iso": iso, "seconds": seconds.get((method, iso))}
+    for (method, iso), own in frame.groupby(["method", "iso"], sort=False):
+        mean: Row = {"method": METHODS[str(method)], "iso": iso, "seconds": seconds[method, iso]}
         for n, whole, edge in own[["f_number", "psnr", "edge_psnr"]].to_numpy():
             mean |= {f"psnr {n:g}": whole, f"edge_psnr {n:g}": edge}
-        means += [mean] if len(own) else []
+        means.append(mean)
+    means.sort(key=lambda row: (list(METHODS.values()).index(row["method"]), row["iso"]))
     columns = {"method": "{method:md}", "ISO": "{iso}"}
     for name in (f"{f_number:g}" for f_number in F_NUMBERS):
         columns[f"f/{name}"] = f"{{psnr {name}:.1f}} / {{edge_psnr {name}:.1f}}"

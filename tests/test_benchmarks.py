@@ -108,7 +108,7 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("paper", "data", "--weights", "none.safetensors"), "there is no none.json"),
         (("ptc", "data"), "`folder` (='data')"),
         (("ptc", "--weights", "a"), "`weights` (='a')"),
-        (("features", "--weights", "none.pth"), "`weights` (='none.pth')"),
+        (("features", "--weights", "a"), "`weights` (='a')"),
         (("throughput", "--against", "none"), "`against` (='none')"),
         (("recorded", "none"), "`scenes` (='recorded:"),
         (("recorded", "runs"), "must hold captures"),
@@ -216,16 +216,6 @@ def test_plain_scaling_and_ours_have_the_same_range() -> None:
     assert training.STOPS[0] <= stops.min() + 0.01
     assert stops.max() <= training.STOPS[1]
     assert {training.AUGMENTATIONS[arm].stops for arm in ("exposure", "full")} == {training.STOPS}
-
-
-def test_aliked_wants_its_weights(tmp_path: Path) -> None:
-    kornia = pytest.importorskip("kornia.feature")
-    torch.save(kornia.ALIKED("aliked-n16").state_dict(), tmp_path / "random.pth")
-    found = features.aliked(tmp_path / "random.pth")(torch.rand(2, 3, 64, 64), 20)
-    assert [(f.points.shape, len(f.descriptors)) for f in found] == [((20, 2), 20)] * 2
-    torch.save({"other": torch.zeros(1)}, tmp_path / "other.pth")
-    with pytest.raises(ValueError, match="`weights`"):
-        features.aliked(tmp_path / "other.pth")
 
 
 @pytest.mark.slow

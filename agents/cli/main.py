@@ -63,10 +63,7 @@ def bench(
     ] = None,
     weights: Annotated[
         Path | None,
-        Option(
-            help="Of paper: measure these weights, and train nothing; of features: ALIKED's "
-            "(aliked-n16.pth), judged beside."
-        ),
+        Option(help="Of paper: measure these weights, and train nothing."),
     ] = None,
     part: Annotated[
         str | None, Option(help="Of transfer: agents or tables; by default both.")
@@ -101,7 +98,7 @@ _TAKES = {
     "against": ("throughput",),
     "folder": ("paper", "recorded"),
     "part": ("transfer",),
-    "weights": ("paper", "features"),
+    "weights": ("paper",),
 }
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
+from itertools import product
 from typing import Any, NamedTuple
 
 import cv2
@@ -61,12 +61,8 @@ class Condition(NamedTuple):
 
 def conditions(gaps: tuple[float, ...] = GAPS, isos: tuple[float, ...] = ISOS) -> list[Condition]:
     """All of them; without a gap both kinds are the same."""
-    return [
-        Condition(gap, kind, iso)
-        for gap in gaps
-        for kind in ((AROUND, BELOW) if gap else (AROUND,))
-        for iso in isos
-    ]
+    every = (Condition(*own) for own in product(gaps, (AROUND, BELOW), isos))
+    return [own for own in every if own.gap or own.kind == AROUND]
 
 
 #: What is known of a pair, its pictures (2, 3, SIZE, SIZE), sRGB in [0, 1] of 8 bits, and the
@@ -147,7 +143,7 @@ def measures(first: Features, second: Features, homography: np.ndarray) -> dict[
         many are within 3; ``corner_error``: mean error of the corners [pixel] under the estimated
         homography, infinite where there is none.
     """
-    i, j = training.mutual_matches(first.descriptors, second.descriptors)
+    i, j = mutual_matches(first.descriptors, second.descriptors)
     there, back = (f.points.double().numpy() for f in (first, second))
     a, b = there[i], back[j]
     errors = np.linalg.norm(mapped(a, homography) - b, axis=1)
@@ -157,6 +153,13 @@ def measures(first: Features, second: Features, homography: np.ndarray) -> dict[
     ways = (there, back, homography), (back, there, np.linalg.inv(homography))
     result["repeatability"] = float(np.mean([_repeated(*way) for way in ways]))
     return result | {"corner_error": _corner_error(a, b, homography)}
+
+
+def mutual_matches(first: Tensor, second: Tensor) -> tuple[list[int], list[int]]:
+    """Indices of descriptors (N, D) and (M, D) that are each other's nearest."""
+    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
+    found = matcher.match(first.numpy(), second.numpy()) if len(first) and len(second) else ()
+    return [match.queryIdx for match in found], [match.trainIdx for match in found]
 
 
 def _repeated(points: np.ndarray, found: np.ndarray, homography: np.ndarray) -> float:
@@ -180,33 +183,6 @@ def _corner_error(first: np.ndarray, second: np.ndarray, homography: np.ndarray)
     return float(errors.mean()) if np.isfinite(errors).all() else float("inf")
 
 
-# -- ALIKED ---------------------------------------------------------------------------------------
-
-
-def aliked(weights: Path) -> Detect:
-    """ALIKED (Zhao et al. 2023) through kornia, with the user's file of ``aliked-n16.pth``."""
-    try:
-        from kornia.feature import ALIKED
-    except ImportError:
-        wanted = "ALIKED needs kornia: install the extra with pip install 'ae-env[features]'"
-        raise ImportError(wanted) from None
-    model = ALIKED("aliked-n16", max_num_keypoints=KEYPOINTS, detection_threshold=0.0)
-    try:
-        state = torch.load(weights, map_location="cpu", weights_only=True)
-        missing, _ = model.load_state_dict(state, strict=False)
-    except Exception as error:
-        missing = [str(error)]
-    if missing:
-        raise ValueError(f"`weights` (={str(weights)!r}) must hold aliked-n16: no {missing[0]!r}")
-    model.eval()
-
-    @torch.no_grad()
-    def detect(pictures: Tensor, count: int) -> list[Features]:
-        return [Features(f.keypoints[:count], f.descriptors[:count]) for f in model(pictures)]
-
-    return detect
-
-
 # -- report ---------------------------------------------------------------------------------------
 
 #: Trainings under each augmentation.
@@ -217,7 +193,6 @@ LABELS = {
     "scaling": "plain exposure scaling",
     "exposure": "ours, exposure only",
     "full": "**ours, in full**",
-    "aliked": "ALIKED, given weights",
 }
 #: Measures of a row of results.
 MEASURES = ["repeatability", *(f"accuracy_{k}" for k in THRESHOLDS), "accuracy", "matches"]
@@ -285,9 +260,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
 
 def _frame(runs: list[Row]) -> pd.DataFrame:
     """A row for each run and test pair."""
-    frame = pd.DataFrame(
-        {"arm": run["arm"], "seed": run["seed"], **row} for run in runs for row in run["test"]
-    )
+    head = ("arm", "seed")
+    frame = pd.DataFrame({k: run[k] for k in head} | row for run in runs for row in run["test"])
     frame["accuracy"] = frame[[f"accuracy_{k}" for k in THRESHOLDS]].mean(axis=1)
     errors = frame["corner_error"].astype(float).fillna(np.inf)
     for px in CORNER_ERRORS:  # the mean is the area under the curve
@@ -359,12 +333,6 @@ def _judged(detects: dict[str, Detect], body: int, quick: bool) -> dict[str, lis
     return judge(detects, held_out_pairs("test", taken, body, QUICK_SOURCES if quick else None))
 
 
-def measure_aliked(weights: str, body: int, quick: bool) -> list[Row]:
-    torch.set_num_threads(1)
-    rows = _judged({"aliked": aliked(Path(weights))}, body, quick)["aliked"]
-    return [{"arm": "aliked", "seed": 0, "steps": None, "seconds": None, "test": rows}]
-
-
 def measure_time(seed: int) -> list[Row]:
     torch.set_num_threads(1)
     rows = []
@@ -381,17 +349,10 @@ def measure_time(seed: int) -> list[Row]:
     return rows
 
 
-def parts(seed: int, quick: bool, weights: Path | None = None) -> list[Part]:
-    found = [Part("time", measure_time, threads=1)]
-    if weights is not None:
-        if not weights.is_file():
-            raise ValueError(f"`weights` (={str(weights)!r}) must be an existing file")
-        aliked(weights)  # raises before any work
-        arguments = {"weights": str(weights.resolve()), "body": seed}
-        found.append(Part("aliked", measure_aliked, arguments, 1))
-    for number in range(seed, seed + (1 if quick else SEEDS)):
-        found.append(Part(f"seed {number}", measure, {"seed": number, "body": seed}, 1))
-    return found
+def parts(seed: int, quick: bool) -> list[Part]:
+    numbers = range(seed, seed + (1 if quick else SEEDS))
+    found = [Part(f"seed {n}", measure, {"seed": n, "body": seed}, 1) for n in numbers]
+    return [Part("time", measure_time, threads=1), *found]
 
 
 run = benchmark("features", parts, report)

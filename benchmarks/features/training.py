@@ -243,18 +243,6 @@ def sample(dense: Tensor, points: Tensor) -> Tensor:
     return F.normalize(values[..., 0].transpose(1, 2), dim=-1)
 
 
-def mutual_matches(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of descriptors (N, D) and (M, D) that are each other's nearest."""
-    if not len(first) or not len(second):
-        none = torch.zeros(0, dtype=torch.int64)
-        return none, none
-    similar = first @ second.T
-    forth, back = similar.argmax(dim=1), similar.argmax(dim=0)
-    index = torch.arange(len(first))
-    mutual = back[forth] == index
-    return index[mutual], forth[mutual]
-
-
 # -- augmentations --------------------------------------------------------------------------------
 
 #: Exposures that plain scaling and ours draw from [EV]; the tests lie within.

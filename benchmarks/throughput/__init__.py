@@ -3,11 +3,10 @@
     ae-env bench throughput
     ae-env bench throughput --against ANOTHER_CHECKOUT_OR_COMMIT
 
-Parts: environment steps beside a fused kernel, copies of the environment and a lookup; resets
-beside steps; the first episode after installation; growth of time and memory with pixels and
-states; a 24-megapixel raw through the simulator beside LibRaw. With another checkout, both are
-timed in turns (`benchmarks.throughput.paired`). The real files that ``AE_ENV_DATA`` names are used
-where they are.
+Parts: environment steps beside a fused kernel, copies of the environment; resets
+beside steps; the first episode after installation; growth of time and memory with pixels; a
+24-megapixel raw through the simulator beside LibRaw. With another checkout, both are timed in turns
+(`benchmarks.throughput.paired`). The real files that ``AE_ENV_DATA`` names are used where they are.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from benchmarks.harness import Part, Report, Row, benchmark, pivot, sections, ta
 from benchmarks.isolated import CORES
 from benchmarks.throughput import frames
 from benchmarks.throughput.paired import COLUMNS, checkout, measure_paired
-from benchmarks.throughput.steps import LOOKUP, measure_cold_start, measure_resets, measure_steps
+from benchmarks.throughput.steps import measure_cold_start, measure_resets, measure_steps
 
 #: Threads and frame sizes of the steps; the first is drawn.
 STEPS = ((CORES, 128), (CORES, 64), (1, 128))
@@ -43,16 +42,14 @@ def parts(seed: int, quick: bool, against: Path | None = None) -> list[Part]:
 
 
 _STEPS = """case = {case} | envs = {num_envs} | steps/s = {steps_per_second:,.0f} |
-of kernel = {ratio_to_kernel:.2f} | of lookup = {ratio_to_lookup:.3f} | spread = {spread:.0%} |
-error = {error_codes:g}"""
+of kernel = {ratio_to_kernel:.2f} | spread = {spread:.0%}"""
 _RESETS = """case = {case} | envs = {num_envs} | reset [ms] = {reset_ms:.2f} |
 step [ms] = {step_ms:.2f} | reset in steps = {ratio:.2f} | of the means = {ratio_of_means:.2f} |
 spread = {spread:.0%}"""
 _COLD = """case = {case} | in all [s] = {total_s:.2f} | import [s] = {import_s:.2f} |
 make [s] = {make_s:.2f} | reset [s] = {reset_s:.2f} | step [s] = {step_s:.2f} |
 processor time [s] = {cpu_s:.2f} | more episodes [s] = {episodes_s:.2f} | spread = {spread:.0%}"""
-_CURVES = """curve = {curve} | against = {against} |
-time = {exponents[seconds][0]:.2f} ± {exponents[seconds][1]:.2f} |
+_CURVES = """curve = {curve} | time = {exponents[seconds][0]:.2f} ± {exponents[seconds][1]:.2f} |
 memory = {exponents[mib][0]:.2f} ± {exponents[mib][1]:.2f}"""
 _FRAMES = """case = {case}, {file}, {megapixels:.1f} MP | all [s] = {seconds:.2f} |
 first [s] = {first:.2f} | peak [MiB] = {peak_mib:,.0f} | read [s] = {stages[read]:.2f} |
@@ -75,11 +72,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         row["title"] = f"{row['size']} x {row['size']}, {row['threads']} thread"
         row["title"] += "s" * (row["threads"] > 1)
     contents = "time [ms] = {ms:.2f} | memory [MiB] = {mib:.1f}"
-    by_x = sections(
-        growth,
-        "Against {against}",
-        lambda own: pivot(own, own[0]["against"] + " = {x:,.0f}", "{curve}", contents),
-    )
+    by_x = pivot(growth, "pixels = {x:,.0f}", "{curve}", contents)
     tables = {
         "before": table(paired, COLUMNS) if paired else "Not measured in this run.",
         "steps": sections(steps, "{title}", lambda own: table(own, _STEPS)),
@@ -90,7 +83,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     }
     figure = Figure(figsize=(10.0, 5.0), dpi=80, layout="constrained")
     frame = pd.DataFrame(steps)
-    frame = frame[(frame["title"] == frame["title"][0]) & (frame["case"] != LOOKUP)]
+    frame = frame[frame["title"] == frame["title"][0]]
     frame.index = frame["case"] + frame["num_envs"].map(" ({})".format)  # type: ignore[assignment]
     axis, speeds = figure.subplots(), frame["steps_per_second"].sort_values()
     speeds.plot.barh(ax=axis, logx=True, xlabel="steps per second, " + frame["title"].iloc[0])

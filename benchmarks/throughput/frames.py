@@ -1,4 +1,4 @@
-"""How time and memory grow with pixels and states, and a 24-megapixel raw beside LibRaw.
+"""How time and memory grow with pixels, and a 24-megapixel raw beside LibRaw.
 
 Every point is measured in a process of its own, because its peak memory is wanted. Memory is the
 peak less what the process held before it, with all libraries loaded and warm. The large frame is a
@@ -8,12 +8,12 @@ camera's.
 
 from __future__ import annotations
 
-import itertools
 import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +25,8 @@ from scipy.stats import linregress
 
 import ae_env  # noqa: F401  registers the environment
 from benchmarks.harness import RUNS, Part, Row, data_root
-from benchmarks.isolated import forget_peak, median_seconds, peak_memory, timed
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    read_raw,
-    write_dng,
-)
-from simulator.camera import get_camera
+from benchmarks.isolated import forget_peak, peak_memory, timed
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.discs import disc_blur
 from simulator.radiance.procedural import dead_leaves
 from simulator.raw.dng import SOFTWARE_NAME
@@ -44,7 +35,6 @@ from simulator.raw.dng import SOFTWARE_NAME
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.
 PIXELS = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2000, 3000))
-STATES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 #: Least seconds that a point is repeated for, quick and in full.
 _LEAST = (0.1, 0.6)
 #: Memory below this is that of the allocator's own steps [MiB].
@@ -55,28 +45,20 @@ _TILE, _DEFOCUS = 512, 4.0
 
 
 def growth_parts(quick: bool) -> Iterator[Part]:
-    pixels = [{"height": h, "width": w} for h, w in (PIXELS[1:4] if quick else PIXELS)]
-    states = [{"count": n} for n in (STATES[:7:3] if quick else STATES)]
-    curves: dict[str, tuple[Callable[..., Any], list[Any], dict[str, Any]]] = {
-        "exposure + noise": (measure_pixels, pixels, {"weights": None}),
-        "full model": (measure_pixels, pixels, {"weights": "compact"}),
-        "sweep, bank noise": (measure_states, states, {"noise": "bank"}),
-        "sweep, exact noise": (measure_states, states, {"noise": "exact"}),
-    }
-    for curve, (task, points, fixed) in curves.items():
-        for point in points:
-            label = f"growth|{curve}|{'x'.join(map(str, point.values()))}"
-            yield Part(label, task, {"curve": curve, **point, **fixed}, fresh_cache=True)
+    curves = {"exposure + noise": None, "full model": "compact"}
+    for (curve, weights), (h, w) in product(curves.items(), PIXELS[1:4] if quick else PIXELS):
+        arguments = {"curve": curve, "height": h, "width": w, "weights": weights}
+        yield Part(f"growth|{curve}|{h}x{w}", measure_pixels, arguments, fresh_cache=True)
 
 
 def curves(points: list[Row]) -> list[Row]:
     rows = []
-    for (against, curve), own in pd.DataFrame(points).groupby(["against", "curve"], sort=False):
+    for curve, own in pd.DataFrame(points).groupby("curve", sort=False):
         exponents = {
             key: fitted_exponent(list(zip(own["x"], own[key], strict=True)), floor)
             for key, floor in (("seconds", 0.0), ("mib", MEMORY_FLOOR))
         }
-        row: Row = {"curve": curve, "against": against, "exponents": exponents}
+        row: Row = {"curve": curve, "exponents": exponents}
         rows.append(row | {"points": own[["x", "seconds", "mib"]].to_dict("records")})
     return rows
 
@@ -113,26 +95,8 @@ def measure_pixels(curve: str, height: int, width: int, weights: str | None, qui
     memory = peak_memory() - before
     while sum(seconds) < _LEAST[not quick]:
         seconds.append(timed(lambda: simulator.simulate(raw, settings, **options)))
-    return _point("pixels", curve, 4.0 * height * width, float(np.median(seconds)), memory)
-
-
-def measure_states(curve: str, count: int, noise: Any, quick: bool) -> Row:
-    """A sweep of a clean 128 x 128 scene over `count` states: time, and memory of the frames."""
-    raw, clean = noisy_raw(128, 128), NoiseLevelFunction.zero()
-    prepared = PreparedScene(raw.data.clamp(min=0.0), raw.settings, raw.camera, clean)
-    every = itertools.product(range(8), range(8), range(8))
-    states = [CameraSettings(100 * 2**i, 2.0 ** (-t - 2), 2 ** (1 + n / 2)) for i, t, n in every]
-    states = [states[i] for i in np.random.default_rng(0).permutation(len(states))[:count]]
-    prepared.expose(states[:1], noise=noise)
-    forget_peak()
-    before = peak_memory()
-    seconds = median_seconds(lambda: prepared.expose(states, noise=noise), least=_LEAST[not quick])
-    return _point("states", curve, float(count), seconds, peak_memory() - before)
-
-
-def _point(against: str, curve: str, x: float, seconds: float, mib: float) -> Row:
-    row: Row = {"against": against, "curve": curve, "x": x}
-    return row | {"seconds": seconds, "ms": 1e3 * seconds, "mib": mib}
+    row: Row = {"curve": curve, "x": 4.0 * height * width, "mib": memory}
+    return row | {"seconds": float(np.median(seconds)), "ms": 1e3 * float(np.median(seconds))}
 
 
 def noisy_raw(height: int, width: int) -> RawImage:

@@ -46,29 +46,29 @@ BOTH = "both"
 
 
 def scenes_of(
-    name: str, crop: Crop, split: Split, camera: CameraProfile, resolution: int | None
+    name: str,
+    crop: Crop,
+    split: Split,
+    camera: CameraProfile,
+    resolution: int | None,
+    high_iso: bool = False,
 ) -> list[Scene]:
-    names = ("bundled", "polyhaven") if name == BOTH else (name,)
-    common: dict[str, Any] = {"camera": camera, "resolution": resolution, "crop": crop}
-    return [scene for one in names for scene in load_scenes(one, split, **common)]
-
-
-def at_high_iso(
-    name: str, split: Split, camera: CameraProfile, resolution: int | None
-) -> list[Scene]:
-    """Scenes of a set, each photographed once at an ISO of 1600 to 6400, drawn by its name.
+    """Scenes of a set; or each photographed once at an ISO of 1600 to 6400, drawn by its name.
 
     What `source="raw"` makes of them but for the ISO: exposure and noise are drawn alike.
     """
-    scenes = scenes_of(name, "box", split, camera, resolution)
-    return [simulate_source_raw(scene, iso_range=HIGH_ISO) for scene in scenes]
+    names = ("bundled", "polyhaven") if name == BOTH else (name,)
+    common: dict[str, Any] = {"camera": camera, "resolution": resolution, "crop": crop}
+    found = [scene for one in names for scene in load_scenes(one, split, **common)]
+    return [simulate_source_raw(s, iso_range=HIGH_ISO) for s in found] if high_iso else found
 
 
 #: What the environment's `scenes` names, as ``"benchmarks.transfer.agents:high_iso_both_box"``.
 both_box: Callable[..., list[Scene]] = partial(scenes_of, BOTH, "box")
-high_iso_both_box: Callable[..., list[Scene]] = partial(at_high_iso, BOTH)
-high_iso_bundled_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled")
-high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small")
+high_iso_both_box: Callable[..., list[Scene]] = partial(both_box, high_iso=True)
+high_iso_bundled_box, high_iso_small_box = (
+    partial(scenes_of, name, "box", high_iso=True) for name in ("bundled", "bundled:small")
+)
 
 
 # -- worlds ---------------------------------------------------------------------------------------

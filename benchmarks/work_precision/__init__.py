@@ -21,18 +21,9 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from benchmarks import harness
 from benchmarks.fidelity.models import train_missing
-from benchmarks.harness import (
-    Part,
-    Report,
-    Row,
-    benchmark,
-    clipped,
-    psnr,
-    quartiles,
-    sections,
-    table,
-)
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, sections, table
 from benchmarks.isolated import CORES, ROOT, timed
 from benchmarks.work_precision import plans
 from benchmarks.work_precision.methods import Method, all_methods
@@ -69,10 +60,10 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         _captured(method, small.raw(seed), small.states(1), seed)
     for index, trial in enumerate(chosen):
         _one_trial(records, methods, trial, trial.states(count), seed + 1000 * index, index)
-    floor, rows = _median(records.pop(REFERENCE)["noise"]), []
+    floor, rows = float(np.median(records.pop(REFERENCE)["noise"] or np.nan)), []
     for method in methods:
         own = records[method.key]
-        low, middle, high = quartiles(own["ms"])
+        low, middle, high = harness.quartiles(own["ms"])
         row: Row = {"part": "precision", "method": method.name, "height": height, "width": width}
         row |= {"dtype": method.dtype, "tolerance": method.tolerance}
         row |= {"mode": "transition" if method.prepare is None else "shared"}
@@ -81,16 +72,12 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         for percent in (10, 90):
             row[f"psnr_db_{percent}_percent"] = float(np.quantile(own["psnr"], percent / 100))
         row |= {"relative_rmse": float(np.mean(own["rmse"])), "noise_variance_floor": floor}
-        row |= {"noise_variance_error": _median(own["noise"])}
+        row |= {"noise_variance_error": float(np.median(own["noise"] or np.nan))}
         rows.append(row | {"scenes": len(chosen), "states_per_scene": count})
     points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
     for row, best in zip(rows, pareto_front(points), strict=True):
         row["pareto"] = best
     return rows
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if len(values) else None
 
 
 def _one_trial(
@@ -218,7 +205,7 @@ relative RMSE = {relative_rmse:.4f} | noise = {noise_variance_error:.1%}"""
 _SCENES = """{height} x {width}: {scenes} scenes, {states_per_scene} states of each, two \
 photographs; floor of the noise: {noise_variance_floor:.1%}"""
 _BOUND = """tolerance = {tolerance:g} | cases = {cases} | networks = {networks} |
-predicted = {predicted:.3g} | measured = {measured:.3g} ({ci95[0]:.2g} to {ci95[1]:.2g}) |
+predicted = {predicted:.3g} | measured = {measured:.3g} |
 90 % bound holds = {covered:.0%} | kept = {said:.0%} | truly = {kept:.0%}"""
 _FACTORS = """part = {part} | cases = {cases} | 10 % = {low:.2f} | median = {middle:.2f} |
 90 % = {high:.2f} | 90 % bound holds = {covered:.0%}"""
@@ -269,7 +256,7 @@ def _by_tolerance(rows: list[Row]) -> list[Row]:
         row["networks"] = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
         row |= {key: own[key].median() for key in ("predicted", "measured")}
         row |= {key: own[key].mean() for key in ("covered", "said")}
-        found.append(row | {"ci95": _interval(own), "kept": kept.mean() if len(kept) else None})
+        found.append(row | {"kept": kept.mean() if len(kept) else None})
     return found
 
 
@@ -288,17 +275,6 @@ def _by_part(rows: list[Row]) -> list[Row]:
         row |= {name: np.quantile(ratios, share) for name, share in _QUANTILES.items()}
         found.append(row | {"covered": np.mean([r["measured"] <= r["bound"] for r in own])})
     return found
-
-
-def _interval(rows: pd.DataFrame) -> list[float]:
-    """95 % bootstrap interval of the median error over scenes."""
-    groups = [own.to_numpy() for _, own in rows.groupby("scene", sort=False)["measured"]]
-    rng = np.random.default_rng(0)
-    medians = [
-        np.median(np.concatenate([groups[i] for i in rng.integers(len(groups), size=len(groups))]))
-        for _ in range(1000)
-    ]
-    return [float(q) for q in np.quantile(medians, [0.025, 0.975])]
 
 
 def _headline(rows: list[Row]) -> Figure:

@@ -20,6 +20,7 @@ import functools
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,18 +32,11 @@ from ae_env import ExposureGrid
 from benchmarks.harness import Row, cropped, data_root
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    get_camera,
-    incident_ev100,
-)
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, incident_ev100
 from simulator.camera_simulator import Depth
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
-from simulator.noise.noise_level_function import noise_variance
+from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import Split, reference_scenes
 
@@ -141,10 +135,8 @@ def _in_turn(kinds: dict[str, list[ReferenceScene]], counts: dict[str, int]) -> 
     columns = [kinds[kind][:count] for kind, count in counts.items()]
     chosen = [c[i] for i in range(max(counts.values())) for c in columns if i < len(c)]
     camera = ReferenceCamera(get_camera(CAMERA))
-    return tuple(
-        Trial(scene, source_settings(scene, *SOURCES[i % len(SOURCES)]), camera)
-        for i, scene in enumerate(chosen)
-    )
+    sources = [source_settings(s, *SOURCES[i % len(SOURCES)]) for i, s in enumerate(chosen)]
+    return tuple(Trial(*own, camera) for own in zip(chosen, sources, strict=True))
 
 
 def _scenes(
@@ -153,9 +145,8 @@ def _scenes(
     """Scenes of exactly `size` by kind."""
     profile = get_camera(CAMERA)
     found = reference_scenes(split, profile, number=groups, size=drawn, data=data_root())
-    kinds: dict[str, list[ReferenceScene]] = {
-        kind: [] for kind in ("depth", "flat", "photograph", "radiance")
-    }
+    names = ("depth", "flat", "photograph", "radiance")
+    kinds: dict[str, list[ReferenceScene]] = {kind: [] for kind in names}
     for scene in found:
         if min(scene.size) >= min(size) and max(scene.size) >= max(size):
             known = scene.kind if scene.kind in kinds else "flat"
@@ -295,10 +286,7 @@ def left_out(kind: str, seed: int, quick: bool) -> Row:
     predicted, times, every = [], [], []
     examples = [_source(t, taken, seed) for t in known[: 1 if quick else SCENES]]
     for source in examples:
-
-        def prepared(source: Any = source) -> PreparedScene:
-            return own.prepare(source, tolerance=DEFAULT, **told)
-
+        prepared: Any = partial(own.prepare, source, tolerance=DEFAULT, **told)
         for plan in map(prepared().plan, GRID):
             for step in plan.steps:
                 share = int(step.runs) / (len(examples) * len(GRID))
@@ -307,10 +295,8 @@ def left_out(kind: str, seed: int, quick: bool) -> Row:
         some = [GRID[(i * len(GRID) // FULL_STATES + i) % len(GRID)] for i in range(FULL_STATES)]
         for _ in range(1 if quick else REPEATS):
             times.append(timed(lambda p=prepared: p().expose(GRID)))  # type: ignore[misc]
-            every += [
-                timed(lambda s=source, x=x: own.simulate(s, x, tolerance=None, **told))  # type: ignore[misc]
-                for x in some
-            ]
+            full_run = partial(own.simulate, source, tolerance=None, **told)
+            every += [timed(partial(full_run, settings)) for settings in some]
     sweep, full = 1e3 * float(np.median(times)), 1e3 * float(np.mean(every)) * len(GRID)
     row = {"part": "left_out", "kind": kind, "scenes": len(examples), "share": names}
     row |= {"predicted_mean": float(np.mean(predicted)), "predicted_largest": max(predicted)}
