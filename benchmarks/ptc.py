@@ -132,7 +132,7 @@ def curves(rows: list[Row]) -> Figure:
             line = {"y": given["dark"] ** 2 + given["gain"] * mean, "style": {"c": colour}}
             drawn.append(common | line | {"label": f"ISO {row['iso']:g}"})
     # Below a variance of 30 there are only saturated steps.
-    labels = {"xlabel": "mean [DN]", "ylabel": "variance [DN²]"}
+    labels: Row = {"xlabel": "mean [DN]", "ylabel": "variance [DN²]"}
     return panels(drawn, yscale="log", ylim=(30, None), **labels)
 
 

@@ -242,8 +242,8 @@ def _closeness(
     similar = [ssim(p, reference, channel_axis=2) for p in pictures]
     near = np.abs(env.grid.ev100 - scene.ev100) <= NEAR_EV
     found = {f"aspect:{name}": -error for name, error in errors.items()}
-    exposed = np.where(near, -rmse, np.nan)
-    return found | {"rmse": -rmse, "ssim": np.array(similar), "exposed": exposed}
+    exposures = np.where(near, -rmse, np.nan)
+    return found | {"rmse": -rmse, "ssim": np.array(similar), "exposed": exposures}
 
 
 # -- report ---------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     figure = Figure(figsize=(10.0, 5.0), dpi=80, layout="constrained")
     frame = pd.DataFrame(steps)
     frame = frame[frame["title"] == frame["title"][0]]
-    frame.index = frame["case"] + frame["num_envs"].map(" ({})".format)  # type: ignore[assignment]
+    frame.index = frame["case"] + frame["num_envs"].map(" ({})".format)
     axis, speeds = figure.subplots(), frame["steps_per_second"].sort_values()
     speeds.plot.barh(ax=axis, logx=True, xlabel="steps per second, " + frame["title"].iloc[0])
     return Report([*steps, *paired], tables, meta=more, figures={"throughput.png": figure})
