@@ -1,7 +1,5 @@
 """The long training: both agents over several seeds, and every light meter, on unseen scenes.
 
-    ae-env bench agents
-
 Trained agents lie under ``runs/bench_agents``, so that a second run continues where the first was
 stopped. It writes the report of an evaluation on each set of scenes to ``agents/`` under the output
 folder. Real places are looked for in the folder of real files and in the cache. Trainings run side

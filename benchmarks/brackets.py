@@ -1,7 +1,5 @@
 """The exposure step against a real multi-exposure bracket (1 to 32 ms in whole stops).
 
-    ae-env bench brackets
-
 Measures, per plane, the ratio between consecutive exposures against `simulator.exposure_ratio`,
 then simulates the 2 to 32 ms frames from the 1 ms frame and the 1 ms frame from each of them, with
 and without the noise of the source removed (by `compact`), and compares with the real ones.

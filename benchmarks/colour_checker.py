@@ -1,7 +1,5 @@
 """Colour accuracy of `simulator.develop` on real raws of a ColorChecker.
 
-    ae-env bench colour_checker
-
 Every patch is averaged on the packed raw, brought to the chart's exposure by one scale, developed
 (linear tone) and compared with the chart's published colour: CIE dE2000, D50, 2 degree observer.
 """

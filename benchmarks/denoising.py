@@ -1,7 +1,5 @@
 """Denoising of real detail that no training saw, sampled as a sensor samples it.
 
-    ae-env bench denoising
-
 One crop of every source of the test split of `simulator.training.scenes`: views into radiance maps,
 photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
 every method; the gain is that of the PSNR over the noisy input. One thread.

@@ -156,11 +156,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     seconds = pd.DataFrame(rows).groupby(["method", "iso"])["seconds"].median()
     means: list[Row] = []
     for (method, iso), own in frame.groupby(["method", "iso"], sort=False):
-        mean: Row = {
-            "method": METHODS[str(method)],
-            "iso": iso,
-            "seconds": seconds.get((method, iso)),
-        }
+        mean: Row = {"method": METHODS[str(method)], "iso": iso}
+        mean["seconds"] = seconds.get((method, iso))
         for n, whole, edge in own[["f_number", "psnr", "edge_psnr"]].to_numpy():
             mean |= {f"psnr {n:g}": whole, f"edge_psnr {n:g}": edge}
         means.append(mean)

@@ -1,7 +1,5 @@
 """Cost and taste of the scorers, and whether they tell good captures from bad ones.
 
-    ae-env bench scorers
-
 *Gain* and *best exposure*: noisy captures without blur of the small bundled test scenes.
 *Correlation*: for every bundled test scene, with a motion and a defocus drawn as in an episode, the
 64 states are simulated and compared with the reference: the same scene noise-free, blur-free and

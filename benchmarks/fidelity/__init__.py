@@ -1,7 +1,5 @@
 """The camera simulator against the reference camera: error and time of every module.
 
-    ae-env bench simulator
-
 Needs trained weights: ``compact`` comes with the package; ``paper`` and the baselines ``pc`` and
 ``dl`` are trained by their configurations, once, where ``runs/simulator`` does not hold them. The
 real files that ``AE_ENV_DATA`` names are used where they are. One thread: what the networks are

@@ -1,7 +1,5 @@
 """Error against run time: every method, the plan's predictions, what is left out.
 
-    ae-env bench work-precision
-
 Needs trained weights as ``ae-env bench simulator`` does: ``compact`` comes with the package,
 ``paper``, ``pc`` and ``dl`` are trained once where ``runs/simulator`` does not hold them.
 
