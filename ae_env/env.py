@@ -10,7 +10,15 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from ae_env.episodes.core import EpisodeCore, FindTransitions, Frames, MakeTask, Task, check_actions
+from ae_env.episodes.core import (
+    EpisodeCore,
+    FindTransitions,
+    FrameBatch,
+    Frames,
+    MakeTask,
+    Task,
+    check_actions,
+)
 from ae_env.episodes.lookup import RECORDED
 from ae_env.episodes.state import Episode, Episodes, check_options
 from ae_env.grid import ExposureGrid
@@ -21,7 +29,7 @@ from ae_env.scorers.captures import Captures, describe_captures, reads_pixels
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
-from simulator.capture.batch import MODULES, FrameSource, FrameStatistics
+from simulator.capture.batch import MODULES, FrameSource
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_seed, check_word
@@ -40,16 +48,8 @@ class AutoExposure(Task):
     """Scores each frame, takes the costs off, and compares it with the oracle.
 
     Parts of the score that look at no frame are cached in static light, and so are expectations.
-
-    Args:
-        episodes: The episodes, with their scenes and options.
-        captures: What records their frames.
-        scorer: Rates the frames.
-        transitions: Light and exposures behind frames, `CaptureBatch.transitions`, where parts that
-            are measured on frames are replaced by their expectation; else None.
-
-    Attributes:
-        tables: Where expectations of all states are worked out.
+    With `transitions` (`CaptureBatch.transitions`), parts that are measured on frames are replaced
+    by their expectation.
     """
 
     def __init__(
@@ -94,21 +94,14 @@ class AutoExposure(Task):
         self._scored[lights] = False
         self._means[lights] = np.nan
 
-    def measure(
-        self,
-        env_indices: np.ndarray,
-        frames: FrameStatistics,
-        outputs: Mapping[str, np.ndarray],
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
+    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
         """Scores (B,) by ``score:`` and part, and ``image_mean`` where a cost needs it."""
         columns: dict[str, np.ndarray] = {}
         if not self._reads_tables:
-            scores = self._score(env_indices, frames, outputs, gains, rows)
+            scores = self._score(frames)
             columns = {f"score:{name}": values for name, values in scores.items()}
         if "flicker" in self.episodes.options.costs:
-            flat = outputs["codes"].reshape(len(env_indices), -1)
+            flat = frames.outputs["codes"].reshape(len(frames.gains), -1)
             columns["image_mean"] = flat.sum(axis=1, dtype=np.int64) / (255.0 * flat.shape[1])
         return columns
 
@@ -178,49 +171,39 @@ class AutoExposure(Task):
             self._tables.put(key, table, table.nbytes)
         return table
 
-    # -- scores of captures -------------------------------------------------------------------
-
-    def _score(
-        self,
-        env_indices: np.ndarray,
-        frames: FrameStatistics,
-        outputs: Mapping[str, np.ndarray],
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
-        """Scores (B,) of the captures of `env_indices` by part; the arguments are `measure`'s."""
+    def _score(self, frames: FrameBatch) -> dict[str, np.ndarray]:
+        """Scores (B,) of the captures by part."""
         episodes, terms = self.episodes, self._terms
-        boxes = episodes.box_factor[episodes.scene[env_indices]]
-        source_noise = frames.source_noise * np.square(boxes)[:, None, None]
+        boxes = episodes.box_factor[episodes.scene[frames.env_indices]]
+        source_noise = frames.statistics.source_noise * np.square(boxes)[:, None, None]
         captures: Captures | None = None
         if self._reads_images or not episodes.static or terms.reads_captures:
-            captures = self._describe(env_indices, gains, rows, source_noise)
+            captures = self._describe(frames, source_noise)
         if episodes.static:
-            scores = self._known_scores(env_indices, gains, source_noise)
+            scores = self._known_scores(frames, source_noise)
         else:
             assert captures is not None
             scores = terms.torch_scores(None, captures, "light", "blur")
         if terms.parts:
-            states = episodes.state[env_indices]
+            states = episodes.state[frames.env_indices]
             if self._transitions is None:
-                means = terms.measured(outputs["codes"], states, source_noise)
+                means = terms.measured(frames.outputs["codes"], states, source_noise)
             else:
-                means = self._expected_means(env_indices, self._transitions, boxes, rows)
+                means = self._expected_means(frames, self._transitions, boxes)
             scores |= terms.score(means, captures)
         if self._reads_images and captures is not None:
-            shown = torch.from_numpy(outputs["signals"]).clamp(0.0, 1.0)
+            shown = torch.from_numpy(frames.outputs["signals"]).clamp(0.0, 1.0)
             scores |= terms.torch_scores(shown, captures, "image")
         return scores
 
-    def _known_scores(
-        self, env_indices: np.ndarray, gains: np.ndarray, source_noise: np.ndarray
-    ) -> dict[str, np.ndarray]:
+    def _known_scores(self, frames: FrameBatch, source_noise: np.ndarray) -> dict[str, np.ndarray]:
         """Scores in static light of the parts that look at no frame, cached."""
+        env_indices = frames.env_indices
         lights = self.episodes.light_index[env_indices]
         states = self.episodes.state[env_indices]
         new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
         if len(new) >= _MANY:
-            described = self._describe(env_indices[new], gains[new], None, source_noise[new])
+            described = self._describe(frames, source_noise, new)
             found = self._terms.torch_scores(None, described, "light", "blur")
             self._scores[lights[new], states[new]] = np.stack(list(found.values()), axis=1)
             self._scored[lights[new], states[new]] = True
@@ -245,37 +228,30 @@ class AutoExposure(Task):
         return of_light | self._terms.closed_form_terms(shown, prepared, "blur")
 
     def _expected_means(
-        self,
-        env_indices: np.ndarray,
-        transitions: FindTransitions,
-        boxes: np.ndarray,
-        rows: np.ndarray | None,
+        self, frames: FrameBatch, transitions: FindTransitions, boxes: np.ndarray
     ) -> np.ndarray:
         """`TermScores.expected` of the captures; in static light, cached."""
-        episodes = self.episodes
+        episodes, env_indices = self.episodes, frames.env_indices
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
         missing = np.isnan(self._means[lights, states, 0]) | (not episodes.static)
         if missing.any():
             exposed = transitions(lights[missing], states[missing])
-            some = None if rows is None else rows[missing]
+            some = None if frames.rows is None else frames.rows[missing]
             found = self._terms.expected(exposed, states[missing], boxes[missing], some)
             self._means[lights[missing], states[missing]] = found
         return self._means[lights, states]
 
     def _describe(
-        self,
-        env_indices: np.ndarray,
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-        source_noise: np.ndarray,
+        self, frames: FrameBatch, source_noise: np.ndarray, part: Any = slice(None)
     ) -> Captures:
-        episodes = self.episodes
+        episodes, env_indices, rows = self.episodes, frames.env_indices[part], frames.rows
         scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
         light = noises = None
         if not self.in_chunks:
             light = torch.empty(1).expand(len(env_indices), *scenes[0].light.shape)
-        if source_noise.any():
-            noises = [NoiseLevelFunction(tuple(s), tuple(r)) for s, r in source_noise.tolist()]
+        if source_noise[part].any():
+            pairs = source_noise[part].tolist()
+            noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
         return describe_captures(
             scenes,
             [episodes.grid[state] for state in episodes.state[env_indices].tolist()],
@@ -283,8 +259,8 @@ class AutoExposure(Task):
             speed=episodes.speed[env_indices],
             defocus=episodes.defocus[env_indices],
             movements=[episodes[index].movement for index in env_indices.tolist()],
-            gain=gains,
-            row_gain=rows,
+            gain=frames.gains[part],
+            row_gain=None if rows is None else rows[part],
             light=light,
             source_noise=noises,
             noisy=self.tables.noise,
@@ -328,16 +304,12 @@ class AutoExposureBase(SpecProperty):
 
     @property
     def scene_ids(self) -> tuple[str, ...]:
-        """Names of all scenes, of sequences of all frames, by ``info["scene_id"]`` of a vector
-        environment.
-        """
+        """Names of all scenes (of sequences: frames), by a vector environment's ``scene_id``."""
         return self.core.scene_ids
 
     @property
     def module_names(self) -> tuple[str, ...]:
-        """Steps of the simulator, joined by ``"+"``, by ``info["modules"]`` of a vector
-        environment.
-        """
+        """Steps of the simulator, joined by ``"+"``, by a vector environment's ``modules``."""
         return (*MODULES, RECORDED)
 
     @property
@@ -346,7 +318,7 @@ class AutoExposureBase(SpecProperty):
         return self.core.options.delays
 
     def episode(self, env_index: int = 0) -> Episode:
-        """The drawn values of an environment's episode, and its current frame and state."""
+        """What was drawn for an environment's episode, and its current frame and state."""
         return self.core.episode(env_index)
 
     def scene(self, env_index: int = 0) -> Scene:
@@ -524,21 +496,23 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         chosen = check_options(options)
         super().reset(seed=check_seed(seed))
         self.core.begin(_FIRST, [self.np_random], [chosen])
-        self._last = self.core.observe(_FIRST)
-        return _first(self._last.observation), self.info_of(self._last.info, 0)
+        return self._observe()
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
         ended = self.core.transition(_FIRST, check_actions("action", action, ())[None])
+        observation, info = self._observe()
+        assert self._last is not None
+        return observation, float(self._last.reward[0]), bool(ended[0]), False, info
+
+    def _observe(self) -> tuple[Observation, dict[str, Any]]:
         self._last = self.core.observe(_FIRST)
-        info = self.info_of(self._last.info, 0)
-        reward = float(self._last.reward[0])
-        return _first(self._last.observation), reward, bool(ended[0]), False, info
+        observation = {name: values[0] for name, values in self._last.observation.items()}
+        return observation, self.info_of(self._last.info, 0)
 
     def action_masks(self) -> np.ndarray:
         """(S,) bool: states that the scene allows."""
-        mask: np.ndarray = self.core.action_masks(_FIRST)[0]
-        return mask
+        return np.asarray(self.core.task.allowed(_FIRST)[0])
 
     def expected_scores(self) -> np.ndarray:
         """(S,) float64: expectation over noise of every state's score in the current frame."""
@@ -551,10 +525,6 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         """
         pictures = self._pictures(1)
         return None if pictures is None else pictures[0]
-
-
-def _first(observation: Observation) -> Observation:
-    return {name: values[0] for name, values in observation.items()}
 
 
 def _row(columns: dict[str, Any], row: int) -> dict[str, Any]:

@@ -97,14 +97,10 @@ class ExposureGrid:
         """A grid from a name, such as ``"default"`` or ``"video"``, or a mapping of its lists."""
         if isinstance(spec, ExposureGrid):
             return spec
-        named = {
-            "default": cls.default,
-            "third_stop": cls.third_stop,
-            "video": cls.video,
-            "bracket": cls.bracket,
-        }
+        named = ("bracket", "default", "third_stop", "video")
         if isinstance(spec, str) and spec in named:
-            return named[spec]()
+            grid: ExposureGrid = getattr(cls, spec)()
+            return grid
         names = ("isos", "exposure_times", "f_numbers")
         if isinstance(spec, Mapping) and set(spec) == set(names):
             try:
@@ -115,7 +111,7 @@ class ExposureGrid:
         if isinstance(spec, Mapping):
             hint = "".join(did_you_mean(key, names) for key in spec if key not in names)
         raise ValueError(
-            f"`grid` (={spec!r}) must be one of {sorted(named)}, an ExposureGrid, or a mapping "
+            f"`grid` (={spec!r}) must be one of {list(named)}, an ExposureGrid, or a mapping "
             f"with exactly the keys {list(names)}{hint}"
         )
 

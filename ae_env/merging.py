@@ -56,13 +56,8 @@ def log_error(
 ) -> torch.Tensor:
     """Error of each sample [EV], at most `WORST_EV`, which samples that no frame shows have.
 
-    ``|log2((light + floor) / (truth + floor))|``.
-
-    Args:
-        light: (B, 4, H, W) of `merge`.
-        precision: (B, 4, H, W) of `merge`.
-        truth: (B, 4, H, W) the light.
-        floor: (B,) light below which errors count less.
+    ``|log2((light + floor) / (truth + floor))|`` of `light` and `precision` (B, 4, H, W) of
+    `merge`, `truth` (B, 4, H, W) and `floor` (B,), light below which errors count less.
     """
     dark = floor[:, None, None, None].to(light)
     ratio = (light.clamp(min=0.0) + dark) / (truth.clamp(min=0.0) + dark)

@@ -45,14 +45,13 @@ _TINY = sys.float_info.min
 
 
 def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """8-bit codes of a signal on the scale where white is 1.
+    """8-bit codes ``round(255 sqrt((x + p) / (1 + p)))`` of a signal whose white is 1.
+
+    x is clipped to [-p, 1], p = 1/1024.
 
     Args:
         signal: Float tensor of any shape.
         out: uint8 tensor of this shape to write to, instead of a new one.
-
-    Returns:
-        uint8: ``round(255 sqrt((x + p) / (1 + p)))``, x clipped to [-p, 1], p = 1/1024.
     """
     codes = signal.clamp(-PEDESTAL, 1.0).add_(PEDESTAL).div_(1.0 + PEDESTAL)
     codes = codes.sqrt_().mul_(255.0).round_()
@@ -60,23 +59,13 @@ def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) ->
 
 
 def encode_array(signal: np.ndarray) -> np.ndarray:
-    """`encode_observation` of an array, without torch: its threads do not survive a fork.
-
-    Args:
-        signal: Of any shape.
-
-    Returns:
-        uint8 of this shape.
-    """
+    """`encode_observation` of an array, without torch: its threads do not survive a fork."""
     light = np.clip(signal, -PEDESTAL, 1.0) + PEDESTAL
     return np.rint(255.0 * np.sqrt(light / (1.0 + PEDESTAL))).astype(np.uint8)
 
 
 def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
-    """What an image processor hands to its auto exposure, from the 8-bit codes of frames.
-
-    Args:
-        codes: (N, 4, R, R) uint8.
+    """What an image processor hands to its auto exposure, from 8-bit codes (N, 4, R, R) of frames.
 
     Returns:
         ``raw`` (N, 4, 12, 16) uint8: codes of the mean signal of each zone of each plane, in 12
@@ -91,13 +80,11 @@ def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     sums = np.add.reduceat(decode_observation(codes), rows, axis=-2)
     sums = np.add.reduceat(sums, columns, axis=-1)
     area = np.diff(rows, append=height)[:, None] * np.diff(columns, append=width)
-    means = np.clip(sums / area, 0.0, 1.0)
-    zones = encode_array(means)
     flat = codes.reshape(len(codes), -1)
     counts = np.stack([np.bincount(frame, minlength=256) for frame in flat])
     shares = (counts / flat.shape[1]).astype(np.float32)
     return {
-        "raw": zones,
+        "raw": encode_array(np.clip(sums / area, 0.0, 1.0)),
         "histogram": shares.reshape(len(codes), HISTOGRAM_BINS, -1).sum(axis=2),
         "clipped": np.ascontiguousarray(shares[:, [255, 0]]),
     }
@@ -131,15 +118,12 @@ def decode_settings(settings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def encode_sensors(speed: np.ndarray, defocus: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Readings of the gyro and the focus drive.
+    """Readings (N, 2) float32 in [-1, 1] of the gyro and the focus drive; no motion reads -1.
 
     Args:
         speed: (N,) image speed [frame heights/s], >= 0.
         defocus: (N,) blur diameter at f/4 [pixel of a 64-pixel frame], > 0.
         noise: (N, 2) standard normals; the readings are off by 15 % times these.
-
-    Returns:
-        (N, 2) float32 in [-1, 1]; no motion reads -1.
     """
     # A kernel, because a dozen NumPy calls for two numbers are 8 % of the time of a step.
     out = np.empty((len(speed), 2), np.float32)

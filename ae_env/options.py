@@ -100,14 +100,12 @@ class EnvOptions:
             object.__setattr__(self, "costs", {})
         if isinstance(self.scenes, str) and not self.scenes:
             raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
-        check_word("split", self.split, get_args(Split))
-        check_word("observation", self.observation, get_args(ObservationKind))
-        check_word("crop", self.crop, get_args(Crop))
-        check_word("reward", self.reward, get_args(Reward))
-        check_word("source", self.source, get_args(Source))
+        kinds = {"split": Split, "observation": ObservationKind, "crop": Crop}
+        for name, kind in (kinds | {"reward": Reward, "source": Source}).items():
+            check_word(name, getattr(self, name), get_args(kind))
         check_word("noise", self.noise, get_args(Noise), True, False)  # True is "bank"
-        check_flag("sensors", self.sensors)
-        check_flag("with_oracle", self.with_oracle)
+        for name in ("sensors", "with_oracle"):
+            check_flag(name, getattr(self, name))
         check_tolerance(self.tolerance)
         why = ": the default CNNs of RL libraries take no smaller image"
         resolution = check_integer("resolution", self.resolution, MIN_RESOLUTION, 4096, more=why)
@@ -132,9 +130,7 @@ class EnvOptions:
         if self.simulator is not None:
             check_weights(self.simulator)
         if not isinstance(self.costs, Mapping):
-            raise ValueError(
-                f"`costs` (={self.costs!r}) must map names of {list(COSTS)} to weights"
-            )
+            raise ValueError(f"`costs` (={self.costs!r}) must map some of {COSTS} to weights")
         for name, weight in self.costs.items():
             check_word("costs", name, COSTS)
             check_number(f"costs[{name!r}]", weight, 0.0, MAX_COST)
@@ -143,13 +139,8 @@ class EnvOptions:
 
     def _check_recorded(self) -> None:
         """Real captures have the light, the motion and the noise that they have."""
-        defaults = {
-            "motion": ("random", "none"),
-            "depth": ("random", "far"),
-            "lighting": ("static",),
-            "noise": (True,),
-            "source": ("light",),
-        }
+        defaults: dict[str, tuple[Any, ...]] = {"lighting": ("static",), "source": ("light",)}
+        defaults |= {"motion": ("random", "none"), "depth": ("random", "far"), "noise": (True,)}
         for name, allowed in defaults.items():
             value = getattr(self, name)
             if not any(value is word or value == word for word in allowed):
@@ -168,11 +159,7 @@ class EnvOptions:
 
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
-        """Options from the entries of a file or another mapping.
-
-        Raises:
-            ValueError: If one is unknown; the message proposes the nearest name.
-        """
+        """Options from a mapping; a `ValueError` for an unknown one proposes the nearest name."""
         known = [f.name for f in fields(cls)]
         for name in kwargs:
             if name not in known:
@@ -250,10 +237,10 @@ class EnvOptions:
 def takes_env_arguments(
     without: Collection[str] = (), **defaults: Any
 ) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Decorates a constructor that passes `EnvArguments` on.
+    """Decorates a constructor that passes `EnvArguments` on: its signature shows all of them.
 
-    Its signature shows all of them. An unknown one stays Python's own `TypeError` with its wording,
-    which Gymnasium's consumers look for; the message proposes the nearest name.
+    An unknown one stays Python's own `TypeError` with its wording, which Gymnasium's consumers look
+    for; the message proposes the nearest name.
 
     Args:
         without: Arguments that the task does not have.
@@ -292,11 +279,7 @@ def takes_env_arguments(
 
 
 def checked_delay(delay: Any) -> int | dict[str, int]:
-    """`delay` with Python's integers; a mapping of equal ones, of all controls, as one.
-
-    Raises:
-        ValueError: If it is neither, or names no control.
-    """
+    """`delay` with Python's integers, one of all controls where they are equal."""
     if not isinstance(delay, Mapping):
         more = f" frames, or a mapping of them by {list(CONTROLS)}"
         return check_integer("delay", delay, 0, MAX_DELAY, more=more)

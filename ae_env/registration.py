@@ -9,36 +9,24 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-#: The tasks: module and class, for one episode and for many, and the actions after which an episode
-#: is truncated; None where episodes end by themselves.
-TASKS: dict[str, tuple[str, str, int | None]] = {
-    "ae_env/AutoExposure-v0": (
-        "ae_env.env:AutoExposureEnv",
-        "ae_env.vector_env:AutoExposureVectorEnv",
-        8,
-    ),
-    "ae_env/AutoExposureVideo-v0": (
-        "ae_env.tasks:AutoExposureVideoEnv",
-        "ae_env.tasks:AutoExposureVideoVectorEnv",
-        96,
-    ),
-    "ae_env/ExposureBracket-v0": (
-        "ae_env.tasks:ExposureBracketEnv",
-        "ae_env.tasks:ExposureBracketVectorEnv",
-        None,
-    ),
+#: The tasks: the name that their classes begin with, for one episode ``...Env`` and for many
+#: ``...VectorEnv``, and the actions after which an episode is truncated; None where it ends itself.
+TASKS: dict[str, tuple[str, int | None]] = {
+    "ae_env/AutoExposure-v0": ("AutoExposure", 8),
+    "ae_env/AutoExposureVideo-v0": ("AutoExposureVideo", 96),
+    "ae_env/ExposureBracket-v0": ("ExposureBracket", None),
 }
 ENV_IDS = tuple(TASKS)
 
 
 def register_envs() -> None:
     """Registers every id once; calling it again changes nothing."""
-    for name, (entry_point, vector_entry_point, steps) in TASKS.items():
+    for name, (begin, steps) in TASKS.items():
         if name not in gym.registry:
             gym.register(
                 id=name,
-                entry_point=entry_point,
-                vector_entry_point=vector_entry_point,
+                entry_point=f"ae_env:{begin}Env",
+                vector_entry_point=f"ae_env:{begin}VectorEnv",
                 max_episode_steps=steps,
             )
 
@@ -47,11 +35,7 @@ class InProcessSpec(EnvSpec):
     """Spec of an environment with an argument, such as a callable, that JSON cannot hold."""
 
     def to_json(self) -> str:
-        """Raises, and names the argument.
-
-        Raises:
-            ValueError: Always.
-        """
+        """Raises a `ValueError` that names the argument."""
         for name, value in self.kwargs.items():
             if not _is_json(value):
                 raise ValueError(

@@ -22,15 +22,13 @@ from simulator.camera import CameraProfile
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.develop import develop
 from simulator.settings import CameraSettings, format_exposure_time
+from simulator.utils.checks import check_type
 
 #: Least side of a rendered frame [pixel].
 FRAME_PIXELS = 256
-#: A contact sheet of more states than this would be unreadable.
-MAX_SHEET_STATES = 256
-#: Height of one picture on the contact sheet [pixel].
-THUMB_PIXELS = 104
-#: Height that scenes are averaged to for it [packed pixel].
-CAPTURE_PIXELS = 192
+#: A contact sheet of more states would be unreadable. Height of one picture on it [pixel], and that
+#: which scenes are averaged to for it [packed pixel].
+MAX_SHEET_STATES, THUMB_PIXELS, CAPTURE_PIXELS = 256, 104, 192
 #: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
 PATH_COLOURS = ("#D55E00", "#56B4E9", "#FFFFFF", "#CC79A7", "#009E73", "#0072B2", "#E69F00")
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
@@ -48,7 +46,7 @@ def render_frame(
         scene: The scene that it shows.
         camera: The body.
         settings: Settings of the capture.
-        score: Score of the capture.
+        score: Its score.
 
     Returns:
         (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
@@ -79,9 +77,7 @@ def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
     band = Image.new("RGBA", (picture.width, height), (0, 0, 0, 150))
     draw = ImageDraw.Draw(band)
     for i, line in enumerate(lines):
-        font = _font(size)
-        while draw.textlength(line, font) > picture.width - size and font.size > 6:
-            font = _font(int(font.size) - 1)
+        font = _fitting_font(draw, line, size, picture.width - size, least=6)
         draw.text((size // 2, size // 4 + int(1.35 * size * i)), line, _INK, font)
     captioned = picture.convert("RGBA")
     captioned.alpha_composite(band, (0, picture.height - height))
@@ -90,9 +86,6 @@ def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
 
 def _font(size: int) -> Any:
     return ImageFont.load_default(size)
-
-
-# -- the contact sheet ----------------------------------------------------------------------------
 
 
 def contact_sheet(
@@ -116,36 +109,28 @@ def contact_sheet(
     Args:
         scene: The scene, of any size and shape; large ones are averaged down first.
         camera: The body; that of the scene by default.
-        grid: The states; the default grid's 64 by default.
+        grid: The states, at most 256; the default grid's 64 by default.
         scorer: Scorer of the captures, as `make_scorer` takes it.
-        speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
-        movement: Directions of the image's motion, and the subject's own.
+        speed, defocus, movement: See `ae_env.scorers.captures.prepare_scene`.
         path: States that a policy went through, the start state first; or several by name.
         seed: Seed of the noise.
 
     Raises:
-        ValueError: If the grid has more than 256 states, or a path leaves it, or `scene` is none.
+        ValueError: If the grid has more states, or a path leaves it, or `scene` is none.
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(f"`scene` (={scene!r}) must be a Scene, such as load_scenes() returns")
+    check_type("scene", scene, Scene)
     camera = scene.camera if camera is None else camera
     grid = ExposureGrid.default() if grid is None else grid
     if len(grid) > MAX_SHEET_STATES:
-        raise ValueError(
-            f"`grid` ({len(grid)} states) must have at most {MAX_SHEET_STATES} states to be shown "
-            "on one contact sheet"
-        )
+        raise ValueError(f"`grid` ({len(grid)} states) must have at most {MAX_SHEET_STATES} states")
     paths = _checked_paths(path, len(grid))
     scene = scene.averaged(max(1, min(scene.light.shape[1:]) // CAPTURE_PIXELS))
     tables = ScoreTables(grid, camera, make_scorer(scorer))
     moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
     table = tables.table(scene, **moves)
-    frames: Iterable[torch.Tensor]
-    if scene.recorded is None:
+    frames: Iterable[torch.Tensor] | None = scene.recorded
+    if frames is None:
         frames = prepare_scene(scene, camera, **moves).stream(grid.states, seed=seed)
-    else:
-        frames = scene.recorded
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, moves, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)
@@ -158,10 +143,10 @@ def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
     paths = {}
     for name, states in named.items():
         values = np.asarray(states)
-        if values.ndim != 1 or not values.size or values.dtype.kind not in "iu":
-            raise ValueError(f"`path` of {name!r} (={states!r}) must be a list of states")
-        if values.min() < 0 or values.max() >= count:
-            raise ValueError(f"`path` of {name!r} (={values.tolist()}) must be in [0, {count})")
+        fits = values.ndim == 1 and values.size > 0 and values.dtype.kind in "iu"
+        if not fits or values.min() < 0 or values.max() >= count:
+            rule = f"must be a list of states in [0, {count})"
+            raise ValueError(f"`path` of {name!r} (={states!r}) {rule}")
         paths[str(name)] = values.tolist()
     return paths
 
@@ -230,8 +215,7 @@ class _Sheet:
         width, height = self.panel
 
         def lopsidedness(columns: int) -> float:
-            rows = -(-count // columns)
-            return abs(float(np.log(columns * width / (rows * height))))
+            return abs(float(np.log(columns * width / (-(-count // columns) * height))))
 
         return min(range(1, count + 1), key=lopsidedness)
 
@@ -246,9 +230,8 @@ class _Sheet:
         """Upper left corner of a panel's first picture."""
         width, height = self.panel
         x = _MARGIN + _LABEL_WIDTH + column * (width + _LABEL_WIDTH + _PANEL_GAP)
-        return x, _TITLE_HEIGHT + 2 * _LABEL_HEIGHT + row * (
-            height + 2 * _LABEL_HEIGHT + _PANEL_GAP
-        )
+        y = _TITLE_HEIGHT + 2 * _LABEL_HEIGHT
+        return x, y + row * (height + 2 * _LABEL_HEIGHT + _PANEL_GAP)
 
     def draw(self, title: tuple[str, str]) -> Image.Image:
         """The finished sheet."""
@@ -315,9 +298,8 @@ class _Sheet:
             row, column = divmod(i, columns)
             dx = int(width * (column + 1) / (columns + 1))
             dy = int((height - 16) * (row + 1) / (rows + 1)) + 2
-            spots = {
-                s: (2 * (self.corner(s)[0] + dx), 2 * (self.corner(s)[1] + dy)) for s in states
-            }
+            corners = {state: self.corner(state) for state in states}
+            spots = {s: (2 * (x + dx), 2 * (y + dy)) for s, (x, y) in corners.items()}
             colour = PATH_COLOURS[i % len(PATH_COLOURS)]
             route = [spots[s] for s, _ in itertools.groupby(states)]
             for ink, thickness in (("black", 11), (colour, 6)):
@@ -329,9 +311,8 @@ class _Sheet:
     def _draw_star(self, draw: ImageDraw.ImageDraw) -> None:
         x, y = self.corner(self.table.oracle)
         width, height = self.thumb
-        draw.rectangle(
-            (2 * x - 4, 2 * y - 4, 2 * (x + width) + 3, 2 * (y + height) + 3), None, "white", 6
-        )
+        frame = (2 * x - 4, 2 * y - 4, 2 * (x + width) + 3, 2 * (y + height) + 3)
+        draw.rectangle(frame, None, "white", 6)
         draw.polygon(_star(2 * (x + width - 18), 2 * (y + 18), 24), "white", "black")
 
     def _draw_legend(self, sheet: Image.Image, draw: ImageDraw.ImageDraw) -> None:
@@ -369,7 +350,9 @@ def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
     return [(column, row) for column, row in corners.tolist()]
 
 
-def _fitting_font(draw: ImageDraw.ImageDraw, line: str, size: int, width: int) -> Any:
-    while size > 9 and draw.textlength(line, _font(size)) > width:
+def _fitting_font(
+    draw: ImageDraw.ImageDraw, line: str, size: int, width: int, *, least: int = 9
+) -> Any:
+    while size > least and draw.textlength(line, _font(size)) > width:
         size -= 1
     return _font(size)

@@ -14,18 +14,16 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from torch.nn.functional import pad
+from scipy import ndimage
 
 from ae_env.env import AutoExposureBase, AutoExposureEnv
-from ae_env.episodes.core import Task
+from ae_env.episodes.core import FrameBatch, Task
 from ae_env.episodes.state import Episodes
 from ae_env.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from ae_env.options import EnvArguments, takes_env_arguments
-from ae_env.registration import TASKS
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.vector_env import AutoExposureVectorEnv
-from simulator.capture.batch import FrameStatistics
 from simulator.capture.prepared_scene import Layout
 from simulator.optics.motion import Taps, path_blur_apart
 from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
@@ -104,9 +102,7 @@ class AutoExposureVideoVectorEnv(AutoExposureVectorEnv):
     All arguments are those of `AutoExposureVectorEnv`, with the defaults of the task.
     """
 
-    __init__ = takes_env_arguments(
-        max_episode_steps=TASKS["ae_env/AutoExposureVideo-v0"][2], **VIDEO
-    )(AutoExposureVectorEnv.__init__)
+    __init__ = takes_env_arguments(max_episode_steps=96, **VIDEO)(AutoExposureVectorEnv.__init__)
 
 
 # -- brackets -------------------------------------------------------------------------------------
@@ -138,20 +134,10 @@ class _Truth:
 class ExposureBracket(Task):
     """Merges the frames of an episode, and rewards what each adds to the quality.
 
-    The frame of the reset is the viewfinder's, metered and not merged. The camera's shake between
-    frames is taken out, as bursts are aligned before they are merged; a subject that moves on its
-    own is elsewhere in each frame. The scorer, costs, lighting and delay of the options are not
-    used.
-
-    Args:
-        episodes: The episodes, with their scenes and options.
-        unused: What else a task is given.
-        budget: Time that all frames of an episode may take together [s].
-        max_frames: Frames of an episode at most.
+    See `ExposureBracketEnv`, which has the limits. What else a task is given is not used.
 
     Attributes:
-        num_actions: The states, and to stop.
-        stop: The action that ends an episode.
+        stop: The action that ends an episode, behind those of the states.
 
     Raises:
         ValueError: If the scenes are recorded.
@@ -183,15 +169,12 @@ class ExposureBracket(Task):
         self._truths: dict[int, _Truth] = {}
         self._metered: dict[int, int] = {}  # state, by scene
         self._times = np.array([state.exposure_time for state in grid])
-        black, span = np.array(camera.black_level), np.array(camera.span)
-        self._black, self._span = (
-            torch.from_numpy(a.astype(np.float32))[:, None, None] for a in (black, span)
-        )
+        levels = torch.tensor([camera.black_level, camera.span], dtype=torch.float32)
+        self._black, self._span = levels[:, :, None, None]
 
     def columns(self) -> dict[str, np.ndarray]:
         """The frames taken, and what they are worth, n long each."""
-        mine = {name: value for name, value in vars(self).items() if name != "_times"}
-        return {name: value for name, value in mine.items() if isinstance(value, np.ndarray)}
+        return {n: v for n, v in vars(self).items() if isinstance(v, np.ndarray) and n != "_times"}
 
     def spaces(self) -> dict[str, gym.Space[Any]]:
         """``bracket`` is observed beside the latest frame."""
@@ -207,26 +190,20 @@ class ExposureBracket(Task):
     def initial(self, env_indices: np.ndarray, options: Sequence[Mapping[str, Any]] | None) -> None:
         """Shows the viewfinder's frame at the metered state, or at the one asked for."""
         self._left[env_indices] = self.budget
-        for zeroed in (self._gains, self._clock, self._middle, self._first_middle, self._count):
-            zeroed[env_indices] = 0
-        for zeroed in (self._fresh, self._quality, self._error):
-            zeroed[env_indices] = 0
+        zeroed = self._gains, self._clock, self._middle, self._first_middle, self._count
+        for values in (*zeroed, self._fresh, self._quality, self._error):
+            values[env_indices] = 0
         for full in (self._unseen, self._white, self._noisy):
             full[env_indices] = 1.0
         for row, env_index in enumerate(env_indices.tolist()):
             if options is None or options[row].get("state") is None:
                 scene = self.episodes.scene.item(env_index)
                 if scene not in self._metered:
-                    self._metered[scene] = self._metered_state(self.episodes.scenes[scene])
+                    shown = self.episodes.scenes[scene]
+                    stops = math.log2(mean_anchor(shown.clean_light[1:3].mean(dim=0)))
+                    ev100 = -shown.reference.log2_exposure - stops
+                    self._metered[scene] = self.episodes.grid.nearest(ev100)
                 self.episodes.state[env_index] = self._metered[scene]
-
-    def _metered_state(self, scene: Scene) -> int:
-        """The state nearest to what an average meter reads."""
-        green = scene.clean_light[1:3].mean(dim=0)
-        ev100 = -scene.reference.log2_exposure - math.log2(mean_anchor(green))
-        return self.episodes.grid.nearest(ev100)
-
-    # -- step ---------------------------------------------------------------------------------
 
     def transition(
         self, env_indices: np.ndarray, actions: np.ndarray
@@ -251,19 +228,13 @@ class ExposureBracket(Task):
         """(K,) bool: no frame was taken, or the last."""
         return ~takes | (self._count[env_indices] == self.max_frames)
 
-    def measure(
-        self,
-        env_indices: np.ndarray,
-        frames: FrameStatistics,
-        outputs: Mapping[str, np.ndarray],
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
+    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
         """Merges the frames that were taken: what that adds to the quality (B,)."""
+        env_indices = frames.env_indices
         before = self._quality[env_indices].copy()
         fresh = np.flatnonzero(self._fresh[env_indices])
         if len(fresh):
-            self._add_frames(env_indices[fresh], outputs["numbers"][fresh])
+            self._add_frames(env_indices[fresh], frames.outputs["numbers"][fresh])
         return {"gain": self._quality[env_indices] - before}
 
     def reward(
@@ -368,7 +339,7 @@ def displaced(scene: Scene, rows: int, columns: int) -> Scene:
     if layout is None or layout.subject is None:
         return scene
     there = Taps(np.full(4, -rows), np.full(4, -columns), _STAY.weights)
-    mask = _shifted(layout.mask, rows, columns)
+    mask = torch.from_numpy(ndimage.shift(layout.mask.numpy(), (0, rows, columns), order=0))
     behind = layout.behind
 
     def moved(planes: torch.Tensor) -> torch.Tensor:
@@ -383,20 +354,10 @@ def displaced(scene: Scene, rows: int, columns: int) -> Scene:
     return replace(scene, light=moved(scene.light), denoised=denoised, layout=new)
 
 
-def _shifted(planes: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
-    """`planes` (P, H, W) further down and right, 0 where nothing comes from."""
-    height, width = planes.shape[1:]
-    # Padded on the side where nothing comes from, cut off on the other.
-    grown = pad(planes, (max(columns, 0), max(-columns, 0), max(rows, 0), max(-rows, 0)))
-    return grown[:, max(-rows, 0) :, max(-columns, 0) :][:, :height, :width]
-
-
 class _Bracket(AutoExposureBase):
     """The limits that both environments of the bracket task add."""
 
-    #: Time that all frames of an episode may take together [s].
     budget: float
-    #: Frames of an episode at most.
     max_frames: int
 
     def _set_limits(self, budget: float, max_frames: int) -> None:
@@ -512,8 +473,7 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
 class ExposureBracketVectorEnv(_Bracket, AutoExposureVectorEnv):
     """`num_envs` episodes of `ExposureBracketEnv`, photographed in batches.
 
-    All other arguments are those of `AutoExposureVectorEnv`, but for those that the task does not
-    have.
+    All other arguments are those of `AutoExposureVectorEnv` that the task has.
     """
 
     @takes_env_arguments(WITHOUT, **BRACKET)

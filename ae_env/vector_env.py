@@ -58,12 +58,13 @@ class AutoExposureVectorEnv(
             rule = ", or None for never"
             max_episode_steps = check_integer("max_episode_steps", max_episode_steps, 1, more=rule)
         self.max_episode_steps = max_episode_steps
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.metadata = {
-            "render_modes": ["rgb_array"],
-            "render_fps": 30,
-            "autoreset_mode": self.autoreset_mode,
-        }
+        if not isinstance(autoreset_mode, AutoresetMode):
+            modes = {known: one for one in AutoresetMode for known in (one.name, one.value)}
+            check_word("autoreset_mode", autoreset_mode, tuple(modes))
+            autoreset_mode = modes[autoreset_mode]
+        self.autoreset_mode = autoreset_mode
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+        self.metadata |= {"autoreset_mode": autoreset_mode}
         self._set_up(arguments, num_envs, render_mode)
         self.single_action_space = gym.spaces.Discrete(self.core.num_actions)
         self.single_observation_space = self.core.observation_space()
@@ -82,7 +83,7 @@ class AutoExposureVectorEnv(
 
     def action_masks(self) -> np.ndarray:
         """(N, S) bool: states that the scene of each environment allows."""
-        return self.core.action_masks(self._all)
+        return self.core.task.allowed(self._all)
 
     def expected_scores(self) -> np.ndarray:
         """(N, S) float64: expected score of every state in the current frame of each episode."""
@@ -118,7 +119,7 @@ class AutoExposureVectorEnv(
             return self._shown(fresh), info
         # The others show their frames again; the same noise keys give the same frames.
         shown = self._last or self.core.observe(self._all)
-        _replace_rows(shown, fresh, env_indices)
+        _assign_rows(vars(shown), vars(fresh), env_indices)
         return self._shown(shown), info
 
     def step(
@@ -156,8 +157,6 @@ class AutoExposureVectorEnv(
         """
         return self._pictures(self.num_envs)
 
-    # -- helpers ----------------------------------------------------------------------------------
-
     def _begin(
         self, env_indices: np.ndarray, options: Sequence[dict[str, Any]] | None = None
     ) -> None:
@@ -169,22 +168,21 @@ class AutoExposureVectorEnv(
     def _restart(self, finished: np.ndarray, frames: Frames) -> tuple[Observation, dict[str, Any]]:
         """Begins new episodes in the environments `finished`, whose last frames are `frames`."""
         whole = len(finished) == self.num_envs
-        last = frames.observation if whole else _rows_of(frames.observation, finished)
-        last_info = frames.info if whole else _rows_of(frames.info, finished)
+        last = vars(frames) if whole else _rows_of(vars(frames), finished)
         final_obs = np.full(self.num_envs, None, dtype=object)
         for row, i in enumerate(finished.tolist()):
-            final_obs[i] = {name: values[row] for name, values in last.items()}
+            final_obs[i] = {name: values[row] for name, values in last["observation"].items()}
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[finished] = True
         infos: dict[str, Any] = {"final_obs": final_obs, "_final_obs": mask}
-        infos["final_info"] = self._vector_info(last_info, finished)
+        infos |= {"final_info": self._vector_info(last["info"], finished)}
         infos["_final_info"] = mask.copy()
         self._begin(finished)
-        fresh = self.core.observe(finished)
+        fresh = replace(self.core.observe(finished), reward=last["reward"])
         if whole:
-            frames = replace(fresh, reward=frames.reward)
+            frames = fresh
         else:
-            _replace_rows(frames, replace(fresh, reward=frames.reward[finished]), finished)
+            _assign_rows(vars(frames), vars(fresh), finished)
         infos |= self._vector_info(frames.info, self._all)
         return self._shown(frames), infos
 
@@ -219,10 +217,8 @@ class AutoExposureVectorEnv(
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        seeds = _entries(seed)
+        seeds = self._entries("seed", seed)
         if seeds is not None:
-            if len(seeds) != self.num_envs:
-                raise ValueError(f"`seed` (length {len(seeds)}) must have {self.num_envs} entries")
             return [check_seed(single, f"seed[{i}]") for i, single in enumerate(seeds)]
         first = check_integer("seed", plain(seed), 0, more=f", or {self.num_envs} of them")
         return list(range(first, first + self.num_envs))
@@ -230,12 +226,8 @@ class AutoExposureVectorEnv(
     def _reset_mask(self, mask: Any) -> np.ndarray:
         if mask is None:
             return np.ones(self.num_envs, dtype=bool)
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.shape != (self.num_envs,)
-            or mask.dtype != np.bool_
-            or not mask.any()
-        ):
+        fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,)
+        if not fits or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(
                 f"`options['reset_mask']` (={mask!r}) must be a boolean array "
                 f"({self.num_envs},) with at least one True"
@@ -245,26 +237,23 @@ class AutoExposureVectorEnv(
     def _split_options(self, options: dict[str, Any]) -> list[dict[str, Any]]:
         split: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for name, value in options.items():
-            values = _entries(value)
-            if values is None:
-                values = [plain(value)] * self.num_envs
-            if len(values) != self.num_envs:
-                raise ValueError(
-                    f"`options[{name!r}]` (length {len(values)}) must have {self.num_envs} entries"
-                )
+            values = self._entries(f"options[{name!r}]", value)
+            values = [plain(value)] * self.num_envs if values is None else values
             for single, own in zip(split, values, strict=True):
                 single[name] = own
         return split
 
+    def _entries(self, name: str, value: Any) -> list[Any] | None:
+        """The entries of an ordered collection, one per environment; None for a single value."""
+        if isinstance(value, Mapping | Set) or not hasattr(value, "__len__"):
+            return None
+        values = plain_list(value)
+        if values is not None and len(values) != self.num_envs:
+            raise ValueError(f"`{name}` (length {len(values)}) must have {self.num_envs} entries")
+        return values
 
-def _entries(value: Any) -> list[Any] | None:
-    """The entries of any ordered collection, one per environment; None for a single value."""
-    if isinstance(value, Mapping | Set) or not hasattr(value, "__len__"):
-        return None
-    return plain_list(value)
 
-
-def _rows_of(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+def _rows_of(columns: Mapping[str, Any], rows: np.ndarray) -> dict[str, Any]:
     """Copies of `rows` of columns, which may be nested dictionaries."""
     return {
         name: _rows_of(values, rows) if isinstance(values, dict) else values[rows]
@@ -272,25 +261,10 @@ def _rows_of(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _replace_rows(frames: Frames, new: Frames, rows: np.ndarray) -> None:
-    """Writes the frames `new` of some environments to `rows` of those of all."""
-    _assign_rows(frames.observation, new.observation, rows)
-    _assign_rows(frames.info, new.info, rows)
-    frames.reward[rows], frames.raw[rows] = new.reward, new.raw
-
-
-def _assign_rows(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None:
+def _assign_rows(columns: Mapping[str, Any], new: Mapping[str, Any], rows: np.ndarray) -> None:
     """Writes `new` to `rows` of columns, which may be nested dictionaries."""
     for name, values in columns.items():
         if isinstance(values, dict):
             _assign_rows(values, new[name], rows)
         else:
             values[rows] = new[name]
-
-
-def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    if isinstance(mode, AutoresetMode):
-        return mode
-    modes = {known: one for one in AutoresetMode for known in (one.name, one.value)}
-    check_word("autoreset_mode", mode, tuple(modes))
-    return modes[mode]

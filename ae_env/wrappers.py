@@ -6,7 +6,8 @@
 | `RelativeActions` | `MultiDiscrete([3, 3, 3])` | down, stay or up, for all controls at once |
 | `ContinuousActions` | `Box(-1, 1, (3,))` | Av, Tv, Sv between the grid's extremes |
 
-The counterparts for vector environments are called `VectorControlActions` and so on.
+They take an `ae_env/AutoExposure-v0`, wrapped or not; a `ValueError` says that an environment has
+no grid. The counterparts for vector environments are called `VectorControlActions` and so on.
 
 `action_masks()` of the first two has one mask per control, one after the other, which is how
 `MaskablePPO` takes a `MultiDiscrete`. A position is allowed where some allowed state has it: the
@@ -66,10 +67,6 @@ class _GridActions(RecordConstructorArgs):
     def _states_of(self, actions: Any) -> np.ndarray:
         """States (...) int64 that `actions` choose."""
         raise NotImplementedError
-
-    def _now(self) -> np.ndarray:
-        """The current states."""
-        return np.asarray(getattr(self._inner, self._states_name))
 
     def _checked(self, actions: Any, sizes: tuple[int, ...]) -> np.ndarray:
         """`actions` as int64 with column i in [0, sizes[i])."""
@@ -135,11 +132,14 @@ class _Steps(_GridActions):
 
     def _states_of(self, actions: Any) -> np.ndarray:
         steps, last = self._checked(actions, (3, 3, 3)) - 1, np.array(self._grid.shape) - 1
-        return self._states_at(np.clip(self._grid.controls(self._now()) + steps, 0, last))
+        return self._states_at(np.clip(self._current() + steps, 0, last))
+
+    def _current(self) -> np.ndarray:
+        return self._grid.controls(getattr(self._inner, self._states_name))
 
     def action_masks(self) -> np.ndarray:
         """(..., 9) bool: steps of each control to a position that some allowed state has."""
-        controls, masks = self._grid.controls(self._now()), []
+        controls, masks = self._current(), []
         for i, mask in enumerate(self._control_masks()):
             targets = controls[..., i, None] + np.array([-1, 0, 1])
             targets = np.clip(targets, 0, self._grid.shape[i] - 1)
@@ -172,12 +172,6 @@ class _Apex(_GridActions):
 class ControlActions(_Controls, _One):
     """Actions `MultiDiscrete([I, T, N])`: positions of ISO, exposure time and f-number.
 
-    Args:
-        env: An `ae_env/AutoExposure-v0`, wrapped or not.
-
-    Raises:
-        ValueError: If `env` has no grid.
-
     >>> import ae_env
     >>> env = ControlActions(gym.make("ae_env/AutoExposure-v0", scenes="bundled:small"))
     >>> env.action_space, str(env.unwrapped.grid[int(env.action(np.array([1, 2, 3])))])
@@ -191,12 +185,6 @@ class RelativeActions(_Steps, _One):
     For ISO, exposure time and f-number at once, because a single control cannot trade shutter for
     ISO without leaving the right exposure on the way. Steps count from the state of the latest
     capture; a step beyond the end of a list stays at the end.
-
-    Args:
-        env: An `ae_env/AutoExposure-v0`, wrapped or not.
-
-    Raises:
-        ValueError: If `env` has no grid.
     """
 
 
@@ -205,12 +193,6 @@ class ContinuousActions(_Apex, _One):
 
     The allowed state at the least distance in stops is taken; ties go to the lower ISO. Values
     beyond the box are clipped.
-
-    Args:
-        env: An `ae_env/AutoExposure-v0`, wrapped or not.
-
-    Raises:
-        ValueError: If `env` has no grid.
     """
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ae_env.scenes.folder import find_files
-from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
@@ -41,9 +40,7 @@ class Random(Policy):
         super().reset(num_envs, seed)
         self._rng = np.random.default_rng(seed)
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Draw a state per camera."""
         count = len(self.context.grid) if action_masks is None else action_masks.shape[1]
         draws = self._rng.random((len(observations["raw"]), count))
@@ -56,7 +53,7 @@ class BestFixed(Policy):
     def __init__(self, context: PolicyContext) -> None:
         super().__init__(context)
         self.name = "best_fixed"
-        self.mean_scores: NDArray[np.float64] | None = None
+        self.mean_scores: Floats | None = None
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
         """Average the expected scores of all states over the scenes of `envs`."""
@@ -65,9 +62,7 @@ class BestFixed(Policy):
         scores = [expected_scores(envs)[batch.valid] for batch in episodes.batches(envs)]
         self.mean_scores = np.concatenate(scores).mean(axis=0)
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Always the best state, or the best allowed one."""
         if self.mean_scores is None:
             raise ValueError("policy 'best_fixed' learns from scenes first: call fit(envs)")
@@ -79,7 +74,7 @@ class Oracle(Policy):
     """Knows the expected score of every state, in the light that it knows.
 
     Args:
-        context: The camera, the grid and the observation.
+        context: The camera.
         knows: ``"last_frame"``: the light of the frame that it has just seen, as a policy does
             that measures light without error but foresees nothing; ``"clairvoyant"``: that of the
             frames that its decision exposes, each control's own: the ceiling that regret is
@@ -96,16 +91,16 @@ class Oracle(Policy):
     def act(
         self,
         observations: Observations,
-        action_masks: NDArray[np.bool_] | None = None,
+        action_masks: Bools | None = None,
         info: Mapping[str, Any] | None = None,
-    ) -> NDArray[np.int64]:
+    ) -> Ints:
         """The best allowed state in the light that it knows."""
         if info is None or self._oracle_info not in info:
-            needs = "environments made with_oracle=True"
-            if self._oracle_info != "oracle_state":
-                needs = "an evaluation, which knows the light to come"
-            raise ValueError(f"policy {self.name!r} needs `info` of {needs}")
-        return np.asarray(info[self._oracle_info], dtype=np.int64).copy()
+            raise ValueError(
+                f"policy {self.name!r} needs `info` with {self._oracle_info!r}, of environments "
+                "made with_oracle=True or, where it knows the light to come, of an evaluation"
+            )
+        return np.array(info[self._oracle_info], dtype=np.int64)
 
 
 class Recorded(Policy):
@@ -118,7 +113,7 @@ class Recorded(Policy):
     time, ISO and EV, in stops, add up.
 
     Args:
-        context: The camera, the grid and the observation.
+        context: The camera.
         path: Folder of raws, or a single raw.
 
     Raises:
@@ -132,16 +127,14 @@ class Recorded(Policy):
         ours = _coordinates(context.grid.states)
         #: Cost of every state, per raw, ``(T, S)``.
         self._cost = ((_coordinates(self.settings)[:, None] - ours[None]) ** 2).sum(axis=2)
-        self._frame = self._first = 1 + max(context.delays)  # that the first decision exposes
+        self.reset(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Restart the sequence."""
         super().reset(num_envs, seed)
-        self._frame = self._first
+        self._frame = 1 + max(self.context.delays)  # that the first decision exposes
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """The state nearest to the next raw's settings, or the nearest allowed one."""
         self.check_reset(observations)
         cost = self._cost[min(self._frame, len(self._cost) - 1)].round(9)
@@ -156,14 +149,12 @@ def _raw_files(path: str | os.PathLike[str]) -> list[Path]:
         with suppress(ValueError):  # no file of any known kind
             raws = [file for file in find_files(folder)[1] if file.suffix.lower() in RAW_SUFFIXES]
     if not raws:
-        raise ValueError(
-            f"`path` (={os.fspath(path)!r}) must be a folder of raws: 'recorded:FOLDER'"
-        )
+        given = os.fspath(path)
+        raise ValueError(f"`path` (={given!r}) must be a folder of raws: 'recorded:FOLDER'")
     return raws
 
 
-def _coordinates(settings: tuple[CameraSettings, ...]) -> NDArray[np.float64]:
+def _coordinates(settings: tuple[CameraSettings, ...]) -> Floats:
     """Aperture, time, ISO and EV of each, in stops, ``(n, 4)``."""
-    return np.array(
-        [(s.aperture_stop / 3.0, s.time_value, s.speed_value, s.log2_exposure) for s in settings]
-    )
+    values = [(s.aperture_stop / 3, s.time_value, s.speed_value, s.log2_exposure) for s in settings]
+    return np.array(values)

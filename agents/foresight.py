@@ -11,21 +11,16 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ae_env.observation import decode_settings
 from agents.metering.reading import (
     SATURATED_STEP_EV,
-    Floats,
     Reading,
     ZoneMatcher,
     frame_ev100,
     zone_signals,
 )
-from agents.policy import Observations, PolicyContext
-
-Ints = NDArray[np.int64]
-
+from agents.policy import Floats, Ints, Observations, PolicyContext
 
 #: Points [mean absolute errors] and weights over which a forecast is averaged: those of Gauss and
 #: Hermite for a normal distribution, whose standard deviation is 1.25 of its mean absolute error.
@@ -58,14 +53,7 @@ class TrendTracker:
     (constant-velocity model). The rate is expected to die away: after each frame a share of
     `damping` of it is left (Gardner and McKenzie 1985). A mostly saturated frame only says that the
     light is not below a bound, a black one that it is not above: what was expected stays if it
-    agrees.
-
-    Args:
-        num_envs: Cameras.
-        ev_range: Lowest and highest EV100 of the camera's exposure states.
-        alpha: In (0, 1].
-        beta: In [0, 1]; 0 for no trend.
-        damping: In [0, 1].
+    agrees. `ev_range` is that of the exposure states [EV100].
     """
 
     def __init__(
@@ -80,7 +68,7 @@ class TrendTracker:
         self.ev100, self.rate = np.full(num_envs, np.nan), np.zeros(num_envs)
 
     def update(self, reading: Reading, exposed_at: Floats) -> None:
-        """Take in one frame's reading, and the EV100 that it was taken at, ``(N,)``."""
+        """See `LightTracker.update`."""
         low, high = self.ev_range
         expected = self.ev100 + self.damping * self.rate
         bound = reading.ev100 - SATURATED_STEP_EV * reading.saturated
@@ -104,12 +92,7 @@ class TrendTracker:
 
 
 class Foresight:
-    """Rolls the light of each camera through the delays of its controls.
-
-    Args:
-        context: The grid and the delays.
-        tracker: What expects the light to come.
-    """
+    """Rolls the light that a `tracker` expects through the delays of each camera's controls."""
 
     def __init__(self, context: PolicyContext, tracker: LightTracker) -> None:
         self.grid, self._camera, self._tracker = context.grid, context.camera, tracker
@@ -119,11 +102,7 @@ class Foresight:
         self._actions: list[Ints] = []  # the newest last
 
     def observe(self, reading: Reading, observations: Observations) -> Reading:
-        """Take in one frame of each camera, and what a light meter reads in it.
-
-        Returns:
-            That reading; where the frame clips, from what it shows (`ZoneMatcher`).
-        """
+        """Take in a frame of each camera; returns its reading, where it clips by `ZoneMatcher`."""
         zones = zone_signals(observations["raw"], self._camera)
         exposed_at = frame_ev100(observations)
         reading = self._matcher.match(reading, zones, exposed_at)
@@ -149,10 +128,7 @@ class Foresight:
 
         A control that is in effect earlier than another is free in the other's frame, as the next
         decision will choose it; one that is in effect later is that of an earlier decision there.
-
-        Args:
-            scores: From the metered EV100 of a frame to come, ``(N,)``, to the expected score of
-                every state in it, ``(N, S)``.
+        `scores` are those of every state, ``(N, S)``, at the metered EV100 of a frame, ``(N,)``.
         """
         total: Floats = np.zeros((len(self._actions[0]), 1, 1, 1))
         for frame in sorted(set(self.leads)):

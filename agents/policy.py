@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +16,17 @@ if TYPE_CHECKING:
     from simulator.camera import CameraProfile
 
 Observations = Mapping[str, NDArray[Any]]
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class BracketLimits:
-    """What the frames of an episode of `ExposureBracket-v0` may take together.
+class BracketLimits(NamedTuple):
+    """What the frames of an episode of `ExposureBracket-v0` may take together."""
 
-    Args:
-        budget: Time [s].
-        max_frames: How many there may be.
-        box_factor: Photosites averaged a side into one pixel, which the noise depends on.
-    """
-
-    budget: float
+    budget: float  # [s]
     max_frames: int
-    box_factor: int
+    box_factor: int  # photosites averaged a side into one pixel, which the noise depends on
 
 
 @dataclass(frozen=True)
@@ -77,9 +73,6 @@ class Policy:
     A policy is causal: `act` sees the frames so far and nothing else. Override `reset` (call it
     through `super`) and `act`; override `fit` where the policy has something to learn from the
     training scenes. Per-camera memory lives in arrays of length `num_envs`.
-
-    Args:
-        context: The camera, the grid and the observation.
     """
 
     #: Only a privileged policy's `act` gets ``info=`` as well; its scores are upper bounds.
@@ -105,17 +98,12 @@ class Policy:
                 f"of {count}: call reset(num_envs) first"
             )
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
-        """Choose the next frame's state for each camera.
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
+        """Choose the next frame's state for each camera: indices into the grid, ``(num_envs,)``.
 
         Args:
             observations: Arrays with a leading axis of `num_envs`.
             action_masks: ``(num_envs, len(grid))``, False where a state is not allowed.
-
-        Returns:
-            Indices into the grid, int64, shape ``(num_envs,)``.
         """
         raise NotImplementedError(f"{type(self).__name__} must implement `act`")
 
@@ -123,9 +111,7 @@ class Policy:
         """Learn from the training scenes of `envs`; called once, before evaluation."""
 
 
-def masked_argmax(
-    utility: NDArray[np.floating], action_masks: NDArray[np.bool_] | None
-) -> NDArray[np.int64]:
+def masked_argmax(utility: NDArray[np.floating], action_masks: Bools | None) -> Ints:
     """Index of the highest allowed utility per row, ties to the lower index.
 
     >>> masked_argmax(np.array([[1.0, 3.0, 2.0]]), np.array([[True, False, True]]))
@@ -133,5 +119,4 @@ def masked_argmax(
     """
     if action_masks is not None:
         utility = np.where(action_masks, utility, -np.inf)
-    best: NDArray[np.int64] = np.argmax(utility, axis=-1).astype(np.int64)
-    return best
+    return np.asarray(np.argmax(utility, axis=-1), np.int64)

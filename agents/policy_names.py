@@ -16,9 +16,9 @@ from ae_env.utils.user_files import find_attribute, load_from_file
 from agents.policy import Policy, PolicyContext
 from simulator.utils.checks import did_you_mean
 
-#: Light meters that weigh pixels or zones.
+#: Light meters: those that weigh pixels or zones, and all; the others look at the histogram or at
+#: gradients.
 CLASSIC_METERS = ("average", "centre_weighted", "matrix", "spot")
-#: All light meters; those after the classic ones look at the histogram or at gradients.
 METERS = (*CLASSIC_METERS, "highlight_weighted", "skewness", "entropy", "shim", "zhang")
 #: The programs that nothing has to be learnt for, and all.
 MANUAL_PROGRAMS = ("P", "A", "S", "M")
@@ -77,7 +77,7 @@ def list_policies() -> list[str]:
 
 
 def is_metering(name: str) -> bool:
-    """Whether `name`, with or without a program and options, is that of a metering policy.
+    """Whether `name` is that of a metering policy.
 
     >>> is_metering("spot?compensation=1"), is_metering("rpi_agc:A"), is_metering("random")
     (True, True, False)
@@ -88,13 +88,9 @@ def is_metering(name: str) -> bool:
 def training_seeds(name: str) -> list[str]:
     """The names under which `make_policy` knows the training seeds of a learnt agent.
 
-    Args:
-        name: ``"ppo"`` or ``"regression"``, alone or with ``":video"``, for all seeds that come
-            with the package; ``"ppo:runs/ppo-*"`` for the files that match; anything else stands
-            for itself. Options of the name are those of each.
-
-    Raises:
-        ValueError: If no file matches a pattern.
+    ``"ppo"`` or ``"regression"``, alone or with ``":video"``, stands for all seeds that come with
+    the package, ``"ppo:runs/ppo-*"`` for the files that match (a `ValueError` if none does), any
+    other for itself. Options of the name are those of each.
 
     >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
     (['0', '1', '2'], ['spot:P'])
@@ -132,13 +128,11 @@ def split_class(base: str) -> tuple[str, str]:
 def split_options(name: str) -> tuple[str, dict[str, Any]]:
     """A policy's name without its options, and the options.
 
-    Args:
-        name: A name, or a name, ``?`` and options ``key=value`` with ``&`` between them, as in a
-            URL. Values are YAML scalars; a fraction such as ``1/60`` is a number too.
+    They are ``key=value`` after a ``?`` with ``&`` between them, as in a URL. Values are YAML
+    scalars; a fraction such as ``1/60`` is a number too.
 
     Raises:
-        ValueError: If `name` is not a text, an option has no value or a value that is no scalar, or
-            one is given twice.
+        ValueError: If an option has no value or a value that is no scalar, or is given twice.
 
     >>> split_options("centre_weighted:P?compensation=-1&shutter_cap=1/50")
     ('centre_weighted:P', {'compensation': -1, 'shutter_cap': 0.02})
@@ -225,7 +219,7 @@ def make_policy(
 
 
 def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
-    """The class of a policy, and the arguments that the name `base` gives."""
+    """The class of a policy, and the arguments that `base`, the `name` without options, gives."""
     found = (_POLICIES | _BRACKETS).get(_SHORT.get(base, base))
     head, tail = split_class(base)
     if found is None and head in _WITH_FILE:

@@ -25,21 +25,15 @@ _ID = re.compile(r"([\w-][\w/-]*[\w-]/)?[\w-]+-v\d+")
 
 
 def check_dataset_id(dataset_id: str) -> None:
-    """Checks the name of a dataset that is to be written.
-
-    Raises:
-        ValueError: If it is none, or there is a dataset of that name.
-        ImportError: If the extra ``minari`` is not installed.
-    """
+    """Checks the name of a dataset that is to be written, and that the extra is installed."""
+    rule = None
     if not _ID.fullmatch(dataset_id):
-        raise ValueError(
-            f"`out` (={dataset_id!r}) must be a name of Minari, such as 'ae_env/matrix-v0'"
-        )
-    if dataset_id in _minari().list_local_datasets():
-        raise ValueError(
-            f"`out` (={dataset_id!r}) is there already: take a higher version, or remove it with "
-            f"`minari delete {dataset_id}`"
-        )
+        rule = "must be a name of Minari, such as 'ae_env/matrix-v0'"
+    elif dataset_id in _minari().list_local_datasets():
+        rule = "is there already: take a higher version, or remove it with "
+        rule += f"`minari delete {dataset_id}`"
+    if rule is not None:
+        raise ValueError(f"`out` (={dataset_id!r}) {rule}")
 
 
 def record_dataset(
@@ -53,7 +47,7 @@ def record_dataset(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Any:
-    """Runs `policy` and writes what it saw, chose and got.
+    """Runs `policy` and writes what it saw, chose and got; returns the `minari.MinariDataset`.
 
     Observations are stored as they are, not as JPEG. Every episode has its ``seed`` and, as its
     reset option, its scene: ``env.reset(seed=seed, options=options)`` begins it again.
@@ -68,9 +62,6 @@ def record_dataset(
         episodes: How many; episode i has the seed ``seed + i``.
         seed: Of the first.
         progress: Called with the episodes that are done, and all.
-
-    Returns:
-        The `minari.MinariDataset`.
 
     Raises:
         ValueError: See `check_dataset_id`.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ae_env.options import EnvOptions
 from ae_env.scenes.load import BUNDLED, REAL
 from ae_env.utils.user_files import UserCodeError
-from agents.policy import Observations
+from agents.policy import Bools, Floats, Ints, Observations
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
@@ -24,21 +24,11 @@ ENV_ID = "ae_env:ae_env/AutoExposure-v0"
 #: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
 MIN_TRAINING_GROUPS = 15
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 def make_envs(
     env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Environments without autoreset, whose episodes allow `frames` actions and more.
-
-    Args:
-        env_options: Arguments of the environment, such as ``{"split": "test"}``.
-        num_envs: Episodes at a time.
-        frames: Actions that an episode must allow.
-        with_oracle: Whether `info` holds ``oracle_state``.
-    """
+    """Environments of the arguments `env_options`, without autoreset, for `frames` actions."""
     options = {**env_options, "with_oracle": with_oracle, "autoreset_mode": "DISABLED"}
     # One frame more than is used: the episode must not end inside the evaluation.
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
@@ -47,9 +37,8 @@ def make_envs(
 def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[str, Any], bool]:
     """Arguments of an environment to train on for an evaluation on `scenes`.
 
-    Returns:
-        Its ``scenes``, with the ``grid`` of recorded ones; and whether they are others, the bundled
-        ones, because `scenes` has too few source groups for a training split.
+    That is ``scenes``, with the ``grid`` of recorded ones; and whether they are others, the bundled
+    ones, because `scenes` has too few source groups for a training split.
     """
     if isinstance(scenes, str) and scenes in (*BUNDLED, *REAL):
         return {"scenes": scenes}, False
@@ -85,33 +74,22 @@ def expected_scores(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Floats:
     return np.array(base.expected_scores(), dtype=np.float64)
 
 
-def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> NDArray[np.bool_]:
+def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Bools:
     """States that the scene of each episode allows, ``(N, S)``."""
     base: Any = envs.unwrapped
     return np.array(base.action_masks(), dtype=np.bool_)
 
 
-@dataclass(frozen=True)
-class EpisodeBatch:
-    """One batch of freshly reset episodes.
+class EpisodeBatch(NamedTuple):
+    """One batch of freshly reset episodes."""
 
-    Args:
-        index: Numbers of the episodes, ``(N,)``.
-        observations: Of the reset frame.
-        info: Of the reset frame.
-        action_masks: Allowed states, ``(N, S)`` bool.
-        groups: Source group of each episode's scene, ``(N,)``.
-        valid: False for the copies that fill the last batch.
-        seed: Seed of the batch's first episode.
-    """
-
-    index: Ints
+    index: Ints  # (N,) numbers of the episodes
     observations: Observations
     info: Mapping[str, Any]
-    action_masks: NDArray[np.bool_]
-    groups: NDArray[Any]
-    valid: NDArray[np.bool_]
-    seed: int
+    action_masks: Bools  # (N, S) allowed states
+    groups: NDArray[Any]  # (N,) source group of each episode's scene
+    valid: Bools  # (N,) False for the copies that fill the last batch
+    seed: int  # of the batch's first episode
 
 
 @dataclass(frozen=True)
@@ -120,18 +98,12 @@ class RolloutPlan:
 
     The seed alone decides an episode's motion, defocus, noise and start, so that an episode is the
     same in a batch of any size.
-
-    Args:
-        scenes: What is photographed.
-        seeds: Seed of each episode, length E.
-        scene: Index of each episode's scene, ``(E,)``.
-        starts: State in which each begins; None where the seed draws it.
     """
 
     scenes: Sequence[Scene]
-    seeds: Sequence[int]
-    scene: Ints
-    starts: Sequence[int | None]
+    seeds: Sequence[int]  # (E,) of each episode
+    scene: Ints  # (E,) index of each episode's scene
+    starts: Sequence[int | None]  # (E,) state in which each begins; None where the seed draws it
 
     @classmethod
     def of_each_scene(
@@ -139,11 +111,7 @@ class RolloutPlan:
     ) -> RolloutPlan:
         """All scenes, `count` times in a row; episode i has the seed ``seed + i``.
 
-        Args:
-            scenes: The scenes.
-            count: Episodes of each.
-            seed: Of the first.
-            most: Use so many scenes at most, evenly over the list; None for all.
+        Of more scenes than `most`, so many are used, evenly over the list.
         """
         used = len(scenes) if most is None else min(most, len(scenes))
         scene = np.tile(np.arange(used) * len(scenes) // used, count)
@@ -164,15 +132,9 @@ class RolloutPlan:
             options = {"scene": [scene.scene_id for scene in scenes], "state": states}
             seeds: Any = [self.seeds[i] for i in index.tolist()]
             observations, info = envs.unwrapped.reset(seed=seeds, options=options)
-            yield EpisodeBatch(
-                index=index,
-                observations=observations,
-                info=info,
-                action_masks=action_masks(envs),
-                groups=np.array([scene.group for scene in scenes]),
-                valid=valid,
-                seed=int(self.seeds[begin]),
-            )
+            groups, masks = np.array([scene.group for scene in scenes]), action_masks(envs)
+            seed = int(self.seeds[begin])
+            yield EpisodeBatch(index, observations, info, masks, groups, valid, seed)
 
 
 @contextmanager
@@ -185,12 +147,8 @@ def errors_of(policy: str, method: str) -> Iterator[None]:
         raise UserCodeError(text) from error
 
 
-def checked_states(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
-    """The actions that a policy returned, as int64.
-
-    Raises:
-        UserCodeError: Unless they are allowed states, one per camera.
-    """
+def checked_states(name: str, actions: Any, masks: Bools) -> Ints:
+    """The actions that a policy returned; a `UserCodeError` if not one allowed state per camera."""
     try:
         array = np.asarray(actions)
     except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor of a GPU

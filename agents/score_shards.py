@@ -39,18 +39,9 @@ _LOCAL, _RAY = "local", "ray"
 class ShardPlan:
     """What a run does; every shard is made from it and its own number alone.
 
-    Args:
-        files: Raws and radiance maps, as the workers find them.
-        names: Of the files, in the tables.
-        out: Folder of the results, which all workers reach.
-        per_shard: Files of a shard.
-        resolution: Packed pixels a side that scenes are averaged to.
-        camera: Camera that radiance maps are photographed with; a raw has its own.
-        grid: Name of the exposure grid.
-        scorer: Name of the scorer.
-        weights: Networks that take the noise out of raws, or ``"none"``.
-        captures: Whether to write the captures, too.
-        seed: Seed of their noise.
+    `files` are raws and radiance maps as the workers find them, `names` those in the tables; `out`
+    is a folder that all workers reach. Scenes are averaged to `resolution` packed pixels a side;
+    `camera` photographs radiance maps, a raw has its own; `seed` is that of the captures' noise.
     """
 
     files: tuple[str, ...]
@@ -87,11 +78,7 @@ class ShardPlan:
         return [shard for shard in self.shards if not self.table(shard).exists()]
 
     def begin(self) -> None:
-        """Writes the plan, or checks that the folder's is the same.
-
-        Raises:
-            ValueError: If the folder holds the results of another plan.
-        """
+        """Writes the plan, or raises a `ValueError` where the folder's is another."""
         path, text = Path(self.out, PLAN), json.dumps(asdict(self), indent=1)
         if path.exists() and path.read_text(encoding="utf-8") != text:
             raise ValueError(
@@ -102,11 +89,7 @@ class ShardPlan:
 
 
 class ShardWriter:
-    """Makes shards; what does not depend on the shard is loaded once.
-
-    Args:
-        plan: What to do.
-    """
+    """Makes shards; what does not depend on the shard is loaded once."""
 
     def __init__(self, plan: ShardPlan) -> None:
         self.plan = plan
@@ -117,12 +100,7 @@ class ShardWriter:
         self._networks = None if plan.weights == "none" else SceneNetworks(plan.weights)
 
     def write(self, shard: int) -> dict[str, Any]:
-        """Writes one shard.
-
-        Returns:
-            How many scenes and files that could not be read it has, how long it took [s], and
-            which machine and process made it.
-        """
+        """Writes a shard; tells how many scenes and bad files it has, seconds and process."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -195,17 +173,10 @@ class ShardWriter:
 def run(
     plan: ShardPlan, on: str, progress: Callable[[int, int], None], workers: int = 1
 ) -> list[dict[str, Any]]:
-    """Makes the shards that are missing.
+    """Makes the shards that are missing; what `ShardWriter.write` tells of each.
 
-    Args:
-        plan: What to do.
-        on: ``"local"``: in this process; ``"ray"``: on a Ray of this machine alone; an address
-            such as ``"ray://head:10001"`` or ``"auto"``: on that cluster.
-        progress: Called with the shards that are done, and all.
-        workers: Processes on the cluster.
-
-    Returns:
-        What `ShardWriter.write` tells of each shard that was made.
+    `on` is ``"local"``: in this process; ``"ray"``: on a Ray of this machine alone; or an address
+    such as ``"ray://head:10001"`` or ``"auto"``: on that cluster, in so many `workers`.
     """
     check_engine(on)
     plan.begin()
@@ -213,9 +184,8 @@ def run(
     progress(total - len(todo), total)
     if not todo:
         return []
-    shards = (
-        map(ShardWriter(plan).write, todo) if on == _LOCAL else _on_ray(plan, todo, on, workers)
-    )
+    local = on == _LOCAL
+    shards = map(ShardWriter(plan).write, todo) if local else _on_ray(plan, todo, on, workers)
     made = []
     for told in shards:
         made.append(told)
@@ -224,12 +194,7 @@ def run(
 
 
 def check_engine(on: str) -> None:
-    """Checks `on`, see `run`.
-
-    Raises:
-        ImportError: If it needs Ray, which is not there; names the extra.
-        ValueError: If it is neither a name nor an address.
-    """
+    """Checks `on`, see `run`; an `ImportError` names the extra where Ray is not there."""
     if on not in (_LOCAL, _RAY, "auto") and ":" not in on:
         raise ValueError(f"`on` (={on!r}) must be local, ray, auto or the address of a cluster")
     if on != _LOCAL and importlib.util.find_spec("ray") is None:

@@ -31,7 +31,8 @@ from simulator.networks.weights import load_modules
 from simulator.reference.sequences import any_pairs
 from simulator.training import paper_dataset
 from simulator.training.paper_dataset import CapturedSequence, split_dataset, train_on_captures
-from simulator.training.train import SimulatorConfig, load_config
+from simulator.training.train import SimulatorConfig
+from simulator.utils.config_file import load_yaml
 
 #: What is trained: the paper's networks, parameter concatenation and decoupled learning.
 TRAINED = ("paper", "pc", "dl")
@@ -130,7 +131,7 @@ def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
 def trained(
     name: str, folder: Path, sequences: list[CapturedSequence], seed: int, quick: bool
 ) -> Path:
-    config = load_config(CONFIGS / f"{name}.yaml")
+    config = load_yaml(CONFIGS / f"{name}.yaml", SimulatorConfig)
     changes: dict[str, Any] = {"seed": seed}
     if quick:
         changes |= dict.fromkeys(config.stages(), QUICK_STAGE)

@@ -51,7 +51,7 @@ def flat_fields(camera: CameraProfile, iso: float, path: str, rows: bool, seed: 
         body = ReferenceCamera(camera, sensor_noise=rows)
         scenes = [ReferenceScene("flat", "flat", "flat", light, base) for light in (dark, lit)]
         pairs = zip(LADDER, states, strict=True)
-        frames = torch.stack([body.capture(scenes[x > 0], s, seed).sample for x, s in pairs])
+        frames = torch.stack([body.capture(scenes[int(x > 0)], s, seed).sample for x, s in pairs])
     else:
         clean, simulator = NoiseLevelFunction.zero(), CameraSimulator(device="cpu", cache=None)
         kind: Any = "sensor" if rows else "exact"

@@ -73,9 +73,6 @@ class ExposureAugmentation:
         modules: Which of ``"exposure"``, ``"blur"`` and ``"noise"`` act. What is drawn does not
             depend on it. With none, pictures are returned as they are.
 
-    Raises:
-        ValueError: If an argument is out of its range.
-
     >>> augment = ExposureAugmentation(stops=(-2.0, -2.0), modules=("exposure",))
     >>> grey = torch.full((1, 4, 2, 2), 0.4)
     >>> augment(grey, [0])[0, 0, 0, 0]
@@ -93,21 +90,15 @@ class ExposureAugmentation:
     def __post_init__(self) -> None:
         if not isinstance(self.camera, CameraProfile):
             object.__setattr__(self, "camera", get_camera(self.camera))
-        if not self.profile.nlf_by_iso:
-            raise ValueError(f"`camera` (={self.profile.name!r}) must have a noise calibration")
-        for name, low, high in (
-            ("stops", -20.0, 20.0),
-            ("isos", 1.0, 1e7),
-            ("defocus", 0.0, _WIDEST),
-            ("motion", 0.0, _WIDEST),
-            ("highlights", 0.0, 20.0),
-        ):
+        self.profile.nlf(100.0)  # raises where there is no noise calibration
+        blurs, bounds = (0.0, _WIDEST), {"stops": (-20.0, 20.0), "isos": (1.0, 1e7)}
+        bounds |= {"defocus": blurs, "motion": blurs, "highlights": (0.0, 20.0)}
+        for name, (low, high) in bounds.items():
             object.__setattr__(self, name, _check_range(name, getattr(self, name), low, high))
         named = isinstance(self.modules, Iterable) and not isinstance(self.modules, str)
-        modules = tuple(self.modules) if named else (None,)
-        if any(name not in MODULES for name in modules):
+        if not named or not set(self.modules) <= set(MODULES):
             raise ValueError(f"`modules` (={self.modules!r}) must be some of {list(MODULES)}")
-        object.__setattr__(self, "modules", modules)
+        object.__setattr__(self, "modules", tuple(self.modules))
 
     @property
     def profile(self) -> CameraProfile:
@@ -218,9 +209,6 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
     """Seeds of the samples `indices` of an epoch, for a batch that is augmented once collated.
 
     Each is a function of its index, of the training's `seed` and of the `epoch`, all >= 0.
-
-    >>> sample_seeds(0, 1, [5, 7]) == sample_seeds(0, 1, [5]) + sample_seeds(0, 1, [7])
-    True
     """
     given = indices.tolist() if isinstance(indices, torch.Tensor) else indices
     if isinstance(given, str) or not isinstance(given, Iterable):
@@ -240,9 +228,6 @@ class AugmentedDataset(Dataset[Any]):
             one. All that `ExposureAugmentation` takes.
         augmentation: What photographs them.
         seed: Of the training, >= 0.
-
-    Raises:
-        ValueError: If an argument, or a sample that is asked for, is none of these.
     """
 
     def __init__(
@@ -275,11 +260,8 @@ class AugmentedDataset(Dataset[Any]):
         sample = self.dataset[number]
         image, *rest = sample if isinstance(sample, tuple | list) and sample else [sample]
         if not isinstance(image, torch.Tensor) or image.ndim != 3:
-            shape = tuple(image.shape) if isinstance(image, torch.Tensor) else type(image).__name__
-            raise ValueError(
-                f"`dataset` ({shape} at {number}) must hold tensors (C, H, W), or tuples that "
-                "begin with one"
-            )
+            rule = "must hold tensors (C, H, W), or tuples that begin with one"
+            raise ValueError(f"`dataset` ({type(image).__name__} at {number}) {rule}")
         seeds = sample_seeds(self.seed, self.epoch, [number])
         (augmented,) = self.augmentation(image[None], seeds)
         if sample is image:
@@ -306,28 +288,19 @@ def _check_range(name: str, given: Any, low: float, high: float) -> tuple[float,
 
 
 def _check_images(images: Any) -> torch.Tensor:
-    if not isinstance(images, torch.Tensor) or images.ndim != 4 or images.shape[1] not in (3, 4):
-        kind = tuple(images.shape) if isinstance(images, torch.Tensor) else type(images).__name__
-        raise ValueError(
-            f"`images` (={kind}) must be a tensor (B, 3, H, W) of pictures or (B, 4, H, W) of "
-            "packed raws"
-        )
-    if images.layout != torch.strided or images.is_complex():
-        raise ValueError(
-            f"`images` ({images.layout}, {images.dtype}) must be dense and hold real numbers"
-        )
-    if images.shape[1] == 4:
-        return check_packed("images", images, ndim=4) if len(images) else images
-    if min(images.shape[2:]) < 1:
-        raise ValueError(f"`images` (shape {tuple(images.shape)}) must not be empty")
+    check_type("images", images, torch.Tensor)
+    shape, dense = tuple(images.shape), images.layout == torch.strided and not images.is_complex()
+    if len(shape) != 4 or shape[1] not in (3, 4) or min(shape[2:]) < 1 or not dense:
+        rule = "must be (B, 3, H, W) of pictures or (B, 4, H, W) of packed raws, dense and real"
+        raise ValueError(f"`images` (shape {shape}, {images.layout}, {images.dtype}) {rule}")
+    if shape[1] == 4 and len(images):
+        return check_packed("images", images, ndim=4)
     if images.dtype == torch.uint8 or not len(images):
         return images
     low, high = torch.aminmax(images)
     if not images.is_floating_point() or not (low >= 0.0 and high <= 1.0):  # also refuses NaN
-        raise ValueError(
-            f"`images` ({images.dtype}, {low.item():g} to {high.item():g}) must be floating point "
-            "in [0, 1], or uint8"
-        )
+        found = f"{images.dtype}, {low.item():g} to {high.item():g}"
+        raise ValueError(f"`images` ({found}) must be floating point in [0, 1], or uint8")
     return images
 
 

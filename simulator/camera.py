@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -15,12 +16,14 @@ from typing import Any
 import numpy as np
 
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
-from simulator.utils.checks import check_integer, check_word
+from simulator.utils.checks import check_integer, check_number, check_word
 
 #: A sample at or below this signal counts as clipped low: ten stops below white.
 LOW_CLIP = 2.0**-10
 #: A sample at or above this signal counts as clipped high.
 HIGH_CLIP = 1.0 - 1e-6
+#: Least and greatest ISO.
+_ISOS = (sys.float_info.min, sys.float_info.max)
 
 
 class BayerPattern(StrEnum):
@@ -74,10 +77,10 @@ class CameraProfile:
     bit_depth: int
     make: str = "unknown"
     model: str = "unknown"
-    nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict)
-    read_noise_by_iso: Mapping[float, ReadNoise] = field(default_factory=dict)
-    segments: tuple[float, ...] = ()
-    colour_matrix: tuple[tuple[float, float, float], ...] | None = None
+    nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict, hash=False)
+    read_noise_by_iso: Mapping[float, ReadNoise] = field(default_factory=dict, hash=False)
+    segments: tuple[float, ...] = field(default=(), hash=False)
+    colour_matrix: tuple[tuple[float, float, float], ...] | None = field(default=None, hash=False)
     colour_matrix_source: str = ""
     pixel_pitch_um: float | None = None
     row_time: float = 0.0
@@ -126,14 +129,6 @@ class CameraProfile:
         table.flags.writeable = False
         return table
 
-    @property
-    def full_well(self) -> float | None:
-        """Electrons at sensor white at the base ISO, 1 / shot of green; None without an NLF."""
-        if not self.nlf_by_iso:
-            return None
-        shot = self.nlf_by_iso[min(self.nlf_by_iso)].shot[1]
-        return 1.0 / shot if shot > 0 else None
-
     def nlf(self, iso: float) -> NoiseLevelFunction:
         """Noise level function at `iso`.
 
@@ -150,8 +145,22 @@ class CameraProfile:
                 f"camera {self.name!r} has no noise calibration; give `nlf`, or estimate one with "
                 "simulator.estimate_nlf"
             )
-        _check_iso(iso)
-        return _interpolate_nlf(self, float(iso))
+        iso, table = check_number("iso", iso, *_ISOS), self.nlf_by_iso
+        if iso in table:
+            return table[iso]
+        isos = _segment(self, table, iso)
+        if not isos[0] < iso < isos[-1]:
+            nearest = min(isos, key=lambda i: abs(math.log(iso / i)))
+            stops = math.log2(iso / min(max(iso, min(table)), max(table)))  # beyond the table
+            return _amplified(self, table[nearest], iso / nearest, stops)
+        high = next(i for i in isos if i > iso)
+        low = isos[isos.index(high) - 1]
+        t = math.log(iso / low) / math.log(high / low)
+        shot, read = (
+            [x ** (1 - t) * y**t for x, y in zip(*pair, strict=True)]
+            for pair in zip(*((table[i].shot, table[i].read) for i in (low, high)), strict=True)
+        )
+        return NoiseLevelFunction(shot, read, source=table[low].source)  # type: ignore[arg-type]
 
     def read_noise(self, iso: float, box_factor: int = 1) -> ReadNoise:
         """Rows and tails of the read noise at `iso`, of averages of `box_factor` squared pixels.
@@ -168,8 +177,7 @@ class CameraProfile:
                 "shape: `noise` must be 'exact' or 'bank'; a profile of your own has it in "
                 "`read_noise_by_iso`"
             )
-        _check_iso(iso)
-        table = self.read_noise_by_iso
+        iso, table = check_number("iso", iso, *_ISOS), self.read_noise_by_iso
         isos = _segment(self, table, iso)
         row, shape = (
             float(np.interp(math.log(iso), np.log(isos), [getattr(table[i], name) for i in isos]))
@@ -199,48 +207,12 @@ class CameraProfile:
         """This camera with its noise calibrated by one measurement at `iso`."""
         return replace(self, nlf_by_iso={float(iso): nlf}, segments=(), source=nlf.source)
 
-    def __hash__(self) -> int:
-        return hash((self.name, self.cfa, self.black_level, self.white_level))
-
-
-def _check_iso(iso: float) -> None:
-    if not (isinstance(iso, Real) and math.isfinite(iso) and iso > 0):
-        raise ValueError(f"`iso` (={iso!r}) must be positive and finite")
-
 
 def _segment(camera: CameraProfile, table: Mapping[float, object], iso: float) -> list[float]:
     """The ISOs of `table` in the conversion-gain segment of `iso`; all where it has none."""
     bounds = [0.0, *camera.segments, math.inf]
     index = sum(iso >= b for b in bounds) - 1
     return sorted(i for i in table if bounds[index] <= i < bounds[index + 1]) or sorted(table)
-
-
-def _interpolate_nlf(camera: CameraProfile, iso: float) -> NoiseLevelFunction:
-    table = camera.nlf_by_iso
-    if iso in table:
-        return table[iso]
-    isos = _segment(camera, table, iso)
-    if not isos[0] < iso < isos[-1]:
-        nearest = min(isos, key=lambda i: abs(math.log(iso / i)))
-        return _amplified(camera, table[nearest], iso / nearest, _stops_beyond(table, iso))
-    high = next(i for i in isos if i > iso)
-    low = isos[isos.index(high) - 1]
-    t = math.log(iso / low) / math.log(high / low)
-
-    def blend(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
-        return tuple(x ** (1 - t) * y**t for x, y in zip(a, b, strict=True))
-
-    first, second = table[low], table[high]
-    return NoiseLevelFunction(
-        shot=blend(first.shot, second.shot),  # type: ignore[arg-type]
-        read=blend(first.read, second.read),  # type: ignore[arg-type]
-        source=first.source,
-    )
-
-
-def _stops_beyond(table: Mapping[float, NoiseLevelFunction], iso: float) -> float:
-    """Stops by which `iso` is above the table (negative: below); 0 inside."""
-    return math.log2(iso / min(max(iso, min(table)), max(table)))
 
 
 def _amplified(

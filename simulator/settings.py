@@ -1,13 +1,9 @@
-"""Camera settings and the photographic arithmetic between them.
-
-Everything is computed in log2 and float64; callers cast last.
-"""
+"""Camera settings and the photographic arithmetic between them, in log2 and float64."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 #: Calibration constant of reflected-light meters in the saturation-based ISO 12232 relation used
 #: throughout: a surface of luminance L gives ``x = L * t * ISO / (120 * N**2)`` of sensor white.
@@ -40,6 +36,14 @@ class CameraSettings:
 
     The ranges keep every exposure ratio between two settings below 2**106, a finite float32.
 
+    Attributes:
+        aperture_stop: Aperture in sixths of the f-number's octave (thirds of a stop):
+            ``round(6 log2 N)``.
+        effective_f_number: The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper,
+            section 3.1).
+        log2_exposure: log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective
+            f-number.
+
     Raises:
         ValueError: If a value is not a number in its range.
 
@@ -50,6 +54,9 @@ class CameraSettings:
     iso: float
     exposure_time: float
     f_number: float
+    aperture_stop: int = field(init=False, repr=False, compare=False)
+    effective_f_number: float = field(init=False, repr=False, compare=False)
+    log2_exposure: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -65,6 +72,11 @@ class CameraSettings:
             if not low <= number <= high:
                 raise ValueError(f"`{name}` (={value!r}) must be a number in [{low:g}, {high:g}]")
             object.__setattr__(self, name, number)
+        stop = round(6.0 * math.log2(self.f_number))
+        exposure = math.log2(self.exposure_time) + math.log2(self.iso / 100.0) - stop / 3.0
+        object.__setattr__(self, "aperture_stop", stop)
+        object.__setattr__(self, "effective_f_number", 2.0 ** (stop / 6.0))
+        object.__setattr__(self, "log2_exposure", exposure)
 
     @classmethod
     def from_exif(cls, iso: float, exposure_time: float, f_number: float) -> CameraSettings:
@@ -75,23 +87,6 @@ class CameraSettings:
         """
         settings = cls(iso, exposure_time, f_number)
         return cls(settings.iso, snap_exposure_time(settings.exposure_time), settings.f_number)
-
-    @cached_property
-    def aperture_stop(self) -> int:
-        """Aperture in sixths of the f-number's octave (thirds of a stop): ``round(6 log2 N)``."""
-        return round(6.0 * math.log2(self.f_number))
-
-    @cached_property
-    def effective_f_number(self) -> float:
-        """The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper, section 3.1)."""
-        return 2.0 ** (self.aperture_stop / 6.0)
-
-    @cached_property
-    def log2_exposure(self) -> float:
-        """log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective f-number."""
-        return (
-            math.log2(self.exposure_time) + math.log2(self.iso / 100.0) - self.aperture_stop / 3.0
-        )
 
     @property
     def ev100(self) -> float:

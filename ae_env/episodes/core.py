@@ -32,7 +32,7 @@ from ae_env.scorers.score_table import ScoreTable
 from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Noise, Transitions
+from simulator.capture.sensor import Noise, Transitions, single_normals
 from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
@@ -63,14 +63,30 @@ class Frames:
     raw: np.ndarray
 
 
+@dataclass(frozen=True)
+class FrameBatch:
+    """Frames that were just recorded, of B environments.
+
+    Args:
+        env_indices: (B,) of the environments.
+        statistics: Of the frames.
+        outputs: The frames (B, 4, R, R), by the names of `Task.outputs`.
+        gains: (B,) light relative to the scenes' own.
+        rows: (B, R) light of each row relative to that, or None; see `Captures`.
+    """
+
+    env_indices: np.ndarray
+    statistics: FrameStatistics
+    outputs: Mapping[str, np.ndarray]
+    gains: np.ndarray
+    rows: np.ndarray | None
+
+
 class Task:
     """What an action does and what a frame is worth, as functions of running episodes.
 
     Here every action takes a frame, moves nothing else, and no episode ends by itself; a task gives
     at least `measure`, `reward` and `score_table`.
-
-    Args:
-        episodes: The episodes, with their scenes and options.
 
     Attributes:
         num_actions: Number of actions; those below the number of states take a frame there.
@@ -122,23 +138,8 @@ class Task:
         """What is observed beside the latest frame, (B, ...) by name."""
         return {}
 
-    def measure(
-        self,
-        env_indices: np.ndarray,
-        frames: FrameStatistics,
-        outputs: Mapping[str, np.ndarray],
-        gains: np.ndarray,
-        rows: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
-        """Columns (B,) that `reward` takes, from the frames just recorded.
-
-        Args:
-            env_indices: (B,) of the environments.
-            frames: Statistics of their frames.
-            outputs: Their frames (B, 4, R, R), by the names of `outputs`.
-            gains: (B,) light relative to the scenes' own.
-            rows: (B, R) light of each row relative to that, or None; see `Captures`.
-        """
+    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
+        """Columns (B,) that `reward` takes, from the frames just recorded."""
         raise NotImplementedError
 
     def reward(
@@ -164,16 +165,11 @@ MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | N
 
 
 class EpisodeCore:
-    """Scenes, grid, camera and task, and the episodes that run on them.
+    """Scenes, grid, camera and task, and the episodes that run on them, `num_envs` side by side.
 
     A pickle holds its arguments and where the episodes are; scenes are loaded, and everything else
-    is worked out again, where it is unpickled.
-
-    Args:
-        options: The environment's arguments.
-        num_envs: Number of episodes side by side.
-        make_task: Makes the task; it must pickle.
-        scenes: Those of `options` where they are loaded already.
+    is worked out again, where it is unpickled. `make_task` must pickle; `scenes` are those of
+    `options` where they are loaded already.
     """
 
     def __init__(
@@ -221,7 +217,6 @@ class EpisodeCore:
         return _restored(*self._restorable(self.scenes))
 
     def _restorable(self, scenes: Sequence[Scene] | None) -> tuple[Any, ...]:
-        """Arguments of `_restored`, which copies the columns."""
         arguments = self.options, len(self.episodes.begun), self._make_task, scenes
         return arguments, self.episodes.columns(), self.task.columns()
 
@@ -235,8 +230,6 @@ class EpisodeCore:
             apertures += len(DIAMETERS) + apertures
         as_recorded_and_denoised = 1 + any(s.denoised is not None for s in scenes)
         return as_recorded_and_denoised * apertures + 1
-
-    # -- spaces -------------------------------------------------------------------------------
 
     def observation_space(self) -> gym.spaces.Dict:
         """Space of one episode's observation."""
@@ -259,12 +252,6 @@ class EpisodeCore:
             spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         return gym.spaces.Dict(spaces | self.task.spaces())
 
-    def action_masks(self, env_indices: np.ndarray) -> np.ndarray:
-        """(B, A) bool: actions that the episodes allow; all of them before the first reset."""
-        return self.task.allowed(env_indices)
-
-    # -- reset --------------------------------------------------------------------------------
-
     def begin(
         self,
         env_indices: np.ndarray,
@@ -283,14 +270,8 @@ class EpisodeCore:
         self._captures.forget(lights)
         self.task.forget(lights)
 
-    # -- step ---------------------------------------------------------------------------------
-
     def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Advances the episodes of `env_indices` (K,) by one frame.
-
-        Args:
-            env_indices: Whose turn it is.
-            actions: (K,) their actions, integers; applied after the delay.
+        """Advances the episodes of `env_indices` (K,) by one frame, each with its action.
 
         Returns:
             (K,) bool, which episodes have ended with it.
@@ -358,7 +339,7 @@ class EpisodeCore:
         for name in self.task.outputs:
             if name not in outputs:
                 outputs[name] = np.empty(raw.shape, _DTYPES[name])
-        frames = self._captures.record(
+        found = self._captures.record(
             episodes.light_index[env_indices],
             episodes.state[env_indices],
             episodes.noise_seed[env_indices],
@@ -367,15 +348,15 @@ class EpisodeCore:
             **outputs,
         )
         columns = {
-            "clipped_high": frames.clipped_high,
-            "clipped_low": frames.clipped_low,
-            "excess_noise": frames.excess_variance,
-            "predicted_error": frames.predicted_error,
-            "modules": frames.modules,
+            "clipped_high": found.clipped_high,
+            "clipped_low": found.clipped_low,
+            "excess_noise": found.excess_variance,
+            "predicted_error": found.predicted_error,
+            "modules": found.modules,
         }
         if self.options.sensors:
-            columns["sensor_normals"] = frames.sensor_normals(2)
-        columns |= self.task.measure(env_indices, frames, outputs, gains, rows)
+            columns["sensor_normals"] = single_normals(found.keys, 2)
+        columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows))
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         return columns
@@ -423,11 +404,7 @@ class EpisodeCore:
 
 
 def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """`actions` as an array.
-
-    Raises:
-        ValueError: Unless they are integers of `shape`, () for a single one.
-    """
+    """`actions` as an array; a `ValueError` unless they are integers of `shape`, () for one."""
     try:
         array = np.asarray(actions)
     except ValueError:  # rows of different lengths

@@ -17,8 +17,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
-RECORDED = "recorded"
-_MODULE = len(MODULES)
+RECORDED, _MODULE = "recorded", len(MODULES)
 #: Signal up to which a sample counts as clipped low.
 _LOW = 2.0**-10
 
@@ -26,10 +25,7 @@ _LOW = 2.0**-10
 class LookupBatch:
     """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
 
-    Args:
-        scenes: Scenes with `Scene.recorded`.
-        prepared: Function that returns the merged light of a scene's index.
-        camera: The body.
+    The scenes have `Scene.recorded`; `prepared` returns the merged light of one by its index.
     """
 
     def __init__(
@@ -59,22 +55,18 @@ class LookupBatch:
         states: np.ndarray,
         seeds: np.ndarray,
         frames: np.ndarray,
-        *,
         row_gain: np.ndarray | None = None,
-        codes: np.ndarray | None = None,
-        numbers: np.ndarray | None = None,
-        signals: np.ndarray | None = None,
+        **outputs: np.ndarray,
     ) -> FrameStatistics:
-        """Copies frames to every output that is given; see `CaptureBatch.record`."""
+        """Copies frames to the outputs; see `CaptureBatch.record`."""
         frames_of: Any = [self._scenes[scene].recorded for scene in indices.tolist()]
         shown = np.stack([f[s].numpy() for f, s in zip(frames_of, states.tolist(), strict=True)])
         digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
-        if codes is not None:
-            encode_observation(torch.from_numpy(shown), out=torch.from_numpy(codes))
-        if numbers is not None:
-            numbers[:] = digital
-        if signals is not None:
-            signals[:] = shown
+        if "codes" in outputs:
+            encode_observation(torch.from_numpy(shown), out=torch.from_numpy(outputs["codes"]))
+        for name, values in (("numbers", digital), ("signals", shown)):
+            if name in outputs:
+                outputs[name][:] = values
         count, nothing = len(shown), np.zeros(len(shown))
         return FrameStatistics(
             clipped_low=(shown <= _LOW).reshape(count, -1).mean(axis=1),

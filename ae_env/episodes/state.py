@@ -18,7 +18,7 @@ from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
 from simulator.optics.motion import Movement
-from simulator.utils.checks import check_integer, did_you_mean
+from simulator.utils.checks import check_integer, check_word, did_you_mean
 
 #: Share of the episodes in which nothing moves.
 STATIC_SHARE = 1.0 / 3.0
@@ -190,23 +190,18 @@ class Episodes:
             self.box_factor[index] = scene.box_factor
             self._known[index] = True
 
-    # -- drawing ------------------------------------------------------------------------------
-
     def draw(
         self,
         rngs: Sequence[np.random.Generator],
         options: Sequence[Mapping[str, Any]] | None = None,
     ) -> dict[str, np.ndarray]:
-        """K episodes as columns, each of its own generator.
+        """K episodes as columns (K,) by the names of `Episode`.
 
         The draws do not depend on what is chosen, which only replaces them.
 
         Args:
             rngs: K generators; each gives the same count of numbers for every episode.
             options: For each the ``scene``, ``state`` and ``frame`` that it shall have.
-
-        Returns:
-            (K,) arrays by the names of `Episode`.
 
         Raises:
             ValueError: If there is no such scene, state or frame.
@@ -265,8 +260,6 @@ class Episodes:
             found[name] = check_integer(f"options[{name!r}]", value, 0, most, more=rule)
         return found
 
-    # -- running ------------------------------------------------------------------------------
-
     def begin(self, env_indices: np.ndarray, drawn: Mapping[str, np.ndarray]) -> None:
         """Puts the episodes `drawn`, columns of `Episode`, into `env_indices`."""
         for name in _FIELDS:
@@ -288,9 +281,8 @@ class Episodes:
         self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
         self.pending[env_indices, -1] = actions
         in_effect = [self.pending[env_indices, -1 - delay] for delay in self._delays]
-        self.state[env_indices] = (
-            in_effect[0] if len(in_effect) == 1 else self.grid.mixed(*in_effect)
-        )
+        mixed = in_effect[0] if len(in_effect) == 1 else self.grid.mixed(*in_effect)
+        self.state[env_indices] = mixed
         self.frame[env_indices] += 1
         changed = env_indices[:0]
         if self._bounds is not None:
@@ -343,7 +335,7 @@ class Episodes:
     # -- the light of the current frames ------------------------------------------------------
 
     def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure [s] in the current frame of an episode, relative to its scene's own.
+        """Light of an exposure [s] in an episode's current frame, relative to its scene's own.
 
         Returns:
             That of the frame, and (R,) that of each row relative to it, or None (`Lighting.rows`).
@@ -370,22 +362,13 @@ class Episodes:
 
 
 def check_options(options: Any, *more: str) -> dict[str, Any]:
-    """The options of a reset, None or a mapping of names in `OPTIONS` and `more`, as a dictionary.
-
-    Raises:
-        ValueError: If there is another name, or it is no mapping.
-    """
-    known = [*OPTIONS, *more]
-    if options is None:
-        return {}
-    if not isinstance(options, Mapping):
+    """The options of a reset, None or a mapping of names in `OPTIONS` and `more`, as a dict."""
+    known = (*OPTIONS, *more)
+    if not isinstance(options, Mapping | None):
         raise ValueError(f"`options` (={options!r}) must be None or a dictionary with {known}")
-    for name in options:
-        if name not in known:
-            raise ValueError(
-                f"`options` has {name!r}; it may have {known}{did_you_mean(name, known)}"
-            )
-    return dict(options)
+    for name in options or {}:
+        check_word("options", name, known)
+    return dict(options or {})
 
 
 def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
@@ -396,7 +379,6 @@ def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
 
 
 def _allowed_states(scene: Scene, num_states: int) -> np.ndarray:
-    """(S,) bool: the states that `scene` allows."""
     if scene.allowed is None:
         return np.ones(num_states, bool)
     if len(scene.allowed) != num_states:

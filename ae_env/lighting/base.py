@@ -1,8 +1,4 @@
-"""`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list.
-
-Flickering light (mains, dimmed LEDs, screens) changes within a frame, too: a rolling shutter makes
-bands of it.
-"""
+"""`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
-from simulator.utils.checks import check_integer, check_number, check_word
+from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
@@ -25,10 +21,8 @@ MAX_FRAMES = 2**20
 #: Depth of a lamp on the mains, where none is given.
 MAINS_DEPTH = 0.8
 #: Precision of the light of a row, relative to the lamp's long-term mean: smaller differences are
-#: rounding errors of float64.
-_RESOLUTION = 1e-12
-#: Least light of a row: its logarithm must be finite.
-_DARKEST = 2.0**-MAX_STOPS
+#: rounding errors of float64. The least light, whose logarithm must be finite.
+_RESOLUTION, _DARKEST = 1e-12, 2.0**-MAX_STOPS
 #: The lamp's clock restarts after this time [s]: beyond it, float64 does not resolve a period.
 _CLOCK = 1e8
 
@@ -113,18 +107,16 @@ class Lighting:
             exposure_time: Time the shutter is open [s].
             phase: The episode's own phase, in [0, 1).
         """
-        return 1.0
+        return float(2.0 ** self._stops(frame, phase))
+
+    def _stops(self, frame: int, phase: float) -> float:
+        """Change of a frame's light from the scene's [EV]."""
+        return 0.0
 
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure, row by row.
-
-        Args:
-            frame: See `gain`.
-            exposure_time: See `gain`.
-            phase: See `gain`.
-            shutter: How the frame is read.
+        """Light of an exposure as of `gain`, row by row of a frame that `shutter` reads.
 
         Returns:
             Mean relative light of the frame, and (rows,) float64 that of each row relative to this
@@ -147,14 +139,14 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     """
     if isinstance(spec, Lighting):
         return spec
-    if not isinstance(spec, str | Mapping):
+    options: dict[str, Any] = {"kind": spec} if isinstance(spec, str) else {}
+    if isinstance(spec, Mapping):
+        options = dict(spec)
+    if "kind" not in options:
         raise ValueError(
             f"`lighting` (={spec!r}) must be one of {sorted(KINDS)}, a mapping with a 'kind' of "
             "them, or a Lighting"
         )
-    options = {"kind": spec} if isinstance(spec, str) else dict(spec)
-    if "kind" not in options:
-        raise ValueError(f"`lighting` (={spec!r}) needs a 'kind', one of {sorted(KINDS)}")
     name = options.pop("kind")
     check_word("lighting", name, tuple(sorted(KINDS)))
     kind = KINDS[name]
@@ -174,9 +166,8 @@ class StepLighting(Lighting):
     stops: float = -4.0
     at: int = 4
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        return float(2.0**self.stops) if frame >= self.at else 1.0
+    def _stops(self, frame: int, phase: float) -> float:
+        return self.stops if frame >= self.at else 0.0
 
 
 @dataclass(frozen=True)
@@ -187,10 +178,8 @@ class RampLighting(Lighting):
     stops: float = -4.0
     stops_per_frame: float = 0.5
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        change = min(abs(self.stops), self.stops_per_frame * frame)
-        return float(2.0 ** math.copysign(change, self.stops))
+    def _stops(self, frame: int, phase: float) -> float:
+        return math.copysign(min(abs(self.stops), self.stops_per_frame * frame), self.stops)
 
 
 @dataclass(frozen=True)
@@ -201,10 +190,8 @@ class SineLighting(Lighting):
     stops: float = 2.0
     period: float = 16.0
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        turn = frame / self.period + phase
-        return float(2.0 ** (self.stops * math.sin(2.0 * math.pi * turn)))
+    def _stops(self, frame: int, phase: float) -> float:
+        return self.stops * math.sin(2.0 * math.pi * (frame / self.period + phase))
 
 
 @dataclass(frozen=True)
@@ -222,10 +209,9 @@ class TunnelLighting(Lighting):
     leave: int = 10
     edge: int = 2
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
+    def _stops(self, frame: int, phase: float) -> float:
         inside, outside = self._share(frame - self.enter), self._share(frame - self.leave)
-        return float(2.0 ** (self.stops * (inside - outside)))
+        return self.stops * (inside - outside)
 
     def _share(self, frames: int) -> float:
         """Share of a change that has happened `frames` after its start."""
@@ -244,12 +230,8 @@ class LensCapLighting(Lighting):
     on: int = 2
     off: int = 5
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
-        return 2.0**self.stops if self.on <= frame < self.off else 1.0
-
-
-# -- by a list of the user's -----------------------------------------------------------------------
+    def _stops(self, frame: int, phase: float) -> float:
+        return self.stops if self.on <= frame < self.off else 0.0
 
 
 @dataclass(frozen=True)
@@ -257,10 +239,8 @@ class ScheduleLighting(Lighting):
     """The light changes by `ev[n]` stops in frame n, relative to the scene's; the last one holds.
 
     Args:
-        ev: One number per frame, within +- `MAX_STOPS`: a list, a tuple or a one-dimensional
-            array.
-        file: In place of `ev`, a text file with one number per line, or a CSV with a column
-            ``ev``.
+        ev: One number per frame, within +- `MAX_STOPS`: a list, tuple or one-dimensional array.
+        file: In place of `ev`, a text file with one number per line, or a CSV with a column ``ev``.
 
     >>> ScheduleLighting(ev=[0, -1, 2]).gain(7, 0.01, 0.0)
     4.0
@@ -287,29 +267,21 @@ class ScheduleLighting(Lighting):
         )
         object.__setattr__(self, "ev", checked)
 
-    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
+    def _stops(self, frame: int, phase: float) -> float:
         assert self.ev is not None
-        return float(2.0 ** self.ev[min(frame, len(self.ev) - 1)])
+        return float(self.ev[min(frame, len(self.ev) - 1)])
 
 
 def _numbers(ev: Any) -> list[Any]:
-    if isinstance(ev, np.ndarray) and ev.ndim == 1:
-        return list(ev)
-    if isinstance(ev, Sequence) and not isinstance(ev, str | bytes):
+    is_list = isinstance(ev, Sequence) and not isinstance(ev, str | bytes)
+    if is_list or (isinstance(ev, np.ndarray) and ev.ndim == 1):
         return list(ev)
     raise ValueError(f"`lighting['ev']` (={ev!r}) must be a list of numbers, one per frame")
 
 
 def _read(file: Any) -> list[float]:
-    """The numbers of a file.
-
-    Raises:
-        ValueError: If it cannot be read, or a row holds no finite number.
-    """
     rule = f"`lighting['file']` (={str(file)!r})"
-    if not isinstance(file, str | Path):
-        raise ValueError(f"{rule} must be a path")
+    check_type("lighting['file']", file, str, Path)
     try:
         text = Path(file).expanduser().read_text(encoding="utf-8-sig")
         rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
@@ -331,9 +303,6 @@ def _read(file: Any) -> list[float]:
         if not math.isfinite(values[-1]):
             raise ValueError(f"{rule}, row {number} (={cell!r}), must be a number of stops")
     return values
-
-
-# -- faster than frames ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -365,7 +334,7 @@ class FlickerLighting(Lighting):
     frame_rate: float = 30.0
 
     def lamp(self, phase: float) -> Lamp:
-        """The part of the light that flickers, with `phase` as of `gain`."""
+        """The part of the light that flickers, at a `phase` as of `gain`."""
         if self.duty is None:
             return MainsLamp(frequency=self.frequency, phase=phase)
         return PulsedLamp(frequency=self.frequency, duty=self.duty, phase=phase)

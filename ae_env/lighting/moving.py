@@ -14,9 +14,6 @@ import numpy as np
 from ae_env.lighting.base import FlickerLighting, Lighting, RollingShutter
 from simulator.utils.checks import check_word
 
-#: Mean light that a camera sees as it turns, in 72 directions [EV], 5 degrees apart: a line for
-#: each public panorama (CC0) of the test split of `ae_env.scenes.polyhaven`, from `light_around`.
-_PANS_FILE = "pans.csv"
 #: Frames that are drawn; after the last one the light stays.
 FRAMES = 1024
 #: Episodes whose light is kept.
@@ -94,8 +91,11 @@ def clouds(rng: Generator) -> np.ndarray:
 
 @functools.cache
 def read_pans() -> dict[str, tuple[float, ...]]:
-    """EV of each direction, by the panorama's name."""
-    text = (files("ae_env.lighting") / _PANS_FILE).read_text(encoding="utf-8")
+    """Mean light that a camera sees as it turns in a place [EV], in 72 directions 5 degrees apart.
+
+    Of each public panorama (CC0) of the test split of `ae_env.scenes.polyhaven`, `light_around`.
+    """
+    text = (files("ae_env.lighting") / "pans.csv").read_text(encoding="utf-8")
     return {line[0]: tuple(map(float, line[1:])) for line in csv.reader(text.splitlines())}
 
 
@@ -194,7 +194,7 @@ class MovingLighting(Lighting):
         return float(2.0 ** stops[min(frame, FRAMES - 1)]), None
 
     def _lamp(self, lamp: tuple[float, float]) -> FlickerLighting:
-        return FlickerLighting(lamp[0], lamp[1], frame_rate=self.frame_rate)
+        return FlickerLighting(*lamp, frame_rate=self.frame_rate)
 
 
 @functools.lru_cache(_KEPT)

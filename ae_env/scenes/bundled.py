@@ -52,10 +52,8 @@ FIRST_TEST_INDEX = 1000
 SMALL_GROUPS = 2
 #: How many times the training groups of "bundled" there are in "bundled:large"; same test groups.
 LARGE_FACTOR = 4
-#: Kinds of the bundled scenes; those of scikit-image's photographs last.
-KINDS = (*GROUPS_PER_KIND, "photograph")
-#: Name of the hard kinds together.
-HARD = "hard"
+#: Kinds of the bundled scenes, those of scikit-image's photographs last; the hard ones together.
+KINDS, HARD = (*GROUPS_PER_KIND, "photograph"), "hard"
 #: From so many missing groups on, drawing takes long enough for a log line and a progress bar.
 _MANY = 64
 #: Part of every cache key: raise it with any change of the stored values.
@@ -103,9 +101,6 @@ def bundled_scenes(
     kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
     groups = list(_groups(request, size, kinds))
     return DrawnScenes(f"the bundled scenes ({request.split})", groups, key_of_all)
-
-
-# -- drawing --------------------------------------------------------------------------------------
 
 
 class SceneGroup(NamedTuple):
@@ -208,19 +203,13 @@ def add_layout(scene: Scene) -> Scene:
     return replace(scene, layout=draw_layout(scene.scene_id, *scene.light.shape[1:]))
 
 
-# -- the cache ------------------------------------------------------------------------------------
-
-
 def cached_scenes(
     key: str, make: Callable[[], Iterable[Scene]], camera: CameraProfile, resolution: int | None
 ) -> list[Scene]:
     """Scenes without noise of `camera`, from the cache where they have been made before.
 
-    Args:
-        key: Of all that they depend on (`simulator.utils.cache.cache_key`).
-        make: Makes them, all of one size, all with a layout or none.
-        camera: In whose colours they are.
-        resolution: Packed pixels a side; None for `NATIVE_SIZE`.
+    `key` is of all that they depend on; `make` makes them, all of one size, all with a layout or
+    none, of `resolution` packed pixels a side (None for `NATIVE_SIZE`).
     """
     found = _stored(key, camera, resolution)
     if found is None:

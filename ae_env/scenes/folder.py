@@ -1,7 +1,5 @@
 """Scenes from a user's own files: raws and radiance maps in a folder, by a glob, or one by one.
 
-A sequence is a folder of raws that are the frames of one scene over time.
-
 A source group is the unit of splitting and of resampling: two photographs of one subject in
 different splits, or counted as two independent ones, would make results look better and surer than
 they are. The group of a file is, in this order: the one that a ``groups.csv`` beside it names
@@ -46,14 +44,10 @@ from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 logger = logging.getLogger(__name__)
 
 OnError = Literal["stop", "skip"]
-#: With fewer source groups than this nothing is held out for training: all of them are for test.
-FEWEST_GROUPS_TO_SPLIT = 15
-#: Share of the groups that the hash puts into the training split.
-TRAIN_SHARE = 0.7
-#: Shots this close in time [s] are of one subject, whatever they show.
-BURST_SECONDS = 30.0
-#: Shots up to this far apart [s] are of one subject if they look alike.
-SESSION_SECONDS = 300.0
+#: With fewer source groups than this all are for test; of more, the hash trains with this share.
+FEWEST_GROUPS_TO_SPLIT, TRAIN_SHARE = 15, 0.7
+#: Shots this close in time [s] are of one subject; up to this far apart, if they look alike.
+BURST_SECONDS, SESSION_SECONDS = 30.0, 300.0
 #: From this Bhattacharyya coefficient of their histograms on (1 if equal), two shots look alike.
 ALIKE = 0.5
 #: Most file names in a log line about files that were skipped.
@@ -111,16 +105,13 @@ class FolderOptions:
 NOTHING_KNOWN = FolderOptions()
 
 
-# -- scenes ---------------------------------------------------------------------------------------
-
-
 def folder_scenes(
     spec: str | Path, request: SceneRequest, options: FolderOptions = NOTHING_KNOWN
 ) -> list[Scene]:
     """The scenes of a split among the user's files; each is resized before the next file is read.
 
     Args:
-        spec: See `find_files`.
+        spec: A file, a folder (searched with its sub-folders; hidden ones left out) or a glob.
         request: Split, camera and size.
         options: Facts about the files that the caller knows.
 
@@ -147,10 +138,8 @@ def sequence_scenes(
     may change from frame to frame. Raws in `spec` itself are named after it, or ``.`` where a
     folder below has that name.
 
-    Args:
-        spec: A folder, searched with its sub-folders, or a glob.
-        request: Split and size; fewer than 15 sequences are all for test.
-        options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
+    The arguments are those of `folder_scenes`; `on_error` must be ``"stop"``, and fewer than 15
+    sequences are all for test.
 
     Raises:
         ValueError: If there are no raws, one cannot be read, or there are too few to train on.
@@ -190,22 +179,15 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
     return first, first + np.repeat(lengths, lengths) - 1
 
 
-# -- files ----------------------------------------------------------------------------------------
-
-
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
-    """The raws and radiance maps that `spec` names, in natural order, and their folder.
+    """The raws and radiance maps that `spec` names as of `folder_scenes`, in natural order.
 
-    Args:
-        spec: A file, a folder (searched with its sub-folders; hidden ones left out) or a glob.
+    Returns:
+        Their folder, and the files.
 
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
     """
-    if str(spec).startswith("recorded:"):
-        raise ValueError(
-            f"`scenes` (={str(spec)!r}) must be raws or radiance maps here, not a recorded grid"
-        )
     try:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
@@ -224,7 +206,6 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
 
 
 def _listed(spec: str | Path) -> tuple[Path, list[Path]]:
-    """The base folder and every file that `spec` names."""
     path = Path(spec).expanduser()
     if path.is_file():
         return path.parent, [path]
@@ -253,9 +234,6 @@ def _is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
 
 
-# -- reading --------------------------------------------------------------------------------------
-
-
 def _read_files(
     spec: str | Path,
     base: Path,
@@ -267,9 +245,8 @@ def _read_files(
 ) -> list[Scene]:
     """The scenes of a split in files below `base`, which messages call `spec`.
 
-    Args:
-        groups: Source group of each; where it is None the file itself, or shots that belong to it.
-        hint: End of the error of a file that cannot be read, where there are others.
+    `groups` has the source group of each; None for the file itself, or shots that belong to it.
+    `hint` ends the error of a file that cannot be read, where there are others.
     """
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}  # of raws without a group
@@ -384,10 +361,8 @@ def radiance_scenes(
 class Shot:
     """The facts about a raw that decide its source group.
 
-    Args:
-        camera: Make and model.
-        time: When it was taken; None if the file does not say.
-        histogram: Joint histogram of colour and relative brightness, summing to 1.
+    Its make and model, when it was taken if the file says so, and the joint histogram of colour and
+    relative brightness, summing to 1.
     """
 
     camera: str
@@ -457,17 +432,12 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
         table = folder / "groups.csv"
         if not table.is_file():
             continue
-        rows, columns = read_table(table)
-        if not {"file", "group"} <= set(columns):
-            raise ValueError(
-                f"{str(table)!r} (columns {columns}) must have the columns `file` and `group`"
-            )
-        for number, row in enumerate(rows, start=2):
-            name, group = (row["file"] or "").strip(), (row["group"] or "").strip()
+        for number, row in enumerate(read_table(table)[0], start=2):
+            name, group = ((row.get(column) or "").strip() for column in ("file", "group"))
             if not group or not name or not (folder / name).is_file():
                 raise ValueError(
-                    f"{str(table)!r}, line {number} (={name!r}, {group!r}): `file` must exist "
-                    "beside it and `group` must not be empty"
+                    f"{str(table)!r}, line {number} (={name!r}, {group!r}): the column `file` must "
+                    "name a file beside it, and the column `group` its group"
                 )
             groups[(folder / name).resolve()] = group
     return groups

@@ -165,10 +165,8 @@ def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
             return _sized_list(found, spec, request)
         hint = did_you_mean(spec, NAMED, cutoff=0.7)
         if hint or ours:
-            raise ValueError(
-                f"`scenes` (={spec!r}) must be one of {[*NAMED]}, an existing file, folder or "
-                f"glob, or 'pkg.mod:attr'{hint}"
-            )
+            rule = "an existing file, folder or glob, or 'pkg.mod:attr'"
+            raise ValueError(f"`scenes` (={spec!r}) must be one of {[*NAMED]}, {rule}{hint}")
     return folder_scenes(spec, request)
 
 
@@ -184,10 +182,8 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
     where = "sequence" if "sequence" in spec else "path"
     known = tuple(field.name for field in fields(FolderOptions))
     if not isinstance(spec.get(where), str | Path):
-        raise ValueError(
-            f"`scenes` (={dict(spec)!r}) must have a 'path' or a 'sequence'; the other fields are "
-            f"{known}"
-        )
+        rule = f"must have a 'path' or a 'sequence'; the other fields are {known}"
+        raise ValueError(f"`scenes` (={dict(spec)!r}) {rule}")
     for name in spec:
         check_word("scenes", name, (where, *known))
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
@@ -236,20 +232,14 @@ def environment_scenes(
     recorded = RecordedOptions.of(spec)
     facts = (split, camera, resolution, crop, from_raw)
     known_by = (finds_defocus, simulator, noise) if needs_networks else ()
-    key: tuple[Any, ...] | None
+    key: tuple[Any, ...] | None = None
     if needs_networks and simulator not in (None, *SIZES):
-        key = None  # a user's weights may have other content next time
+        pass  # a user's weights may have other content next time
     elif recorded is not None:
-        key = (
-            *facts,
-            *known_by,
-            grid,
-            tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files),
-        )
+        times = tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files)
+        key = (*facts, *known_by, grid, times)
     elif isinstance(spec, str) and spec in NAMED:
         key = (*facts, *known_by, spec)
-    else:
-        key = None
     known = None if key is None else _LOADED.get(key)
     if known is not None:
         return known
@@ -366,11 +356,9 @@ def check_weights(name: str) -> None:
 
 
 class SceneNetworks:
-    """Trained networks, loaded when a scene first needs them.
+    """Trained networks of a name or path, loaded when a scene first needs them.
 
-    Args:
-        name: Name or path of the weights.
-        cache: Whether to use the cache folder for their results.
+    Unless `cache` is false, their results are looked up in the cache folder.
     """
 
     def __init__(self, name: str, *, cache: bool = True) -> None:
@@ -396,13 +384,9 @@ class SceneNetworks:
         return replace(scene, denoised=denoised, residual=None if noise is None else noise.residual)
 
     def resized(self, scene: Scene, resolution: int | None, crop: Crop = "box") -> Scene:
-        """As `Scene.resized`, with `Scene.defocus_map` estimated before any pixels are averaged.
+        """As `Scene.resized`, with `Scene.defocus_map` estimated at the scene's finest resolution.
 
-        Averaging hides small blur, so the map is estimated at the finest resolution.
-
-        Args:
-            scene: At its finest resolution; a map that it has already stays.
-            resolution, crop: See `Scene.resized`.
+        Averaging hides small blur. A map that it has already stays.
         """
         small = scene.resized(resolution, crop)
         if small.defocus_map is not None:

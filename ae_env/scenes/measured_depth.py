@@ -1,4 +1,4 @@
-"""Scenes whose depth was measured: their layout is that of a lens focused at one distance."""
+"""Photographs whose depth was measured: their layout is that of a lens focused at one distance."""
 
 from __future__ import annotations
 
@@ -14,14 +14,11 @@ IN_FOCUS = 0.1
 
 
 def depth_scenes(camera: CameraProfile) -> list[Scene]:
-    """Photographs with measured depth: ``scenes="ae_env.scenes.measured_depth:depth_scenes"``.
+    """Those of ``scenes="ae_env.scenes.measured_depth:depth_scenes"``, in the colours of `camera`.
 
     Each is focused on its front and on its median depth: the subject is what is in focus. How large
     the circle of confusion is, is drawn with each episode, as for every scene. Cones is among them
     where ``AE_ENV_DATA`` has it.
-
-    Args:
-        camera: Whose colour filter array samples the light, in its colours.
     """
     scenes = []
     for found in depth_photographs(camera, data=data_folder()):

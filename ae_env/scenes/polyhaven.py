@@ -56,12 +56,9 @@ _FIELDS_OF_VIEW = (50.0, 85.0)
 #: Standard deviation and largest size of the pitch [degrees].
 _PITCH, _LARGEST_PITCH = 8.0, 20.0
 #: Where the maps come from, and the folder of the cache that they go to.
-URL = "https://dl.polyhaven.org/file/ph-assets/HDRIs/hdr/1k/"
-_FOLDER = "polyhaven"
-#: Seconds in which a server must answer, and go on answering.
-_TIMEOUT = 30.0
-#: Further attempts at a file that arrives broken.
-_RETRIES = 2
+URL, _FOLDER = "https://dl.polyhaven.org/file/ph-assets/HDRIs/hdr/1k/", "polyhaven"
+#: Seconds in which a server must answer; further attempts at a file that arrives broken.
+_TIMEOUT, _RETRIES = 30.0, 2
 #: A map with as many pixels at its very maximum was cut there; with this share at 0, below.
 _CUT_PIXELS, _CUT_SHARE = 40, 1e-3
 #: Latitudes that a surface is turned to, to find where it gets the most light [degrees].
@@ -79,8 +76,7 @@ class Asset(Configuration):
 
     Args:
         name, bytes, sha256: Public name of its file, the file's length and hash.
-        kind: Kind of light.
-        split: ``"train"`` or ``"test"``.
+        kind, split: Kind of light; ``"train"`` or ``"test"``.
         group: Source group: the place; by default the asset itself.
         file: Where it lies in a folder of real files.
     """
@@ -147,12 +143,9 @@ def split_assets(name: str, split: str) -> list[Asset]:
 
 
 def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0) -> list[Scene]:
-    """Views into the panoramas of a split, of each map one after the other.
+    """Views into the panoramas of a split, `views` of each map, one map after the other.
 
-    Args:
-        request: Split, camera and size.
-        views: Views of each map, at least 1.
-        seed: Of the views' directions, their fields of view and the level of the light.
+    `seed` is of the views' directions, their fields of view and the level of the light.
     """
     assets = split_assets("polyhaven", request.split)
     camera, plain = request.camera, request.resize is Scene.resized
@@ -184,10 +177,8 @@ def asset_views(
     The light is sampled at the pitch of the photosites, 2 x `size` a side. Where a map has fewer
     pixels in a view, it is smooth at that pitch; averaged to half of them or less it is not.
     """
-    path = asset.path
-    if path is None:
-        raise FileNotFoundError(f"`asset` (={asset.name!r}) must be there: ae-env scenes download")
-    panorama = read_radiance(path)
+    assert asset.path is not None  # as `split_assets` makes sure
+    panorama = read_radiance(asset.path)
     # Light is summed over cells of a few pixels.
     height, width = (n // _CELL for n in panorama.shape[1:])
     cells = panorama[:, : height * _CELL, : width * _CELL]
@@ -220,12 +211,8 @@ def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
     """Illuminance that a panorama casts on a surface, in units of its luminance times steradian.
 
     What an incident-light meter reads that is held before the subject and faces the camera: turned
-    against the view. A white diffuse surface there has a luminance of it over pi.
-
-    Args:
-        panorama: See `simulator.radiance.maps.perspective`.
-        azimuth, pitch: Longitude and latitude that the surface faces [degrees]; a pitch of 90 is
-            level ground.
+    against the view. A white diffuse surface there has a luminance of it over pi. `azimuth` and
+    `pitch` [degrees] are what the surface faces; a pitch of 90 is level ground.
     """
     height, width = panorama.shape[1:]
     longitude = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * math.pi

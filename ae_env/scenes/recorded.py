@@ -137,15 +137,11 @@ class RecordedOptions:
         return replace(raw.camera, nlf_by_iso=noises, segments=())
 
     def camera(self, default: CameraProfile) -> CameraProfile:
-        """The body that took the raws, with their noise; for pictures `default` without colours.
+        """The body that took the raws, with their noise; of pictures `default` without colours.
 
-        Args:
-            default: Whose noise developed pictures are assumed to have.
+        Developed pictures are assumed to have its noise.
         """
         return self._body or replace(default, colour_matrix=None, colour_matrix_source="")
-
-
-# -- scenes ---------------------------------------------------------------------------------------
 
 
 def recorded_scenes(
@@ -227,12 +223,8 @@ def merged_scene(
 ) -> Scene:
     """A scene of real captures, with the light that they tell together.
 
-    Args:
-        name: Its name, and its source group.
-        raws: Captures with their state of `grid`; one at a time is held.
-        grid: The states.
-        camera: The body, with the noise of its ISO speeds.
-        resize: Brings each capture to its size, before they are merged.
+    `raws` are captures with their state of `grid`, of which one at a time is held; `camera` has the
+    noise of its ISO speeds; `resize` brings each capture to its size, before they are merged.
     """
     frames: dict[int, Scene] = {}
     for state, raw in raws:
@@ -247,12 +239,12 @@ def merged_scene(
             sampled=True,
         )
         frames[state] = resize(capture)
-    recorded = torch.zeros(len(grid), *next(iter(frames.values())).light.shape)
-    allowed = np.zeros(len(grid), bool)
+    merged, allowed = _merged(list(frames.values())), np.zeros(len(grid), bool)
+    recorded = torch.zeros(len(grid), *merged.light.shape)
     for state, frame in frames.items():
         recorded[state], allowed[state] = frame.light, True
     return replace(
-        _merged(list(frames.values())),
+        merged,
         scene_id=name,
         group=name,
         kind=KEY,
@@ -303,12 +295,10 @@ class RecordedFile:
     """One real capture.
 
     Args:
-        path: Its file.
-        settings: Settings that it was taken at.
+        path, settings: Its file, and the settings that it was taken at.
         scene: Name of what it shows, of a frame of video with the frame's number.
         group: Source group: what it shows whatever the light.
-        sequence: The video that it is a frame of; empty for a still scene.
-        frame: Its number in that video.
+        sequence, frame: The video that it is a frame of, empty for a still scene, and which.
     """
 
     path: Path
@@ -332,16 +322,13 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
     Raises:
         ValueError: If there is no capture, one does not state its settings, or a table is wrong.
     """
-    if not folder.is_dir():
-        raise ValueError(f"`scenes` (='recorded:{folder}') must name an existing folder")
     tables = _read_tables(folder)
     paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
     found = [_recorded(folder, path, tables, known) for path in paths]
     if not found:
         raise ValueError(
-            f"`scenes` (='recorded:{folder}') must hold captures: raws "
-            f"({', '.join(RAW_SUFFIXES[:6])} ...) or pictures "
-            f"({', '.join(PICTURE_SUFFIXES[:3])} ...)"
+            f"`scenes` (='recorded:{folder}') must be an existing folder that has captures: raws "
+            f"({', '.join(RAW_SUFFIXES[:6])} ...) or pictures ({PICTURE_SUFFIXES[0]} ...)"
         )
     return sorted(found, key=lambda file: (file.sequence, file.frame, file.scene, file.settings))
 
@@ -360,7 +347,9 @@ def _recorded(
     for number, part in enumerate(parts):
         named, rest = settings_in_name(part)
         place = [path, *path.parents][len(parts) - 1 - number]
-        row = _table_row(tables, place)
+        row = tables.get(place) or tables.get(place.with_suffix("")) or {}
+        if not row and not place.suffix:  # a folder anywhere by its name
+            row = tables.get(place.name, {})
         if named or row:
             settings |= named | row
             last = number
@@ -442,12 +431,6 @@ def _read_tables(folder: Path) -> dict[Path | str, dict[str, float]]:
     return found
 
 
-def _table_row(tables: Mapping[Path | str, dict[str, float]], place: Path) -> dict[str, float]:
-    """Settings that a table gives the file or folder `place`; a folder anywhere by its name."""
-    found = tables.get(place) or tables.get(place.with_suffix(""))
-    return found or (tables.get(place.name, {}) if not place.suffix else {})
-
-
 def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
     """Name and settings of each row of a table."""
     rows, columns = read_table(table)
@@ -494,9 +477,6 @@ def _in_file(path: Path) -> dict[str, float]:
     values = {what: tags.get(tag) for what, tag in zip(_SETTINGS, names, strict=True)}
     numbers = {n: v[0] if isinstance(v, tuple) else v for n, v in values.items() if v}
     return {name: float(value) for name, value in numbers.items() if float(value) > 0}
-
-
-# -- the grid that files make ---------------------------------------------------------------------
 
 
 def recorded_grid(files: Sequence[RecordedFile]) -> ExposureGrid:

@@ -19,7 +19,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
-from simulator.settings import CameraSettings, incident_ev100
+from simulator.settings import LUX_AT_EV0, CameraSettings
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
@@ -171,7 +171,7 @@ class Scene:
         white, as a meter on the sensor sees it) is 0.12.
         """
         if self.illuminance is not None:
-            return incident_ev100(self.illuminance)
+            return math.log2(self.illuminance / LUX_AT_EV0)  # `incident_ev100`, checked before
         green = self.light[1:3].mean(dim=0)
         return -self.reference.log2_exposure - math.log2(mean_anchor(green))
 
@@ -199,10 +199,7 @@ class Scene:
             scene_id: Unique name.
             group: Source group; `scene_id` by default.
             nlf: Noise left in `packed`; none by default.
-            illuminance: Light on the subject [lux], if known.
-            white_balance: Gains of R, G, B.
-            kind: Sort of scene.
-            **fields: Further fields of `Scene`.
+            illuminance, white_balance, kind, **fields: See `Scene`.
 
         Raises:
             ValueError: If a value has the wrong shape or lies outside its range.
@@ -225,11 +222,8 @@ class Scene:
     def from_raw(cls, raw: RawImage, *, scene_id: str, kind: str = "raw", **fields: Any) -> Scene:
         """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
-        Args:
-            raw: The photograph; its settings become the reference.
-            scene_id: Unique name.
-            kind: Sort of scene.
-            **fields: Further arguments of `from_array`, such as an `illuminance` that was measured.
+        Its settings become the reference; `fields` are further arguments of `from_array`, such as
+        an `illuminance` that was measured.
 
         Raises:
             ValueError: If neither the raw nor its camera knows the noise.
@@ -461,11 +455,8 @@ class SceneSet(Sequence[Scene]):
 class SceneRequest:
     """The split, the camera and the size that scenes are loaded for.
 
-    Args:
-        split: ``"train"``, ``"test"`` or ``"all"``.
-        camera: Camera in whose colours light is stated, unless a raw brings its own.
-        resolution, crop: See `Scene.resized`.
-        resize: Brings each scene to that size, as `Scene.resized` does.
+    `camera` is that in whose colours light is stated, unless a raw brings its own; `resize` brings
+    each scene to `resolution` and `crop`, as `Scene.resized` does.
     """
 
     split: Split

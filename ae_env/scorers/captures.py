@@ -5,11 +5,10 @@ Captures are described for any batch of frames, or for every state of a scene at
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,11 +20,6 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DIAMETERS
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.utils.cache import LruCache
-
-#: Memory for cached descriptions of captures [byte], some 1000 scenes at 64 states, and what those
-#: of one state take, about.
-_MEMORY_BYTES, _STATE_BYTES = 2**26, 1000
 
 ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
@@ -40,10 +34,10 @@ DependsOn = Literal["image", "light", "blur"]
 class Scorer(Protocol):
     """Rates images between 0 and 1; higher is better.
 
-    A scorer has ``domain``, ``"raw"`` or ``"srgb"``, and may have ``depends_on``, by default
+    It has ``domain``, ``"raw"`` or ``"srgb"``, and may have ``depends_on``, by default
     ``"image"``. Called with images (B, C, H, W) in [0, 1] (C = 4 for raw, 3 for sRGB) and the
-    `Captures` they come from, it returns (B,) in [0, 1]. A scorer with ``depends_on`` ``"light"``
-    or ``"blur"`` reads the captures only and is called with ``images=None``.
+    `Captures` they come from, it returns (B,) in [0, 1]. With ``depends_on`` ``"light"`` or
+    ``"blur"`` it reads the captures only and is called with ``images=None``.
     """
 
     domain: Domain
@@ -53,10 +47,7 @@ class Scorer(Protocol):
 
 
 def reads_pixels(scorer: Scorer) -> bool:
-    """Whether `scorer` looks at images or at the light of a scene; True unless it says otherwise.
-
-    Those with ``reads_pixels = False`` see the settings, the exposure and the blur only.
-    """
+    """Whether `scorer` looks at images or light: unless it has ``reads_pixels = False``."""
     return bool(getattr(scorer, "reads_pixels", True))
 
 
@@ -131,10 +122,8 @@ class Captures:
     def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
         """Variance of a native pixel's noise in the captures, at the recorded `signal`.
 
-        The camera's own at the settings, or the source's where it brought more.
-
-        Args:
-            signal: (B, 4, ...), at least 0, white is 1.
+        The camera's own at the settings, or the source's where it brought more. `signal` is
+        (B, 4, ...), at least 0, white is 1.
         """
         variance = torch.zeros_like(signal)
         if not self.noisy:
@@ -178,7 +167,7 @@ def prepare_scene(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
         movement: Directions of the image's motion, and the subject's own.
     """
-    prepared = replace(scene.prepared, camera=camera)
+    prepared = scene.prepared.changed(camera=camera)
     return in_episode(prepared, speed=speed, defocus=defocus, movement=movement)
 
 
@@ -205,9 +194,6 @@ def source_noises(
     return found
 
 
-# -- descriptions ---------------------------------------------------------------------------------
-
-
 def describe_captures(
     scenes: Sequence[Scene],
     settings: Sequence[CameraSettings],
@@ -228,14 +214,12 @@ def describe_captures(
         scenes: Scene of each capture.
         settings: Settings of each capture.
         camera: The body.
-        speed: (B,) image speed [frame heights per second].
-        defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
-        movements: Directions of the motion and subjects' own, B long; None for along the rows.
+        speed, defocus: (B,) each, see `prepare_scene`.
+        movements: Of each capture, see `prepare_scene`; None for along the rows.
         gain: (B,) light relative to the scenes' own.
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
         light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
-        source_noise: See `Captures`.
-        noisy: See `Captures`.
+        source_noise, noisy: See `Captures`.
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
@@ -274,12 +258,8 @@ def layout_blur(
 ) -> PixelBlur | None:
     """Blur of S captures of a scene with a layout; None where all pixels have the same.
 
-    Args:
-        scene: The scene.
-        movement: Directions of the image's motion, and the subject's own.
-        speed: Image speed [frame heights per second].
-        numbers: (3, S) exposure times [s], diameters of the largest disc of defocus [pixel], and
-            blur that the scene brings itself [pixel].
+    `movement` and `speed` are those of `prepare_scene`; `numbers` (3, S) exposure times [s],
+    diameters of the largest disc of defocus [pixel], and blur that the scene brings itself [pixel].
     """
     layout, height, (times, discs, own) = scene.layout, scene.light.shape[-2], numbers
     if layout is None or not (discs.any() or movement.subject_speed):
@@ -313,41 +293,22 @@ def _stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlu
     return PixelBlur(levels, shares)
 
 
-@dataclass(frozen=True)
-class _AtRest:
-    """Captures of a scene at rest in its own light, and the numbers that blur depends on."""
-
-    scene: weakref.ref[Scene]
-    captures: Captures
-
-    @cached_property
-    def blurs(self) -> tuple[np.ndarray, np.ndarray]:
-        """(3, K) times, aperture blurs and own blur of states that differ in them, and (S,) which
-        of them each state has.
-        """
-        states = self.captures.settings
-        times = [state.exposure_time for state in states]
-        aperture_blurs = [4.0 / state.effective_f_number for state in states]
-        numbers = np.stack([times, aperture_blurs, self.captures.blur_px.numpy()], axis=1)
-        few, alike = np.unique(numbers, axis=0, return_inverse=True)
-        return few.T.copy(), alike.reshape(-1)
-
-
 class SceneCaptures:
-    """Describes captures of a scene, and caches what depends neither on blur nor on its light.
+    """Describes captures of a scene at the states of a grid, of which it knows all that it can.
 
-    Args:
-        camera: The body.
-        states: The settings of the S states.
-        noisy: Whether captures have noise.
-        copies: Whether scorers get a copy of the light.
+    Scorers get a copy of the light with `copies`; for `noisy` see `Captures`.
     """
 
     def __init__(
         self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool, copies: bool
     ) -> None:
         self.camera, self.states, self.noisy, self.copies = camera, states, noisy, copies
-        self._at_rest: LruCache[_AtRest] = LruCache(_MEMORY_BYTES)
+        nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in states}}
+        self._nlf = [nlfs[s.iso] for s in states]
+        # (K, 2) times and f-numbers of states that differ in them, and (S,) which each state has.
+        blurs = np.array([(s.exposure_time, s.effective_f_number) for s in states])
+        self._blurs, which = np.unique(blurs, axis=0, return_inverse=True)
+        self._which = which.reshape(-1)
 
     def describe(
         self,
@@ -357,39 +318,34 @@ class SceneCaptures:
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> Captures:
-        """Captures of some of the states.
+        """Captures of some of the states, `part`, of a scene that is `prepared` as in the episode.
 
-        Args:
-            scene: The scene.
-            prepared: As it is in the episode.
-            part: Which of the states.
-            gain: Light relative to the scene's own, one or (S,).
-            row_gain: (S, H) light of each row relative to that, see `Captures`.
+        `gain` is the light relative to the scene's own, one or (S,), `row_gain` (S, H) that of each
+        row relative to that, see `Captures`.
         """
-        known, states = self._known(scene, part), self.states[part]
+        states, count = self.states[part], len(self.states[part])
         blur, alike = self.blur(scene, prepared, part)
         pixel_blur: PixelBlur | None = None
         if isinstance(blur, PixelBlur):
             pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
-            blur_px = blur.rms_px[alike]
-        else:
-            blur_px = blur[alike]
-        light: dict[str, Any] = {}
-        if isinstance(gain, np.ndarray):
-            gain = gain[part]
-        if isinstance(gain, np.ndarray) or gain != 1.0:
-            light["ratio"] = torch.from_numpy(known.captures.ratio.numpy() * gain)
-            light["proper_ev"] = torch.from_numpy(known.captures.proper_ev.numpy() + np.log2(gain))
-        own_light = scene.clean_light.clone() if self.copies else scene.clean_light
-        return replace(
-            known.captures,
-            scene_light=own_light.expand(len(states), -1, -1, -1),
-            blur_px=blur_px,
+            blur = blur.rms_px
+        gains = np.broadcast_to(gain, len(self.states))[part]
+        ratios = [2.0 ** (s.log2_exposure - scene.reference.log2_exposure) for s in states]
+        light = scene.clean_light.clone() if self.copies else scene.clean_light
+        return Captures(
+            settings=states,
+            scene_ids=[scene.scene_id] * count,
+            scene_light=light.expand(count, -1, -1, -1),
+            ratio=torch.from_numpy(ratios * gains),
+            nlf=self._nlf[part],
+            proper_ev=torch.from_numpy(scene.ev100 + np.log2(gains)),
+            blur_px=blur[alike],
+            white_balance=torch.tensor([scene.white_balance] * count),
+            colour_matrices=[scene.camera.colour_matrix] * count,
             row_gain=None if row_gain is None else torch.from_numpy(row_gain[part]),
-            source_noise=source_noises(prepared, states, gain),
+            source_noise=source_noises(prepared, states, gains),
             noisy=self.noisy,
             pixel_blur=pixel_blur,
-            **light,
         )
 
     def blur(
@@ -401,33 +357,14 @@ class SceneCaptures:
             (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
             of the K each state has. The arguments are those of `describe`.
         """
-        numbers, alike = self._known(scene, part).blurs
+        few, alike = np.unique(self._which[part], return_inverse=True)
+        times, f_numbers = self._blurs[few].T
         speed, movement, height = prepared.image_speed, prepared.movement, scene.light.shape[-2]
-        times, aperture_blurs, own = numbers
+        own = [scene.own_blur(f_number) for f_number in f_numbers.tolist()]
         # In steps of a 64-pixel frame, as episodes state it: to the bit as in `describe_captures`.
-        discs = (prepared.defocus * 64.0 / height) * aperture_blurs * height / 64.0
-        found: torch.Tensor | PixelBlur | None = layout_blur(
-            scene, movement, speed, np.stack([times, discs, own])
-        )
-        if found is None:
-            found = torch.from_numpy(np.hypot(np.hypot(speed * times * height, discs), own))
-        return found, torch.from_numpy(alike)
-
-    def _known(self, scene: Scene, part: slice) -> _AtRest:
-        states = self.states[part]
-        key = (id(scene), states[0], len(states))
-        known = self._at_rest.get(key)
-        if known is None or known.scene() is not scene:  # an id may be given out again
-            nothing = np.zeros(len(states))
-            captures = describe_captures(
-                [scene] * len(states),
-                states,
-                self.camera,
-                speed=nothing,
-                defocus=nothing,
-                gain=nothing + 1.0,
-                light=torch.empty(0),  # keeps no scene alive
-            )
-            known = _AtRest(weakref.ref(scene), captures)
-            self._at_rest.put(key, known, _STATE_BYTES * len(states))
-        return known
+        discs = (prepared.defocus * 64.0 / height) * (4.0 / f_numbers) * height / 64.0
+        found = layout_blur(scene, movement, speed, np.stack([times, discs, own]))
+        if found is not None:
+            return found, torch.from_numpy(alike)
+        blur = np.hypot(np.hypot(speed * times * height, discs), own)
+        return torch.from_numpy(blur), torch.from_numpy(alike)

@@ -180,14 +180,10 @@ DEFECTS = ("exposure", "noise", "white_balance", "saturation", "haze", "blur")
 
 
 def severity(defect: str, images: torch.Tensor) -> torch.Tensor:
-    """Estimated severity (B,) float64 of a defect; each scorer's docstring says what 1 stands for.
+    """Estimated severity (B,) float64 of one of `DEFECTS` in sRGB `images` (B, 3, H, W) in [0, 1].
 
-    Args:
-        defect: One of `DEFECTS`.
-        images: (B, 3, H, W) sRGB in [0, 1].
-
-    Returns:
-        In [0, 1]; for ``"saturation"`` in [-1, 1], negative where the colours are too weak.
+    In [0, 1], or of ``"saturation"`` in [-1, 1], negative where the colours are too weak; each
+    scorer's docstring says what 1 stands for.
     """
     if defect != "exposure":
         return mapped(defect, SIGNS[defect](images))
@@ -203,9 +199,6 @@ def mapped(name: str, sign: torch.Tensor) -> torch.Tensor:
     right = torch.bucketize(sign, x).clamp_(1, len(x) - 1)
     share = (sign - x[right - 1]) / (x[right] - x[right - 1])
     return y[right - 1] + share * (y[right] - y[right - 1])
-
-
-# -- scorers --------------------------------------------------------------------------------------
 
 
 class _Analytic:

@@ -49,9 +49,8 @@ class Fidelity:
     depends_on: DependsOn = "image"
     version = 1
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         first, which = distinct_references(captures)
         ideal = [_lab(picture) for picture in reference_pictures(captures, first)]
         scores = [
@@ -80,12 +79,7 @@ def _lab(picture: torch.Tensor) -> np.ndarray:
 
 
 def reference_pictures(captures: Captures, which: list[int]) -> torch.Tensor:
-    """sRGB (N, 3, H, W) of the captures' scenes at the right exposure, without noise and blur.
-
-    Args:
-        captures: The captures.
-        which: Indices of N of them.
-    """
+    """sRGB (N, 3, H, W) of N captures' scenes at the right exposure, without noise and blur."""
     ratio = captures.ratio * torch.exp2(captures.ev100 - captures.proper_ev)
     light = captures.scene_light[which] * ratio[which].to(captures.scene_light)[:, None, None, None]
     return developed(
@@ -126,8 +120,7 @@ def opencv() -> Any:
     return cv2
 
 
-def luma_bytes(images: torch.Tensor) -> np.ndarray:
-    """Luma (B, H, W) uint8 of sRGB pictures (B, 3, H, W) in [0, 1]."""
+def _luma_bytes(images: torch.Tensor) -> np.ndarray:
     return luma_of(images).clamp(0.0, 1.0).mul(255.0).round().to("cpu", torch.uint8).numpy()
 
 
@@ -145,17 +138,8 @@ def _inside(height: int, width: int) -> int:
     return max(1, height - 2 * _PATCH) * max(1, width - 2 * _PATCH)
 
 
-class Keypoints:
-    """Number of ORB keypoints: 1 - exp(-n / n0), n0 = 15 per 1000 pixels inside ORB's border.
-
-    Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV 2011, in OpenCV with its FAST
-    threshold of 20 of 255, patches and a border of 15 pixels, and at most 60 keypoints per 1000
-    pixels. A frame of 30 pixels a side or less has none. ORB takes strong noise for corners: pair
-    it with ``noise``, or use ``matches``.
-
-    Raises:
-        ImportError: If OpenCV is not installed.
-    """
+class _OrbScorer:
+    """Base of scorers by ORB keypoints; an `ImportError` where OpenCV is not installed."""
 
     domain: Domain = "srgb"
     depends_on: DependsOn = "image"
@@ -163,19 +147,28 @@ class Keypoints:
     version = 1
 
     def __init__(self) -> None:
-        opencv()
+        opencv()  # raises now, not at the first score
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+
+class Keypoints(_OrbScorer):
+    """Number of ORB keypoints: 1 - exp(-n / n0), n0 = 15 per 1000 pixels inside ORB's border.
+
+    Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV 2011, in OpenCV with its FAST
+    threshold of 20 of 255, patches and a border of 15 pixels, and at most 60 keypoints per 1000
+    pixels. A frame of 30 pixels a side or less has none. ORB takes strong noise for corners: pair
+    it with ``noise``, or use ``matches``.
+    """
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         height, width = images.shape[2:]
         orb = _detector(height, width)
-        counts = [len(orb.detect(picture, None)) for picture in luma_bytes(images)]
+        counts = [len(orb.detect(picture, None)) for picture in _luma_bytes(images)]
         typical = _inside(height, width) * TYPICAL_PER_1000 / 1000.0
         return 1.0 - torch.exp(-torch.tensor(counts, dtype=torch.float64) / typical)
 
 
-class Matches:
+class Matches(_OrbScorer):
     """Share of a well-exposed, noise-free reference's ORB keypoints that are found again.
 
     The reference is the scene's light at the right exposure (``captures.proper_ev``), without noise
@@ -184,22 +177,10 @@ class Matches:
     scene from the same place, so a match is an inlier where its two ends lie within 1/64 of the
     picture's height: the true transform is the identity and need not be estimated by RANSAC.
     Without a keypoint in the reference the score is 0 in every state.
-
-    Raises:
-        ImportError: If OpenCV is not installed.
     """
 
-    domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
-    needs = "extra cv"
-    version = 1
-
-    def __init__(self) -> None:
-        opencv()
-
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         cv2 = opencv()
         height, width = images.shape[2:]
         orb = _detector(height, width, MOST_MATCHED)
@@ -207,10 +188,10 @@ class Matches:
         first, which = distinct_references(captures)
         references = [
             orb.detectAndCompute(picture, None)
-            for picture in luma_bytes(reference_pictures(captures, first))
+            for picture in _luma_bytes(reference_pictures(captures, first))
         ]
         scores = []
-        for picture, reference in zip(luma_bytes(images), which, strict=True):
+        for picture, reference in zip(_luma_bytes(images), which, strict=True):
             points, descriptors = orb.detectAndCompute(picture, None)
             known, wanted = references[reference]
             if descriptors is None or wanted is None:

@@ -21,32 +21,26 @@ from torch.nn.utils import fuse_conv_bn_eval
 from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.utils.user_files import UserCodeError
 from simulator.utils.cache import cache_dir
-from simulator.utils.checks import check_integer
+from simulator.utils.checks import check_integer, check_type
 
 
 def find_model_file(
-    scorer: str,
-    given: str | os.PathLike[str] | None,
-    variable: str,
-    name: str,
-    *,
-    how: str,
-) -> Path:
-    """The model file of a scorer: `given`, else what `variable` names, else `name` in the cache.
+    scorer: str, given: str | os.PathLike[str] | None, variable: str, name: str, *, how: str
+) -> tuple[str, str]:
+    """The model file of a scorer, and its SHA-256: another file of that name gives other scores.
+
+    It is `given`, else what `variable` names, else `name` in the cache.
 
     Raises:
         ValueError: If there is none; the message says where to put it, and `how` to get it.
     """
     named = os.environ.get(variable) if given is None else os.fspath(given)
+    file = Path(named).expanduser() if named else cache_dir() / name
+    if file.is_file():
+        return str(file.resolve()), hashlib.sha256(file.read_bytes()).hexdigest()
     if named:
-        file = Path(named).expanduser()
-        if file.is_file():
-            return file
         source = f"`{variable}`" if given is None else "`file`"
         raise ValueError(f"{source} (={named!r}) must be the model file of {scorer!r}; {how}")
-    file = cache_dir() / name
-    if file.is_file():
-        return file
     raise ValueError(
         f"scorer {scorer!r} needs a model file, which does not come with ae-env: set "
         f"{variable}=FILE, or put it at {file}; {how}"
@@ -111,14 +105,7 @@ class NimaMobileNet(nn.Module):
         self.head = nn.Linear(inputs, RATINGS)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Share of each rating.
-
-        Args:
-            pictures: (B, 3, 224, 224) in [-1, 1].
-
-        Returns:
-            (B, 10), each row sums to 1.
-        """
+        """Shares (B, 10) of the ratings of `pictures` (B, 3, 224, 224) in [-1, 1]; summing to 1."""
         features = self.features(pictures).mean(dim=(2, 3))
         ratings: Tensor = self.head(features).softmax(dim=1)
         return ratings
@@ -132,10 +119,7 @@ PUBLISHED = {
 
 
 def read_network(file: str | os.PathLike[str]) -> NimaMobileNet:
-    """The network of a file, ready for inference.
-
-    Args:
-        file: ``.safetensors``, as ``examples/convert_nima.py`` writes it.
+    """The network of a ``.safetensors`` that ``examples/convert_nima.py`` wrote, for inference.
 
     Raises:
         ValueError: If it cannot be read, or is not of this network.
@@ -173,22 +157,21 @@ _CHUNK = 8
 
 
 def mean_rating(network: nn.Module, images: Tensor) -> Tensor:
-    """Mean rating (B,) in [1, 10] of sRGB pictures.
-
-    Args:
-        network: A `NimaMobileNet`.
-        images: (B, 3, H, W) sRGB in [0, 1], resized to 224 x 224 whatever their shape.
-    """
-    size = (INPUT_SIZE, INPUT_SIZE)
+    """Mean rating (B,) in [1, 10] of sRGB (B, 3, H, W) in [0, 1], whatever their shape."""
     ratings = torch.arange(1.0, RATINGS + 1.0, dtype=torch.float64)
     means = []
     with torch.no_grad():
         for part in images.split(_CHUNK):  # type: ignore[no-untyped-call]
-            if part.shape[2:] != size:
-                part = functional.interpolate(part, size, mode="bilinear", antialias=True)
+            part = _of_size(part, INPUT_SIZE)
             part = (2.0 * part.clamp(0.0, 1.0) - 1.0).to(memory_format=torch.channels_last)
             means.append(network(part).double() @ ratings)
     return torch.cat(means)
+
+
+def _of_size(pictures: Tensor, side: int) -> Tensor:
+    if pictures.shape[2:] == (side, side):
+        return pictures
+    return functional.interpolate(pictures, (side, side), mode="bilinear", antialias=True)
 
 
 @lru_cache(maxsize=4)
@@ -212,30 +195,19 @@ class Nima:
 
     domain: Domain = "srgb"
     depends_on: DependsOn = "image"
-    needs = "weights"
     version = 1
     #: Name of the scorer and of its weights.
-    name = ""
+    name: str
 
     def __init__(self, file: str | os.PathLike[str] | None = None) -> None:
-        found = find_model_file(
-            self.name,
-            file,
-            f"AE_ENV_{self.name.upper()}",
-            f"{self.name}.safetensors",
-            how=(
-                "examples/convert_nima.py makes it from the published Keras weights, whose git "
-                f"blob id is {PUBLISHED[self.name]} (docs/scorers.md)"
-            ),
-        )
-        self.file = str(found.resolve())
-        #: SHA-256 of the file: other weights under the same name give other scores.
-        self.digest = hashlib.sha256(found.read_bytes()).hexdigest()
+        how = "examples/convert_nima.py makes it from the published Keras weights, whose git "
+        how += f"blob id is {PUBLISHED[self.name]} (docs/scorers.md)"
+        own = f"AE_ENV_{self.name.upper()}", f"{self.name}.safetensors"
+        self.file, self.digest = find_model_file(self.name, file, *own, how=how)
         _network(self.file, self.digest)  # raises now, not at the first score
 
-    def __call__(self, images: Tensor | None, captures: Captures) -> Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: Tensor, captures: Captures) -> Tensor:
+        """Scores (B,)."""
         return (mean_rating(_network(self.file, self.digest), images) - 1.0) / (RATINGS - 1.0)
 
 
@@ -327,37 +299,26 @@ class Classifier:
             self._model: Network | tuple[str, str] = model
             self.size = size or DEFAULT_SIZE
             return
-        if not isinstance(model, str | os.PathLike | None):
-            raise ValueError(f"`model` (={model!r}) must be an ONNX file, a callable or None")
-        found = find_model_file(
-            "classifier",
-            model,
-            VARIABLE,
-            "classifier.onnx",
-            how="an ONNX file of one input (B, 3, S, S) and an output (B, classes)",
-        ).resolve()
-        # SHA-256 of the file: another network under the same name gives other scores.
-        self._model = str(found), hashlib.sha256(found.read_bytes()).hexdigest()
+        check_type("model", model, str, os.PathLike, None)
+        how = "an ONNX file of one input (B, 3, S, S) and an output (B, classes)"
+        self._model = find_model_file("classifier", model, VARIABLE, "classifier.onnx", how=how)
         self.batch, own_size = _input_shape(*self._model)
         if size is not None and own_size not in (None, size):
-            raise ValueError(f"`size` (={size}) must be that of {str(found)!r}, {own_size}")
+            raise ValueError(f"`size` (={size}) must be that of {self._model[0]!r}, {own_size}")
         self.size = own_size or size or DEFAULT_SIZE
 
-    def __call__(self, images: Tensor | None, captures: Captures) -> Tensor:
+    def __call__(self, images: Tensor, captures: Captures) -> Tensor:
         """Scores (B,) of sRGB `images` (B, 3, H, W).
 
         Raises:
             UserCodeError: If the network raises, or returns anything but numbers (B, classes).
         """
-        assert images is not None
         mean, std = (torch.tensor(v)[:, None, None] for v in (self.mean, self.std))
-        shape = (self.size, self.size)
         scores = []
         with torch.no_grad():
             for part in images.split(self.batch or _CLASSIFIED_AT_ONCE):  # type: ignore[no-untyped-call]
-                if part.shape[2:] != shape:
-                    part = functional.interpolate(part, shape, mode="bilinear", antialias=True)
-                outputs = self._outputs((part.float().clamp(0.0, 1.0) - mean) / std)
+                part = _of_size(part, self.size).float().clamp(0.0, 1.0)
+                outputs = self._outputs((part - mean) / std)
                 scores.append(_confidence(outputs, len(part)))
         return torch.cat(scores)
 
@@ -449,8 +410,8 @@ class PyiqaMetric:
 
     Raises:
         ImportError: If pyiqa is not installed.
-        ValueError: If pyiqa has no such metric, it needs a reference picture, or it states no
-            finite range.
+        ValueError: If pyiqa has no such metric, it needs a reference picture, or its range is
+            not finite.
     """
 
     domain: Domain = "srgb"
@@ -477,9 +438,8 @@ class PyiqaMetric:
         self.low, self.high = _range(getattr(self._metric, "score_range", None), rule)
         self.lower_better = bool(getattr(self._metric, "lower_better", False))
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
         with torch.no_grad():
             values = torch.as_tensor(self._metric(images)).double().reshape(len(images))
         share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)

@@ -1,7 +1,8 @@
 """Measures of one developed picture: exposure, detail and noise, and the scorers that they make.
 
-The functions take luma (B, H, W) in [0, 1], gamma-encoded as in an 8-bit picture. None of the
-exposure scorers knows the incident light: they want every scene middle grey.
+The functions take luma (B, H, W) in [0, 1], gamma-encoded as in an 8-bit picture, and return (B,)
+float64 or, of each pixel, (B, H, W). None of the exposure scorers knows the incident light: they
+want every scene middle grey.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def by_parts(
 ) -> torch.Tensor:
     """`function` of a few `images` (B, ...) at a time, as one batch.
 
-    They stay in the CPU's cache: several times as fast where a function takes many steps.
+    Those stay in the CPU's cache: several times as fast where a function takes many steps.
     """
     step = len(images)
     if images.device.type == "cpu":
@@ -73,12 +74,10 @@ def by_parts(
 
 
 def squared_gradient(luma: torch.Tensor, weights: tuple[float, float]) -> torch.Tensor:
-    """gx^2 + gy^2 (B, H, W) of 3 x 3 difference filters, borders repeated.
+    """gx^2 + gy^2 (B, H, W) of 3 x 3 difference filters, borders repeated; `luma` in any range.
 
-    Args:
-        luma: (B, H, W), any range.
-        weights: Weight of the middle row (column) and of the two beside it, such as `SOBEL`. The
-            filters are not normalised: a step of 1 gives ``middle + 2 * side``.
+    `weights` are of the middle row (column) and of the two beside it, such as `SOBEL`. The filters
+    are not normalised: a step of 1 gives ``middle + 2 * side``.
     """
     middle, side = weights
     padded = pad(luma[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
@@ -90,16 +89,11 @@ def squared_gradient(luma: torch.Tensor, weights: tuple[float, float]) -> torch.
 
 
 def check_luma(luma: torch.Tensor) -> torch.Tensor:
-    """`luma` as it is.
-
-    Raises:
-        ValueError: Unless it is a floating point tensor (B, H, W) with pixels.
-    """
-    if not torch.is_tensor(luma) or luma.ndim != 3 or not luma.is_floating_point():
+    """`luma` as it is; a `ValueError` unless it is floating point (B, H, W) with pixels."""
+    known = torch.is_tensor(luma) and luma.is_floating_point() and luma.ndim == 3
+    if not known or min(luma.shape[1:]) < 1:
         what = f"{tuple(luma.shape)} {luma.dtype}" if torch.is_tensor(luma) else repr(luma)
-        raise ValueError(f"`luma` (={what}) must be a floating point tensor (B, H, W)")
-    if min(luma.shape[1:]) < 1:
-        raise ValueError(f"`luma` (shape {tuple(luma.shape)}) must have pixels")
+        raise ValueError(f"`luma` (={what}) must be a floating point tensor (B, H, W) with pixels")
     return luma
 
 
@@ -107,22 +101,15 @@ def check_luma(luma: torch.Tensor) -> torch.Tensor:
 
 #: Grey levels of the histogram.
 LEVELS = 256
-#: Largest squared Sobel gradient that Shim's metric assumes, of luma in [0, 1]: 4^2 + 4^2.
-_LARGEST_SOBEL = 32.0
-#: Scharr's filter sums to this on each side: with it, gradients are grey levels per pixel.
-_SCHARR_SUM = 32.0
+#: Largest squared Sobel gradient that Shim's metric assumes, of luma in [0, 1]: 4^2 + 4^2; and the
+#: sum of each side of Scharr's filter, with which gradients are grey levels per pixel.
+_LARGEST_SOBEL, _SCHARR_SUM = 32.0, 32.0
 
 
 def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
     """Entropy of the histogram of 256 grey levels [bit], in [0, 8].
 
     ``-sum p log2 p`` (C. E. Shannon, 1948) over the levels ``round(255 luma)``.
-
-    Args:
-        luma: (B, H, W) in [0, 1].
-
-    Returns:
-        (B,) float64.
 
     >>> histogram_entropy(torch.tensor([[[0.0, 1.0], [0.0, 1.0]]])).item()
     1.0
@@ -161,9 +148,6 @@ def shim_gradient(
         threshold: delta, gradients below it count as noise, in [0, 1).
         slope: lambda > 0; the larger, the more weak gradients count.
 
-    Returns:
-        (B,) float64.
-
     Source: I. Shim, J.-Y. Lee, I. S. Kweon, "Auto-adjusting camera exposure for outdoor robotics
     using gradient information", IROS 2014; delta 0.06, lambda 1000.
     """
@@ -172,33 +156,29 @@ def shim_gradient(
 
 
 def zhang_gradient(luma: torch.Tensor, *, p: float = 0.7, k: float = 5.0) -> torch.Tensor:
-    """Zhang's soft percentile of the squared gradient [(grey levels of 255 per pixel)^2], >= 0.
+    """Zhang's soft percentile of the squared gradient [(grey levels of 255 per pixel)^2].
 
     The squared gradients G (Scharr's filter over 32) of the S pixels are sorted, ascending, and
     averaged with weights ``sin(pi/2 i / (n - 1))^k`` for i < n and
-    ``sin(pi/2 - pi/2 (i - n + 1) / (S - n))^k`` above, n = floor(p S), i from 0.
+    ``sin(pi/2 - pi/2 (i - n + 1) / (S - n))^k`` above, n = floor(p S), i from 0. Its range is
+    0 to 2 * 127.5^2.
 
     Args:
         luma: (B, H, W) in [0, 1].
         p: Percentile that counts most, in (0, 1).
         k: Concentration around it, > 0.
 
-    Returns:
-        (B,) float64; at most 2 * 127.5^2.
-
     Source: Z. Zhang, C. Forster, D. Scaramuzza, "Active exposure control for robust visual odometry
     in HDR environments", ICRA 2017; p 0.7, k 5.
     """
     squares = squared_gradient(check_luma(luma), SCHARR).flatten(1)
+    if squares.device.type == "cpu":  # numpy sorts several times as fast
+        ascending = torch.from_numpy(np.sort(squares.detach().numpy(), axis=1))
+    else:
+        ascending = squares.sort(dim=1).values
     weights = _percentile_weights(squares.shape[1], p, k).to(squares)
     scale = (255.0 / _SCHARR_SUM) ** 2
-    return (_ascending(squares) * weights).sum(dim=1, dtype=torch.float64).mul_(scale)
-
-
-def _ascending(rows: torch.Tensor) -> torch.Tensor:
-    if rows.device.type == "cpu":  # numpy sorts several times as fast
-        return torch.from_numpy(np.sort(rows.detach().numpy(), axis=1))
-    return rows.sort(dim=1).values
+    return (ascending * weights).sum(dim=1, dtype=torch.float64).mul_(scale)
 
 
 def _percentile_weights(samples: int, p: float, k: float) -> torch.Tensor:
@@ -230,12 +210,6 @@ def immerkaer_sigma(luma: torch.Tensor) -> torch.Tensor:
     ``sqrt(pi / 2) / (6 (W - 2) (H - 2))`` times the sum of `immerkaer_response` over the pixels
     that have all eight neighbours; 0 where there are none. Fine texture is read as noise.
 
-    Args:
-        luma: (B, H, W) in [0, 1].
-
-    Returns:
-        (B,) float64.
-
     Source: J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding
     64(2), 1996.
     """
@@ -257,7 +231,7 @@ def shin_metric(
 
     L_grad is mean over standard deviation (of a sample) of the means of `shim_response` in a grid
     of 10 x 10 cells, 0 where there is no gradient and at most 1000; H is `histogram_entropy`;
-    L_noise is `shin_noise`.
+    L_noise is `shin_noise`. About -10 to 3.
 
     Args:
         luma: (B, H, W) in [0, 1].
@@ -265,9 +239,6 @@ def shin_metric(
         beta: Weight of the noise, >= 0.
         gradient_gain: K_g.
         entropy_gain: K_e [1 / bit].
-
-    Returns:
-        (B,) float64, about -10 to 3.
 
     Source: U. Shin, J. Park, G. Shim, F. Rameau, I. S. Kweon, "Camera exposure control for robust
     robot vision with noise-aware image quality assessment", IROS 2019, with the factor of 1/6 in
@@ -299,14 +270,8 @@ def shin_noise(luma: torch.Tensor) -> torch.Tensor:
     return torch.where(number < 1e-4 * samples, immerkaer_sigma(luma), masked)
 
 
-# -- scorers of detail and noise ------------------------------------------------------------------
-
-
 class Shim:
-    """Shim's gradient information (2014), weak gradients included: higher with more detail.
-
-    The mean of `shim_response` as it is, in [0, 1]: see `shim_gradient`.
-    """
+    """Shim's gradient information (2014), weak gradients included: `shim_gradient` as it is."""
 
     domain: Domain = "srgb"
 
@@ -479,14 +444,10 @@ class WellExposedness:
 
 
 class Entropy:
-    """Entropy of the luma histogram in bits, over the 8 bits of 256 grey levels.
-
-    See `histogram_entropy`. Noise raises it.
-    """
+    """Entropy of the luma histogram (`histogram_entropy`) over its 8 bits. Noise raises it."""
 
     domain: Domain = "srgb"
-    bits = 8.0
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        return histogram_entropy(luma_of(images)) / self.bits
+        return histogram_entropy(luma_of(images)) / 8.0

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from ae_env.scorers import defects, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
-from ae_env.scorers.terms import CompositeScorer
+from ae_env.scorers.terms import CompositeScorer, check_part
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
@@ -63,9 +63,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
 
 
 def register_scorer(name: str) -> Callable[[Factory], Factory]:
-    """Class decorator that makes a scorer known as `name`.
-
-    Registering the same class again (a notebook cell run twice) replaces it.
+    """Class decorator that makes a scorer known as `name`; the latest one counts (notebooks).
 
     Raises:
         ValueError: If `name` is not an identifier or belongs to a built-in scorer.
@@ -108,13 +106,7 @@ def scorer_entry_points() -> list[EntryPoint]:
     return list(entry_points(group=ENTRY_POINT_GROUP))
 
 
-def registered_scorer(name: str) -> Callable[[], Any] | None:
-    """The class that is registered as `name`, or None."""
-    return _REGISTRY.get(name)
-
-
 def _find_scorer(name: str) -> Any:
-    """The scorer of a name; `CompositeScorer` checks that it is one."""
     factory = _REGISTRY.get(name)
     if factory is not None:
         # The errors of this package's own scorers are clear already.
@@ -133,10 +125,9 @@ def _find_scorer(name: str) -> Any:
     if attribute:
         return _instantiate(name, load_attribute(name, rule))
     known = list_scorers()
-    hint = did_you_mean(name, known)
     raise ValueError(
-        f"`scorer` (={name!r}) must be one of {known}, 'package.module:name', 'my_file.py:name' "
-        f"or 'pyiqa:metric'{hint}"
+        f"{rule} must be one of {known}, 'package.module:name', 'my_file.py:name' or "
+        f"'pyiqa:metric'{did_you_mean(name, known)}"
     )
 
 
@@ -155,15 +146,12 @@ def _instantiate(name: str, found: Any) -> Any:
 
 
 def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
-    """A scorer from a name, a mapping of names to weights, or a callable.
+    """A scorer, of one part or more, from a name, a mapping of names to weights, or a callable.
 
     Args:
         spec: A registered name, ``"package.module:name"``, ``"path/to/my_file.py:name"``,
             ``"pyiqa:metric"``, a mapping such as ``{"noise": 0.5, "my_file.py:MyScore": 0.5}``
             (weighted mean), or a callable ``(images, captures) -> (B,)``.
-
-    Returns:
-        A composite of one or more parts.
 
     Raises:
         ValueError: If a name is unknown (the nearest is proposed) or cannot be loaded (the cause is
@@ -188,15 +176,14 @@ def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
 
 
 def _weighted_mean(spec: Mapping[str, float]) -> CompositeScorer:
-    rule = f"`scorer` (={dict(spec)!r}) must map"
-    if not spec or not all(isinstance(name, str) for name in spec):
-        raise ValueError(f"{rule} one name or more to weights, as {{'noise': 0.5}} does")
-    for weight in spec.values():
-        known = isinstance(weight, Real) and not isinstance(weight, bool)
-        if not (known and 0 < weight < math.inf):
-            raise ValueError(f"{rule} names to weights, which must all be > 0 and finite")
-    if len({_short(name) for name in spec}) < len(spec):
-        raise ValueError(f"{rule} names that differ behind the colon, too")
+    names = [_short(name) for name in spec if isinstance(name, str)]
+    weights = [weight for weight in spec.values() if isinstance(weight, Real)]
+    fit = all(0 < w < math.inf and not isinstance(w, bool) for w in weights)
+    if not (spec and fit and len(spec) == len(set(names)) == len(weights)):
+        raise ValueError(
+            f"`scorer` (={dict(spec)!r}) must map one name or more, which differ behind the colon, "
+            "to weights > 0 and finite, as {'noise': 0.5} does"
+        )
     parts = {_short(name): _find_scorer(name) for name in spec}
     return CompositeScorer(parts, {_short(name): float(w) for name, w in spec.items()})
 
@@ -236,21 +223,18 @@ def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
             yield from _nested(part, (*path, name))
 
 
-# -- the rows of ``ae-env scorers`` ---------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ScorerRow:
-    """One scorer.
+    """One scorer; a field is empty where it is unknown, or there is nothing to say.
 
     Args:
         name: The name that `make_scorer` takes.
-        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``; empty if unknown.
-        depends_on: ``"image"``, ``"light"`` or ``"blur"``; empty if unknown.
-        needs: File or package that does not come with this one; empty if it needs none.
+        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``.
+        depends_on: ``"image"``, ``"light"`` or ``"blur"``.
+        needs: File or package that does not come with this one.
         summary: First line of its docstring.
         package: The package that it comes from.
-        error: Why it cannot be loaded; empty if it can, or if only what it needs is missing.
+        error: Why it cannot be loaded, unless only what it needs is missing.
     """
 
     name: str
@@ -267,7 +251,7 @@ def describe_scorers() -> list[ScorerRow]:
     points = {point.name: point for point in reversed(scorer_entry_points())}
     rows = []
     for name in list_scorers():
-        factory = registered_scorer(name)
+        factory = _REGISTRY.get(name)
         if factory is None:
             point = points[name]
             package = point.dist.name if point.dist is not None else point.module.partition(".")[0]
@@ -276,7 +260,8 @@ def describe_scorers() -> list[ScorerRow]:
         needs = getattr(factory, "needs", "")
         try:
             # Where a file may be missing, the class says everything.
-            found = factory if needs else _made(name)
+            found = factory if needs else _find_scorer(name)
+            check_part(name, found)
             rows.append(_row(name, found, package))
         except (Exception, SystemExit) as error:
             cause: BaseException = error
@@ -285,13 +270,6 @@ def describe_scorers() -> list[ScorerRow]:
             line = " ".join(f"{type(cause).__name__}: {cause}".split())
             rows.append(ScorerRow(name, package=package, error=line))
     return rows
-
-
-def _made(name: str) -> Any:
-    """The scorer of that name, without the composite that `make_scorer` puts around one."""
-    scorer = make_scorer(name)
-    parts = list(scorer.parts.values())
-    return parts[0] if len(parts) == 1 and list(scorer.parts) == [name] else scorer
 
 
 def _row(name: str, found: Any, package: str) -> ScorerRow:

@@ -1,20 +1,17 @@
 """Expected scores of every exposure state of a scene.
 
-``q(s)`` is the expectation, over noise, of the score of a capture at state s. Where a part of the
-scorer has that in closed form it is used (of the terms that are measured on frames, to the first
-order: see `ae_env.scorers.terms`); other parts are averaged over common noise seeds, with
-their standard error.
+``q(s)`` is the expectation, over noise, of the score of a capture at state s. Parts of the scorer
+that have it in closed form (to the first order those that are measured on frames, see
+`ae_env.scorers.terms`) use it; other parts are averaged over common noise seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
@@ -27,7 +24,6 @@ from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.optics.motion import ALONG_ROWS, Movement
-from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
 
 #: Memory for the blurred light of one table [byte].
@@ -59,10 +55,9 @@ class ScoreTable:
 
     @cached_property
     def oracle(self) -> int:
-        """The best state that is allowed; ties go to the lower index, that is the lower ISO.
+        """The best allowed state; of those within `TIE` of it, the one of the lowest index and ISO.
 
-        States of equal exposure score alike but for the rounding of their settings: a tie is
-        whatever comes within `TIE` of the best.
+        States of equal exposure score alike but for the rounding of their settings.
         """
         mean = self.mean if self.allowed is None else np.where(self.allowed, self.mean, -np.inf)
         return int(np.argmax(mean >= mean.max() - TIE))
@@ -72,9 +67,7 @@ class ScoreTables:
     """Score tables of scenes under one scorer, camera and grid.
 
     Args:
-        grid: The states.
-        camera: The body that takes the captures.
-        scorer: The scorer that rates them.
+        grid, camera, scorer: The states, the body that takes the captures, and what rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
         tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.
@@ -115,9 +108,7 @@ class ScoreTables:
 
         Args:
             scene: The scene.
-            speed: See `prepare_scene`.
-            defocus: See `prepare_scene`.
-            movement: See `prepare_scene`.
+            speed, defocus, movement: See `prepare_scene`.
             gain: Light relative to the scene's own; (S,) where it depends on the state, as in
                 flickering light.
             row_gain: (S, H) light of each row relative to that, see `Captures`.
@@ -156,12 +147,9 @@ class ScoreTables:
     def _recorded_table(
         self, scene: Scene, prepared: PreparedScene, parts: dict[str, np.ndarray]
     ) -> ScoreTable:
-        """Scores of the captures that there are; 0 where there is none.
+        """Scores of the captures that there are, `Scene.recorded`; 0 where there is none.
 
-        Args:
-            scene: With `Scene.recorded`.
-            prepared: Its merged light.
-            parts: Scores of the parts that look at no frame.
+        `prepared` is their merged light, `parts` have the scores of those that look at no frame.
         """
         frames, allowed = scene.recorded, scene.allowed
         assert frames is not None
@@ -219,21 +207,14 @@ class ScoreTables:
         for part in slices(len(self.states), CHUNK):
             states, rows = self.states[part], None if row_gain is None else row_gain[part]
             light: Any = {"gain": gains[part], "row_gain": rows}
-            captures = terms.captures.describe(scene, prepared, part, gain, row_gain)
-            scored = [
-                terms.torch_scores(images, captures, "image")
-                for images in self._images(prepared, states, **light)
-            ]
+            captures, scored = terms.captures.describe(scene, prepared, part, gain, row_gain), []
+            for seed in range(self.noise_seeds):
+                if self.noise:
+                    images = prepared.expose(states, seed=seed, **light)
+                else:
+                    images = clip_and_quantise(
+                        prepared.expected_sweep(states, **light), self.camera
+                    )
+                scored.append(terms.torch_scores(images.clamp_(0.0, 1.0), captures, "image"))
             chunks.append({name: np.stack([s[name] for s in scored]) for name in scored[0]})
         return {name: np.concatenate([c[name] for c in chunks], axis=1) for name in chunks[0]}
-
-    def _images(
-        self, prepared: PreparedScene, states: Sequence[CameraSettings], **light: Any
-    ) -> Iterable[torch.Tensor]:
-        """Captures (S, 4, H, W) in [0, 1] of `states`, one of each for every noise seed."""
-        if not self.noise:
-            signals = prepared.expected_sweep(states, **light)
-            yield clip_and_quantise(signals, self.camera).clamp_(0.0, 1.0)
-            return
-        for seed in range(self.noise_seeds):
-            yield prepared.expose(states, seed=seed, **light).clamp_(0.0, 1.0)

@@ -64,21 +64,14 @@ _jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
 
 
 class TermScores:
-    """Scores of one scorer at the states of a grid, part by part.
-
-    Args:
-        scorer: The scorer.
-        camera: The body that takes the captures.
-        states: The settings of the S states.
-        noise: Whether captures are noisy.
+    """Scores of one scorer at the states of a grid, part by part; see `ScoreTables`.
 
     Attributes:
         parts: Parts that are made of the terms of `ae_env.scorers.terms` alone, composites
             included, and measured on frames; by name. Their expectation has a closed form.
         torch_terms: All other parts, which torch evaluates; None if there are none.
         reads_captures: Whether `parts` need `Captures` besides the means.
-        closed_form: Whether every part's expectation has a closed form, so that no noise is drawn
-            for it.
+        closed_form: Whether every part's expectation has one, so that no noise is drawn for it.
         captures: Describes captures of a scene at the states.
     """
 
@@ -92,7 +85,8 @@ class TermScores:
     ) -> None:
         self.camera, self.states, self.noise = camera, states, noise
         self.parts = {n: p for n, p in scorer.parts.items() if _is_known(p) and _has_pixels(p)}
-        self.torch_terms = scorer.subset(set(scorer.parts) - set(self.parts))
+        others = {n: p for n, p in scorer.parts.items() if n not in self.parts}
+        self.torch_terms = CompositeScorer(others) if others else None
         self.reads_captures = any(type(part) not in _COLUMNS for part in self.parts.values())
         self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
         # Scorers of one's own get a copy of the light, lest they write to the scene.
@@ -119,10 +113,7 @@ class TermScores:
     ) -> dict[str, np.ndarray]:
         """Scores (B,) of those of `torch_terms` that depend on `kinds`.
 
-        Args:
-            images: (B, 4, H, W) in [0, 1]; None where the kinds look at none.
-            captures: The captures.
-            kinds: Any of `DependsOn`.
+        `images` are (B, 4, H, W) in [0, 1]; None where the kinds look at none.
         """
         if self.torch_terms is None:
             return {}
@@ -139,12 +130,7 @@ class TermScores:
     ) -> dict[str, np.ndarray]:
         """Scores (S,) of those of `torch_terms` that look at no frame but depend on `kinds`.
 
-        Args:
-            scene: The scene.
-            prepared: As it is in the episode.
-            kinds: ``"light"``, ``"blur"`` or both.
-            gain: See `ScoreTables.table`.
-            row_gain: See `ScoreTables.table`.
+        `prepared` is the scene as it is in the episode; for the gains see `ScoreTables.table`.
         """
         names = [] if self.torch_terms is None else self.torch_terms.names(*kinds)
         if self.torch_terms is None or not names:
@@ -167,9 +153,7 @@ class TermScores:
     ) -> np.ndarray:
         """(K, 4, 256) float32 `Noise.shares` of each code.
 
-        Args:
-            shot_read: (K, 2, 4) noise of a native pixel.
-            source_noise: (K, 2, 4) noise of the source, where it may be greater.
+        The noise of native pixels is (K, 2, 4), as is that of the source, where it may be greater.
         """
         light = _SIGNALS.double().numpy()
         variance = np.zeros((len(shot_read), 4, 256))
@@ -182,11 +166,9 @@ class TermScores:
         return shares
 
     def score(self, means: np.ndarray, captures: Captures | None) -> dict[str, np.ndarray]:
-        """Scores (B,) float64 by part.
+        """Scores (B,) float64 by part, from the `means` (B, 3) of `measured` or `expected`.
 
-        Args:
-            means: (B, 3) result of `measured` or `expected` for the captures.
-            captures: The captures; None unless `reads_captures`.
+        `captures` may be None unless `reads_captures`.
         """
         return {name: _score(part, means, captures) for name, part in self.parts.items()}
 
@@ -227,13 +209,10 @@ class TermScores:
         box_factors: np.ndarray,
         row_gain: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Expectation (B, 3) of `measured` over the noise that the transitions add.
+        """Expectation (B, 3) of `measured` over the noise that the transitions (B,) add.
 
-        Args:
-            transitions: Light and exposures.
-            states: (B,) of the frames.
-            box_factors: (B,) sensor pixels averaged per side into one of the frame.
-            row_gain: (B, H) light of each row relative to the frame's, or None.
+        `box_factors` (B,) sensor pixels per side are averaged into one of the frame; `row_gain`
+        (B, H) is the light of each row relative to the frame's.
         """
         table = transitions.before_rounding(self.camera).averaged_table()
         source_noise = table[:, 3:] * np.square(box_factors)[:, None, None]
@@ -324,23 +303,14 @@ def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarra
     return np.asarray(np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0))
 
 
-# -- kernels --------------------------------------------------------------------------------------
-
-
 @_jit
 def measure_codes(  # type: ignore[no-untyped-def]
     first, last, codes, shares, which, dark, means
 ):
-    """Means of the frames `first` to `last`.
+    """Means (B, 3) float64 of frames (B, 4, N) uint8, from the `first` to before the `last`.
 
-    Args:
-        first: First frame.
-        last: One past the last.
-        codes: (B, 4, N) uint8.
-        shares: (K, 4, 256) float32, what a sample of each code adds to `noise`.
-        which: (B,) which of them each frame has.
-        dark: (256,) float32, what a sample of each code adds to the share of blocked ones.
-        means: (B, 3) float64 to write to.
+    A sample adds to the share of blocked ones what `dark` (256,) says of its code, and to `noise`
+    what `shares` (K, 4, 256) say, of which frame b has those at ``which[b]``.
     """
     size = codes.shape[2]
     # Four histograms: a sample need not wait for that of the sample before.
@@ -387,14 +357,10 @@ def _normal_above(z):  # type: ignore[no-untyped-def]
 def expect_codes(dark, clean, edges, shot, read, out):  # type: ignore[no-untyped-def]
     """Expectations of functions of the code that noisy light is recorded as.
 
-    Args:
-        dark: (256,) float32 by code, the first function.
-        clean: (256,) float32, the second.
-        edges: (256,) signals from which each code is recorded, or one above.
-        shot: Shot noise that is added.
-        read: Read noise that is added.
-        out: (3, G) float32 to write to, at `_FINE` values of light between two codes: the
-            probability of the last code, and both expectations.
+    `dark` and `clean` (256,) are the functions, `edges` (256,) the signals from which each code or
+    one above is recorded; `shot` and `read` are the noise that is added. `out` (3, G) gets, at
+    `_FINE` values of light between two codes, the probability of the last code, and both
+    expectations.
     """
     unit, start, last, count = (1.0 + PEDESTAL) / 255.0**2, 0, 0, out.shape[1]
     i = 0
@@ -440,19 +406,11 @@ def _interpolated(table, places, shares):  # type: ignore[no-untyped-def]
 def expect_means(  # type: ignore[no-untyped-def]
     first, last, light, rows, columns, ratio, row_gain, grid, tables, means
 ):
-    """Expected means of the frames `first` to `last`.
+    """Expected means (B, 3) of the frames from the `first` to before the `last`.
 
-    Args:
-        first: First frame.
-        last: One past the last.
-        light: (B,) addresses of (4, R, C) float32.
-        rows: R; 1 where all rows have the same gain.
-        columns: C.
-        ratio: (B, 4) float32, what the light is multiplied by.
-        row_gain: (B, R) float32.
-        grid: G.
-        tables: (B,) addresses of (4, 3, G) float32 of `expect_codes`.
-        means: (B, 3) float64 to write to.
+    `light` has addresses (B,) of (4, R, C) float32, which `ratio` (B, 4) and `row_gain` (B, R)
+    multiply; R is 1 where all rows have the same gain. `tables` has those of (4, 3, G) float32 of
+    `expect_codes`, G the `grid`.
     """
     kept, shares = np.empty((2, _BLOCK), np.float32)
     places = np.empty(_BLOCK, np.int32)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 from typing import Any, get_args
@@ -25,12 +25,11 @@ from simulator.raw.develop import develop
 
 logger = logging.getLogger(__name__)
 
-#: A user's scorer that takes longer than this for one batch is named in the log, once [s].
-SLOW_SECONDS = 5.0
 #: Scores may be this far outside [0, 1] by rounding.
 ROUNDING = 1e-6
-#: Names of the scorers that were found to be slow in this process.
-_slow: set[str] = set()
+#: A user's scorer that takes longer than this for one batch is named in the log, once [s].
+SLOW_SECONDS = 5.0
+_slow: set[str] = set()  # those that were found in this process
 
 
 def depends_on(scorer: Scorer) -> DependsOn:
@@ -47,8 +46,7 @@ class CompositeScorer:
         weights: Weight of each part, > 0; they are divided by their sum. Equal by default.
 
     Raises:
-        ValueError: If there are no parts, one is not a scorer, or a weight is missing or not
-            positive.
+        ValueError: If a part is no scorer, or a weight is missing or not positive.
     """
 
     domain: Domain = "raw"
@@ -57,12 +55,12 @@ class CompositeScorer:
         self, parts: Mapping[str, Scorer], weights: Mapping[str, float] | None = None
     ) -> None:
         weights = dict.fromkeys(parts, 1.0) if weights is None else dict(weights)
-        if not parts or set(weights) != set(parts):
-            raise ValueError(f"`weights` (={weights}) must name exactly the parts {list(parts)}")
-        if not all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values()):
-            raise ValueError(f"`weights` (={weights}) must all be > 0, and finite numbers")
+        fit = all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values())
+        if not (parts and fit and set(weights) == set(parts)):
+            rule = f"must give each of the parts {list(parts)} a finite number > 0"
+            raise ValueError(f"`weights` (={weights}) {rule}")
         for name, part in parts.items():
-            _check_part(name, part)
+            check_part(name, part)
         total = sum(weights.values())
         self.parts = dict(parts)
         self.weights = {name: weight / total for name, weight in weights.items()}
@@ -83,11 +81,6 @@ class CompositeScorer:
         """Names of the parts that depend on one of `kinds`."""
         return [name for name, part in self.parts.items() if depends_on(part) in kinds]
 
-    def subset(self, names: Collection[str]) -> CompositeScorer | None:
-        """The parts of `names` alone, equally weighted; None if there are none."""
-        parts = {name: part for name, part in self.parts.items() if name in names}
-        return CompositeScorer(parts) if parts else None
-
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of raw `images` (B, 4, H, W) in [0, 1]."""
         scores: torch.Tensor = self.combine(self.score_parts(images, captures))
@@ -103,7 +96,7 @@ class CompositeScorer:
 
         The images are developed to sRGB only if a part asks for it.
         """
-        srgb: torch.Tensor | None = None
+        views: dict[str, torch.Tensor | None] = {"raw": images}
         scores = {}
         for name in self.names(*kinds):
             part = self.parts[name]
@@ -111,13 +104,11 @@ class CompositeScorer:
             if depends_on(part) == "image":
                 if images is None:
                     raise ValueError(f"scorer {name!r} needs `images`, got None")
-                view = images
-                if part.domain == "srgb":
-                    if srgb is None:
-                        gains, matrices = captures.white_balance, captures.colour_matrices
-                        srgb = developed(images, gains, matrices)
-                    view = srgb
-                if len(self.names("image")) > 1:
+                if part.domain not in views:
+                    gains, matrices = captures.white_balance, captures.colour_matrices
+                    views[part.domain] = developed(images, gains, matrices)
+                view = views[part.domain]
+                if view is not None and len(self.names("image")) > 1:
                     view = view.clone()  # a part may write to its images
             scores[name] = scores_of(name, part, view, captures)
         return scores
@@ -146,10 +137,10 @@ class CompositeScorer:
 def developed(
     images: torch.Tensor, white_balance: torch.Tensor, matrices: Sequence[ColourMatrix | None]
 ) -> torch.Tensor:
-    """sRGB (B, 3, H, W), each image with the colours of its own scene's camera.
+    """sRGB (B, 3, H, W) of raws (B, 4, H, W), each in the colours of its own scene's camera.
 
     Args:
-        images: (B, 4, H, W) raws.
+        images: The raws.
         white_balance: (B, 3) gains of R, G, B.
         matrices: XYZ (D65) to camera RGB of each, B long; None where unknown.
     """
@@ -159,8 +150,8 @@ def developed(
     return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
 
 
-def _check_part(name: str, part: Any) -> None:
-    """Raises a `ValueError` unless `part` is a scorer."""
+def check_part(name: str, part: Any) -> None:
+    """Raises a `ValueError` unless `part`, which is called `name`, is a scorer."""
     if not callable(part):
         raise ValueError(f"`scorer` (={name!r}) must be callable, got {type(part).__name__}")
     for attribute, known, value in (
@@ -182,8 +173,8 @@ def scores_of(
     """Scores (B,) float64 in [0, 1] of one scorer.
 
     Args:
-        name: Name of the scorer in errors.
-        scorer: The scorer.
+        name: Its name in errors.
+        scorer: The scorer, which may be the user's own.
         images: (B, C, H, W), or None where it has a closed form.
         captures: The B captures that the images come from.
 
@@ -217,10 +208,7 @@ def is_own(scorer: Any) -> bool:
 
 
 def _versions(captures: Captures) -> dict[str, int]:
-    """The counts of writes that torch keeps for each tensor of `captures`, views included.
-
-    Zero counts are left out, as are properties that have not been computed yet.
-    """
+    """The counts of writes, where not 0, that torch keeps for the tensors of `captures`."""
     tensors = {name: value for name, value in vars(captures).items() if torch.is_tensor(value)}
     counted = {name: t._version for name, t in tensors.items() if not t.is_inference()}
     return {name: version for name, version in counted.items() if version}
@@ -311,9 +299,6 @@ class Highlights:
     """Blown highlights: ``exp(-f / 0.15)``, f the share of pixels with a plane at white.
 
     At white is the last of the 8-bit codes: 0.996 of sensor white or more.
-
-    Attributes:
-        scale: Share at which the score is 1/e, 0.15.
     """
 
     domain: Domain = "raw"
@@ -328,10 +313,7 @@ class Highlights:
 class Shadows:
     """Blocked shadows: ``exp(-f / 0.20)``, f the mean of ``sigmoid(-(log2(x) + 9) / 0.5)``.
 
-    Attributes:
-        scale: Share at which the score is 1/e, 0.20.
-        depth: How far below white a sample is half blocked, 9 stops.
-        width: Of the sigmoid, 0.5 stop.
+    9 stops below white, a sample is half blocked.
     """
 
     domain: Domain = "raw"
@@ -358,9 +340,6 @@ class Noise:
     frame: shot and read noise at the settings, or the source's where that is greater; none where
     the frame has none. It is of the sensor's own pixels, not of the box-averaged frame: otherwise
     ISO would be nearly free.
-
-    Attributes:
-        half_snr: SNR at which the score is a half, 18.
     """
 
     domain: Domain = "raw"
@@ -382,8 +361,7 @@ class Noise:
 class Sharpness:
     """Motion and defocus blur: mean over the pixels of ``1 / (1 + (b / b0)^2)``.
 
-    b is the extent of both blurs of a pixel together in pixels of the frame, b0 a 64th of its
-    height.
+    b is the extent of both blurs of a pixel together, b0 a 64th of the frame's height.
     """
 
     domain: Domain = "raw"

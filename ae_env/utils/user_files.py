@@ -40,9 +40,7 @@ def split_file_name(name: str) -> tuple[str, str] | None:
 def load_attribute(name: str, argument: str) -> Any:
     """The object that ``"package.module:name"`` names; ``name`` may have dots.
 
-    Args:
-        name: The module and the name in it.
-        argument: How errors begin, such as ``"`scenes` (='my.module:scenes')"``.
+    `argument` is how errors begin, such as ``"`scenes` (='my.module:scenes')"``.
 
     Raises:
         ValueError: If the module cannot be imported (the cause is chained), or lacks the name.
@@ -63,14 +61,14 @@ def load_attribute(name: str, argument: str) -> Any:
 
 
 def load_from_file(path: str, name: str, argument: str, example: str = "MyClass") -> Any:
-    """The object that a Python file calls `name`.
+    """The object that a Python file calls `name`, a class or a function.
 
     The file is run once, and again after it has changed. It may import modules beside it, as a
     script may; files in different folders may have helpers of the same name.
 
     Args:
         path: The file; a relative one is looked for in the current folder, ``~`` is the home.
-        name: A class, or a function.
+        name: The object's name.
         argument: How errors begin, such as ``"`scorer` (='my_scorer.py:MyScore')"``.
         example: A name that the error proposes where there is none.
 
@@ -91,11 +89,8 @@ def find_attribute(module: ModuleType, name: str, argument: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        own = [
-            key
-            for key, value in vars(module).items()
-            if inspect.isclass(value) and value.__module__ == module.__name__
-        ]
+        classes = [(k, value) for k, value in vars(module).items() if inspect.isclass(value)]
+        own = [key for key, value in classes if value.__module__ == module.__name__]
         found = ", ".join(own) or "no class at all"
         hint = did_you_mean(name, own)
         raise ValueError(f"{argument}: no class {name!r} there; found {found}{hint}") from None
@@ -176,9 +171,7 @@ def list_presets(kind: str = "env") -> list[str]:
 def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
     """The YAML file of a preset of one `kind`, a folder of ``configs/``.
 
-    Args:
-        name: Name of a preset, or the path of a ``.yaml`` file.
-        kind: Such as ``"env"``.
+    `name` is that of a preset, or the path of a ``.yaml`` file.
 
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.
@@ -210,10 +203,7 @@ def find_config(path: Path) -> Path:
 
 
 def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
-    """Keyword arguments of ``gymnasium.make`` from a preset of ``configs/env``.
-
-    Args:
-        name: Such as ``"tunnel"``, or the path of a ``.yaml`` file.
+    """Keyword arguments of ``gymnasium.make`` from a preset of ``configs/env`` or a ``.yaml`` file.
 
     Raises:
         ValueError: If there is no such preset, or it cannot be read, is too large or no mapping.

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import correlate1d
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from simulator import CameraSimulator, RawImage, render_srgb
@@ -70,7 +70,6 @@ def hdr_picture(
     in the darkest pictures.
 
     Args:
-        raw: The photograph.
         stops: The bracket reaches from -`stops` to +`stops` [EV], in [0.05, 10].
         step: Between its pictures [EV], in [0.05, `stops`].
         simulator: What reduces noise; by default ``CameraSimulator.from_pretrained()``.
@@ -116,11 +115,7 @@ def _exposed(raw: RawImage, ev: float) -> RawImage:
 def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
     """Linear light (H, W, 3) float32 in the primaries of sRGB, white-balanced, not clipped.
 
-    It is turned as the camera was held, as a developed picture is.
-
-    Args:
-        raw: Says how it is balanced and turned, and its camera's colours.
-        radiance: (4, H, W), see `HdrPicture`.
+    The `radiance` of an `HdrPicture` of `raw`, turned as the camera was held.
     """
     gains = np.array(raw.white_balance) / min(raw.white_balance)
     red, green, green2, blue = radiance.double().cpu().numpy()
@@ -145,9 +140,7 @@ def import_openexr() -> Any:
     try:
         import OpenEXR
     except ImportError:
-        raise ImportError(
-            "EXR files need OpenEXR: install the extra with pip install 'ae-env[hdr]'"
-        ) from None
+        raise ImportError("EXR files need OpenEXR: pip install 'ae-env[hdr]'") from None
     return OpenEXR
 
 
@@ -155,7 +148,7 @@ def import_openexr() -> Any:
 
 
 def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
-    """Fuses a bracket.
+    """Fuses a bracket to a picture (3, H, W) in [0, 1].
 
     A picture counts where it is bright if it is one of the darker ones, and where it is dark if it
     is one of the brighter ones; and more where its brightnesses are rare, so that it has contrast
@@ -165,9 +158,6 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
         pictures: N >= 2 pictures (3, H, W) float32 in [0, 1], sRGB, or a function that yields
             them, always the same ones, called several times: a bracket of large pictures need
             not be held at once.
-
-    Returns:
-        (3, H, W) in [0, 1].
 
     Raises:
         ValueError: If there are fewer than 2 pictures.
@@ -211,11 +201,7 @@ def _weight(luma: Tensor, mean: float, width: float) -> Tensor:
 
 def _smoothed(weight: Tensor) -> Tensor:
     """`weight` (H, W) after a Gaussian of `SMOOTHING`, borders repeated."""
-    radius = int(3 * SMOOTHING)
-    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / SMOOTHING) ** 2)
-    values = weight.cpu().numpy()
-    for axis in (0, 1):
-        values = correlate1d(values, taps / taps.sum(), axis=axis, mode="nearest")
+    values = gaussian_filter(weight.cpu().numpy(), SMOOTHING, mode="nearest", truncate=3.0)
     return torch.from_numpy(values).to(weight.device)
 
 

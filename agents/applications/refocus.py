@@ -7,7 +7,6 @@ stays in focus, and has nothing blurred before it, keeps its pixels as they were
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -21,7 +20,7 @@ from agents.applications.hdr import import_openexr
 from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage, defocus
 from simulator.optics.thin_lens import SHARP
 from simulator.training.scenes import fill_from_nearest
-from simulator.utils.checks import check_word
+from simulator.utils.checks import check_number, check_word
 
 #: The numbers of a depth map: distances, or inverse distances.
 DepthKind = Literal["distance", "disparity"]
@@ -50,7 +49,6 @@ def refocus(
     cannot see blur below about 1.5 pixels: a picture that is sharp throughout stays as it is.
 
     Args:
-        raw: The photograph.
         f_number: As marked, at most the raw's own; down to 0.5.
         depth: Distances from the lens [m], (H, W) or (2H, 2W) for a raw of H x W packed pixels;
             inf allowed. None estimates the blur.
@@ -65,9 +63,8 @@ def refocus(
         confusion at `f_number` [packed pixel].
 
     Raises:
-        ValueError: If the aperture closes, if `depth` and `lens` do not come together or do not
-            fit `raw`, if the camera's pixel pitch is needed and not known, or if neither depth nor
-            networks are there; before any work.
+        ValueError: Before any work, if the aperture closes, if `depth` and `lens` do not come
+            together or fit `raw`, or if pixel pitch or networks are needed and missing.
     """
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
@@ -139,8 +136,8 @@ def read_depth(
     """Distances from the lens, of a depth camera's, a stereo matcher's or a network's file.
 
     Args:
-        path: A PNG of one channel (8 or 16 bit), an EXR (channel Z, Y or R) or a ``.npy`` array
-            (H, W).
+        path: A PNG of one channel (8 or 16 bit), an EXR (channel Z, Y or R; an `ImportError` if
+            OpenEXR is not installed) or a ``.npy`` array (H, W).
         kind: ``"disparity"`` where larger numbers are nearer: 1 / metres, times a constant.
         scale: Metres for each unit, or 1 / metres for each unit of disparity. By default
             a PNG of distances is in millimetres, an EXR or ``.npy`` in metres; a disparity has
@@ -151,18 +148,14 @@ def read_depth(
         negative elsewhere; 0 is infinitely far in a disparity of floats), the nearest pixel's.
 
     Raises:
-        ImportError: If an EXR is given and OpenEXR is not installed.
         ValueError: If the file is no such map, or `kind` or `scale` is wrong.
     """
     path = Path(path)
     check_word("kind", kind, get_args(DepthKind))
-    if scale is not None and not 0.0 < scale < math.inf:
-        raise ValueError(f"`scale` (={scale!r}) must be finite and > 0")
-    if scale is None and kind == "disparity":
-        raise ValueError("`scale` (=None) must be given for a disparity: 1 / metres for each unit")
+    if scale is not None or kind == "disparity":
+        unit = "1 / metres" if kind == "disparity" else "metres"
+        check_number("scale", scale, 1e-12, 1e12, more=f": {unit} for each unit")
     values = _read_map(path)
-    if values.ndim != 2 or not values.size:
-        raise ValueError(f"`depth` (={str(path)!r}, shape {values.shape}) must be one map (H, W)")
     of_png = path.suffix.lower() == ".png"
     zero_counts = kind == "disparity" and not of_png  # infinitely far
     known = np.isfinite(values) & ((values > 0) | ((values == 0) & zero_counts))
@@ -176,27 +169,27 @@ def read_depth(
 
 
 def _read_map(path: Path) -> np.ndarray:
-    """The numbers of a file, float64."""
-    if path.suffix.lower() not in (".png", ".exr", ".npy"):
-        raise ValueError(f"`depth` (={str(path)!r}) must end in .png, .exr or .npy")
+    """The map (H, W) of numbers in a file, float64."""
     try:
         match path.suffix.lower():
             case ".png":
                 with Image.open(path, formats=["PNG"]) as picture:
-                    if picture.mode not in ("L", "I;16", "I;16B", "I"):
-                        raise ValueError(f"{picture.mode}, not one channel of 8 or 16 bit")
-                    values = np.asarray(picture)
+                    # Indices into a palette would look like a map.
+                    values = np.asarray(picture.convert() if picture.mode == "P" else picture)
             case ".npy":
-                values = np.load(path, allow_pickle=False)
-                if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif":
-                    raise ValueError("not one array of numbers")
-            case _:
+                values = np.asarray(np.load(path, allow_pickle=False))
+            case ".exr":
                 with import_openexr().File(str(path), separate_channels=True) as file:
                     channels = {name: channel.pixels for name, channel in file.channels().items()}
                 found = [channels[name] for name in ("Z", "Y", "R") if name in channels]
-                if not found:
-                    raise ValueError(f"channels {sorted(channels)}, none of Z, Y and R")
-                values = found[0]
+                values = found[0] if found else np.empty(0)
+            case _:
+                raise ValueError("the file must end in .png, .exr or .npy")
+        if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
+            raise ValueError(
+                "the file must hold one map (H, W) of numbers: a PNG of one channel, an EXR with a "
+                "channel Z, Y or R, or an array"
+            )
     except (OSError, SyntaxError, RuntimeError, EOFError, ValueError) as error:
         raise ValueError(f"`depth` (={str(path)!r}) cannot be read: {error}") from error
     return np.asarray(values, np.float64)

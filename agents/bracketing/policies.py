@@ -22,7 +22,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.merging import LOG_FLOOR, SATURATED, WORST_EV, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
 from ae_env.tasks import FRAME_GAP
-from agents.policy import Observations, Policy, PolicyContext
+from agents.policy import Bools, BracketLimits, Floats, Ints, Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
 from simulator.camera import CameraProfile
 from simulator.radiance.light import WHITE_SIGNAL
@@ -31,8 +31,6 @@ from simulator.utils.checks import check_flag, check_number
 if TYPE_CHECKING:
     import gymnasium as gym
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Centres of the bins of log2 luminance, relative to the EV100 of the viewfinder's frame.
 BINS = np.arange(-16.0, 16.0, 0.5)
@@ -54,24 +52,11 @@ class Schedules:
     Luminance is in units of that which makes an exposure at EV100 0 white. A schedule has `states`
     (M, K), -1 for none, each `counts` times (M, S), so many `frames` (M,), the `longest` of so long
     (M,) [s]; the first is no frame at all.
-
-    Args:
-        grid: The states.
-        camera: The body, whose noise is known.
-        budget: Time of all frames together [s].
-        max_frames: Frames of a schedule at most.
-        box_factor: Photosites averaged a side into one pixel.
     """
 
-    def __init__(
-        self,
-        grid: ExposureGrid,
-        camera: CameraProfile,
-        budget: float,
-        max_frames: int,
-        box_factor: int,
-    ) -> None:
-        self.grid, self.budget, self.max_frames = grid, budget, max_frames
+    def __init__(self, grid: ExposureGrid, camera: CameraProfile, limits: BracketLimits) -> None:
+        self.grid, self.limits = grid, limits
+        budget, max_frames, box_factor = limits
         self._exposures = exposures = np.array([s.exposure_time for s in grid])
         found = [(-1,) * max_frames]
         for count in range(1, max_frames + 1):
@@ -119,11 +104,8 @@ class Schedules:
     def errors(self, reference: float, floor: float, light: Floats, blur: Floats) -> Floats:
         """(M,) expected error of each schedule over all samples [EV].
 
-        Args:
-            reference: EV100 that `BINS` are relative to.
-            floor: log2 of the luminance below which errors count less.
-            light: (L,) share of the samples in each of `BINS`.
-            blur: (S,) error that the blur of each state makes [EV].
+        `light` (L,) are the shares of the samples in `BINS`, which are relative to `reference`;
+        `blur` (S,) is the error that the blur of each state makes [EV].
         """
         noise = self.noise_error(reference, floor)
         if not blur.any():
@@ -134,7 +116,7 @@ class Schedules:
         both = np.where(noise < WORST_EV, np.hypot(noise, merged), noise)
         return np.minimum(both, WORST_EV) @ light.astype(np.float32)
 
-    def completions(self, taken: Ints, time_left: float) -> NDArray[np.bool_]:
+    def completions(self, taken: Ints, time_left: float) -> Bools:
         """(M,) bool: schedules that hold the states `taken` and fit into the `time_left` [s]."""
         counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
         more = self.frames - len(taken)
@@ -181,10 +163,7 @@ class Bracketing(Policy):
         space = context.observation_space
         if space["raw"].dtype != np.uint8 or "histogram" in space.spaces:
             raise ValueError("bracketing policies need `observation`='uint8'")
-        limits = context.bracket
-        self.schedules = Schedules(
-            context.grid, context.camera, limits.budget, limits.max_frames, limits.box_factor
-        )
+        self.schedules = Schedules(context.grid, context.camera, context.bracket)
         self.stop = len(context.grid)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
@@ -234,12 +213,10 @@ class Bracketing(Policy):
         luminance, known = (part.flatten().double().numpy() for part in (light, precision))
         return luminance / scale, known * scale**2, limit
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> Ints:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """The next frame's state for each camera, or to stop."""
         self.observe(observations)
-        left = np.asarray(observations["bracket"][:, 0], np.float64) * self.schedules.budget
+        left = np.asarray(observations["bracket"][:, 0], np.float64) * self.schedules.limits.budget
         speeds = np.zeros(self.num_envs)
         if "sensors" in observations:
             speeds = decode_sensors(observations["sensors"])[0]
@@ -258,11 +235,9 @@ class Bracketing(Policy):
 
 
 class FixedBracket(Bracketing):
-    """The meter's exposure and as many stops above and below it, at the lowest ISO that fits.
+    """The meter's exposure and `step` stops above and below it, at the lowest ISO that fits.
 
-    Args:
-        context: The camera.
-        step: Stops from frame to frame; 0 takes the metered frame alone.
+    With a step of 0, the metered frame alone.
     """
 
     def __init__(self, context: PolicyContext, step: float = 2.0) -> None:
@@ -274,10 +249,8 @@ class FixedBracket(Bracketing):
         """The next of the frames."""
         count = len(self.taken(camera))
         steps = np.array([0.0, 1.0, -1.0] if self.step else [0.0])
-        wanted = (self._reference[camera] + self.step * steps)[: self.schedules.max_frames]
-        if count >= len(wanted):
-            return self.stop
-        return int(self._plan(wanted)[count])
+        wanted = (self._reference[camera] + self.step * steps)[: self.schedules.limits.max_frames]
+        return self.stop if count >= len(wanted) else int(self._plan(wanted)[count])
 
     def _plan(self, wanted: Floats) -> Ints:
         """States within half a stop of the EV100 `wanted`, at the lowest ISO, that fit."""
@@ -288,7 +261,7 @@ class FixedBracket(Bracketing):
         for longest in reversed(grid.exposure_times):
             chosen: Ints = np.where(times <= longest, off, np.inf).argmin(axis=1)
             gaps = FRAME_GAP * (len(chosen) - 1)
-            if times[chosen].sum() + gaps <= self.schedules.budget:
+            if times[chosen].sum() + gaps <= self.schedules.limits.budget:
                 break
         return chosen
 
@@ -299,12 +272,8 @@ class Hasinoff(Bracketing):
     Of all schedules that fit into the time, the one whose merged signal-to-noise ratio is largest
     where it is smallest over the range of the scene's light (Hasinoff et al., CVPR 2010). The range
     is that of the viewfinder's frame; where that is clipped it reaches `headroom` above white. The
-    schedule knows no motion, so exposures are at most `longest`.
-
-    Args:
-        context: The camera.
-        headroom: Stops; None: `fit` finds it on training scenes.
-        longest: Longest exposure time [s]; None likewise.
+    schedule knows no motion, so exposures are at most `longest` [s]. `fit` finds what is None on
+    training scenes.
     """
 
     def __init__(
@@ -378,7 +347,7 @@ class Hasinoff(Bracketing):
 def describe(
     light: Floats, precision: Floats, limit: float, reference: float
 ) -> NDArray[np.float32]:
-    """(3, L) histograms over `BINS`: of clear samples, of white ones, of those in the noise.
+    """(3, L) histograms of clear samples, of white ones, of those in the noise.
 
     White samples count where they begin, at `limit`; those in the noise at the noise. See
     `Bracketing.merged`; `BINS` are relative to `reference` [EV100].
@@ -396,9 +365,7 @@ def describe(
 class Planner(Bracketing):
     """Takes the frame that the best schedule for the light begins with, planned again each frame.
 
-    Args:
-        context: The camera.
-        blur: Whether the error of motion blur (`blur_error`) is added to that of noise.
+    With `blur`, the error of motion blur (`blur_error`) is added to that of noise.
     """
 
     def __init__(self, context: PolicyContext, blur: bool = True) -> None:
@@ -441,15 +408,12 @@ def run_brackets(
     most: int | None = None,
     name: str | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Episodes of each scene of `envs` (autoreset mode DISABLED), driven by `policy`.
+    """`count` episodes of each scene of `envs`, of autoreset mode DISABLED, driven by `policy`.
 
     Args:
-        policy: The policy.
+        policy, name: The policy, and its name in errors; by default its own.
         envs: Environments of `ExposureBracket-v0`.
-        count: Episodes of each scene.
-        seed: Of the first.
-        most: Use so many scenes at most.
-        name: The policy's name in errors; by default its own.
+        count, seed, most: See `RolloutPlan.of_each_scene`.
 
     Returns:
         ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each

@@ -166,37 +166,34 @@ def scene_files(scenes: Any, on_error: str) -> Any:
         return scenes
     from ae_env.scenes.recorded import RecordedOptions
 
-    if RecordedOptions.of(scenes) is not None:
-        raise ValueError(
-            f"`on-error` (={on_error!r}) must be 'stop' for recorded grids: take captures that "
-            "cannot be read out of the folder, and their states are forbidden"
-        )
-    given = scenes if isinstance(scenes, Mapping) else {"path": scenes}
-    return {**given, "on_error": on_error}
+    rule = None
+    if scenes is None:
+        rule = "is about the files of --scenes: give that, too"
+    elif RecordedOptions.of(scenes) is not None:
+        rule = "must be 'stop' for recorded grids: take captures that cannot be read out of the "
+        rule += "folder, and their states are forbidden"
+    if rule is not None:
+        raise ValueError(f"`on-error` (={on_error!r}) {rule}")
+    return {"path": scenes, "on_error": on_error}
 
 
 def make_folder(
     path: Path, *, name: str = "out", file: Path | None = None, make: bool = True
 ) -> None:
-    """Makes a folder for results, before any work is done.
+    """Makes a folder for results, or checks that it could be made, before any work is done.
 
-    Args:
-        path: The folder.
-        name: The option that names it, or names `file` in it.
-        file: The file.
-        make: False only checks that it could be made.
-
-    Raises:
-        ValueError: If nothing can be written there.
+    `name` is the option that names it, or `file` in it; raises if nothing can be written there.
     """
-    given = f"`{name}` (={str(file or path)!r})"
+    given, rule = f"`{name}` (={str(file or path)!r})", None
     try:
         existing = next(p for p in (path, *path.parents) if p.exists())
         if not existing.is_dir():
             wanted = "be" if file is None else "lie in"
-            raise ValueError(f"{given} must {wanted} a folder, but {existing} is a file")
-        if file is not None and file.is_dir():
-            raise ValueError(f"{given} must be a file, but it is a folder")
+            rule = f"must {wanted} a folder, but {existing} is a file"
+        elif file is not None and file.is_dir():
+            rule = "must be a file, but it is a folder"
+        if rule is not None:
+            raise ValueError(f"{given} {rule}")
         with tempfile.TemporaryFile(dir=existing):
             pass
         if make:
@@ -208,21 +205,19 @@ def make_folder(
 def check_outputs(*read: Path | None, **files: tuple[Path | None, str]) -> None:
     """Checks that files have their endings, are none that is read, and can be written.
 
-    It makes nothing: whoever writes a file makes its folder, and an error before leaves none.
-
-    Args:
-        read: Files that are read, the raw first.
-        files: By the name of the option, the file or None, and its ending.
+    `read` are files that are read, the raw first; `files`, by the name of the option, have their
+    endings. It makes nothing: whoever writes a file makes its folder, and an error leaves none.
     """
+    names = ("the raw itself", "a file that is read")
     for name, (path, suffix) in files.items():
         if path is None:
             continue
-        if path.suffix.lower() != suffix:
-            raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
-        for i, own in enumerate(read):
+        rules = [] if path.suffix.lower() == suffix else [f"must end in {suffix}"]
+        for own, what in zip(read, names, strict=False):
             if own is not None and path.resolve() == own.resolve():
-                what = "the raw itself" if i == 0 else "a file that is read"
-                raise ValueError(f"`{name}` (={str(path)!r}) must not be {what}")
+                rules.append(f"must not be {what}")
+        if rules:
+            raise ValueError(f"`{name}` (={str(path)!r}) {rules[0]}")
         make_folder(path.parent, name=name, file=path, make=False)
 
 

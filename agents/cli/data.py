@@ -186,9 +186,7 @@ def score_tables(
     print_files({"score tables": out / "tables-*.parquet"})
 
 
-def cache(
-    clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = False,
-) -> None:
+def cache(clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = False) -> None:
     """Show what is cached between runs (scenes, networks' outputs), or clear it.
 
     Example: `ae-env cache --clear`; the folder is another one where AE_ENV_CACHE names it.
@@ -235,12 +233,13 @@ def _play(name: str, arguments: dict[str, Any]) -> None:
     import gymnasium as gym
     import numpy as np
 
-    envs = gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)
-    list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
-    envs.reset(seed=0)
-    for _ in range(4):
-        envs.step(np.arange(16))
-    envs.close()
+    from agents.rollouts import scenes_of
+
+    with closing(gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)) as envs:
+        scenes_of(envs)  # draws every one
+        envs.reset(seed=0)
+        for _ in range(4):
+            envs.step(np.arange(16))
 
 
 def _use_rest() -> None:

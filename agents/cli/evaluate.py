@@ -101,22 +101,17 @@ def evaluate(
     """
     options = (*_ENVIRONMENT, *_CONDITION, *_EPISODES)
     given = {name: context.params[name] for name in options if context.params[name] is not None}
-    if scenes is not None:
-        given["scenes"] = console.scene_files(scenes, on_error)
-    elif on_error != "stop":
-        raise ValueError(
-            f"`on-error` (={on_error!r}) is about the files of --scenes: give that, too"
-        )
+    found = console.scene_files(scenes, on_error)
+    given |= {} if found is None else {"scenes": found}
     device = console.torch_device(device)
     plan = make_plan(preset, env, policy or [], given)
     if append is not None:
+        rule = None if append.parent.is_dir() else f"fails: there is no folder {append.parent}"
         if plan.hash is None:
-            raise ValueError(
-                f"`append` (={str(append)!r}) takes the results of a benchmark only: give "
-                "--preset ae_bench_v2_still, _video or _bracket"
-            )
-        if not append.parent.is_dir():
-            raise ValueError(f"`append` (={str(append)!r}): there is no folder {append.parent}")
+            rule = "takes the results of a benchmark only: give --preset ae_bench_v2_still, _video "
+            rule += "or _bracket"
+        if rule is not None:
+            raise ValueError(f"`append` (={str(append)!r}) {rule}")
         console.make_folder(append.parent, name="append", file=append)
     elif author:
         raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
@@ -124,12 +119,7 @@ def evaluate(
 
 
 def _run(
-    plan: EvaluationPlan,
-    out: Path,
-    append: Path | None,
-    author: str,
-    workers: int | None,
-    device: str,
+    plan: EvaluationPlan, out: Path, append: Path | None, author: str, workers: Any, device: str
 ) -> None:
     from agents.evaluation.jobs import Jobs
     from agents.evaluation.plan import plan_scenes

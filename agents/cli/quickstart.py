@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -46,7 +47,7 @@ def quickstart(
     from agents.evaluation.engine import evaluate, fit_policies
     from agents.evaluation.plan import MAX_SEED
     from agents.report.evaluation import write_report
-    from agents.rollouts import make_envs, training_arguments
+    from agents.rollouts import make_envs, scenes_of, training_arguments
     from simulator.utils.checks import check_integer
 
     console.make_folder(out)
@@ -59,11 +60,10 @@ def quickstart(
     with console.progress_bars() as progress:
         # Scenes and compiled code into their caches, before processes share the trainings.
         with progress("scenes") as task:
-            envs = make_envs(environment, num_envs=1, frames=1)
-            found = list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
-            envs.reset(seed=seed)
-            envs.close()
-            task(1, 1, f"{len(found)} to learn from")
+            with closing(make_envs(environment, num_envs=1, frames=1)) as envs:
+                count = len(scenes_of(envs))  # draws every one
+                envs.reset(seed=seed)
+            task(1, 1, f"{count} to learn from")
         agents = _train(environment, out, seed, progress, device)
         policies = _policies(unseen, agents, device)
         with progress("light meters learn their programs") as task:
@@ -74,9 +74,8 @@ def quickstart(
             )
     commands = next_commands(scenes, out, agents, on_error)
     meta = {"trained_on": learnt["scenes"], "zero_shot": zero_shot}
-    written = write_report(
-        result, out, command=console.command_line(), next_commands=commands, extra_meta=meta
-    )
+    more: dict[str, Any] = {"next_commands": commands, "extra_meta": meta}
+    written = write_report(result, out, command=console.command_line(), **more)
     if zero_shot:
         print_line(f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes")
     print_scores(result)
@@ -102,11 +101,7 @@ def _train(
         jobs.append(TrainingJob(name, config, out / "agents" / name, device))
     with progress("training regression") as first, progress("training PPO") as second:
         tasks = {"regression": first, "ppo": second}
-
-        def report(name: str, done: int, total: int, values: dict[str, float]) -> None:
-            tasks[name](done, total, values)
-
-        train_in_parallel(jobs, progress=report)
+        train_in_parallel(jobs, progress=lambda name, *values: tasks[name](*values))
         for task in tasks.values():
             task(1, 1)
     return {job.name: job.out for job in jobs}
@@ -119,9 +114,8 @@ def _policies(
     from agents.policy_names import make_policy
     from agents.rollouts import make_envs
 
-    envs = make_envs(environment, num_envs=1, frames=1)
-    context = PolicyContext.from_envs(envs)
-    envs.close()
+    with closing(make_envs(environment, num_envs=1, frames=1)) as envs:
+        context = PolicyContext.from_envs(envs)
     learnt = {name: f"{name}:{path}" for name, path in agents.items()}
     names = {name: name for name in BASELINES[:-1]} | learnt | {"oracle": "oracle"}
     return {name: make_policy(own, context, device=device) for name, own in names.items()}

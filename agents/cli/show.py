@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -101,16 +101,10 @@ def film(
 
     console.check_outputs(out=(out, ".gif"))
     check_word("light", light, (*MOVES, *KIND_SETS))
-    envs = gym.make_vec(
-        "ae_env/AutoExposureVideo-v0",
-        num_envs=1,
-        scenes=scenes,
-        split="test",
-        lighting={"kind": "moving", "kinds": light},
-        max_episode_steps=frames + 1,
-        render_mode="rgb_array",
-        with_oracle=True,
-    )
+    options: dict[str, Any] = {"scenes": scenes, "split": "test", "max_episode_steps": frames + 1}
+    options |= {"lighting": {"kind": "moving", "kinds": light}, "with_oracle": True}
+    options["render_mode"] = "rgb_array"
+    envs = gym.make_vec("ae_env/AutoExposureVideo-v0", num_envs=1, **options)
     with closing(envs), progress_bars() as progress:
         if scene is not None:
             check_word("scene", scene, tuple(one.scene_id for one in scenes_of(envs)))

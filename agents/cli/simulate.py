@@ -250,9 +250,8 @@ def _lens(
     from simulator.utils.checks import check_number
 
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length
-    if millimetres is None:
-        raise ValueError("`focal-length` (=None) must be given: the file does not say it")
-    millimetres = check_number("focal-length", float(millimetres), 1e-3, 1e6, more=" mm")
+    more = " mm; the file does not say it" if focal_length is None else " mm"
+    millimetres = check_number("focal-length", millimetres, 1e-3, 1e6, more=more)
     with console.option_names(focus_distance="focus", focal_length="focal-length"):
         return Lens(millimetres / 1000.0, _focus_distance(focus, metres))
 
@@ -263,10 +262,8 @@ def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
 
     height, width = metres.shape
     if focus is None:
-        rows, columns = (
-            slice(n * 9 // 20, max(n * 11 // 20, n * 9 // 20 + 1)) for n in (height, width)
-        )
-        return float(np.median(metres[rows, columns]))
+        middle = [slice(n * 9 // 20, max(n * 11 // 20, n * 9 // 20 + 1)) for n in metres.shape]
+        return float(np.median(metres[tuple(middle)]))
     with suppress(ValueError):  # no numbers
         match [float(number) for number in focus.split(",")]:
             case [distance] if distance > 0.0:

@@ -82,9 +82,10 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from ae_env.utils.user_files import find_config
-    from simulator.training.train import first_modules, load_config, train_and_save
+    from simulator.training.train import SimulatorConfig, first_modules, train_and_save
+    from simulator.utils.config_file import load_yaml
 
-    training = load_config(find_config(config))
+    training = load_yaml(find_config(config), SimulatorConfig)
     if seed is not None:
         training = training.model_copy(update={"seed": seed})
     if training.start is not None:
@@ -145,10 +146,8 @@ def export(
     seen, grid = card["context"], trained_grid(card)
     states = {n: list(getattr(grid, n)) for n in ("isos", "exposure_times", "f_numbers")}
     options = {"resolution": seen["resolution"][-1], "sensors": seen["sensors"], "grid": states}
-    envs = gym.make_vec(
-        "ae_env:ae_env/AutoExposure-v0", num_envs=1, scenes="bundled:small", **options
-    )
-    with contextlib.closing(envs):
+    task = "ae_env:ae_env/AutoExposure-v0"
+    with contextlib.closing(gym.make_vec(task, scenes="bundled:small", **options)) as envs:
         agent = make_policy(name, PolicyContext.from_envs(envs))
     file = export_agent(agent, out)
     controller = Controller(file)

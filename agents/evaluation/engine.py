@@ -81,8 +81,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Run every policy over the same episodes, from starts that are drawn.
 
-    The reset frame does not count; frames are counted after each action. Scores are always the
-    expected scores q, whatever the environment's reward.
+    Frames are counted after each action. Scores are always the expected scores q, whatever the
+    environment's reward.
 
     Args:
         policies: By name in the tables; a list holds the same agent from several training seeds.
@@ -178,13 +178,9 @@ class TrainedPolicy:
 
 
 class EvaluationRun:
-    """A plan with its scenes and episodes; a context manager that closes its environments.
+    """A plan with its scenes, loaded by default, and episodes; closes its environments at the end.
 
-    Args:
-        plan: The plan.
-        scenes: Those of the plan; loaded by default.
-        device: Torch device of a learnt agent's network.
-        batch: Episodes of frames at a time, at most.
+    `device` is that of a learnt agent's network, `batch` the most episodes of frames at a time.
     """
 
     def __init__(
@@ -238,10 +234,7 @@ class EvaluationRun:
     def _make_envs(
         self, condition: Condition, num_envs: int, frames: int, *, scored: bool = False
     ) -> VectorEnv:
-        """Environments of a condition.
-
-        Only those that are `scored` have the plan's scorer: policies see environments without.
-        """
+        """Environments of a condition; policies see those without the plan's scorer."""
         if condition.budget is not None:
             return self._make_brackets(condition, scenes=self.scenes, split="all")
         unused = ("costs",) if scored else ("costs", "reward")
@@ -313,17 +306,10 @@ class EvaluationRun:
     def run_policy(
         self, name: str, policy: Policy, condition: Condition, light: Arrays, report: Report
     ) -> Track:
-        """Runs `policy`, which is fitted, through all episodes of `condition`.
+        """The track of `policy`, which is fitted, through all episodes of `condition`.
 
-        Args:
-            name: The policy's name in errors.
-            policy: The policy.
-            condition: Light and delay, or budget.
-            light: What `score_light` returns; only a privileged policy needs it.
-            report: Called with the frames done since the last call.
-
-        Returns:
-            The track, with ``start_states`` (1, E), the states of the reset frames.
+        Its arrays have ``start_states`` (1, E), the states of the reset frames, besides. `name` is
+        the policy's in errors; only a privileged one needs `light`, which `score_light` returns.
         """
         if condition.budget is not None:
             return self._run_brackets(name, policy, condition, report)
@@ -371,9 +357,7 @@ class EvaluationRun:
     def result(
         self, condition: Condition, light: Arrays, tracks: Mapping[TrainedPolicy, Track]
     ) -> EvaluationResult:
-        """Everything measured in `condition`: what `score_light` (empty for brackets) and
-        `run_policy` returned.
-        """
+        """What `score_light` (nothing for brackets) and `run_policy` measured in `condition`."""
         scenes = [self.scenes[i] for i in self.episodes.scene]
         table = np.arange(len(scenes)) % max(self.num_tables, 1)
         known: dict[str, Any] = {name: values[table] for name, values in light.items()}
@@ -418,12 +402,12 @@ def fit_policies(
         batch: Episodes at a time.
         progress: Called before and after each fit.
     """
-    learners = {name: policy for name, policy in policies.items() if _learns(policy)}
+    learners = [(name, policy) for name, policy in policies.items() if _learns(policy)]
     if not learners:
         return
     report = progress or (lambda *_: None)
     with closing(_training_envs(env_options, batch)) as envs:
-        for i, (name, policy) in enumerate(learners.items()):
+        for i, (name, policy) in enumerate(learners):
             report(i, len(learners), name)
             with errors_of(name, "fit"):
                 policy.fit(envs, seed)
@@ -450,14 +434,8 @@ def run_batch(
 ) -> Arrays:
     """Run one policy over one batch of episodes, which `envs` are freshly reset to.
 
-    Args:
-        name: The policy's name in errors.
-        policy: The policy.
-        envs: The environments.
-        batch: The episodes.
-        frames: Actions.
-        oracle: (N, frames + 1) best state of every frame, the reset frame first, which a privileged
-            policy's ``info`` gets.
+    A privileged policy's ``info`` gets `oracle`, (N, frames + 1), the best state of every frame,
+    the reset frame first.
 
     Returns:
         The arrays of a `Track` without their leading axis, of the valid episodes, and their
@@ -467,7 +445,7 @@ def run_batch(
     with errors_of(name, "reset"):
         policy.reset(envs.num_envs, seed=batch.seed)
     observations, info, masks = batch.observations, batch.info, batch.action_masks
-    start = np.array(info["state"], dtype=np.int64)
+    start = np.array(info["state"], dtype=np.int64)[batch.valid]
     seen: dict[str, list[NDArray[Any]]] = {}
     seconds = []
     for frame in range(frames):
@@ -493,7 +471,7 @@ def run_batch(
             seen.setdefault(key, []).append(value)
     return {
         **{key: np.stack(values, axis=1)[batch.valid] for key, values in seen.items()},
-        "start_states": start[batch.valid],
+        "start_states": start,
         "seconds": np.array(seconds),
     }
 
@@ -558,8 +536,7 @@ def best_states(scores: NDArray[np.float64], allowed: NDArray[np.bool_]) -> Ints
     2
     """
     known = np.where(allowed, scores, -np.inf)
-    best: Ints = np.argmax(known >= known.max(axis=-1, keepdims=True) - TIE, axis=-1)
-    return best
+    return np.argmax(known >= known.max(axis=-1, keepdims=True) - TIE, axis=-1)
 
 
 def batch_size(count: int, most: int = BATCH) -> int:

@@ -26,14 +26,9 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its percentile-bootstrap interval.
+    """An estimate from all groups and training seeds with its percentile-bootstrap interval.
 
-    Args:
-        value: The estimate from all groups and seeds.
-        low: Lower end, None below 15 groups.
-        high: Upper end, None below 15 groups.
-        num_groups: Source groups.
-        num_seeds: Training seeds (1 where there is nothing to train).
+    Below 15 source groups the ends are None.
     """
 
     value: float
@@ -73,14 +68,7 @@ def difference_interval(
     """Paired difference of two policies' normalised scores and its interval.
 
     Both policies are evaluated on the same groups, which are resampled together; the training
-    seeds of each are resampled on their own.
-
-    Args:
-        gains: ``q - q_random`` of the first policy, ``(K1, G)`` or ``(G,)``.
-        other: The same of the second policy, ``(K2, G)`` or ``(G,)``.
-        span: ``q_oracle - q_random`` per source group, ``(G,)``.
-        resamples: Number of resamples.
-        seed: Seed of the resampling.
+    seeds of each are resampled on their own. Arguments are those of `score_interval`.
     """
     first, second, groups = np.atleast_2d(gains), np.atleast_2d(other), len(span)
     value = float((first.mean(0) - second.mean(0)).sum() / span.sum())
@@ -101,9 +89,7 @@ def _group_weights(groups: int, resamples: int, seed: int) -> Floats:
     """How often each group is drawn, ``(R, G)``; the same for all that are compared."""
     rng = np.random.default_rng(seed)
     weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)
-    found = weights.astype(np.float64)
-    found.setflags(write=False)
-    return found
+    return weights.astype(np.float64)
 
 
 def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Floats:
@@ -113,8 +99,7 @@ def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Flo
     if count == 1:
         return sums[:, 0]
     drawn = rng.multinomial(count, np.full(count, 1 / count), size=len(weights)) / count
-    totals: Floats = (sums * drawn).sum(axis=1)
-    return totals
+    return (sums * drawn).sum(axis=1)
 
 
 # -- ranking --------------------------------------------------------------------------------------
@@ -130,10 +115,7 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
     2008). A tier begins with the best policy that is left, and has those below it that are not
     significantly worse than that one.
 
-    Args:
-        gains: ``q - q_random`` by policy, ``(K, G)`` per training seed and source group.
-        span: ``q_oracle - q_random`` per source group, ``(G,)``.
-        resamples: Number of resamples.
+    Arguments are those of `score_interval`, gains by policy.
 
     Returns:
         A row for each policy: its ``place``, ``policy``, its ``tier`` (1 for the best; None below

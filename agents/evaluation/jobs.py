@@ -57,9 +57,9 @@ _MAX_NEIGHBOURS = 200
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work for one process, and about the time that it takes [ms].
+    """Work for one process, of about `cost` ms.
 
-    It scores the light of one condition, or runs a policy in all conditions of one delay or budget.
+    The light of one condition is scored, or a policy is run in all of one delay or budget.
     """
 
     conditions: tuple[str, ...]
@@ -105,11 +105,7 @@ class Jobs(EvaluationRun):
 
     @cached_property
     def privileged(self) -> dict[TrainedPolicy, bool]:
-        """Whether each policy is told the best states.
-
-        Raises:
-            ValueError: If a policy is unknown, or does not fit the environment of some condition.
-        """
+        """Whether each policy is told the best states; raises where one cannot be made."""
         conditions = self.plan.all_conditions
         return {
             trained: bool(getattr(self.make(trained, conditions[names[0]]), "privileged", False))
@@ -161,9 +157,7 @@ class Jobs(EvaluationRun):
         return results
 
     def _left(self) -> list[Job]:
-        """The jobs that are left: light first, and the longest first of each, so that processes end
-        at about the same time.
-        """
+        """Jobs that are left: light first; of each the longest first, so that all end together."""
         conditions, frames = self.plan.all_conditions, self.plan.frames
         lights: dict[str, str] = {}
         for name, condition in conditions.items() if self.num_tables else ():
@@ -292,11 +286,7 @@ def scene_content(scenes: Sequence[Scene]) -> list[Any]:
 
 
 def file_content(spec: Any) -> list[str]:
-    """Hashes of the files that a scorer's or a lighting's specification names.
-
-    Args:
-        spec: A name, or a mapping of names to weights or from options to files.
-    """
+    """Hashes of the files that a scorer's or a lighting's specification, name or mapping, names."""
     names = [*spec, *spec.values()] if isinstance(spec, Mapping) else [spec]
     return [policy_content(name) for name in names if isinstance(name, str)]
 
@@ -305,10 +295,7 @@ def policy_content(name: str) -> str:
     """Hash of the files that decide a policy: its module, weights and folders; "" without any.
 
     With a Python file, all others of its folder count, since it may import them; data that it reads
-    is not known.
-
-    Args:
-        name: As `agents.make_policy` takes it; the name of a scorer or a file works as well.
+    is not known. The name of a scorer or a file works as well.
     """
     base, options = split_options(name)
     files = _own_files(base) or _named_files(base)

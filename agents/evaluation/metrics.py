@@ -1,7 +1,9 @@
 """The metrics of a policy: pure functions of scores, states and exposure values.
 
 Axes: ``S`` states of the grid, ``T`` frames of an episode, ``E`` episodes; leading axes broadcast.
-All scores are expected scores q, never those of one noisy capture.
+`scores` and `allowed`, the action masks, are ``(..., T, S)``; `states` ``(..., T)``; `ev100`
+``(S,)``; `evs`, EV100 of the start state and after each action, ``(..., T + 1)``. All scores are
+expected scores q, never those of one noisy capture.
 """
 
 from __future__ import annotations
@@ -25,11 +27,7 @@ MIN_REST = 4
 
 
 def score_of(scores: Floats, states: Ints) -> Floats:
-    """q of the chosen states.
-
-    Args:
-        scores: ``(..., T, S)``.
-        states: ``(..., T)`` indices; leading axes broadcast against those of `scores`.
+    """q of the chosen states, ``(..., T)``; leading axes broadcast.
 
     >>> score_of(np.array([[0.1, 0.9], [0.3, 0.2]]), np.array([1, 0])).tolist()
     [0.9, 0.3]
@@ -41,8 +39,7 @@ def score_of(scores: Floats, states: Ints) -> Floats:
 
 def oracle_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
     """Best q among the allowed states, ``(..., T)``."""
-    best: Floats = np.where(allowed, scores, -np.inf).max(axis=-1)
-    return best
+    return np.where(allowed, scores, -np.inf).max(axis=-1)
 
 
 def random_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
@@ -51,8 +48,7 @@ def random_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
     >>> random_score(np.array([0.0, 1.0, 0.5]), np.array([True, False, True])).tolist()
     0.25
     """
-    mean: Floats = np.where(allowed, scores, 0.0).sum(axis=-1) / allowed.sum(axis=-1)
-    return mean
+    return np.where(allowed, scores, 0.0).sum(axis=-1) / allowed.sum(axis=-1)
 
 
 def regret_given_ev(
@@ -62,17 +58,9 @@ def regret_given_ev(
 
     Best q among the allowed states whose EV100 is that of the chosen one (within 1/6 EV), minus q
     of the chosen: what is lost between ISO, shutter and aperture, not through the brightness.
-
-    Args:
-        scores: ``(..., T, S)``.
-        states: ``(..., T)``.
-        ev100: EV100 of every state, ``(S,)``.
-        allowed: Action masks, broadcastable to `scores`.
     """
     same = np.abs(ev100 - ev100[states][..., None]) < SAME_EV
-    best: Floats = np.where(same & allowed, scores, -np.inf).max(axis=-1)
-    best -= score_of(scores, states)
-    return best
+    return oracle_score(scores, same & allowed) - score_of(scores, states)
 
 
 def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bool_]) -> Floats:
@@ -82,8 +70,7 @@ def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bo
     """
     good = (scores >= oracle_score(scores, allowed)[..., None] - NEAR_BEST) & allowed
     distance = np.abs(ev100 - ev100[states][..., None])
-    error: Floats = np.where(good, distance, np.inf).min(axis=-1)
-    return error
+    return np.where(good, distance, np.inf).min(axis=-1)
 
 
 def settling(scores: Floats) -> Ints:
@@ -92,12 +79,7 @@ def settling(scores: Floats) -> Ints:
     Where the light changed and then rests to the end, that is the frame after the last change,
     which is the first that a policy has seen of the final light. 0 where the light never changes
     (the reset frame shows it), and where it rests for fewer than `MIN_REST` frames at the end.
-
-    Args:
-        scores: q of every state after each action, ``(E, T, S)``: equal while the light rests.
-
-    Returns:
-        ``(E,)``.
+    Scores ``(E, T, S)`` are equal while the light rests; the result is ``(E,)``.
 
     >>> settling(np.array([[[1.0], [1.0], [2.0], [2.0], [2.0], [2.0], [2.0]]])).tolist()
     [3]
@@ -120,8 +102,7 @@ def frames_to_converge(
     Args:
         errors: EV errors after each action, ``(..., T)``.
         tolerance: Largest error that counts as converged [EV].
-        since: Frame that counts as the first, such as that after a step of the light; broadcastable
-            to the leading axes of `errors`.
+        since: Frame that counts as the first, such as that after a step of the light.
 
     Returns:
         Frames, ``(...)``, 1 for the first, and whether it converged; an episode that never does has
@@ -141,9 +122,7 @@ def frames_to_converge(
 def frames_to_settle(evs: Floats, since: Ints | int = 0) -> Ints:
     """First frame from which the exposure stays within 1/3 EV of where it ends, right or wrong.
 
-    Args:
-        evs: EV100 of the start state and after each action, ``(..., T + 1)``.
-        since: As for `frames_to_converge`.
+    It is counted from `since`, as by `frames_to_converge`.
 
     >>> frames_to_settle(np.array([[9.0, 9.0, 5.0, 6.0, 6.0, 6.0]])).tolist()
     [3]
@@ -154,13 +133,8 @@ def frames_to_settle(evs: Floats, since: Ints | int = 0) -> Ints:
 def overshoot(evs: Floats, since: Ints | int = 0) -> Floats:
     """How far the exposure passes beyond where it ends, in the direction it came from [EV].
 
-    Args:
-        evs: EV100 of the start state and after each action, ``(..., T + 1)``.
-        since: Index in `evs` of the state that the approach begins from; broadcastable to the
-            leading axes.
-
-    Returns:
-        ``(...)``, >= 0; where start and end are equal, the largest excursion to either side.
+    The approach begins from the state of index `since` in `evs`. At least 0; where start and end
+    are equal, the largest excursion to either side.
 
     >>> overshoot(np.array([[0.0, 5.0, 3.0], [0.0, 2.0, 3.0]])).tolist()
     [2.0, 0.0]
@@ -172,15 +146,11 @@ def overshoot(evs: Floats, since: Ints | int = 0) -> Floats:
     direction = np.sign(final - first)
     beyond = evs - final
     along = np.where(direction == 0, np.abs(beyond), beyond * direction)
-    most: Floats = np.maximum(along.max(axis=-1), 0.0)
-    return most
+    return np.maximum(along.max(axis=-1), 0.0)
 
 
 def reversals(evs: Floats) -> Ints:
     """Changes of direction of the exposure: sign changes between successive EV steps.
-
-    Args:
-        evs: EV100 of the start state and after each action, ``(..., T + 1)``.
 
     >>> reversals(np.array([0.0, 3.0, 3.0, 2.0, 4.0])).tolist()
     2
@@ -190,8 +160,7 @@ def reversals(evs: Floats) -> Ints:
     # Frames without a step keep the heading: that of the last frame with one, the first at latest.
     moved = np.where(steps != 0, np.arange(steps.shape[-1]), 0)
     heading = np.take_along_axis(steps, np.maximum.accumulate(moved, axis=-1), axis=-1)
-    count: Ints = (heading[..., :-1] * steps[..., 1:] < 0).sum(axis=-1)
-    return count
+    return (heading[..., :-1] * steps[..., 1:] < 0).sum(axis=-1)
 
 
 def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
@@ -199,22 +168,15 @@ def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
 
     Args:
         image_means: Mean linear signal of each frame after an action, in [0, 1], ``(..., T)``.
-        static: Whether the light is that of the frame before, ``(..., T - 1)``.
-
-    Returns:
-        ``(...)``; 0 where no two frames have the same light.
+        static: Whether the light is that of the frame before, ``(..., T - 1)``; if never, 0.
     """
     change = np.abs(np.diff(image_means, axis=-1))
     static = np.broadcast_to(static, change.shape)
-    total: Floats = (change * static).sum(axis=-1) / np.maximum(static.sum(axis=-1), 1)
-    return total
+    return (change * static).sum(axis=-1) / np.maximum(static.sum(axis=-1), 1)
 
 
 def jump(code_means: Floats) -> Floats:
-    """Mean visible jump: the change of the mean companded code between successive frames.
-
-    Args:
-        code_means: Mean code of each frame after an action, in [0, 1], ``(..., T)``.
+    """Mean visible jump: the change of the mean companded code, in [0, 1], between frames (..., T).
 
     >>> float(jump(np.array([0.5, 0.5, 0.75])))
     0.125
@@ -231,13 +193,7 @@ def delayed_states(states: Ints, start_states: Ints, delay: int) -> Ints:
 
 
 def group_means(values: NDArray[Any], groups: NDArray[Any]) -> Floats:
-    """Means over the episodes of each source group, ``(..., G)``; groups in sorted order.
-
-    Args:
-        values: ``(..., E)``.
-        groups: Source group of each episode, ``(E,)``.
-    """
+    """Means of `values` (..., E) over the episodes of each of `groups` (E,): (..., G), sorted."""
     names, index = np.unique(groups, return_inverse=True)
     member = (index[:, None] == np.arange(len(names))).astype(np.float64)
-    means: Floats = np.asarray(values, np.float64) @ (member / member.sum(axis=0))
-    return means
+    return np.asarray(values, np.float64) @ (member / member.sum(axis=0))

@@ -160,7 +160,7 @@ class EvaluationPlan(Configuration):
 
     @property
     def measure(self) -> Literal["score", "quality"]:
-        """What the policies are compared by: scores of frames, or the quality of brackets."""
+        """What the policies are compared by."""
         return "quality" if self.budgets else "score"
 
     @property
@@ -207,25 +207,21 @@ class EvaluationPlan(Configuration):
 
     def arguments(self, condition: Condition) -> dict[str, Any]:
         """Arguments of the environment's observations and light in `condition`."""
-        base = {"split": "test", **self.environment}
-        return {**base, "lighting": condition.lighting, "delay": condition.delay}
+        own = {"lighting": condition.lighting, "delay": condition.delay}
+        return {"split": "test", **self.environment, **own}
 
     def describe(self, other: Callable[[Any], Any] = repr) -> dict[str, Any]:
         """Every entry as JSON values; objects of a caller's own by the function `other`."""
         entries = {k: v for k, v in dict(self).items() if k not in self._unused}
         if "conditions" in entries:
-            conditions = self.conditions.items()
             entries["conditions"] = {
-                name: {"lighting": one.lighting, "delay": one.delay} for name, one in conditions
+                name: {"lighting": one.lighting, "delay": one.delay}
+                for name, one in self.conditions.items()
             }
         return dict(json.loads(json.dumps(entries, default=other, allow_nan=False)))
 
     def protocol(self) -> dict[str, Any]:
-        """JSON values of everything that decides the episodes and their scores.
-
-        Raises:
-            ValueError: If an entry is no JSON value.
-        """
+        """JSON values of all that decides the episodes and scores; a `ValueError` of others."""
 
         def refuse(value: Any) -> Any:
             raise ValueError(f"every entry of a plan must be a JSON value, not {value!r}")
@@ -236,11 +232,7 @@ class EvaluationPlan(Configuration):
         return found
 
     def changed(self, **entries: Any) -> EvaluationPlan:
-        """The same plan with other entries, checked.
-
-        Raises:
-            ValueError: If an entry is out of range.
-        """
+        """The same plan with other entries, checked."""
         given = {name: getattr(self, name) for name in self.model_fields_set}
         return EvaluationPlan.model_validate(given | entries)
 
@@ -280,11 +272,7 @@ def digest(*parts: object) -> str:
 
 
 def plan_scenes(plan: EvaluationPlan) -> list[Scene]:
-    """The scenes of `plan`, in its order; of a sequence, its first frame.
-
-    Raises:
-        ValueError: If one of `scene_ids` is not there.
-    """
+    """The scenes of `plan`, in its order; of a sequence, its first frame."""
     options = plan.options()
     scenes = options.load_scenes()
     if options.in_sequences:
@@ -329,12 +317,9 @@ def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureG
 def start_state(start: str, scene: Scene, grid: ExposureGrid) -> int | None:
     """State in which an episode begins, among those that the scene allows; ties to the lower ISO.
 
-    Args:
-        start: ``"dark"``: the least exposure of the grid, its highest EV100 (the under-exposed
-            end); ``"middle"``: the state whose EV100 is nearest to that of the scene's right
-            exposure; ``"bright"``: the most exposure of the grid; ``"random"``: drawn.
-        scene: What is photographed.
-        grid: The states.
+    ``"dark"``: the least exposure of the grid, its highest EV100; ``"middle"``: the state whose
+    EV100 is nearest to that of the scene's right exposure; ``"bright"``: the most exposure;
+    ``"random"``: None, the seed draws it.
     """
     if start == "random":
         return None

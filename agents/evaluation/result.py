@@ -169,14 +169,12 @@ class EvaluationResult:
         """Mean q of the oracle over the frames, ``(E,)``; a bracket's quality is at most 1."""
         if self.measure == "quality":
             return np.ones(len(self.groups))
-        mean: Floats = metrics.oracle_score(self.scores, self.allowed).mean(axis=-1)
-        return mean
+        return metrics.oracle_score(self.scores, self.allowed).mean(axis=-1)
 
     @cached_property
     def _best(self) -> Ints:
         """The oracle's state in every frame, ties to the lower index, ``(E, T)``."""
-        best: Ints = np.where(self.allowed, self.scores, -np.inf).argmax(axis=-1)
-        return best
+        return np.where(self.allowed, self.scores, -np.inf).argmax(axis=-1)
 
     @property
     def oracle_states(self) -> Ints:
@@ -187,30 +185,25 @@ class EvaluationResult:
     def delayed_oracle(self) -> Floats:
         """Mean q of the oracle whose decisions take effect after `delays`, ``(E,)``."""
         late = (metrics.delayed_states(self._best, self.start_states, d) for d in self.delays)
-        mean: Floats = metrics.score_of(self.scores, self.grid.mixed(*late)).mean(axis=-1)
-        return mean
+        return metrics.score_of(self.scores, self.grid.mixed(*late)).mean(axis=-1)
 
     @cached_property
     def random(self) -> Floats:
         """Exact mean q of a random policy over the frames, ``(E,)``; 0 for brackets."""
         if self.measure == "quality":
             return np.zeros(len(self.groups))
-        mean: Floats = metrics.random_score(self.scores, self.allowed).mean(axis=-1)
-        return mean
+        return metrics.random_score(self.scores, self.allowed).mean(axis=-1)
 
     def episode_metrics(self, policy: str) -> dict[str, NDArray[Any]]:
         """Every metric of `policy` per training seed and episode, ``(K, E)``.
 
         `ev_error` is per frame, ``(K, E, T)``: its median and percentiles are over frames.
         """
-        if policy not in self._metrics:
-            self._metrics[policy] = self._measured(policy)
         return self._metrics[policy]
 
     @cached_property
     def _metrics(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Metrics that were computed, by policy."""
-        return {}
+        return {policy: self._measured(policy) for policy in self.tracks}
 
     @cached_property
     def settling(self) -> Ints:
@@ -258,8 +251,8 @@ class EvaluationResult:
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
     def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
-        """Mean of a metric of `episode_metrics`: over a source group's episodes, then over groups
-        and seeds; of the `episodes` that are True, ``(E,)``, or of all.
+        """Mean of a metric over a source group's episodes, then over groups and seeds; of the
+        `episodes` that are True, ``(E,)``, or of all.
         """
         members = self.condition("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]
@@ -270,9 +263,7 @@ class EvaluationResult:
     ) -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
-        Args:
-            policy: Name of the policy.
-            condition: As of `condition`, or which of the episodes, ``(E,)``.
+        Of the episodes of `condition`, a name or a mask ``(E,)``.
         """
         members = self.condition(condition) if isinstance(condition, str) else condition
         gains = (self.episode_metrics(policy)[self.measure] - self.random)[:, members]
@@ -290,7 +281,7 @@ class EvaluationResult:
 
 
 def as_results(results: EvaluationResult | Results) -> Results:
-    """Results by condition, of one result as well."""
+    """Results by condition, of a single one too."""
     if not isinstance(results, EvaluationResult):
         return results
     plan = results.plan
@@ -464,10 +455,7 @@ def best_meter(result: EvaluationResult) -> str | None:
 def difference_rows(
     result: EvaluationResult, minus: str, *, resamples: int = RESAMPLES
 ) -> pd.DataFrame:
-    """Paired differences of every other policy's normalised score to that of `minus`.
-
-    A row for each policy and part that has scenes.
-    """
+    """Paired differences of every other policy's normalised score to that of `minus`, by part."""
     rows = []
     for part in result.conditions:
         other, span = result.group_gains(minus, part)
@@ -489,8 +477,8 @@ def difference_rows(
 
 
 def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """Policies by their score over all conditions, each with the same weight; none that is
-    privileged. A row for each, as of `agents.evaluation.intervals.rank`.
+    """`rank` of policies by their score over all conditions, each with the same weight; none that
+    is privileged.
     """
     first = next(iter(results.values()))
     names = [name for name, track in first.tracks.items() if not track.privileged]
@@ -505,24 +493,23 @@ def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataF
 
 def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
     """Normalised score per policy, training seed and part, for those with several seeds."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for part in result.conditions:
         for policy in (name for name, track in result.tracks.items() if track.num_seeds > 1):
             gains, span = result.group_gains(policy, part)
-            for k, value in enumerate(np.sum(gains, axis=1) / np.sum(span)):
-                score = {"training_run": k, "normalised_score": float(value)}
-                rows.append({"policy": policy, "condition": part, **score})
+            for k, value in enumerate((gains.sum(axis=1) / span.sum()).tolist()):
+                run = {"policy": policy, "condition": part, "training_run": k}
+                rows.append({**run, "normalised_score": value})
     return rows
 
 
 def oracle_histogram(result: EvaluationResult) -> dict[str, dict[str, float]]:
     """Share of the episodes in which each value of each control is the oracle's.
 
-    Returns:
-        ``{"iso": {"100": 0.4, ...}, "exposure_time": {...}, "f_number": {...}}``.
+    ``{"iso": {"100": 0.4, ...}, "exposure_time": {...}, "f_number": {...}}``.
     """
-    controls = result.grid.controls(result.oracle_states)  # (E, 3)
     grid = result.grid
+    controls = grid.controls(result.oracle_states)  # (E, 3)
     axes = {"iso": grid.isos, "exposure_time": grid.exposure_times, "f_number": grid.f_numbers}
     return {
         name: {f"{v:g}": float((controls[:, i] == j).mean()) for j, v in enumerate(values)}

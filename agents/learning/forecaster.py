@@ -27,22 +27,17 @@ from agents.metering.reading import (
     ZoneMatcher,
     mean_reading,
 )
+from agents.policy import Floats
 from simulator.utils.config_file import Configuration
-
-Floats = NDArray[np.float64]
 
 #: Frames ahead that are forecast, from the frame in hand (0) on.
 HORIZON = 4
 #: Kinds of light that it learns from; lamps have no light that goes anywhere.
 KINDS = tuple(kind for kind in KIND_SETS["train"] if kind != "lamps")
-#: Frames of a sample.
-_LENGTH = 128
-#: Changes beyond this are not learnt from [EV].
-_LARGEST = 8.0
-#: Least spread of a forecast [EV].
-_LEAST_SPREAD = 0.02
-#: Numbers that describe a frame.
-_INPUTS = 4
+#: Frames of a sample, and numbers that describe one.
+_LENGTH, _INPUTS = 128, 4
+#: Changes beyond this are not learnt from, and the least spread of a forecast [EV].
+_LARGEST, _LEAST_SPREAD = 8.0, 0.02
 
 
 class ForecasterTraining(Configuration):
@@ -73,11 +68,7 @@ class ForecasterTraining(Configuration):
 
 
 class LightForecaster(nn.Module):
-    """Change of the light in the next frames, from the readings so far.
-
-    Args:
-        width: Units of the recurrent network.
-    """
+    """Change of the light in the next frames, from the readings so far, by `width` units."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -89,15 +80,10 @@ class LightForecaster(nn.Module):
     def forward(
         self, readings: torch.Tensor, state: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What is expected of the next frames, from each frame's reading on.
+        """What is expected of the next frames, from each of the `readings` (B, T, 4) on.
 
-        Args:
-            readings: (B, T, 4) of `describe`.
-            state: Of the frames before; None at the start.
-
-        Returns:
-            Changes of the light (B, T, HORIZON + 1) [EV]; their spreads, the mean absolute error
-            expected; and the state (1, B, width).
+        Changes of the light (B, T, HORIZON + 1) [EV]; their spreads, the mean absolute error
+        expected; and the `state` (1, B, width) for the frames that follow.
         """
         found, state = self.memory(self.inputs(readings), state)
         changes, spreads = self.outputs(found).chunk(2, dim=-1)
@@ -115,12 +101,9 @@ def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np
 
 
 class LearntTracker:
-    """The forecast of trained networks, as a tracker of `agents.foresight`.
+    """The forecast of trained networks, as a `LightTracker`.
 
-    Args:
-        num_envs: Cameras.
-        networks: Of one or more trainings, whose forecasts are averaged; where they differ, the
-            forecast is less sure.
+    Those of several trainings are averaged; where they differ, the forecast is less sure.
     """
 
     def __init__(self, num_envs: int, networks: Sequence[LightForecaster]) -> None:
@@ -234,10 +217,8 @@ def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
     """What an average meter reads on frames exposed for the light three frames before, (B, T).
 
     A frame is 64 luminances, normal in stops with a mean of 1; each exposure is off by about half a
-    stop, and of a grid of whole stops. `light` (B, T) is in EV100; `rng` draws scenes and errors.
-
-    Returns:
-        The readings, matched where frames clip, and the EV100 of the exposures, (B, T) each.
+    stop, and of a grid of whole stops. `light` (B, T) is in EV100. Returns the readings, matched
+    where frames clip, and the EV100 of the exposures, (B, T) each.
     """
     count, frames = light.shape
     spread = rng.uniform(0.8, 2.2, (count, 1))

@@ -18,37 +18,32 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES, encode_settings
 from agents.metering.meters import make_meter
 from agents.metering.reading import frame_ev100
-from agents.policy import Observations, PolicyContext
+from agents.policy import Bools, Ints, Observations, PolicyContext
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
 
-#: Takes frames done, frames in all, and the latest losses of a training.
+#: Takes frames (of a forecaster: steps) done, those in all, and the latest losses of a training.
 Progress = Callable[[int, int, dict[str, float]], None]
 
-#: Range of log2 luminance that the absolute plane maps to about [-1, 1].
-_LUMINANCE_CENTRE, _LUMINANCE_SCALE = 3.0, 8.0
+#: Range of log2 luminance that the absolute plane maps to about [-1, 1], and the smallest signal
+#: that it shows.
+_LUMINANCE_CENTRE, _LUMINANCE_SCALE, _SIGNAL_FLOOR = 3.0, 8.0, 2.0**-12
 #: Blocks are averaged so that the planes are about this large.
 _PLANE_SIZE = 16
 #: Channels of the CNN; their means over quarters of the frame and their maxima are features.
 _CHANNELS, _QUARTERS = 48, 2
-#: Zones of the meter a side.
-_ZONES = 4
-#: A code at or above this share of full scale counts as clipped.
-_CLIPPED = 0.995
-#: The smallest signal that the absolute plane shows.
-_SIGNAL_FLOOR = 2.0**-12
-#: Samples a side, about, that the histogram of a frame's light counts.
-_COUNTED = 32
-#: Centres of the histogram's bins: log2 luminance, in stops of EV100.
-_BINS = torch.arange(-16.0, 24.0, 0.5)
-#: Histograms of a frame: of all samples, and of the brightest of each pixel.
-_HISTOGRAMS = 2
-#: Levels above which a state would put how much of the light [stops from white].
+#: Zones of the meter a side; a code from this share of full scale on counts as clipped.
+_ZONES, _CLIPPED = 4, 0.995
+#: Samples a side, about, that the histogram of a frame's light counts; and the centres of its bins:
+#: log2 luminance, in stops of EV100.
+_COUNTED, _BINS = 32, torch.arange(-16.0, 24.0, 0.5)
+#: Histograms of a frame, of all samples and of the brightest of each pixel; and the numbers in them
+#: that describe its light to a `StateHead`.
+_HISTOGRAMS, LIGHT_NUMBERS = 2, 2 * len(_BINS)
+#: Levels above which a state would put how much of the light [stops from white], and the width of
+#: the steps at them [stops].
 _LEVELS = torch.tensor([1.0, 0.0, -1.0, -2.0, -3.0, -4.5, -6.0, -7.5, -9.0])
-#: Width of the steps at these levels [stops].
 _SOFTNESS = 0.25
-#: Numbers that describe the light of a frame to a `StateHead`.
-LIGHT_NUMBERS = _HISTOGRAMS * len(_BINS)
 #: Numbers of a frame: metered EV against the newest frame's, exposure, clipping, what was asked for
 #: after the frame before it (Av, Tv, Sv).
 NUMBERS = 6
@@ -112,13 +107,10 @@ class ExposureFeatures(nn.Module):
         sensors: torch.Tensor | None,
         history: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Features (B, width).
+        """Features (B, width) of `codes` (B, 4, H, W), the observed raw divided by 255.
 
-        Args:
-            codes: (B, 4, H, W) float, the observed raw divided by 255.
-            settings: (B, 3) float in [-1, 1].
-            sensors: (B, 2) float in [-1, 1]; None where they are not observed.
-            history: (B, ...) float of the frames before, where the space has it.
+        `settings` (B, 3) and `sensors` (B, 2) are in [-1, 1], `history` is (B, ...), where the
+        space has them.
         """
         exposure = self._ev100(settings)[:, None, None, None]
         pooled = nn.functional.avg_pool2d(codes, self.block)  # (B, 4, ~16, ~16)
@@ -140,10 +132,8 @@ class ExposureFeatures(nn.Module):
     ) -> torch.Tensor:
         """Histograms of the frame's luminance, ``(B, LIGHT_NUMBERS)``, for a `StateHead`.
 
-        Args:
-            codes, settings: As for `forward`.
-            histogram: (B, 128) shares of all samples by code, where statistics are observed; the
-                brightest of each pixel is then that of each zone.
+        Where statistics are observed, `histogram` (B, 128) has the shares of all samples by code;
+        the brightest of each pixel is then that of each zone.
         """
         step = max(1, min(codes.shape[2:]) // _COUNTED)
         counted = (codes[:, :, ::step, ::step] * 255.0).round().long()
@@ -209,7 +199,6 @@ class StateHead(nn.Module):
     Args:
         grid: The states.
         features: Size of the features that describe the frame.
-        has_sensors: Whether image speed and defocus are observed.
         outputs: Values per state.
         width: Hidden units.
         trained_on: Grid that the weights come from, on whose scale the states enter; by default
@@ -249,13 +238,7 @@ class StateHead(nn.Module):
     def forward(
         self, features: torch.Tensor, light: torch.Tensor, sensors: torch.Tensor | None
     ) -> torch.Tensor:
-        """Values (B, S, outputs).
-
-        Args:
-            features: (B, features) of the frame.
-            light: (B, LIGHT_NUMBERS) histograms of it, see `ExposureFeatures.light`.
-            sensors: (B, 2) in [-1, 1]; None where they are not observed.
-        """
+        """Values (B, S, outputs), from what `ExposureFeatures` says of the frame."""
         states = self.states.expand(features.shape[0], -1, -1)  # (B, S, 4)
         if self.has_sensors:
             assert sensors is not None
@@ -296,14 +279,10 @@ class MeterHistory:
         self._frames = np.full((num_envs, frames, NUMBERS), np.nan)
         self._action = np.full((num_envs, 3), np.nan)
 
-    def observe(
-        self, observations: Observations, rows: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.float32]:
-        """Takes in a frame of each camera; returns the history (N, frames * NUMBERS), newest first.
+    def observe(self, observations: Observations, rows: Bools | None = None) -> NDArray[np.float32]:
+        """Takes in a frame of all cameras, or of those that `rows` marks.
 
-        Args:
-            observations: Of all cameras.
-            rows: Which of them have a new frame; by default all.
+        Returns the history (N, frames * NUMBERS), newest first.
         """
         reading, exposed = self._meter(observations), frame_ev100(observations)
         action = np.where(np.isnan(self._action), observations["settings"], self._action)
@@ -319,11 +298,11 @@ class MeterHistory:
         flat = np.clip(shown, -_LARGEST, _LARGEST).reshape(len(shown), -1)
         return flat.astype(np.float32)
 
-    def record_action(self, states: NDArray[np.int64]) -> None:
+    def record_action(self, states: Ints) -> None:
         """Remembers the states that were asked for after the frame in hand, ``(N,)``."""
         self._action = self._apex[states].astype(np.float64)
 
-    def forget(self, rows: NDArray[np.bool_]) -> None:
+    def forget(self, rows: Bools) -> None:
         """Forgets the frames of the cameras that `rows` marks."""
         self._frames[rows], self._action[rows] = np.nan, np.nan
 
@@ -355,13 +334,8 @@ def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
 class Session:
     """Where a training runs, what it reports to, and where its state is kept.
 
-    Args:
-        checkpoint: File for the state of the training; a second run resumes from it, with new
-            episodes. None for none.
-        progress: Takes frames (of a forecaster: steps) done, those in all, and the latest losses.
-        device: Torch device of the network.
-        identity: JSON value; the checkpoint of a training with another one is not resumed. By
-            default the hyperparameters.
+    A second run resumes from the file `checkpoint`, with new episodes, unless that is of a training
+    with another `identity`, a JSON value; by default the hyperparameters.
     """
 
     checkpoint: Path | None = None
@@ -386,12 +360,8 @@ UNWATCHED = Session()
 class Optimisation:
     """AdamW with a one-cycle schedule; a training that was interrupted goes on where it was.
 
-    Args:
-        network: What is trained.
-        training: Hyperparameters, with ``learning_rate``, the peak, and ``weight_decay``.
-        session: Where the state is kept: `store` is its checkpoint, a context manager.
-        steps: Optimiser steps in all; `done` of them are.
-        warm_up: Share of the steps in which the learning rate rises.
+    Of `steps` in all, `done` are. The learning rate, at its peak that of the hyperparameters
+    `training`, rises in a share of `warm_up`. `store` is the checkpoint, a context manager.
     """
 
     def __init__(
@@ -423,11 +393,7 @@ class Optimisation:
                 part.load_state_dict(past[name])
 
     def step(self, loss: torch.Tensor) -> None:
-        """One step down `loss`.
-
-        Raises:
-            ValueError: If it is not finite.
-        """
+        """One step down `loss`, a `ValueError` if it is not finite."""
         if not math.isfinite(loss.item()):
             raise ValueError(f"the loss (={loss.item()}) must be finite; lower `learning_rate`")
         self.optimizer.zero_grad()

@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -35,7 +34,7 @@ from agents.learning.networks import (
 )
 from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
 from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
-from agents.policy import Observations, PolicyContext, masked_argmax
+from agents.policy import Bools, Ints, Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
 
@@ -57,8 +56,7 @@ class ExposureExtractor(BaseFeaturesExtractor):
         sensors = observations.get("sensors")
         features = self.features(raw, settings, sensors, observations.get("history"))
         light = self.features.light(raw, settings, observations.get("histogram"))
-        parts = [features, light]
-        return torch.cat(parts if sensors is None else [*parts, sensors], dim=1)
+        return torch.cat([features, light] + ([] if sensors is None else [sensors]), dim=1)
 
 
 class _StateLogits(nn.Module):
@@ -81,15 +79,7 @@ class _StateLogits(nn.Module):
 
 
 class ExposureActorCritic(MultiInputActorCriticPolicy):
-    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits.
-
-    Args:
-        observation_space, action_space, lr_schedule: As SB3 calls it, for a single environment.
-        grid: The exposure states.
-        width: Features that describe a frame.
-        trained_on: See `StateHead`.
-        use_sde: State-dependent exploration, which SB3 has for continuous actions only.
-    """
+    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits."""
 
     def __init__(
         self,
@@ -167,10 +157,8 @@ class PPOTraining(Configuration):
         """Raises a `ValueError` unless `num_envs` rollouts divide into gradient steps."""
         frames = self.n_steps * num_envs
         if frames % self.batch_size:
-            raise ValueError(
-                f"`batch_size` (={self.batch_size}) must divide the frames of a rollout, n_steps * "
-                f"num_envs (={self.n_steps} * {num_envs} = {frames})"
-            )
+            rollout = f"n_steps * num_envs (={self.n_steps} * {num_envs} = {frames})"
+            raise ValueError(f"`batch_size` (={self.batch_size}) must divide a rollout, {rollout}")
 
 
 class PPOPolicy(NetworkPolicy):
@@ -198,9 +186,7 @@ class PPOPolicy(NetworkPolicy):
         frames = self.network.features_extractor.features.history // NUMBERS
         self._history = MeterHistory(self.context, num_envs, frames) if frames else None
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Most probable allowed state (N,)."""
         shown = dict(observations)
         if self._history is not None:
@@ -269,12 +255,8 @@ class _TrainingCallback(BaseCallback):
 
     def state(self) -> dict[str, Any]:
         """State of the training for its checkpoint. A half-done rollout is taken again."""
-        policy = self.model.policy
-        return {
-            "timesteps": self.learnt,
-            "policy": policy.state_dict(),
-            "optimizer": policy.optimizer.state_dict(),
-        }
+        policy, optimizer = self.model.policy.state_dict(), self.model.policy.optimizer.state_dict()
+        return {"timesteps": self.learnt, "policy": policy, "optimizer": optimizer}
 
     def _on_step(self) -> bool:
         self._rewards.append(float(np.mean(self.locals["rewards"])))

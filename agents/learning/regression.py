@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -33,8 +33,8 @@ from agents.learning.networks import (
 )
 from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.meters import make_meter
-from agents.metering.reading import Floats, Reading
-from agents.policy import Observations, PolicyContext, masked_argmax
+from agents.metering.reading import Reading
+from agents.policy import Bools, Floats, Ints, Observations, PolicyContext, masked_argmax
 from agents.policy_names import FORECASTERS, LEARNT, weight_files
 from simulator.utils.config_file import Configuration
 
@@ -42,10 +42,9 @@ from simulator.utils.config_file import Configuration
 _OF_CHANNELS = 0.4
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
-#: Frames that foresight shows to the network in the light to come.
-RECENT = 4
-#: Share of white samples from which a frame's reading is only a bound of the light.
-WHITE_SHARE = 0.5
+#: Frames that foresight shows to the network in the light to come, and the share of white samples
+#: from which a frame's reading is only a bound of the light.
+RECENT, WHITE_SHARE = 4, 0.5
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
@@ -59,12 +58,8 @@ _CHUNKS = 4
 class ScoreRegressor(nn.Module):
     """Predicts the score of each state, and how certain the prediction is.
 
-    Args:
-        observation_space: Observation of a single environment.
-        grid, trained_on: See `StateHead`.
-        width: Features that describe a frame.
-        dropout: Share of the features that a training step leaves out; of the CNN's channels it
-            leaves out 0.4 times as many.
+    A training step leaves out a share of `dropout` of the features, and 0.4 times as many of the
+    CNN's channels.
     """
 
     def __init__(
@@ -117,7 +112,7 @@ class RegressionPolicy(NetworkPolicy):
     """Takes the state with the highest predicted score, accumulated over the frames so far.
 
     Args:
-        context, weights, network, device: As of `NetworkPolicy`.
+        context, weights, network, device: See `NetworkPolicy`.
         foresight: ``"none"``: frames of the same light count together; else the latest frames are
             shown to the network as if taken in the light that is expected, and the state is taken
             that promises most in the frames that its controls are in effect in. ``"trend"``: an
@@ -180,26 +175,30 @@ class RegressionPolicy(NetworkPolicy):
         # and the meter's reading.
         self._recent: list[tuple[torch.Tensor, Any, torch.Tensor | None, Reading]] = []
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Best state (N,) after this frame and those before it in the same light."""
         self.check_reset(observations)
-        if self._foresight is not None:
-            return self._act_ahead(self._foresight, observations, action_masks)
+        reading = self._meter(observations)
+        device = next(self.network.parameters()).device
+        codes, settings, sensors = observation_tensors(observations, device)
+        foresight = self._foresight
+        if foresight is not None:
+            reading = foresight.observe(reading, observations)
+            frame = codes, np.array(observations["settings"]), sensors, reading
+            self._recent = [*self._recent, frame][-RECENT:]
+            utility = foresight.utility(self._scores_in)
+            utility[np.arange(len(utility)), foresight.pending_action] += HYSTERESIS
+            chosen = masked_argmax(utility, action_masks)
+            foresight.record_action(chosen)
+            return chosen
         # The earlier frames of environments whose metered light has changed count no longer.
-        ev100 = self._meter(observations).ev100
-        self.forget((self._frames > 0) & (np.abs(ev100 - self._light) > SAME_LIGHT_EV))
+        self.forget((self._frames > 0) & (np.abs(reading.ev100 - self._light) > SAME_LIGHT_EV))
         self._frames += 1.0
-        self._light += (ev100 - self._light) / self._frames
-        scores, precision = self._predict(*observation_tensors(observations, self._device))
+        self._light += (reading.ev100 - self._light) / self._frames
+        scores, precision = self._predict(codes, settings, sensors)
         self._weighted += precision * scores
         self._precision += precision
         return masked_argmax(self._weighted / self._precision, action_masks)
-
-    @property
-    def _device(self) -> torch.device:
-        return next(self.network.parameters()).device
 
     def _predict(self, *inputs: torch.Tensor | None) -> tuple[Floats, Floats]:
         """Scores of all states and their precision, (N, S) each."""
@@ -207,22 +206,6 @@ class RegressionPolicy(NetworkPolicy):
             scores, log_variance = self.network(*inputs)
         precision = torch.exp(-log_variance)
         return scores.double().cpu().numpy(), precision.double().cpu().numpy()
-
-    def _act_ahead(
-        self,
-        foresight: Foresight,
-        observations: Observations,
-        action_masks: NDArray[np.bool_] | None,
-    ) -> NDArray[np.int64]:
-        reading = foresight.observe(self._meter(observations), observations)
-        codes, _, sensors = observation_tensors(observations, self._device)
-        frame = codes, np.array(observations["settings"]), sensors, reading
-        self._recent = [*self._recent, frame][-RECENT:]
-        utility = foresight.utility(self._scores_in)
-        utility[np.arange(len(utility)), foresight.pending_action] += HYSTERESIS
-        chosen = masked_argmax(utility, action_masks)
-        foresight.record_action(chosen)
-        return chosen
 
     def _scores_in(self, ev100: Floats) -> Floats:
         """Scores (N, S) in light that is metered at `ev100` (N,), from all recent frames."""
@@ -233,19 +216,15 @@ class RegressionPolicy(NetworkPolicy):
         ev100 = np.where(white, newest.ev100, ev100)
         for codes, settings, sensors, reading in self._recent:
             shifted = torch.from_numpy(shift_ev(settings, ev100 - reading.ev100))
-            scores, precision = self._predict(codes, shifted.to(self._device), sensors)
+            scores, precision = self._predict(codes, shifted.to(codes.device), sensors)
             if reading is not newest:
                 precision[white | (reading.saturated >= WHITE_SHARE)] = 0.0
             weighted += precision * scores
             precisions += precision
         return weighted / precisions
 
-    def forget(self, done: NDArray[np.bool_]) -> None:
-        """Forgets the frames of the environments that `done` marks; not with foresight."""
-        if self._foresight is not None and done.any():
-            raise ValueError(
-                "`forget` works without `foresight`; call reset() for all environments"
-            )
+    def forget(self, done: Bools) -> None:
+        """Forgets the frames of the environments that `done` marks; without foresight."""
         for sums in (self._weighted, self._precision, self._light, self._frames):
             sums[done] = 0.0
 
@@ -292,10 +271,10 @@ def train_regression(
     network.to(session.device)
     steps = max(2, training.frames // envs.num_envs)
     run = Optimisation(network, training, session, steps=steps, warm_up=0.1)
-    rollout = Rollout(envs, RegressionPolicy(context, network=network), training, run.done)
+    frames = rollout(envs, RegressionPolicy(context, network=network), training, run.done)
     with run.store:
         while run.done < steps:
-            observations, target = rollout.batch()
+            observations, target = next(frames)
             network.train()
             # Dropout draws from the global generator.
             with _seeded(session.device, training.seed, run.done):
@@ -307,38 +286,26 @@ def train_regression(
     return network
 
 
-class Rollout:
-    """Frames and the scores of all states, from episodes that the policy itself drives.
+def rollout(
+    envs: gym.vector.VectorEnv, policy: RegressionPolicy, training: RegressionTraining, step: int
+) -> Iterator[tuple[dict[str, NDArray[Any]], Floats]]:
+    """Each frame with the scores of all states, and some earlier ones; the policy itself drives.
 
-    `first_step` are the steps that an earlier run has taken; every start draws other episodes.
+    The training begins, or goes on, after `step` steps: every start draws other episodes.
     """
-
-    def __init__(
-        self,
-        envs: gym.vector.VectorEnv,
-        policy: RegressionPolicy,
-        training: RegressionTraining,
-        first_step: int = 0,
-    ) -> None:
-        self.envs, self.policy = envs, policy
-        self.explore, self.base = training.explore, cast(Any, envs.unwrapped)
-        self.rng = np.random.default_rng([training.seed, first_step])
-        self.replay = Replay(training, np.random.default_rng([training.seed, first_step, 1]))
-        self.observations: Observations | None = None
-
-    def batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
-        """The next frame of every episode with its scores, and some earlier ones."""
-        if self.observations is None:
-            self.observations, _ = self.envs.reset(seed=int(self.rng.integers(2**31)))
-            self.policy.reset(self.envs.num_envs)
-        else:
-            actions = self.policy.act(self.observations)
-            random = self.rng.random(len(actions)) < self.explore
-            others = self.rng.integers(len(self.policy.context.grid), size=len(actions))
-            actions = np.where(random, others, actions)
-            self.observations, _, terminated, truncated, _ = self.envs.step(actions)
-            self.policy.forget(terminated | truncated)
-        return self.replay.batch(self.observations, self.base.expected_scores())
+    rng = np.random.default_rng([training.seed, step])
+    replay = Replay(training, np.random.default_rng([training.seed, step, 1]))
+    base: Any = envs.unwrapped
+    observations, _ = envs.reset(seed=int(rng.integers(2**31)))
+    policy.reset(envs.num_envs)
+    while True:
+        yield replay.batch(observations, base.expected_scores())
+        actions = policy.act(observations)
+        random = rng.random(len(actions)) < training.explore
+        others = rng.integers(len(policy.context.grid), size=len(actions))
+        actions = np.where(random, others, actions)
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        policy.forget(terminated | truncated)
 
 
 class Replay:
@@ -349,8 +316,8 @@ class Replay:
         self.memory: list[dict[str, NDArray[Any]]] = []
 
     def batch(
-        self, observations: Observations, target: NDArray[np.float64]
-    ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
+        self, observations: Observations, target: Floats
+    ) -> tuple[dict[str, NDArray[Any]], Floats]:
         """The new frames and some old ones; remembers the new ones and forgets the oldest."""
         new = {**observations, "target": target}
         parts = [new]
@@ -366,7 +333,7 @@ class Replay:
 
 
 def _loss(
-    network: ScoreRegressor, observations: Observations, target: NDArray[np.float64]
+    network: ScoreRegressor, observations: Observations, target: Floats
 ) -> tuple[torch.Tensor, dict[str, float]]:
     """Loss to minimise; the mean squared error, and what the states that seem best lose [score].
 

@@ -18,13 +18,7 @@ class SB3VectorAdapter(VecEnv):
     """Lets SB3 and sb3-contrib train on a Gymnasium vector environment, wrapped or not.
 
     Rollouts are those of SB3's `DummyVecEnv` over single environments with the same seeds, without
-    the cost of stepping them one by one.
-
-    Args:
-        envs: The vector environment, of autoreset mode SAME_STEP.
-
-    Raises:
-        ValueError: If its autoreset mode is another one.
+    the cost of stepping them one by one. A `ValueError` if the autoreset mode is not SAME_STEP.
     """
 
     def __init__(self, envs: gym.vector.VectorEnv) -> None:
@@ -110,12 +104,7 @@ class SB3VectorAdapter(VecEnv):
 
 
 class ShiftedFrames(VecEnvWrapper):
-    """Shows frames shifted by `random_shift`, those of each step otherwise.
-
-    Args:
-        venv: SB3's view of the environments.
-        rng: Draws the shifts.
-    """
+    """Shows frames shifted by `random_shift`, those of each step otherwise."""
 
     def __init__(self, venv: VecEnv, rng: np.random.Generator) -> None:
         super().__init__(venv)
@@ -135,13 +124,7 @@ class ShiftedFrames(VecEnvWrapper):
 
 
 class WithHistory(VecEnvWrapper):
-    """Adds ``history`` to the observations, see `MeterHistory`.
-
-    Args:
-        venv: SB3's view of the environments.
-        context: The camera and the grid.
-        frames: Frames that are kept.
-    """
+    """Adds the ``history`` of so many `frames` to the observations, see `MeterHistory`."""
 
     def __init__(self, venv: VecEnv, context: PolicyContext, frames: int) -> None:
         assert isinstance(venv.observation_space, gym.spaces.Dict)

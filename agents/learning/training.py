@@ -6,9 +6,8 @@ import csv
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -35,12 +34,10 @@ ROWS = 200
 
 
 class AgentConfig(Configuration):
-    """A training of an agent.
+    """A training of an agent, in an environment of a task; a forecaster needs none.
 
     Args:
-        agent: ``"regression"``, ``"ppo"``, or ``"forecaster"``, which needs no environment.
-        task: Id of the environment.
-        environment: Arguments of it.
+        environment: Arguments of the environment.
         max_episode_steps: Actions of an episode; by default those of the task.
         num_envs: Episodes side by side.
         training: Hyperparameters: `RegressionTraining`, `PPOTraining` or `ForecasterTraining`.
@@ -105,11 +102,7 @@ class AgentConfig(Configuration):
 
 
 def load_config(path: str | Path) -> AgentConfig:
-    """The configuration in a YAML file.
-
-    Raises:
-        ValueError: If it is no such file; the message names the file and the entry.
-    """
+    """The configuration in a YAML file; a `ValueError` names the file and the wrong entry."""
     return load_yaml(path, AgentConfig)
 
 
@@ -138,17 +131,8 @@ def train_agent(
     """Trains an agent and writes it to ``out.safetensors`` and ``out.json``.
 
     Beside them, ``out.csv`` is its learning curve (`LearningCurve`). A training that was
-    interrupted goes on from ``out.checkpoint``; one that is complete is not repeated.
-
-    Args:
-        config: The training.
-        out: File name without suffix.
-        progress: Called now and then.
-        tensorboard: Folder for a TensorBoard log.
-        device: Torch device of the network.
-
-    Returns:
-        `out`.
+    interrupted goes on from ``out.checkpoint``; one that is complete is not repeated. `tensorboard`
+    is a folder for a log. Returns `out`.
     """
     if is_trained(config, out):
         return out
@@ -183,12 +167,10 @@ def train_agent(
 def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
     import gymnasium as gym
 
-    import ae_env  # noqa: F401  (registers the environment)
-
     options = {**config.environment, "autoreset_mode": "SAME_STEP"}
     if config.max_episode_steps is not None:
         options["max_episode_steps"] = config.max_episode_steps
-    return gym.make_vec(config.task, num_envs=config.num_envs, **options)
+    return gym.make_vec(f"ae_env:{config.task}", num_envs=config.num_envs, **options)
 
 
 @contextmanager
@@ -208,15 +190,9 @@ def _tensorboard(folder: Path) -> Iterator[Progress]:
 
 
 class LearningCurve:
-    """Writes the mean of each reported value over every 200th part of a training.
+    """Writes the mean of each reported value over every 200th part of a training to a CSV file.
 
-    A training that was interrupted goes on in its file.
-
-    Args:
-        path: File to write, such as ``agent.csv``.
-
-    Raises:
-        ValueError: If there is a file that is no learning curve.
+    A training that was interrupted goes on in its file. A `ValueError` if that is no such curve.
     """
 
     def __init__(self, path: Path) -> None:
@@ -247,11 +223,7 @@ class LearningCurve:
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:
-    """Columns of a file that `LearningCurve` wrote: ``frames`` and the reported values.
-
-    Raises:
-        ValueError: If it is no such file.
-    """
+    """Columns of a file of `LearningCurve`, ``frames`` and values; a `ValueError` if it is none."""
     try:
         rows = list(csv.DictReader(path.read_text().splitlines()))
         return {name: [float(row[name]) for row in rows] for name in ("frames", *rows[0])}
@@ -259,16 +231,8 @@ def load_curve(path: Path) -> dict[str, list[float]]:
         raise ValueError(f"{path} is not a learning curve of `ae-env train`") from error
 
 
-@dataclass(frozen=True)
-class TrainingJob:
-    """One of several agents to train at once.
-
-    Args:
-        name: Shown to the user.
-        config: The training.
-        out: File name of the agent, without suffix.
-        device: Torch device of the network.
-    """
+class TrainingJob(NamedTuple):
+    """One of several agents to train at once, see `train_agent`; `name` is shown to the user."""
 
     name: str
     config: AgentConfig
@@ -282,14 +246,10 @@ def train_in_parallel(
     workers: int | None = None,
     progress: Callable[[str, int, int, dict[str, float]], None] | None = None,
 ) -> None:
-    """Trains every job that is not trained yet, each in a process of its own.
+    """Trains every job that is not trained yet, each in a process of its own (`run_in_parallel`).
 
-    After Ctrl-C the same call resumes from the checkpoints.
-
-    Args:
-        jobs: Agents to train.
-        workers: See `run_in_parallel`.
-        progress: Called with the job's name, frames done, frames in all, and losses.
+    `progress` is called with the job's name, frames done, frames in all, and losses. After Ctrl-C
+    the same call resumes from the checkpoints.
     """
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
     run_in_parallel(_train, waiting, workers=workers, progress=progress)
@@ -300,7 +260,7 @@ def _train(job: TrainingJob) -> None:
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
         nonlocal last
-        if done == total or done - last >= total // 200:
+        if done == total or done - last >= total // ROWS:
             last = done
             send_progress(job.name, done, total, values)
 

@@ -44,13 +44,12 @@ def save_agent(
     context: PolicyContext | None,
     training: dict[str, Any],
 ) -> None:
-    """Writes ``path.safetensors`` and ``path.json``.
+    """Writes ``path.safetensors``, the state of `module`, and ``path.json``.
 
     Args:
         path: File name, with or without one of the two endings.
         kind: ``"regression"``, ``"ppo"`` or ``"forecaster"``.
-        module: Its state is stored.
-        width: Hidden features of its network.
+        width: Hidden features of the network.
         context: That it was trained for; None if for any.
         training: JSON values that identify the training.
 
@@ -82,27 +81,24 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
         ValueError: If a file is damaged or cannot be read, the two are not of one training, or they
             hold another kind of agent.
     """
-    card_path, tensor_path = sibling(path, ".json"), sibling(path, ".safetensors")
-    for file in (tensor_path, card_path):
+    given, card_path = f"`weights` (={str(path)!r})", sibling(path, ".json")
+    for file in (sibling(path, ".safetensors"), card_path):
         if not file.is_file():
             raise FileNotFoundError(
-                f"`weights` (={str(path)!r}): there is no {file.name}; an agent is a .safetensors "
-                "and a .json file of the same name, as `ae-env train` writes them"
+                f"{given}: there is no {file.name}; an agent is a .safetensors and a .json file of "
+                "the same name, as `ae-env train` writes them"
             )
     tensors, card = read_pair(path)
-    if card.get("kind") != kind or card.get("format") != FORMAT_VERSION:
-        raise ValueError(
-            f"`weights` (={str(path)!r}) must be a {kind} agent of format {FORMAT_VERSION}, got "
-            f"{card.get('kind')!r} of format {card.get('format')!r}"
-        )
+    found = card.get("kind"), card.get("format")
+    if found != (kind, FORMAT_VERSION):
+        wanted = f"a {kind} agent of format {FORMAT_VERSION}"
+        raise ValueError(f"{given} must be {wanted}, got {found[0]!r} of format {found[1]!r}")
     try:
         aliases = _Card.model_validate(card).aliases
     except ValidationError as error:
-        raise ValueError(
-            f"`weights` (={str(path)!r}): {card_path.name}: {one_line(error)}"
-        ) from error
-    known = {name: source for name, source in aliases.items() if source in tensors}
-    return tensors | {name: tensors[source] for name, source in known.items()}, card
+        raise ValueError(f"{given}: {card_path.name}: {one_line(error)}") from error
+    copies = {name: tensors[source] for name, source in aliases.items() if source in tensors}
+    return tensors | copies, card
 
 
 def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -> None:
@@ -155,14 +151,13 @@ class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
     Args:
-        context: The camera, the grid and the observation.
-        weights: File that a training wrote; or give `network`.
-        network: A network in memory.
+        context: The camera.
+        weights: File that a training wrote; or give `network`, one in memory.
         device: Torch device for `weights`.
 
     Raises:
-        ValueError: If not exactly one of `weights` and `network` is given, or the weights were
-            trained for another observation or a grid of smaller ranges.
+        ValueError: Unless one of `weights` and `network` is given, and was trained for such an
+            observation and for a grid whose ranges hold that of the context.
     """
 
     #: The name of this kind of agent in its files.

@@ -10,8 +10,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from typing import Any
 
-#: Seconds between two looks at the messages of the workers.
-_PATIENCE = 0.2
 #: In a worker: where its progress goes.
 _messages: Any = None
 
@@ -23,15 +21,10 @@ def run_in_parallel(
     workers: int | None = None,
     progress: Callable[..., None] | None = None,
 ) -> None:
-    """Calls ``work(job)`` for every job, in processes of their own.
+    """Calls ``work(job)`` for every job, in `workers` processes that share the cores.
 
-    After an error or Ctrl-C the jobs that still run are terminated.
-
-    Args:
-        work: A function of a module, which reports with `send_progress`.
-        jobs: Values that can be sent to another process.
-        workers: Processes at a time, each with its share of the cores; by default one per core.
-        progress: Called with the arguments of every `send_progress`.
+    By default there is one per core. `progress` is called with the arguments of every
+    `send_progress` in them. After an error or Ctrl-C the jobs that still run are terminated.
     """
     if not jobs:
         return
@@ -46,7 +39,7 @@ def run_in_parallel(
         try:
             running = {pool.submit(work, job) for job in jobs}
             while running:
-                done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                done, running = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
                 while not messages.empty():
                     message = messages.get()
                     if progress is not None:

@@ -13,9 +13,9 @@ from ae_env.observation import SENSOR_RANGES, decode_sensors
 from agents.foresight import Foresight, TrendTracker
 from agents.metering.meters import make_meter
 from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
-from agents.metering.reading import EVTracker, Floats, ReferenceFrames
+from agents.metering.reading import EVTracker, ReferenceFrames
 from agents.metering.tuned import ScoreRegression
-from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import PROGRAMS
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.utils.checks import check_word
@@ -31,11 +31,10 @@ SEARCH_METERS = ("skewness", "entropy", "shim", "zhang")
 #: Advantage of the last state in a tuned program [score], and in program P; there the square of a
 #: stop counts 1/4 to 1.
 HYSTERESIS_SCORE, HYSTERESIS_COST = 0.002, 0.1
-#: Episodes (of both passes, over as many scenes as that allows) and frames per episode from which a
-#: tuned program learns; three times as many take 35 s and did not score higher on unseen scenes.
-FIT_EPISODES, FIT_FRAMES = 1600, 4
-#: Episodes of one scene in a pass, at most.
-FIT_PER_SCENE = 4
+#: Episodes (of both passes, over as many scenes as that allows; of one scene in a pass at most the
+#: second) and frames per episode from which a tuned program learns; three times as many take 35 s
+#: and did not score higher on unseen scenes.
+FIT_EPISODES, FIT_PER_SCENE, FIT_FRAMES = 1600, 4, 4
 #: Distance of the second pass's seeds from the first's: other episodes of the same scenes.
 SECOND_PASS = 1_000_000
 #: What a meter may foresee.
@@ -46,7 +45,7 @@ class MeteringPolicy(Policy):
     """A light meter and a program that splits its EV between ISO, shutter and aperture.
 
     Args:
-        context: The camera, the grid and the observation.
+        context: The camera.
         meter: One of `agents.policy_names.METERS`, such as ``"average"``.
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
@@ -85,11 +84,8 @@ class MeteringPolicy(Policy):
         check_word("program", program, PROGRAMS)
         self.program = program
         check_word("foresight", foresight, FORESIGHTS)
-        if foresight == "model" and program not in ("tuned", "tuned_blind"):
-            raise ValueError(
-                "`foresight` (='model') needs the scores that a tuned program predicts; program is "
-                f"{program}"
-            )
+        if foresight == "model" and not program.startswith("tuned"):
+            raise ValueError(f"`foresight` (='model') needs a tuned program, not {program}")
         if foresight != "none" and damping:
             raise ValueError(f"`damping` (={damping!r}) must be 0 with `foresight`")
         self.foresight = foresight
@@ -119,11 +115,9 @@ class MeteringPolicy(Policy):
         self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))
         self._frames = 0
-        self._previous: NDArray[np.int64] | None = None
+        self._previous: Ints | None = None
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Meter the frames, then choose by the program."""
         readings = self.observe(observations)
         foresight = self._foresight
@@ -134,7 +128,7 @@ class MeteringPolicy(Policy):
         else:
             if foresight is not None:
                 readings[:, 0] = foresight.ev100(max(foresight.leads))
-            tuned = self.program in ("tuned", "tuned_blind")
+            tuned = self.program.startswith("tuned")
             utility = self._tuned_utility(readings) if tuned else self._program_utility(readings)
         self._previous = masked_argmax(utility, action_masks)
         if foresight is not None:
@@ -162,7 +156,6 @@ class MeteringPolicy(Policy):
         return np.concatenate([ev[:, None], self._sensor_sum / self._frames], axis=1)
 
     def _program_utility(self, readings: Floats) -> Floats:
-        """Minus the cost of each state, by the program's priorities."""
         chooser = self._chooser
         target = readings[:, 0] - self.options.compensation
         cost = program_cost(self.program, chooser, readings) + np.zeros((len(readings), 1))
@@ -175,10 +168,11 @@ class MeteringPolicy(Policy):
             raise ValueError(
                 f"policy {self.name!r} learns from scenes first: call fit(envs), or give `weights`"
             )
-        if self.regression.features.shape[1] != readings.shape[1]:
+        fitted = self.regression.features.shape[1]
+        if fitted != readings.shape[1]:
             raise ValueError(
-                f"policy {self.name!r} was fitted on {self.regression.features.shape[1]} readings "
-                f"but sees {readings.shape[1]}: the environments must agree on `sensors`"
+                f"policy {self.name!r} was fitted on {fitted} readings but sees "
+                f"{readings.shape[1]}: the environments must agree on `sensors`"
             )
         compensated = readings - np.eye(1, readings.shape[1]) * self.options.compensation
         scores = self.regression.predict(compensated) - 10.0 * self._chooser.over_cap
@@ -189,14 +183,11 @@ class MeteringPolicy(Policy):
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
         """Tune on the scenes of `envs` (tuned programs only; the others have nothing to learn).
 
-        Episodes run twice: led by program P, then by what was learnt from those, so that the
-        readings are those of the frames that the tuned program itself takes.
-
-        Args:
-            envs: Training environments; their episodes must not end within 4 frames.
-            seed: Decides the episodes.
+        Episodes, which must not end within 4 frames, run twice: led by program P, then by what was
+        learnt from those, so that the readings are those of the frames that the tuned program
+        itself takes.
         """
-        if self.program not in ("tuned", "tuned_blind"):
+        if not self.program.startswith("tuned"):
             return
         leader = copy.copy(self)
         leader.program, leader.foresight = "P", "none"  # the light of these episodes stays
@@ -205,15 +196,11 @@ class MeteringPolicy(Policy):
         first = leader._gather(envs, seed, per_scene)
         leader.program, leader.regression = self.program, ScoreRegression.fit(*first)
         second = leader._gather(envs, seed + SECOND_PASS, per_scene)
-        both: Any = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
+        both = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
         self.regression = ScoreRegression.fit(*both)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a tuned program; ``weights=path`` restores it.
-
-        Raises:
-            ValueError: If there is none yet.
-        """
+        """Write a tuned program, a `ValueError` if there is none yet; ``weights=path`` loads it."""
         if self.regression is None:
             raise ValueError(f"policy {self.name!r} has nothing to save before fit(envs)")
         self.regression.save(path)
@@ -222,7 +209,7 @@ class MeteringPolicy(Policy):
         self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int, per_scene: int
     ) -> tuple[Floats, Floats, NDArray[Any]]:
         """Readings after the meter has settled, scores of all states, source groups."""
-        features, scores, groups = [], [], []
+        found = []
         drawn = RolloutPlan.of_each_scene(
             scenes_of(envs), count=per_scene, seed=seed, most=FIT_EPISODES // 2
         )
@@ -232,8 +219,7 @@ class MeteringPolicy(Policy):
             for _ in range(FIT_FRAMES - 1):
                 actions = self.act(observations, masks)
                 observations = envs.step(actions)[0]
-            readings = self.observe(observations)
-            features.append(readings[batch.valid])
-            scores.append(expected_scores(envs)[batch.valid])
-            groups.append(batch.groups[batch.valid])
-        return np.concatenate(features), np.concatenate(scores), np.concatenate(groups)
+            columns = self.observe(observations), expected_scores(envs), batch.groups
+            found.append([column[batch.valid] for column in columns])
+        features, scores, groups = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return features, scores, groups

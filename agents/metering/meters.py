@@ -18,14 +18,13 @@ from agents.metering.reading import (
     BLACK_SIGNAL,
     GREEN,
     WHITE_SIGNAL,
-    Floats,
     Meter,
     Reading,
     frame_ev100,
     linear_signal,
     mean_reading,
 )
-from agents.policy import Observations
+from agents.policy import Floats, Observations
 from agents.policy_names import METERS
 from simulator.camera import CameraProfile
 from simulator.utils.checks import check_word
@@ -46,11 +45,7 @@ MATRIX_CALIBRATION_EV = 0.7
 
 
 def make_meter(name: str, camera: CameraProfile) -> Meter:
-    """The meter called `name`, one of `agents.policy_names.METERS`, for `camera`.
-
-    Raises:
-        ValueError: If there is none; the message proposes the nearest name.
-    """
+    """The meter called `name`, one of `agents.policy_names.METERS`; a `ValueError` if none is."""
     check_word("meter", name, METERS)
     if name in ("average", "centre_weighted", "spot"):
         return functools.partial(weighted_reading, camera=camera, name=name)
@@ -64,11 +59,9 @@ def make_meter(name: str, camera: CameraProfile) -> Meter:
 def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
     """Metering weights of the pixels, ``(height, width)``, summing to 1.
 
-    Args:
-        name: ``"average"``; ``"centre_weighted"``: 75 % of the weight in the central circle of half
-            the frame's height (the classic 12 mm circle of 35 mm cameras), the rest around it;
-            ``"spot"``: a central circle of 4 % of the area.
-        height, width: Rows and columns.
+    ``"centre_weighted"``: 75 % of the weight in the central circle of half the frame's height (the
+    classic 12 mm circle of 35 mm cameras), the rest around it; ``"spot"``: a central circle of 4 %
+    of the area.
 
     >>> round(float(weight_map("centre_weighted", 64, 64)[16:48, 16:48].sum()), 2)
     0.77
@@ -80,14 +73,12 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
         weights = np.ones((height, width))
     elif name == "centre_weighted":
         inside = radius <= CENTRE_DIAMETER / 2
-        weights = np.where(
-            inside, CENTRE_SHARE / inside.sum(), (1 - CENTRE_SHARE) / (~inside).sum()
-        )
+        around = (1 - CENTRE_SHARE) / (~inside).sum()
+        weights = np.where(inside, CENTRE_SHARE / inside.sum(), around)
     else:
         area = SPOT_AREA * height * width / height**2  # in frame heights squared
         weights = (radius <= np.sqrt(area / np.pi)).astype(np.float64)
-    normalised: NDArray[np.float32] = (weights / weights.sum()).astype(np.float32)
-    return normalised
+    return np.asarray((weights / weights.sum()).astype(np.float32))
 
 
 def weighted_reading(
@@ -138,8 +129,7 @@ def _zone_means(images: NDArray[Any]) -> Floats:
     for axis in (1, 2):
         size = images.shape[axis]
         starts = np.arange(MATRIX_ZONES) * size // MATRIX_ZONES
-        counts = np.diff(np.append(starts, size))
-        shape = (1, -1, 1) if axis == 1 else (1, 1, -1)
+        counts = np.diff(starts, append=size)
         sums = np.add.reduceat(images, starts, axis=axis, dtype=np.float64)
-        images = sums / counts.reshape(shape)
+        images = sums / np.expand_dims(counts, (0, 3 - axis))
     return images.reshape(len(images), -1)

@@ -10,22 +10,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ae_env.grid import ExposureGrid
+from agents.policy import Bools, Floats, Ints
 from simulator.utils.checks import check_number
-
-Floats = NDArray[np.float64]
 
 #: EVs nearer than this are the same exposure: 1/15 s stands for 1/16 s, 0.09 EV from it.
 SAME_EV = 1.0 / 6.0
-#: Longest shutter of a hand-held camera that knows nothing of its motion [s]; the rule of thumb
-#: 1 / focal length for a normal lens.
-HANDHELD_LIMIT = 1 / 60
-#: With sensors: blur that programs accept, in frame heights (one pixel of a 64-pixel frame).
-BLUR_LIMIT = 1 / 64
-#: Aperture that P tends to.
-PROGRAM_F_NUMBER = 5.6
+#: Longest shutter of a hand-held camera that knows nothing of its motion [s]: the rule of thumb
+#: 1 / focal length for a normal lens. With sensors, the blur that programs accept, in frame heights
+#: (one pixel of a 64-pixel frame). And the aperture that P tends to.
+HANDHELD_LIMIT, BLUR_LIMIT, PROGRAM_F_NUMBER = 1 / 60, 1 / 64, 5.6
 #: A program keeps its EV until another is nearer to the metered one by this, in steps of the grid:
 #: on even steps, while it is within 0.6 steps.
 HYSTERESIS_STEPS = 0.2
@@ -56,16 +51,7 @@ _ABOVE_CEILING_EV = 100.0
 
 @dataclass(frozen=True)
 class ProgramOptions:
-    """The options that every metering policy takes.
-
-    Args:
-        compensation: Exposure compensation [EV], positive is brighter, in [-32, 32].
-        damping: Share of the distance to the metered EV that remains after a frame, in [0, 1).
-        shutter_cap: Longest exposure time that may be used, for any reading, where there is
-            a shorter one [s]; None: no limit.
-        f_number: Aperture that A and M keep.
-        exposure_time: Shutter that S and M keep [s].
-        iso: ISO speed that M keeps; None: it follows the meter.
+    """The options that every metering policy takes, see `MeteringPolicy`.
 
     Raises:
         ValueError: If one is out of range.
@@ -91,9 +77,8 @@ class StateChooser:
     """How well each state of a grid fits an EV and what is set by hand.
 
     Args:
-        grid: The exposure states.
+        grid, options: The exposure states, what is set by hand, and the shutter cap.
         program: ``"P"``, ``"A"``, ``"S"`` or ``"M"``; nothing is set by hand in any other.
-        options: What is set by hand, and the shutter cap.
         ceiling: Whether the EV wanted is the most exposure that may be given.
     """
 
@@ -111,26 +96,22 @@ class StateChooser:
         if options.shutter_cap is not None:
             times = np.array([s.exposure_time for s in grid.states])
             self.over_cap = np.maximum(np.log2(times / options.shutter_cap) - 1e-6, 0.0)
-        self._first = _CAPPED * self.over_cap + _BY_HAND * self._off(program, options)
-        self._allowed = self._first == self._first.min()
-
-    def _off(self, program: str, options: ProgramOptions) -> Floats:
-        """Stops by which each state is further from what is set by hand than the nearest one is."""
-        wanted = []
+        wanted = []  # by hand
         if program in ("A", "M"):
             wanted.append((self.aperture, 2.0 * np.log2(options.f_number)))
         if program in ("S", "M"):
             wanted.append((self.time, -np.log2(options.exposure_time)))
         if program == "M" and options.iso is not None:
             wanted.append((self.speed, np.log2(options.iso / 100.0) + 5.0))
-        off = np.zeros_like(self.aperture)
+        off = np.zeros(len(grid))  # stops further from it than the nearest state is
         for values, value in wanted:
             distance = np.abs(values - value)
             above_least = distance - distance.min()
             off += np.where(above_least < 1e-9, 0.0, above_least)
-        return off
+        self._first = _CAPPED * self.over_cap + _BY_HAND * off
+        self._allowed = self._first == self._first.min()
 
-    def with_hysteresis(self, target: Floats, previous: NDArray[np.int64] | None) -> Floats:
+    def with_hysteresis(self, target: Floats, previous: Ints | None) -> Floats:
         """`target` [EV] ``(N,)``, or the EV of the `previous` states where that is near enough."""
         if previous is None:
             return target
@@ -148,21 +129,17 @@ class StateChooser:
         """Of the states that the cap and what is set by hand leave, ``(N, 1)``."""
         return np.asarray(distance[:, self._allowed].min(axis=1, keepdims=True))
 
-    def nearby(self, target: Floats, limit: float) -> NDArray[np.bool_]:
+    def nearby(self, target: Floats, limit: float) -> Bools:
         """States that may be used within `limit` [EV] of `target` or as near as any, ``(N, S)``."""
         distance = self._distance(target)
         near = np.maximum(self._least_distance(distance) + SAME_EV, limit)
         return np.asarray((distance <= near) & self._allowed)
 
     def utility(self, target: Floats, preference: Floats) -> Floats:
-        """How well each state fits, ``(N, S)``; the highest is to be taken.
+        """How well each state fits the EV100 `target` (N,), ``(N, S)``; the highest is to be taken.
 
         The shutter cap comes first, what is set by hand second, then the EV; among states of the
-        same exposure, `preference` decides.
-
-        Args:
-            target: EV100 wanted, ``(N,)``.
-            preference: Further cost of each state, well below 1000, ``(S,)`` or ``(N, S)``.
+        same exposure, `preference` decides: further cost, well below 1000, ``(S,)`` or ``(N, S)``.
         """
         distance = self._distance(target)
         # Nominal values are rounded (1/15 s for 1/16 s): states this near are the same exposure.
@@ -175,10 +152,8 @@ def check_used(program: str, **options: object) -> None:
     for name, value in options.items():
         users = USED_BY[name]
         if value is not None and program not in users:
-            programs = f"program{'s' if len(users) > 1 else ''} {' and '.join(users)}"
-            raise ValueError(
-                f"`{name}` (={value!r}) is an option of {programs} only, not of {program}"
-            )
+            only = f"of the program {' and '.join(users)} only, not of {program}"
+            raise ValueError(f"`{name}` (={value!r}) is an option {only}")
 
 
 def ev_step(grid: ExposureGrid) -> float:
@@ -190,9 +165,7 @@ def ev_step(grid: ExposureGrid) -> float:
     (1, 1)
     """
     levels = np.sort(grid.ev100)
-    gaps = np.diff(levels)
-    starts = np.concatenate([[True], gaps > SAME_EV])
-    steps = np.diff(levels[starts])
+    steps = np.diff(levels[np.diff(levels, prepend=-np.inf) > SAME_EV])
     return float(np.median(steps)) if len(steps) else 1.0
 
 
@@ -200,13 +173,8 @@ def program_cost(program: str, chooser: StateChooser, readings: Floats) -> Float
     """Which of the states of one EV a program prefers: the cost of each, ``(N or 1, S)``.
 
     P trades in squares of stops: motion blur counts 1, defocus 1/2, gain 1/4, the distance from
-    f/5.6 1/20. A avoids motion blur, then gain; S and M avoid gain.
-
-    Args:
-        program: ``"P"``, ``"A"``, ``"S"`` or ``"M"``.
-        chooser: The states.
-        readings: Metered EV100, and log2 of the image speed and of the defocus spread where the
-            camera has sensors, ``(N, 1 or 3)``.
+    f/5.6 1/20. A avoids motion blur, then gain; S and M avoid gain. For the `readings` see
+    `MeteringPolicy.observe`.
     """
     gain = (chooser.speed - chooser.speed.min())[None]
     if program in ("S", "M"):
@@ -222,7 +190,7 @@ def program_cost(program: str, chooser: StateChooser, readings: Floats) -> Float
 def shutter_limit(readings: Floats) -> Floats:
     """Tv of the slowest shutter that keeps motion blur within the limit, ``(N, 1)``.
 
-    Without a speed among the `readings`, that of a camera in the hand.
+    Where no speed is read, that of a camera in the hand.
     """
     if readings.shape[1] == 1:
         return np.full((len(readings), 1), -np.log2(HANDHELD_LIMIT))
@@ -230,10 +198,7 @@ def shutter_limit(readings: Floats) -> Floats:
 
 
 def aperture_limit(readings: Floats) -> Floats:
-    """Av of the widest aperture that keeps defocus within the limit, ``(N, 1)``.
-
-    Without a defocus spread among the `readings`, that of f/5.6.
-    """
+    """Av of the widest aperture that keeps defocus within the limit; f/5.6 where none is read."""
     if readings.shape[1] == 1:
         return np.full((len(readings), 1), 2.0 * np.log2(PROGRAM_F_NUMBER))
     # Blur diameter at f-number N is 4 D / N pixels of a 64-pixel frame.

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import PEDESTAL, decode_observation, decode_settings
-from agents.policy import Observations
+from agents.policy import Bools, Floats, Observations
 from simulator.camera import CameraProfile
-
-Floats = NDArray[np.float64]
 
 #: The planes that carry luminance.
 GREEN = slice(1, 3)
@@ -50,30 +48,25 @@ _SATURATED = 0.01
 
 @dataclass(frozen=True)
 class Reading:
-    """A meter's result for one frame of each camera.
+    """A meter's result for one frame of each camera: metered EV100, ``(N,)``.
 
-    Args:
-        ev100: Metered EV100, shape ``(N,)``.
-        saturated: Share of the metered weight that is saturated, ``(N,)``: the reading is a lower
-            bound in so far.
-        black: Whether nothing was recorded, ``(N,)``: the reading is an upper bound.
+    Of the metered weight a share is `saturated`: the reading is a lower bound in so far. Where the
+    frame is `black`, nothing was recorded: it is an upper bound.
     """
 
     ev100: Floats
     saturated: Floats
-    black: NDArray[np.bool_]
+    black: Bools
 
 
 class Meter(Protocol):
     """A light meter for a batch of cameras."""
 
     def __call__(self, observations: Observations, estimate: Floats | None = None) -> Reading:
-        """Meter the frames in hand.
+        """Meter the frames in hand of N cameras.
 
-        Args:
-            observations: Of N cameras.
-            estimate: EV100 that the controller holds, ``(N,)``, NaN in the first frame: where a
-                meter that improves on it step by step continues. The others ignore it.
+        A meter that improves step by step on the `estimate` that the controller holds, EV100
+        ``(N,)``, NaN in the first frame, continues there. The others ignore it.
         """
 
 
@@ -91,12 +84,9 @@ def frame_ev100(observations: Observations) -> Floats:
 def linear_signal(
     raw: NDArray[Any], camera: CameraProfile, planes: slice = slice(None)
 ) -> NDArray[np.float32]:
-    """Signal of observed frames, white is 1, from any kind of observation.
+    """Signal of observed frames, white is 1; of the `planes` among R, G1, G2, B.
 
-    Args:
-        raw: ``(N, 4, h, w)``: uint8 codes, float32 signal, or the camera's uint16 numbers.
-        camera: The camera, for its black and white level.
-        planes: Planes to take, of R, G1, G2, B.
+    `raw` (N, 4, h, w) is of any kind: uint8 codes, float32 signal, or the camera's uint16 numbers.
     """
     chosen = raw[:, planes]
     if chosen.dtype == np.uint8:
@@ -140,13 +130,8 @@ class EVTracker:
 
     With damping, the EV that is handed out follows the estimate. It is never read back from the
     settings, so a grid of whole stops does not hold it up, and its past never counts as lying
-    beyond the range: light that comes back after a long night is followed at once.
-
-    Args:
-        num_envs: Cameras.
-        ev_range: Lowest and highest EV100 of the camera's exposure states.
-        damping: Share of the distance to the estimate [EV] that remains after a frame, in [0, 1).
-        compensation: Exposure compensation [EV], by which the range of the past is higher.
+    beyond the `ev_range` of the exposure states, which compensation shifts: light that comes back
+    after a long night is followed at once.
     """
 
     def __init__(
@@ -156,11 +141,8 @@ class EVTracker:
         damping: float = 0.0,
         compensation: float = 0.0,
     ) -> None:
-        self.ev100 = np.full(num_envs, np.nan)
-        self.damped = np.full(num_envs, np.nan)
-        self.ev_range = ev_range
-        self.damping = damping
-        self.compensation = compensation
+        self.ev100, self.damped = np.full((2, num_envs), np.nan)
+        self.ev_range, self.damping, self.compensation = ev_range, damping, compensation
 
     def update(self, reading: Reading) -> Floats:
         """Take in one frame's reading; returns the estimates, ``(N,)``, damped."""
@@ -186,9 +168,6 @@ class ReferenceFrames:
     hand may go to and fro between the two for ever. So it continues on the better one for as long
     as new frames look as that one predicts. Of two frames the less saturated is better; of two that
     are not saturated, the brighter.
-
-    Args:
-        camera: The camera, for its black and white level.
     """
 
     def __init__(self, camera: CameraProfile) -> None:
@@ -215,13 +194,12 @@ class ReferenceFrames:
             # The same state again is a newer look at the same light.
             better = np.where(hides | hid, saturated < known_saturated, ev <= known_ev)
             replaced = better | self._changed(quantiles, ev)
-            for known, new in zip(
-                self._best, (raw, settings, quantiles, saturated, ev), strict=True
-            ):
-                known[replaced] = new[replaced]
+            new = raw, settings, quantiles, saturated, ev
+            for kept, one in zip(self._best, new, strict=True):
+                kept[replaced] = one[replaced]
         return {"raw": self._best[0], "settings": self._best[1]}
 
-    def _changed(self, quantiles: Floats, ev: Floats) -> NDArray[np.bool_]:
+    def _changed(self, quantiles: Floats, ev: Floats) -> Bools:
         """Whether the frames in hand look other than predicted, ``(N,)``."""
         assert self._best is not None
         predicted = self._best[2] * np.exp2(self._best[4] - ev)[:, None]
@@ -231,7 +209,7 @@ class ReferenceFrames:
         stops = np.abs(np.diff(np.log2(np.maximum(both, 1e-6)), axis=0)[0])
         known = shown.any(axis=1)
         middle = np.nanmedian(np.where(known[:, None] & ~shown, np.nan, stops), axis=1)
-        changed: NDArray[np.bool_] = apart | known & (middle > _TOLERANCE_EV)
+        changed: Bools = apart | known & (middle > _TOLERANCE_EV)
         return changed
 
 
@@ -252,7 +230,7 @@ class ZoneMatcher:
     def match(self, reading: Reading, zones: Floats, exposed_at: Floats) -> Reading:
         """Take in one frame of each camera; what it reads, unsaturated where it was matched.
 
-        `zones` are `zone_signals`, `exposed_at` is the EV100 of the frames' settings, ``(N,)``.
+        `zones` are its `zone_signals`, `exposed_at` is the EV100 of its settings, ``(N,)``.
         """
         light, saturated = reading.ev100, reading.saturated
         if self._zones is not None:
@@ -265,13 +243,10 @@ class ZoneMatcher:
         return Reading(light, saturated, reading.black)
 
 
-def light_change(before: Floats, now: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """How many stops more signal `now` has than `before` in the zones that both show.
+def light_change(before: Floats, now: Floats) -> tuple[Floats, Bools]:
+    """How many stops more signal `now` has than `before` in the zones (..., zones) both show.
 
-    Both are signals of zones, (..., zones), NaN where one clips.
-
-    Returns:
-        Stops (...), and whether there was enough to compare; 0 where not.
+    A zone that clips is NaN. Also returns whether there was enough to compare; it is 0 where not.
     """
     both = ~np.isnan(before) & ~np.isnan(now)
     count = np.maximum(both.sum(axis=-1), 1)

@@ -9,15 +9,14 @@ nearest states of a grid. The numbers of that tuning come first.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.metering.programs import PRIORITY_TIME, ProgramOptions, StateChooser, check_used
-from agents.metering.reading import GREEN, TARGET_SIGNAL, Floats, frame_ev100, linear_signal
-from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
+from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import MANUAL_PROGRAMS
 from simulator.utils.checks import check_integer, check_number, check_word
 
@@ -29,13 +28,10 @@ ZONE_WEIGHTS = {
 }
 
 
-@dataclass(frozen=True)
-class Ladder:
+class Ladder(NamedTuple):
     """How an exposure mode splits an exposure: the shutter up to a rung, then the gain, and so on.
 
-    Args:
-        shutter: Rungs of the exposure time [s].
-        gain: Rungs of the gain, 1 at ISO 100.
+    Rungs are exposure times [s], and gains that are 1 at ISO 100.
     """
 
     shutter: tuple[float, ...]
@@ -49,19 +45,12 @@ LADDERS = {
 }
 
 
-@dataclass(frozen=True)
-class Constraint:
-    """The mean of the pixels between two quantiles must not be below, or above, a target.
-
-    Args:
-        lower: Whether the target is a lower bound.
-        quantiles: Between which the pixels are averaged.
-        target: Signal, white is 1.
-    """
+class Constraint(NamedTuple):
+    """The mean of the pixels between two quantiles is at least (`lower`), or at most, a target."""
 
     lower: bool
     quantiles: tuple[float, float]
-    target: float
+    target: float  # signal, white is 1
 
 
 _TOP = Constraint(True, (0.98, 1.0), 0.3)
@@ -71,22 +60,19 @@ CONSTRAINTS = {
     "shadows": (Constraint(True, (0.0, 0.5), 0.17),),
 }
 
-#: Illuminance [lux] and the mean signal aimed at; linear between, constant outside.
+#: Illuminance [lux] and the mean signal aimed at; linear between, constant outside. And the
+#: illuminance that is assumed where none is known [lux].
 TARGET_LUX, TARGET_SIGNALS = (0.0, 1000.0, 10000.0), (0.16, 0.165, 0.17)
-#: Illuminance that is assumed where none is known [lux].
 DEFAULT_LUX = 400.0
 #: No target is above this, whatever the compensation: close to white a mean says nothing.
 TARGET_LIMIT = 0.9
 #: Bins of the histogram that constraints read.
 HISTOGRAM_BINS = 128
-#: Share of the distance to the target that the filter goes per frame.
-SPEED = 0.2
-#: Within this of the target the filter goes with the square root of its speed.
-NEAR = 0.2
-#: Within this of the target it stays.
-STABLE = 0.02
-#: Frames of the start, in which it goes all of the way.
-STARTUP_FRAMES = 10
+#: Share of the distance to the target that the filter goes per frame, and frames of the start, in
+#: which it goes all of the way.
+SPEED, STARTUP_FRAMES = 0.2, 10
+#: Within these of the target the filter goes with the square root of its speed, and stays.
+NEAR, STABLE = 0.2, 0.02
 #: A target above this that the picture exceeds is approached from below, at this part of the
 #: exposure.
 FAST_REDUCE = 0.4
@@ -97,7 +83,7 @@ _LEAST_SIGNAL = 1e-3
 
 
 class LibcameraAgc:
-    """The algorithm for N cameras: statistics of a frame in, the next exposure out.
+    """The algorithm for `num_cameras` N: statistics of a frame in, the next exposure out.
 
     Each frame: the mean of 15 weighted zones gives a gain, which the constraints on the brightest
     or darkest pixels may change; the gain and the exposure *of that frame* give the target; a
@@ -106,18 +92,11 @@ class LibcameraAgc:
     counts from what each frame was taken with.
 
     Args:
-        num_cameras: N.
-        metering: A name of `ZONE_WEIGHTS`.
-        constraint: A name of `CONSTRAINTS`.
+        metering, constraint: Names of `ZONE_WEIGHTS` and of `CONSTRAINTS`.
         ladder: An exposure mode, of `LADDERS` or of one's own.
-        compensation: Exposure compensation [EV], positive is brighter.
         max_exposure_time: Longest that the sensor or the user allows [s].
-        exposure_time: Fixed exposure time [s], in place of the ladder's.
-        gain: Fixed gain, in place of the ladder's.
-        flicker_period: Period of the lamps' light [s], such as 0.01: exposure times of a period
-            and more are whole periods, and the gain makes up for it.
-        speed: Share of the distance to the target that the filter goes per frame, in (0, 1].
-        startup_frames: Frames at first in which it goes all of the way.
+        exposure_time, gain: Fixed ones [s], in place of the ladder's.
+        compensation, flicker_period, speed, startup_frames: As of `RpiAgc`.
     """
 
     def __init__(
@@ -153,37 +132,21 @@ class LibcameraAgc:
             exposure: Exposure time x gain that the frame was taken with [s], ``(N,)``.
             lux: Illuminance, of each or of all.
         """
-        factor, target_signal = self._factor(zones, histogram, lux)
-        target = np.minimum(exposure * factor, self.most_exposure)
-        filtered = self._filter.update(target)
-        reduce = (target_signal > FAST_REDUCE) & (factor < np.sqrt(target_signal))
-        return filtered * np.where(reduce, FAST_REDUCE, 1.0)
-
-    @property
-    def most_exposure(self) -> float:
-        """The most exposure time x gain that the ladder and what is fixed allow [s]."""
-        times, gains = self.ladder.shutter, self.ladder.gain
-        time = times[-1] if self.exposure_time is None else self.exposure_time
-        gain = gains[-1] if self.gain is None else self.gain
-        return float(min(time, self.max_exposure_time) * gain)
-
-    def _factor(
-        self, zones: Floats, histogram: Floats, lux: Floats | float
-    ) -> tuple[Floats, Floats]:
-        """By what the exposure of the frames must change, and the signal it aims at, ``(N,)``."""
-        wanted = self._compensated(
-            np.broadcast_to(np.interp(lux, TARGET_LUX, TARGET_SIGNALS), len(zones))
-        )
+        brighter, count = 2.0**self.compensation, len(zones)
+        aimed = np.broadcast_to(np.interp(lux, TARGET_LUX, TARGET_SIGNALS), count)
+        wanted: Floats = np.minimum(aimed * brighter, TARGET_LIMIT)
         factor = zone_factor(zones, self.weights, wanted)
         for constraint in self.constraints:
-            bound = self._compensated(np.full(len(factor), constraint.target))
+            bound = np.full(count, min(constraint.target * brighter, TARGET_LIMIT))
             other = bound / inter_quantile_mean(histogram, *constraint.quantiles)
             adopted = other > factor if constraint.lower else other < factor
             factor, wanted = np.where(adopted, other, factor), np.where(adopted, bound, wanted)
-        return factor, wanted
-
-    def _compensated(self, signal: Floats) -> Floats:
-        return np.minimum(signal * 2.0**self.compensation, TARGET_LIMIT)
+        time = self.ladder.shutter[-1] if self.exposure_time is None else self.exposure_time
+        gain = self.ladder.gain[-1] if self.gain is None else self.gain
+        most = min(time, self.max_exposure_time) * gain
+        filtered = self._filter.update(np.minimum(exposure * factor, most))
+        reduce = (wanted > FAST_REDUCE) & (factor < np.sqrt(wanted))
+        return filtered * np.where(reduce, FAST_REDUCE, 1.0)
 
     def split(self, exposure: Floats) -> tuple[Floats, Floats]:
         """Exposure time [s] and gain of `exposure` [s], ``(N,)`` each, by the ladder.
@@ -211,11 +174,8 @@ class LibcameraAgc:
 class ExposureFilter:
     """The AGC's filter: a continuous exposure that goes a part of the way at every frame.
 
-    Args:
-        num_cameras: Cameras.
-        speed: Part of the (linear) distance that it goes; the square root of it within 20 % of the
-            target, nothing within 2 %.
-        startup_frames: Frames at first in which it goes all of the way.
+    That is `speed` of the (linear) distance; the square root of it within 20 % of the target,
+    nothing within 2 %; all of the way in the first `startup_frames`.
 
     >>> follow = ExposureFilter(1, startup_frames=0)
     >>> [round(float(follow.update(np.array([x]))[0]), 3) for x in (1.0, 16.0, 16.0)]
@@ -271,12 +231,9 @@ def signal_histogram(signals: NDArray[Any]) -> Floats:
 
 
 def inter_quantile_mean(histogram: Floats, low: float, high: float) -> Floats:
-    """Mean signal of the pixels between two quantiles, ``(N,)``; those of a bin are at its middle.
+    """Mean signal of the pixels between two quantiles, at least one of them, ``(N,)``.
 
-    Args:
-        histogram: ``(N, bins)`` counts of the signals from 0 to 1.
-        low: Lower quantile.
-        high: Upper quantile; at least one pixel is averaged.
+    `histogram` ``(N, bins)`` counts the signals from 0 to 1; those of a bin are at its middle.
     """
     bins = histogram.shape[1]
     above = np.cumsum(histogram, axis=1)
@@ -302,20 +259,16 @@ class RpiAgc(Policy):
     """The Raspberry Pi's AGC (`LibcameraAgc`): the state of the grid that is nearest to it.
 
     Args:
-        context: The camera, the grid and the observation.
+        context: The camera.
         program: ``"P"``: the ladder, at an aperture of `f_number`; ``"A"``: the same, and no other
             aperture; ``"S"``: shutter by hand, the gain follows, and the aperture where the gain
             alone comes less near to the EV; ``"M"``: aperture and shutter by hand.
         metering: ``"centre_weighted"``, ``"spot"`` or ``"matrix"``: weights of the zones.
         mode: ``"normal"``, ``"short"`` or ``"long"``: the ladder.
         constraint: ``"normal"``, ``"highlight"`` or ``"shadows"``.
-        compensation: Exposure compensation [EV], positive is brighter.
-        damping: Share of the distance to the filtered EV that remains after a frame, in [0, 1).
-        shutter_cap: Longest exposure time that may be used [s].
+        compensation, damping, shutter_cap, exposure_time, iso: As of `MeteringPolicy`.
         f_number: Aperture of the lens; by default the widest of the grid, which is nearest to the
             f/1.8 and f/2 of the Raspberry Pi's own cameras.
-        exposure_time: Shutter that S and M keep [s]; None: 1/125.
-        iso: ISO speed that M keeps; None: it follows the meter.
         max_gain: Gain at the end of the ladder, 1 at ISO 100.
         flicker_period: Period of the lamps' light [s], such as 0.01: shutters of a period and more
             are whole periods, and the gain makes up for it (P and A). None: lamps are steady.
@@ -357,16 +310,14 @@ class RpiAgc(Policy):
         max_gain = check_number("max_gain", max_gain, 1.0, 1e5)
         if flicker_period is not None:
             flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
-        self.flicker_period = flicker_period
         self.name = f"rpi_agc:{program}"
-        ladder = LADDERS[mode]
-        gains = (*ladder.gain[:-1], max_gain)
-        self._ladder = Ladder(ladder.shutter, tuple(min(g, max_gain) for g in gains))
+        shutter, gains = LADDERS[mode]
+        gains = tuple(min(g, max_gain) for g in (*gains[:-1], max_gain))
         self._make_agc = functools.partial(
             LibcameraAgc,
             metering=metering,
             constraint=constraint,
-            ladder=self._ladder,
+            ladder=Ladder(shutter, gains),
             compensation=compensation,
             max_exposure_time=shutter_cap,
             exposure_time=time if program in ("S", "M") else None,
@@ -381,25 +332,23 @@ class RpiAgc(Policy):
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Begin the start-up frames of `num_envs` cameras."""
         super().reset(num_envs, seed)
-        self._agc = self._make_agc(num_envs)
+        self.agc = self._make_agc(num_envs)
         self._damped = np.full(num_envs, np.nan)
-        self._previous: NDArray[np.int64] | None = None
+        self._previous: Ints | None = None
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
+    def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Meter the frames, filter the exposure, split it."""
         self.check_reset(observations)
         signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
         signal = np.maximum(signal, 0.0).reshape(len(signal), -1)
         zones = signal @ _zone_matrix(*observations["raw"].shape[2:])
         frame_ev = frame_ev100(observations)
-        brightness = zones @ self._agc.weights / self._agc.weights.sum()
+        brightness = zones @ self.agc.weights / self.agc.weights.sum()
         light = np.log2(np.maximum(brightness, _DARKEST) / TARGET_SIGNAL)
         lux = 2.5 * np.exp2(frame_ev + light)
         # As exposure time x gain at the lens's own f-number, which may not be the frame's.
         area = self.options.f_number**2
-        exposure = self._agc.update(zones, signal_histogram(signal), area * np.exp2(-frame_ev), lux)
+        exposure = self.agc.update(zones, signal_histogram(signal), area * np.exp2(-frame_ev), lux)
         ev = -np.log2(exposure / area)
         states = self.context.grid.ev100
         before = np.clip(self._damped, states.min(), states.max())
@@ -408,15 +357,11 @@ class RpiAgc(Policy):
         self._previous = masked_argmax(self._utility(self._damped), action_masks)
         return self._previous.copy()
 
-    def split(self, exposure: Floats) -> tuple[Floats, Floats]:
-        """Exposure time [s] and gain of `exposure` [s], ``(N,)`` each, by the ladder."""
-        return self._agc.split(exposure)
-
     def _utility(self, ev: Floats) -> Floats:
         """How well each state fits the exposures and the ladder, ``(N, S)``."""
         chooser = self._chooser
         target = chooser.with_hysteresis(ev, self._previous)
-        time, gain = self.split(self.options.f_number**2 * np.exp2(-target))
+        time, gain = self.agc.split(self.options.f_number**2 * np.exp2(-target))
         aperture = chooser.aperture - 2.0 * np.log2(self.options.f_number)
         slower = np.log2(time)[:, None] + chooser.time[None]  # stops shorter than the ladder's
         higher = chooser.speed[None] - 5.0 - np.log2(gain)[:, None]
@@ -430,46 +375,40 @@ class RpiAgc(Policy):
 
         Shutters of whole periods are looked for where that of the ladder is one, up to its longest.
         """
-        if self.flicker_period is None:
+        period = self.agc.flicker_period
+        if period is None:
             return 0.0
         times = np.exp2(-self._chooser.time)
-        periods = times / self.flicker_period
+        periods = times / period
         tolerance = _PERIOD_TOLERANCE * periods
         whole = (np.abs(periods - np.round(periods)) <= tolerance) & (periods > 0.5)
-        whole &= times <= self._ladder.shutter[-1] * (1.0 + _PERIOD_TOLERANCE)
+        whole &= times <= self.agc.ladder.shutter[-1] * (1.0 + _PERIOD_TOLERANCE)
         steady = self._chooser.nearby(target, _NEARBY_EV) & whole
-        found = (time >= self.flicker_period) & steady.any(axis=1)
+        found = (time >= period) & steady.any(axis=1)
         return (found[:, None] & ~steady).astype(np.float64)
 
 
-def zone_map(height: int, width: int) -> NDArray[np.int64]:
-    """Zone of each pixel, ``(height, width)``, 0 to 14.
+#: Where the zones lie: the tuning names them by their order only, centre first. The outer ones are
+#: a sixth of the frame wide and high; within them are three rows and five columns.
+ZONE_LAYOUT = np.array(
+    [
+        [11, 7, 7, 7, 7, 7, 12],
+        [9, 3, 3, 3, 3, 3, 10],
+        [9, 5, 1, 0, 2, 6, 10],
+        [9, 4, 4, 4, 4, 4, 10],
+        [13, 8, 8, 8, 8, 8, 14],
+    ]
+)
 
-    The tuning names the zones by their order only, centre first; they are laid out so::
 
-        11 |     7     | 12
-        ---+-----------+---
-           |     3     |
-         9 | 5 1 0 2 6 | 10
-           |     4     |
-        ---+-----------+---
-        13 |     8     | 14
-
-    The outer zones are a sixth of the frame wide and high.
-    """
-    y, x = np.mgrid[:height, :width]
-    row, column = (y + 0.5) / height, (x + 0.5) / width
-    top, bottom, left, right = row < 1 / 6, row >= 5 / 6, column < 1 / 6, column >= 5 / 6
-    inner = np.minimum((column - 1 / 6) * 7.5, 4.0).astype(np.int64)  # 0 to 4 across
-    zones = np.array([5, 1, 0, 2, 6])[np.clip(inner, 0, 4)]
-    third = (row - 1 / 6) * 4.5
-    zones = np.where(third < 1, 3, np.where(third >= 2, 4, zones))
-    for zone, where in ((7, top), (8, bottom), (9, left), (10, right)):
-        zones = np.where(where, zone, zones)
-    corners = ((11, top & left), (12, top & right), (13, bottom & left), (14, bottom & right))
-    for zone, where in corners:
-        zones = np.where(where, zone, zones)
-    return zones.astype(np.int64)
+def zone_map(height: int, width: int) -> Ints:
+    """Zone of each pixel, ``(height, width)``, 0 to 14."""
+    places = []
+    for size, inner in ((height, 3), (width, 5)):
+        place = (np.arange(size) + 0.5) / size
+        within = np.floor((place - 1 / 6) * (1.5 * inner)).astype(np.int64)
+        places.append(1 + within.clip(-1, inner))
+    return ZONE_LAYOUT[np.ix_(*places)]
 
 
 @functools.lru_cache(maxsize=8)

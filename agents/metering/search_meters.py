@@ -28,37 +28,31 @@ from agents.metering.reading import (
     SATURATED_STEP_EV,
     TARGET_SIGNAL,
     WHITE_SIGNAL,
-    Floats,
     Reading,
     frame_ev100,
     signal_codes,
 )
-from agents.policy import Observations
+from agents.policy import Bools, Floats, Observations
 from simulator.camera import CameraProfile
 
-#: Quantile of the largest of the four planes that is exposed to the right, and how bright.
-HIGHLIGHT_QUANTILE, HIGHLIGHT_SIGNAL = 0.99, 0.9
-#: A frame whose highlights are saturated counts as saturated by at least this share.
-HIGHLIGHT_SATURATED = 0.51
-#: Exposures that a search tries, in EV from the frame in hand, positive is brighter.
-SEARCH_EV = np.arange(-6.0, 6.01, 0.25)
-#: Bins of the simulated histogram.
-BINS = 256
+#: Quantile of the largest of the four planes that is exposed to the right, and how bright; a frame
+#: whose highlights are saturated counts as saturated by at least the third.
+HIGHLIGHT_QUANTILE, HIGHLIGHT_SIGNAL, HIGHLIGHT_SATURATED = 0.99, 0.9, 0.51
+#: Exposures that a search tries, in EV from the frame in hand, positive is brighter; and bins of
+#: the simulated histogram.
+SEARCH_EV, BINS = np.arange(-6.0, 6.01, 0.25), 256
 #: An 18 % card is shown at 0.18: the picture's signal relative to the raw's.
 _DEVELOPED_GAIN = 0.18 / TARGET_SIGNAL
 #: Gammas that Shim's search tries; below 1 brightens.
 GAMMAS = (0.1, 0.5, 0.8, 1.0, 1.2, 1.5, 1.9)
-#: Speed K_p and shape d of Shim's update.
-SHIM_SPEED, SHIM_SHAPE = 2.0, 1.0
-#: Least factor of the exposure in one step of Shim's update.
-SHIM_LEAST = 0.125
+#: Speed K_p and shape d of Shim's update, and the least factor of the exposure in one step of it.
+SHIM_SPEED, SHIM_SHAPE, SHIM_LEAST = 2.0, 1.0, 0.125
 #: Zhang's step: EV per relative change of the metric and EV; its bound [EV]; half of the distance
 #: of the two exposures from which the derivative is taken [EV].
 ZHANG_RATE, ZHANG_LIMIT_EV, ZHANG_DELTA_EV = 3.0, 2.0, 0.25
-#: How often a step that lowers the metric is halved before it is given up.
-HALVINGS = 4
-#: The frame in hand is exposed again by at most so many EV.
-SIMULATED_EV = 4.0
+#: How often a step that lowers the metric is halved before it is given up; and by how many EV the
+#: frame in hand is exposed again at most.
+HALVINGS, SIMULATED_EV = 4, 4.0
 #: Saturated share from which a frame hides something.
 SATURATED_SEEN = 0.01
 #: From a saturated share s of 0.1 on, a frame is too bright by 4 (s - 0.1) EV or more.
@@ -98,15 +92,12 @@ def skewness_reading(
     is 0 is looked for. (About the *mean*, as textbooks have it, the skewness of a power-law code
     does not depend on the exposure until something clips.)
     """
-    shares, ev = (
-        _shares(signal_codes(observations["raw"], camera, GREEN)),
-        frame_ev100(observations),
-    )
+    shares = _shares(signal_codes(observations["raw"], camera, GREEN))
     exposed = _exposed(shares, SEARCH_EV, _DEVELOPED_GAIN)  # (N, K, BINS)
     centres = (np.arange(BINS) + 0.5) / BINS - encoded(np.array(0.18))
     moment = np.cbrt(exposed @ centres**3)  # (N, K), rising with the exposure
     crossing = np.array([np.interp(0.0, row, SEARCH_EV) for row in moment])
-    return _search_reading(shares, ev, crossing)
+    return _search_reading(shares, frame_ev100(observations), crossing)
 
 
 def entropy_reading(
@@ -116,13 +107,10 @@ def entropy_reading(
 
     Noise counts as detail: entropy likes gain.
     """
-    shares, ev = (
-        _shares(signal_codes(observations["raw"], camera, GREEN)),
-        frame_ev100(observations),
-    )
+    shares = _shares(signal_codes(observations["raw"], camera, GREEN))
     exposed = _exposed(shares, SEARCH_EV)  # (N, K, BINS)
     entropy = -(exposed * np.log2(np.maximum(exposed, 1e-30))).sum(axis=2)
-    return _search_reading(shares, ev, peak(entropy, SEARCH_EV))
+    return _search_reading(shares, frame_ev100(observations), peak(entropy, SEARCH_EV))
 
 
 def peak(values: Floats, positions: Floats, best: NDArray[np.intp] | None = None) -> Floats:
@@ -147,18 +135,16 @@ def _shares(codes: NDArray[np.uint8]) -> Floats:
     """Share of each code, ``(N, 256)``."""
     flat = codes.reshape(len(codes), -1)
     counts = [np.bincount(row, minlength=CODES) for row in flat]
-    shares: Floats = np.array(counts, np.float64).reshape(-1, CODES) / flat.shape[1]
-    return shares
+    return np.array(counts, np.float64).reshape(-1, CODES) / flat.shape[1]
 
 
 def _exposed(shares: Floats, evs: Floats, gain: float = 1.0) -> Floats:
     """Histograms ``(N, K, BINS)`` of sRGB codes at other exposures, ``(K,)`` [EV], of `_shares`."""
     below, rest = _edges(tuple(evs), gain)
-    cumulated = np.concatenate([np.zeros((len(shares), 1)), np.cumsum(shares, axis=1)], axis=1)
+    cumulated = np.pad(np.cumsum(shares, axis=1), ((0, 0), (1, 0)))
     lower = cumulated[:, below]
     at_edges = lower + rest * (cumulated[:, below + 1] - lower)  # (N, K, BINS - 1)
-    ends = np.broadcast_to([0.0, 1.0], (*at_edges.shape[:2], 2))
-    return np.diff(np.concatenate([ends[..., :1], at_edges, ends[..., 1:]], axis=2), axis=2)
+    return np.diff(at_edges, axis=2, prepend=0.0, append=1.0)
 
 
 @functools.lru_cache(maxsize=8)
@@ -178,10 +164,8 @@ def _edges(evs: tuple[float, ...], gain: float) -> tuple[NDArray[np.intp], Float
 
 
 def _search_reading(shares: Floats, ev: Floats, found: Floats) -> Reading:
-    """The reading of a search that wants the frame `found` EV brighter, ``(N,)``.
-
-    What is saturated cannot be seen at a lower exposure: it adds to the reading as for any meter.
-    """
+    """The reading of a search that wants the frame `found` EV brighter, ``(N,)``."""
+    # What is saturated cannot be seen at a lower exposure: it adds as for any meter.
     saturated = shares[:, CODE_SIGNALS >= WHITE_SIGNAL].sum(axis=1)
     black = shares @ CODE_SIGNALS <= BLACK_SIGNAL
     return Reading(ev - found + SATURATED_STEP_EV * saturated, saturated, black)
@@ -218,9 +202,8 @@ def shim_reading(
 
     frame = _Frame(observations, estimate, camera)
     base = _table(frame.shift)  # (N, CODES)
-    metric = np.stack(
-        [shim_gradient(torch.from_numpy(frame.luma(base**g))).numpy() for g in GAMMAS], axis=1
-    )
+    shown = [torch.from_numpy(frame.luma(base**gamma)) for gamma in GAMMAS]
+    metric = np.stack([shim_gradient(luma).numpy() for luma in shown], axis=1)
     found = peak(metric, np.array(GAMMAS), metric.argmax(axis=1))
     gamma = np.where(metric.max(axis=1) > _NO_GRADIENT, found, 1.0)
     ratio = SHIM_SHAPE * np.tan((1.0 - gamma) * math.atan(1.0 / SHIM_SHAPE))  # R - 1
@@ -284,23 +267,21 @@ class _Frame:
         """`function` of the luma, as one of how much brighter than the estimate it is [EV]."""
         import torch
 
-        return lambda brighter: function(
-            torch.from_numpy(self.luma(_table(self.shift + brighter)))
-        ).numpy()
+        def measure(brighter: Floats) -> Floats:
+            luma = torch.from_numpy(self.luma(_table(self.shift + brighter)))
+            return np.asarray(function(luma))
 
-    def shows(self, brighter: Floats) -> NDArray[np.bool_]:
+        return measure
+
+    def shows(self, brighter: Floats) -> Bools:
         """Whether the simulation is true at `brighter` than the estimate [EV], ``(N,)``.
 
         What a saturated frame would show at less exposure than its own is not known.
         """
-        shown: NDArray[np.bool_] = (self._share < SATURATED_SEEN) | (self.shift + brighter >= 0.0)
-        return shown
+        return np.asarray((self._share < SATURATED_SEEN) | (self.shift + brighter >= 0.0))
 
     def rising(self, step: Floats, here: Floats, metric: Callable[[Floats], Floats]) -> Floats:
-        """The steps [EV], halved where the metric would be below that `here`, or 0.
-
-        Steps to where the frame shows nothing are as they are.
-        """
+        """The steps [EV], halved where the metric would be below that `here` and known, or 0."""
         for _ in range(HALVINGS + 1):
             falls = (metric(step) < here) & ((step > 0.0) | self.shows(step))
             if not falls.any():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.metering.reading import Floats
+from agents.policy import Floats
 from simulator.utils.files import write_atomically
 
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
@@ -33,16 +33,11 @@ class ScoreRegression:
 
     A local linear fit, weighted by a Gaussian kernel; where few training samples are near, it
     shrinks to the same fit with three times the bandwidths, and that one to the mean.
-
-    Args:
-        features: Readings of the training episodes [stops], ``(n, d)``.
-        scores: Expected score of every state there, ``(n, S)``.
-        bandwidths: Standard deviation of the kernel per reading [stops], ``(d,)``.
     """
 
-    features: Floats
-    scores: Floats
-    bandwidths: Floats
+    features: Floats  # (n, d) readings of the training episodes [stops]
+    scores: Floats  # (n, S) expected score of every state there
+    bandwidths: Floats  # (d,) standard deviation of the kernel [stops]
 
     @classmethod
     def fit(cls, features: Floats, scores: Floats, groups: NDArray[Any]) -> ScoreRegression:
@@ -119,9 +114,8 @@ class ScoreRegression:
         """Write the regression as a safetensors file."""
         from safetensors.numpy import save
 
-        return write_atomically(
-            path, save({k: np.ascontiguousarray(v) for k, v in vars(self).items()})
-        )
+        content = save({name: np.ascontiguousarray(v) for name, v in vars(self).items()})
+        return write_atomically(path, content)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:

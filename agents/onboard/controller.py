@@ -18,13 +18,7 @@ METADATA, FORMAT = "ae_env", 1
 
 
 class ExposureState(NamedTuple):
-    """What a camera is to be set to.
-
-    Args:
-        iso: ISO speed.
-        exposure_time: [s].
-        f_number: Marked f-number.
-    """
+    """What a camera is to be set to: ISO speed, exposure time [s] and marked f-number."""
 
     iso: float
     exposure_time: float
@@ -60,14 +54,12 @@ class Controller:
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
-            found = self._session.get_modelmeta().custom_metadata_map[METADATA]
-        except KeyError:
-            raise ValueError(f"{given} is no export of `ae-env export`") from None
+            found = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "{}")
         except Exception as error:  # ONNX Runtime has errors of its own
             raise ValueError(f"{given} cannot be read: {error}") from error
         self.card: dict[str, Any] = json.loads(found)
         if self.card.get("format") != FORMAT:
-            raise ValueError(f"{given} is of format {self.card.get('format')}, not {FORMAT}")
+            raise ValueError(f"{given} must be an export of `ae-env export`, of format {FORMAT}")
         self.states = [ExposureState(*state) for state in self.card["states"]]
         self.reset(num_cameras)
 
@@ -144,10 +136,8 @@ class Controller:
         """The observed frame of a signal (4, H, W): averaged to `frame_shape`, companded."""
         count, height, width = self.frame_shape
         if planes.ndim != 3 or len(planes) != count or planes[0].size < height * width:
-            raise ValueError(
-                f"`planes` (shape {planes.shape}) must be ({count}, H, W), at least "
-                f"{height} x {width}"
-            )
+            rule = f"({count}, H, W), at least {height} x {width}"
+            raise ValueError(f"`planes` (shape {planes.shape}) must be {rule}")
         averaged = _averaged(_averaged(np.asarray(planes, np.float64), height, 1), width, 2)
         pedestal = self.card["pedestal"]
         shown = np.clip(averaged, -pedestal, 1.0)
@@ -190,7 +180,5 @@ def _averaged(values: NDArray[np.float64], size: int, axis: int) -> NDArray[np.f
     """Means over `size` stretches of an axis, as even as they can be."""
     length = values.shape[axis]
     starts = np.arange(size) * length // size
-    counts = np.diff(np.append(starts, length))
-    shape = [1, 1, 1]
-    shape[axis] = size
-    return np.add.reduceat(values, starts, axis=axis) / counts.reshape(shape)
+    counts = np.diff(starts, append=length)
+    return np.add.reduceat(values, starts, axis=axis) / np.expand_dims(counts, (0, 3 - axis))

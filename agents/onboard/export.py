@@ -27,9 +27,7 @@ class _RegressionGraph(nn.Module):
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.network = network
-        self.ranges: torch.Tensor
-        self.register_buffer("ranges", torch.tensor(SETTINGS_RANGES, dtype=torch.float32))
+        self.network: Any = network
 
     def forward(
         self, raw: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None = None
@@ -43,7 +41,7 @@ class _RegressionGraph(nn.Module):
         signal = (1.0 + PEDESTAL) * codes[:, 1:3].square() - PEDESTAL
         saturated = (signal >= WHITE_SIGNAL).float().mean(dim=(1, 2, 3))
         level = (signal.mean(dim=(1, 2, 3)).clamp(min=BLACK_SIGNAL) / TARGET_SIGNAL).log2()
-        low, high = self.ranges.unbind(dim=1)
+        low, high = self.network.features.ranges.unbind(dim=1)
         apex = low + (settings + 1.0) * 0.5 * (high - low)
         ev100 = (3.0 * apex[:, 0]).round() / 3.0 + apex[:, 1] - (apex[:, 2] - 5.0)
         return ev100 + level + SATURATED_STEP_EV * saturated
@@ -71,15 +69,13 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
     """Writes an agent as one ONNX file: the observation goes in as it is, for any batch.
 
     Args:
-        policy: A `RegressionPolicy` without foresight, or a `PPOPolicy` without a history.
+        policy: A `RegressionPolicy` without foresight, or a `PPOPolicy` without a history, that
+            looks at pixels.
         path: The ``.onnx`` file.
-
-    Returns:
-        The file.
 
     Raises:
         ImportError: If the extra ``onnx`` is not installed.
-        ValueError: If the agent cannot be exported, or does not look at pixels.
+        ValueError: If the agent cannot be exported.
     """
     file = Path(path)
     if file.suffix != ".onnx":
@@ -89,9 +85,7 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
         import onnx
         import onnxscript  # noqa: F401  (torch's exporter needs it)
     except ImportError as error:
-        raise ImportError(
-            "the export needs ONNX: install the extra with pip install 'ae-env[onnx]'"
-        ) from error
+        raise ImportError("the export needs ONNX: pip install 'ae-env[onnx]'") from error
     context = policy.context
     shape = context.observation_space["raw"].shape or ()
     arguments = {"raw": torch.zeros(2, *shape, dtype=torch.uint8), "settings": torch.zeros(2, 3)}
@@ -117,19 +111,18 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
 
 def _graph(policy: Policy) -> nn.Module:
     if "histogram" in policy.context.observation_space.spaces:
-        raise ValueError("`policy`: agents that observe pixels can be exported, not statistics")
-    if isinstance(policy, RegressionPolicy):
-        if policy.foresight != "none":
-            raise ValueError(
-                f"`policy` (={policy.name!r}): export it without `foresight`, which is no part of "
-                "the network"
-            )
-        return _RegressionGraph(policy.network)
-    if isinstance(policy, PPOPolicy):
-        if policy.network.features_extractor.features.history:
-            raise ValueError(f"`policy` (={policy.name!r}) has a history, which is not exported")
-        return _PPOGraph(policy.network)
-    raise ValueError(f"`policy` (={policy.name!r}) must be a regression or a PPO agent")
+        rule = "must observe pixels, not statistics"
+    elif isinstance(policy, RegressionPolicy):
+        if policy.foresight == "none":
+            return _RegressionGraph(policy.network)
+        rule = "must be without `foresight`, which is no part of the network"
+    elif isinstance(policy, PPOPolicy):
+        if not policy.network.features_extractor.features.history:
+            return _PPOGraph(policy.network)
+        rule = "must be without a history, which is not exported"
+    else:
+        rule = "must be a regression or a PPO agent"
+    raise ValueError(f"`policy` (={policy.name!r}) {rule}")
 
 
 def _exported(graph: nn.Module, arguments: dict[str, torch.Tensor], outputs: list[str]) -> Any:

@@ -17,7 +17,7 @@ from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation.plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
-from agents.report.evaluation import Cell, to_markdown
+from agents.report.evaluation import fill
 from simulator.utils.files import machine, versions, write_atomically
 
 if TYPE_CHECKING:
@@ -53,69 +53,14 @@ _MEANS = {
     ),
     "quality": ("log_error", "unseen", "frames", "seconds"),
 }
-#: The tables of a page: their tasks, what is said of each, and its columns by heading.
-_COMMON: dict[str, Cell] = {
-    "policy": "{policy}",
-    "sees": "{observation}",
-    "score": "{score:.4f}",
-    "95 % interval": "{ci95_low:.4f} to {ci95_high:.4f}",
-    "procedural": "{procedural:.4f}",
-    "real": "{real:.4f}",
-}
-_LAST: dict[str, Cell] = {
-    "ms alone": "{ms_alone:.4f}",
-    "seeds": "{training_seeds:.0f}",
-    "author": "{author}",
-    "date": "{date}",
-}
-_FRAMES: dict[str, Cell] = {
-    **_COMMON,
-    "regret": "{regret:.4f}",
-    "within 1/3 EV": "{ev_within_third:.2%}",
-    "frames to converge": "{frames_to_converge:.4f}",
-    "converged": "{converged:.2%}",
-    "reversals": "{reversals:.4f}",
-    "jump": "{jump:.4f}",
-    "white": "{clipped_high:.2%}",
-    **_LAST,
-}
-_BRACKETS: dict[str, Cell] = {
-    **_COMMON,
-    "error [EV]": "{log_error:.4f}",
-    "unseen": "{unseen:.2%}",
-    "frames": "{frames:.4f}",
-    **_LAST,
-}
-_TABLES = {
-    "still": (
-        "Still: `AutoExposure-v0`",
-        "Score: normalised over all conditions, each with the same weight; 0 is a random policy, "
-        "1 the best state of every frame in that frame's own light.",
-        _FRAMES,
-    ),
-    "video": (
-        "Video: `AutoExposureVideo-v0`",
-        "Score: as above. Nobody reaches 1, as the light to come must be guessed: "
-        "`oracle:last_frame`, which is not ranked, knows that of the frame in hand.",
-        _FRAMES,
-    ),
-    "bracket": (
-        "Bracket: `ExposureBracket-v0`",
-        "Score: quality of the merged picture, 1 - mean error / 2 EV, over all time budgets.",
-        _BRACKETS,
-    ),
-}
+#: In the order of the page.
+_TASKS = ("still", "video", "bracket")
 #: What tells a page that this module wrote.
 _MARK = "<!-- written by `ae-env evaluate --append`"
-_PAGE = Path(__file__).with_name("ae_bench.md")
 
 
 def scene_signature(scene: Scene) -> list[Any]:
-    """JSON values that identify a scene: names, right exposure, light and defocus in blocks.
-
-    Args:
-        scene: At the resolution of the plan.
-    """
+    """JSON values of a scene at the plan's resolution: names, light and defocus in blocks."""
     means = _blocks(scene.light.double().clamp(min=2.0**-20))
     exposed = np.log2(means) - scene.reference.log2_exposure
     codes = np.rint(exposed / STEP_EV).astype(int)
@@ -131,8 +76,7 @@ def _blocks(planes: Tensor) -> NDArray[Any]:
     """Means over blocks of each plane (P, H, W), (P, BLOCKS, BLOCKS)."""
     height, width = (size // BLOCKS * BLOCKS for size in planes.shape[1:])
     shape = (len(planes), BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS)
-    means: NDArray[Any] = planes[:, :height, :width].numpy().reshape(shape).mean(axis=(2, 4))
-    return means
+    return planes[:, :height, :width].numpy().reshape(shape).mean(axis=(2, 4))
 
 
 def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
@@ -146,15 +90,8 @@ def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
 
 
 def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
-    """Checks that a benchmark is still the one that its hash was written down for.
-
-    Raises:
-        ValueError: If it is not.
-    """
-    if plan.hash is None:
-        return
-    found = bench_hash(plan, scenes)
-    if found != plan.hash:
+    """Raises a `ValueError` if a benchmark is not the one that its hash was written down for."""
+    if plan.hash is not None and (found := bench_hash(plan, scenes)) != plan.hash:
         raise ValueError(
             f"`hash` of {plan.name!r} is {plan.hash}, but the plan and the light of its scenes "
             f"give {found}: something has changed, so results would not compare with the published "
@@ -183,18 +120,12 @@ def check_append(
 ) -> None:
     """Checks that rows of `policies` can be added to a table, before they are measured.
 
-    Args:
-        table: CSV with `COLUMNS`, or a file to be made.
-        plan: The plan of one of the benchmark's tasks.
-        policies: Those that get a row.
-        author: Who made them.
-
     Raises:
         ValueError: If `plan` is of no benchmark that takes rows, `table` is no benchmark's table or
             has rows of another hash, no policy gets a row, two would get the same one, or a row
             without an author would be replaced.
     """
-    if plan.task not in _TABLES:
+    if plan.task not in _TASKS:
         raise _refusal(table, f"takes no rows of {plan.name}, which AE-Bench v2 has superseded")
     rows, page = _read_own(table, plan), page_of(table)
     if page == table:
@@ -227,19 +158,10 @@ def _refusal(table: Path, text: str) -> ValueError:
 def append_rows(
     table: Path, plan: EvaluationPlan, rows: pd.DataFrame, *, author: str
 ) -> dict[str, Path]:
-    """Adds rows to a benchmark's table, and writes its page again.
+    """Adds rows of `bench_rows` to a benchmark's table, and writes its page again: files by name.
 
     A row of the same task, policy, observation and author is replaced, which is logged; others
-    stay.
-
-    Args:
-        table: CSV with `COLUMNS`; made where missing.
-        plan: The plan of the task.
-        rows: ``policy`` and the numbers of each row, see `bench_rows` and `COLUMNS`.
-        author: Who made the policies.
-
-    Returns:
-        The files by name.
+    stay. The table is made where missing.
 
     Raises:
         ValueError: If the table has other columns, or rows of another hash.
@@ -262,7 +184,7 @@ def append_rows(
     for row in replaced.itertuples():
         logger.warning("%s: replaced the row of %r by %r", table, row.policy, row.author)
     both = both.drop_duplicates(_KEY, keep="last")
-    order = both.task.map(list(_TABLES).index)
+    order = both.task.map(_TASKS.index)
     both = both.assign(order=order, value=-both.score.astype(float))
     both = both.sort_values(["order", "value"], kind="stable")[list(COLUMNS)]
     page = page_of(table)
@@ -276,8 +198,7 @@ def append_rows(
 def _read_own(table: Path, plan: EvaluationPlan) -> pd.DataFrame:
     """Rows of a table; an error where one has another hash."""
     rows = read_table(table)
-    others = set(rows.hash) - {plan.hash}
-    if others:
+    if others := set(rows.hash) - {plan.hash}:
         raise ValueError(
             f"{table} has rows that were measured under the hash {', '.join(others)}, this run "
             f"under {plan.hash}: they do not compare"
@@ -325,14 +246,9 @@ def page_of(table: Path) -> Path:
 
 
 def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the policies that are ranked: means over all conditions or budgets.
-
-    Args:
-        results: By condition.
-        ranking: Over all conditions.
-    """
+    """The rows of the policies that are ranked: means over all conditions or budgets."""
     first = results[static_condition(results)]
-    real = is_real(first.groups)
+    real = np.isin(first.groups, [asset.place for asset in list_assets()])
     parts = {"procedural": ~real, "real": real}
     rows = []
     for one in ranking.to_dict("records"):
@@ -359,11 +275,6 @@ def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def is_real(groups: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which of the source groups are real places."""
-    return np.isin(groups, [asset.place for asset in list_assets()])
-
-
 def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     """The page of a benchmark's table as Markdown."""
 
@@ -373,11 +284,6 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     numbers = rows.assign(
         **{name: pd.to_numeric(rows[name]) for name in COLUMNS if name not in _TEXT}
     )
-    blocks = [
-        f"## {title}\n\n{text}\n\n{to_markdown(numbers[rows.task == task], columns)}"
-        for task, (title, text, columns) in _TABLES.items()
-        if (rows.task == task).any()
-    ]
-    return _PAGE.read_text(encoding="utf-8").format(
-        table=shown(table), page=shown(page_of(table)), hash=plan.hash, tables="\n\n".join(blocks)
-    )
+    by_task = {str(task): own for task, own in numbers.groupby("task")}
+    names = {"table": shown(table), "page": shown(page_of(table))}
+    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, **names)

@@ -8,15 +8,16 @@ import os
 import re
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jinja2
 import numpy as np
 import pandas as pd
 
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES
-from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
+from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, digest
 from agents.evaluation.result import (
     MORE_COLUMNS,
     ROW_COLUMNS,
@@ -43,34 +44,6 @@ from simulator.utils.files import result_meta, write_atomically, write_results
 #: it that returns Markdown, or None.
 Cell = str | Callable[[Mapping[str, Any]], object]
 
-#: Columns of the table of scores.
-_SCORES: dict[str, Cell] = {
-    "policy": "{policy}",
-    "normalised": "{normalised_score:.3f}",
-    "95 % interval": "{ci95:.3f}",
-    "mean score": "{mean_score:.3f}",
-    "regret": "{regret:.3f}",
-    "EV error, median": "{ev_error_median:.2f}",
-    "P95": "{ev_error_p95:.2f}",
-    "within 1/3 EV": "{ev_within_third:.0%}",
-    "frames to converge": "{frames_to_converge:.1f}",
-    "overshoot [EV]": "{overshoot:.2f}",
-    "reversals": "{reversals:.2f}",
-    "flicker": "{flicker:.4f}",
-    "clipped high": "{clipped_high:.1%}",
-    "clipped low": "{clipped_low:.1%}",
-    "ms/decision": "{ms_per_decision:.3f}",
-}
-#: Of brackets, for each budget.
-_BRACKETS: dict[str, Cell] = {
-    "policy": "{policy}",
-    "quality": "{quality:.4f}",
-    "95 % interval": "{ci95:.4f}",
-    "to the best": "{to_best:+.3f} ({to_best_ci95:+.3f})",
-    "error [EV]": "{log_error:.4f}",
-    "unseen": "{unseen:.2%}",
-    "frames": "{frames:.2f}",
-}
 #: Tables of several conditions: heading, column of the rows, and format.
 _BY_CONDITION = (
     ("Normalised score", "normalised_score", ".3f"),
@@ -81,7 +54,6 @@ _BY_CONDITION = (
 )
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
-_PAGE = Path(__file__).with_name("report.html")
 #: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
 _SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
 
@@ -222,8 +194,7 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
 
     page = MarkdownIt("commonmark", {"html": False}).enable("table")
     page.add_render_rule("image", image)
-    template = string.Template(_PAGE.read_text(encoding="utf-8"))
-    return template.substitute(title=html.escape(title), body=page.render(markdown))
+    return _templates().get_template("report.html").render(title=title, body=page.render(markdown))
 
 
 # -- files ----------------------------------------------------------------------------------------
@@ -266,7 +237,8 @@ def write_report(
         rows = bracket_rows(results, ranking)
         assert result.plan is not None
         meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
-        text = _bracket_report(result.plan, rows, command)
+        scenes = repr(result.plan.environment.get("scenes", "bundled"))
+        text = fill("brackets.md", plan=result.plan, rows=rows, meta=meta, scenes=scenes)
         return {
             "results.json": write_results(folder / "results.json", _records(rows), meta),
             "report.md": write_atomically(folder / "report.md", text),
@@ -280,13 +252,15 @@ def write_report(
     columns = [name for name in ROW_COLUMNS if name != "ci95"]
     table = table[[*columns, "ci95_low", "ci95_high", *MORE_COLUMNS]]
     contents = _records(rows[list(ROW_COLUMNS)])
-    files = {
-        "results.json": write_results(folder / "results.json", contents, meta),
-        "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
-        "metrics.csv": _write_csv(folder / "metrics.csv", table),
-    }
-    pictures = _write_pictures(folder, results, rows, ranking, title)
-    text = _Report(results, rows, meta, list(pictures)).markdown(title, next_commands)
+    files = {"results.json": write_results(folder / "results.json", contents, meta)}
+    for name, frame in (("scenes.csv", scene_rows(result)), ("metrics.csv", table)):
+        text = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        files[name] = write_atomically(folder / name, text)
+    order = ranking.policy.tolist()
+    order += [name for name in result.tracks if name not in order]
+    pictures = _write_pictures(folder, results, rows, ranking, title, order)
+    shown = {"title": title, "pictures": pictures, "next_commands": next_commands}
+    text = _report(results, rows, meta, order, **shown)
     page = html_report(text, pictures, f"Exposure policies compared: {title}")
     return {
         **files,
@@ -297,11 +271,14 @@ def write_report(
 
 
 def _write_pictures(
-    folder: Path, results: Results, rows: pd.DataFrame, ranking: pd.DataFrame, title: str
+    folder: Path,
+    results: Results,
+    rows: pd.DataFrame,
+    ranking: pd.DataFrame,
+    title: str,
+    order: Sequence[str],
 ) -> dict[str, Path]:
     result = results[static_condition(results)]
-    order = ranking.policy.tolist()
-    order += [name for name in result.tracks if name not in order]
     if len(results) > 1:
         together = ranking[["policy", "normalised_score", "ci95"]]
         named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
@@ -321,12 +298,6 @@ def _write_pictures(
 def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """Rows as JSON values."""
     return [{str(key): value for key, value in row.items()} for row in rows.to_dict("records")]
-
-
-def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
-    """Writes rows as CSV, numbers with six digits."""
-    text = rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    return write_atomically(path, text)
 
 
 def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
@@ -358,210 +329,81 @@ def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int)
 # -- the report -----------------------------------------------------------------------------------
 
 
-def _bracket_report(plan: EvaluationPlan, rows: pd.DataFrame, command: str) -> str:
-    """``report.md`` of brackets."""
-    scenes = plan.environment.get("scenes", "bundled")
-    parts = [
-        f"# Brackets compared: {escape(plan.name)}",
-        code_block(command),
-        f"{rows.num_groups[0]} source groups of {scenes!r}; {len(plan.seeds)} episodes of each "
-        f"scene; up to {plan.max_frames} frames, merged. Quality is 1 - mean error / 2 EV; the "
-        "error is that of the log radiance of the samples that a frame shows, unseen the share "
-        "that is white in all. Intervals: paired bootstrap over source groups and training seeds.",
-    ]
-    for budget, own in rows.groupby("budget", sort=False):
-        parts += [f"## {budget:g} s", to_markdown(own, _BRACKETS)]
-    return "\n\n".join(parts) + "\n"
+def _report(
+    results: Results, rows: pd.DataFrame, meta: Mapping[str, Any], order: Sequence[str], **more: Any
+) -> str:
+    """``report.md`` of an evaluation of frames."""
+    static = static_condition(results)
+    result = results[static]
+    by = rows.replace({"condition": {"all": static}})
+    by = by[by.condition.isin(list(results))]  # of each condition as a whole
+    scores = {row["policy"]: row["normalised_score"] for row in meta["ranking"]}
+    ordered = rows.sort_values("normalised_score", ascending=False, kind="stable")
+    costs = by[by.condition == static]
+    kinds = {f"{kind} ({own['groups']})": own for kind, own in meta["by_kind"].items()}
+    plan, policies = result.plan, pd.Index(result.tracks, name="policy")
+    return fill(
+        "evaluation.md",
+        meta=meta,
+        results=results,
+        several=len(results) > 1,
+        static=static,
+        plan=plan,
+        row=rows.iloc[0],
+        seed=result.seed,
+        training_seeds=rows.training_seeds.max(),
+        ranking=[
+            row | {"best": _change(row["to_best"]), "next": _change(row["to_next"])}
+            for row in meta["ranking"]
+        ],
+        parts={part: ordered[ordered.condition == part] for part in result.conditions},
+        min_groups=MIN_GROUPS,
+        groups=group_rows(result),
+        conditions=_condition_tables(results, by, order) if len(results) > 1 else [],
+        costs=costs.assign(score=costs.policy.map(scores)),
+        clipping=_clipping(by, static, policies),
+        kinds=pd.DataFrame(kinds).drop(index="groups").rename_axis("policy"),
+        other_scorers=pd.DataFrame(meta["other_scorers"], index=policies),
+        histogram=_histogram_rows(meta["oracle_histogram"]),
+        run=[
+            {"condition": name, "lighting": str(one.lighting), "delay": str(one.delay)}
+            for name, one in (plan.all_conditions.items() if plan else ())
+        ],
+        **more,
+    )
 
 
-@dataclass
-class _Report:
-    """The parts of ``report.md`` of an evaluation of frames."""
-
-    results: Results
-    rows: pd.DataFrame
-    meta: Mapping[str, Any]
-    pictures: Sequence[str]
-
-    def __post_init__(self) -> None:
-        self.static = static_condition(self.results)
-        self.result = self.results[self.static]
-        by = self.rows.replace({"condition": {"all": self.static}})
-        #: Of each condition as a whole.
-        self.by = by[by.condition.isin(list(self.results))]
-        ranking = self.meta["ranking"]
-        self.scores = {row["policy"]: row["normalised_score"] for row in ranking}
-
-    def markdown(self, title: str, next_commands: Sequence[str]) -> str:
-        """The report as Markdown."""
-        parts = [
-            *self._introduction(title),
-            *self._ranking(),
-            "![Scores with intervals](scores.png)",
-            "*Frames to converge*: an episode that never converges counts with all its frames.",
-            *self._scores(),
-            *self._conditions(),
-            *self._cost(),
-            *self._clipping(),
-            *self._details(),
-            "## What the oracle chooses",
-            "Share of the episodes; where one value dominated, the control would not matter.",
-            _histogram_table(self.meta["oracle_histogram"]),
-        ]
-        if self.result.plan is not None:
-            parts += _plan_part(self.result.plan, self.meta["plan"])
-        if next_commands:
-            parts += ["## Next", code_block(*next_commands)]
-        return "\n\n".join(parts) + "\n"
-
-    def _introduction(self, title: str) -> list[str]:
-        meta, row, plan = self.meta, self.rows.iloc[0], self.result.plan
-        seeds = self.rows.training_seeds.max()
-        resampled = f" and {seeds} training seeds" if seeds > 1 else " (one training seed each)"
-        starts = ["random"] if plan is None else plan.starts
-        drawn = [self.result.seed] if plan is None else plan.seeds
-        return [
-            f"# Exposure policies compared: {escape(title)}",
-            f"{code(meta['command'])}, {meta['date']}, commit {meta['commit'] or 'unknown'}.",
-            f"{meta['scenes']} scenes of '{escape(row.source)}' ({row.split} split) from "
-            f"{row.num_groups} source groups; {len(self.results)} "
-            f"condition{'s' * (len(self.results) > 1)} of {meta['episodes']} episodes and "
-            f"{meta['frames']} frames each; starts: {', '.join(starts)}; seeds: "
-            f"{', '.join(map(str, drawn))}. Normalised score: 0 is a random policy, 1 the oracle, "
-            "which knows the expected score of every state. Intervals: paired bootstrap over "
-            f"source groups{resampled}. How everything is defined: `docs/evaluation.md`.",
-        ]
-
-    def _ranking(self) -> list[str]:
-        if not self.scores:
-            return []
-        over = f"all {len(self.results)} conditions, each with the same weight"
-        columns: dict[str, Cell] = {
-            "tier": "{tier}",
-            "policy": "{policy}",
-            "normalised": "{normalised_score:.3f}",
-            "95 % interval": "{ci95:.3f}",
-            "minus the best": lambda row: _change(row["to_best"]),
-            "minus the next": lambda row: _change(row["to_next"]),
+def _condition_tables(
+    results: Results, by: pd.DataFrame, order: Sequence[str]
+) -> list[tuple[str, pd.DataFrame, str]]:
+    """Heading, table and format of each metric: a line per condition, a column per policy."""
+    tables = [(title, _pivot(by, key)[list(order)], form) for title, key, form in _BY_CONDITION]
+    for title, key, reduce, form in (
+        ("Frames until the exposure stays, median", "frames_to_settle", np.median, ".1f"),
+        ("Share of episodes that converge", "converged", np.mean, ".0%"),
+    ):
+        values = {
+            name: [reduce(result.episode_metrics(name)[key]) for result in results.values()]
+            for name in order
         }
-        return [
-            "## Ranking",
-            f"Over {'all scenes' if len(self.results) == 1 else over}. Differences are paired; "
-            "their 95 % intervals hold for all pairs at once, and \\* marks those that leave out "
-            "zero. Policies within a tier do not differ significantly from the tier's best.",
-            to_markdown(self.meta["ranking"], columns),
-        ]
+        index = pd.Index(results, name="condition")
+        tables.append((title, pd.DataFrame(values, index=index), form))
+    return tables
 
-    def _scores(self) -> list[str]:
-        parts = []
-        for part in self.result.conditions:
-            own = self.rows[self.rows.condition == part]
-            own = own.sort_values("normalised_score", ascending=False, kind="stable")
-            parts += [
-                f"## {self.static}, scenes: {part} ({own.num_groups.iloc[0]} groups)",
-                to_markdown(own, _SCORES),
-            ]
-        if self.rows.num_groups[0] < MIN_GROUPS:
-            parts += [
-                "## Every source group",
-                f"Fewer than {MIN_GROUPS} source groups: no intervals, but every value (mean "
-                "score).",
-                _wide(group_rows(self.result), ".3f"),
-            ]
-        return parts
 
-    def _conditions(self) -> list[str]:
-        picture = "![EV error over time](ev_error.png)"
-        if len(self.results) < 2:
-            return ["## EV error over time", picture]
-        names = [*self.scores, *(p for p in self.result.tracks if p not in self.scores)]
-        parts = ["## Conditions", picture]
-        for title, key, form in _BY_CONDITION:
-            parts += [f"### {title}", _wide(self._by_condition(key)[names], form)]
-        for title, key, reduce, form in (
-            ("Frames until the exposure stays, median", "frames_to_settle", np.median, ".1f"),
-            ("Share of episodes that converge", "converged", np.mean, ".0%"),
-        ):
-            values = {
-                name: [reduce(r.episode_metrics(name)[key]) for r in self.results.values()]
-                for name in names
-            }
-            table = pd.DataFrame(values, index=pd.Index(self.results, name="condition"))
-            parts += [f"### {title}", _wide(table, form)]
-        return parts
+def _pivot(by: pd.DataFrame, key: str) -> pd.DataFrame:
+    table = by.pivot(index="condition", columns="policy", values=key)
+    return table.loc[by.condition.unique()]
 
-    def _by_condition(self, key: str) -> pd.DataFrame:
-        """A column of the rows: a line per condition as a whole, a column per policy."""
-        table = self.by.pivot(index="condition", columns="policy", values=key)
-        return table.loc[list(self.results)]
 
-    def _cost(self) -> list[str]:
-        columns: dict[str, Cell] = {
-            "policy": "{policy}",
-            "normalised": "{score:.3f}",
-            "ms, in batches": "{ms_per_decision:.3f}",
-            "ms, one camera alone": "{ms_alone:.3f}",
-            "captures": "{captures_per_decision:g}",
-        }
-        picture = ["![Score against time](cost.png)"] if "cost.png" in self.pictures else []
-        text = "Time in `act` per decision. The plot shows that of one camera alone."
-        own = self.by[self.by.condition == self.static]
-        own = own.assign(score=own.policy.map(self.scores))
-        return ["## Score against time", text, *picture, to_markdown(own, columns)]
-
-    def _clipping(self) -> list[str]:
-        table = pd.DataFrame(index=pd.Index(self.result.tracks, name="policy"))
-        for shade, key in (("white", "clipped_high"), ("black", "clipped_low")):
-            shares = self._by_condition(key)[table.index]
-            table[f"{shade}, {self.static}"] = shares.loc[self.static].map("{:.2%}".format)
-            table[f"{shade}, worst"] = [
-                f"{shares[name].max():.2%} ({escape(shares[name].idxmax())})"
-                for name in table.index
-            ]
-        return ["## Clipping", "Share of the pixels at white and at black.", _wide(table, "")]
-
-    def _details(self) -> list[str]:
-        """What only some evaluations have: kinds, other scorers, paths, differences to a meter."""
-        meta, plan, parts = self.meta, self.result.plan, []
-        if len(meta["by_kind"]) > 1:
-            table = pd.DataFrame(meta["by_kind"]).drop(index="groups").rename_axis("policy")
-            groups = {kind: f"{kind} ({own['groups']})" for kind, own in meta["by_kind"].items()}
-            parts += [
-                "## By kind of scene",
-                f"Normalised score ({self.static}); in brackets the source groups of each kind.",
-                _wide(table.rename(columns=groups), ".3f"),
-            ]
-        if meta["other_scorers"] and plan is not None:
-            count = min(plan.other_scorer_scenes, meta["scenes"])
-            policies = pd.Index(self.result.tracks, name="policy")
-            parts += [
-                "## Under other scorers",
-                f"Mean expected score of the chosen states of {count} scenes under scorers that "
-                "nothing was trained on. Scorers that read noise as detail rise with gain: see "
-                "`docs/scorers.md`.",
-                _wide(pd.DataFrame(meta["other_scorers"], index=policies), ".3f"),
-            ]
-        sheets = [name for name in self.pictures if name.startswith("contact_sheet")]
-        if sheets and plan is not None:
-            parts += [
-                "## Paths",
-                "The states of one scene, the oracle's starred, with those that each policy chose "
-                f"from the start '{plan.starts[0]}', frame by frame.",
-                *(f"![States and paths]({name})" for name in sheets),
-            ]
-        if meta["differences_to_best_meter"]:
-            columns = {
-                "policy": "{policy}",
-                "scenes": "{condition}",
-                "difference": "{difference:+.3f}",
-                "95 % interval": "{ci95:+.3f}",
-            }
-            parts += [
-                f"## Difference to the best meter, {code(meta['best_meter'])} ({self.static})",
-                "Paired on the same episodes; intervals of single differences, not simultaneous.",
-                to_markdown(meta["differences_to_best_meter"], columns),
-            ]
-        return parts
+def _clipping(by: pd.DataFrame, static: str, policies: pd.Index[Any]) -> pd.DataFrame:
+    table = pd.DataFrame(index=policies)
+    for shade, key in (("white", "clipped_high"), ("black", "clipped_low")):
+        shares = _pivot(by, key)[policies]
+        table[f"{shade}, {static}"] = shares.loc[static].map("{:.2%}".format)
+        worst = zip(shares.max(), shares.idxmax(), strict=True)
+        table[f"{shade}, worst"] = [f"{share:.2%} ({escape(name)})" for share, name in worst]
+    return table
 
 
 def _change(change: Mapping[str, Any] | None) -> str | None:
@@ -573,28 +415,37 @@ def _change(change: Mapping[str, Any] | None) -> str | None:
     return cell(change, "{difference:+.3f}" + interval) + mark
 
 
-def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
-    """Share of the episodes in which each value of each control is the oracle's, as a table."""
+def _histogram_rows(histogram: Mapping[str, Mapping[str, float]]) -> list[dict[str, str]]:
     labels: dict[str, Callable[[float], str]] = {
         "iso": "ISO {:g}".format,
         "exposure_time": format_exposure_time,
         "f_number": "f/{:g}".format,
     }
-    rows = []
-    for name, own in histogram.items():
-        shares = [f"{labels[name](float(value))}: {share:.0%}" for value, share in own.items()]
-        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
-    return to_markdown(rows, {"control": "{control}", "share": "{share}"})
-
-
-def _plan_part(plan: EvaluationPlan, described: Mapping[str, Any]) -> list[str]:
-    rows = [
-        {"condition": name, "lighting": str(condition.lighting), "delay": str(condition.delay)}
-        for name, condition in plan.all_conditions.items()
+    return [
+        {
+            "control": name.replace("_", " "),
+            "share": ", ".join(
+                f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()
+            ),
+        }
+        for name, own in histogram.items()
     ]
-    columns = {name: f"{{{name}}}" for name in rows[0]}
-    text = f"Environment: {code(described['environment'])}. sha256 of the plan: "
-    return ["## What was run", f"{text}`{described['sha256']}`.", to_markdown(rows, columns)]
+
+
+def fill(template: str, **values: Any) -> str:
+    """A template beside this module, filled in: one empty line between its parts."""
+    text = _templates().get_template(template).render(values)
+    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    folder = jinja2.FileSystemLoader(Path(__file__).parent)
+    options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True}
+    found = jinja2.Environment(loader=folder, undefined=jinja2.StrictUndefined, **options)
+    found.filters |= {"md": escape, "code": code, "table": to_markdown, "wide": _wide}
+    found.globals["code_block"] = code_block
+    return found
 
 
 # -- the terminal ---------------------------------------------------------------------------------
@@ -605,9 +456,7 @@ def summary(
 ) -> list[tuple[str, pd.DataFrame]]:
     """Tables of an evaluation for the terminal: titles, and frames of texts.
 
-    Args:
-        results: The return value of `evaluate` or `run_plan`.
-        ranking: Of `overall_ranking`; computed by default.
+    `ranking` is that of `overall_ranking`, computed by default.
     """
     results = as_results(results)
     static = static_condition(results)

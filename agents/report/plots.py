@@ -49,11 +49,8 @@ _KINDS = ("photograph", "backlit")
 def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
-    Args:
-        path: File to write.
-        rows: As `result_rows` returns them, and those of ``"all conditions"``, where there are
-            several; those of a single other condition are left out.
-        title: Text above the figure.
+    `rows` are those of `result_rows`, and of ``"all conditions"``, where there are several; those
+    of a single other condition are left out.
     """
     parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
     ordered = parts["all"].sort_values("normalised_score", kind="stable").policy
@@ -69,13 +66,8 @@ def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
             if interval is not None:
                 axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
         label = f"{part} ({parts[part].num_groups.iloc[0]} groups)"
-        marks: dict[str, Any] = {
-            "color": colour,
-            "marker": marker,
-            "markersize": 6,
-            "linestyle": "none",
-        }
-        axes.plot(own.normalised_score, heights, label=label, **marks)
+        marks: dict[str, Any] = {"color": colour, "marker": marker, "linestyle": "none"}
+        axes.plot(own.normalised_score, heights, label=label, markersize=6, **marks)
     axes.axvline(1.0, color="0.35", lw=1.0)
     axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
     axes.axvline(0.0, color="0.75", lw=1.0, ls=":")
@@ -93,13 +85,7 @@ def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
 def plot_convergence(
     path: Path, results: Mapping[str, EvaluationResult], order: Sequence[str]
 ) -> Path:
-    """Draw the mean EV error of every frame, a panel per condition, and write it as PNG.
-
-    Args:
-        path: File to write.
-        results: By condition.
-        order: Policies, the best first.
-    """
+    """Draw the mean EV error of every frame, a panel per condition, and write it as PNG."""
     columns = min(_COLUMNS, len(results))
     rows = -(-len(results) // columns)
     figure = _figure(3.1 * columns + 1.0, 2.1 * rows + 1.2)
@@ -176,13 +162,7 @@ def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> lis
 
 
 def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float]) -> Path:
-    """Draw normalised score against the time of one decision and write it as PNG.
-
-    Args:
-        path: File to write.
-        costs: Time in `act` for one camera alone by policy [ms].
-        scores: Normalised score by policy, the best first.
-    """
+    """Draw normalised score against the time of one decision [ms] and write it as PNG."""
     figure = _figure(7.5, 4.6)
     axes = figure.add_subplot()
     front = pareto_front(costs, scores)
@@ -206,14 +186,8 @@ def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float
 def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
     """Write contact sheets of one scene's states with the paths of the best policies.
 
-    Args:
-        folder: Folder of ``contact_sheet.webp``, and of ``contact_sheet_2.webp`` for more policies.
-        result: The results in unchanging light.
-        order: Policies, the best first.
-
-    Returns:
-        The files by name; none where the scenes are not known, or the grid has more states than a
-        sheet shows.
+    They are ``contact_sheet.webp``, and ``contact_sheet_2.webp`` for more policies; none where the
+    scenes are not known, or the grid has more states than a sheet shows.
     """
     from ae_env.rendering import MAX_SHEET_STATES, contact_sheet
 
@@ -300,22 +274,12 @@ _INK, _PAPER, _ORACLE, _CHOSEN = "#202020", "#ffffff", "#b0b0b0", "#c0392b"
 
 @dataclass
 class Recording:
-    """One policy's episode: lists with a value for every frame.
-
-    Args:
-        name: Of the policy.
-        pictures: (H, W, 3) uint8.
-        ev100: EV100 of the settings.
-        best: EV100 of the best state.
-        scores: Score of the frame.
-        states: Index of the state.
-        regrets: Best state's expected score less that of the frame's state.
-    """
+    """One policy's episode: lists with a value for every frame."""
 
     name: str
-    pictures: list[np.ndarray] = field(default_factory=list)
+    pictures: list[np.ndarray] = field(default_factory=list)  # (H, W, 3) uint8
     ev100: list[float] = field(default_factory=list)
-    best: list[float] = field(default_factory=list)
+    best: list[float] = field(default_factory=list)  # EV100 of the best state
     scores: list[float] = field(default_factory=list)
     states: list[int] = field(default_factory=list)
     regrets: list[float] = field(default_factory=list)
@@ -329,15 +293,10 @@ def record(
     seed: int,
     scene: str | None = None,
 ) -> Recording:
-    """Runs `policy` through one episode.
+    """Runs `policy`, which is fitted, through one episode of so many actions.
 
-    Args:
-        name: Of the policy, in the film.
-        policy: Fitted.
-        envs: One environment, made with ``with_oracle=True`` and ``render_mode="rgb_array"``.
-        frames: Actions.
-        seed: Decides the scene, its light and the start.
-        scene: Id of the scene; drawn by default.
+    `envs` is one environment, made with ``with_oracle=True`` and ``render_mode="rgb_array"``;
+    `seed` decides the light and the start, and the scene where its id is not given.
     """
     base: Any = envs.unwrapped
     options = None if scene is None else {"scene": scene}
@@ -362,9 +321,7 @@ def record(
 
 
 def write_film(
-    path: Path,
-    recordings: Sequence[Recording],
-    progress: Callable[[int, int], None] | None = None,
+    path: Path, recordings: Sequence[Recording], progress: Callable[[int, int], None] | None = None
 ) -> Path:
     """Writes the recordings side by side as an animated GIF, each over a chart of its exposure.
 

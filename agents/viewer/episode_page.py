@@ -41,35 +41,19 @@ _BEST, _POLICIES = "#a0a0a0", PATH_COLOURS[:2]
 def play(
     names: Sequence[str], scene: Scene, *, light: str = STILL, frames: int = 64, seed: int = 0
 ) -> list[Recording]:
-    """One episode of each policy in `scene`, all in the same light.
+    """One episode of each policy in `scene` (at most 64 pixels a side), all in the same light.
 
-    Args:
-        names: Of the policies, as `make_policy` takes them.
-        scene: At most 64 pixels a side.
-        light: One of `LIGHTS`; `AutoExposure-v0` where it stays, else `AutoExposureVideo-v0`.
-        frames: Actions.
-        seed: Decides the light and the start.
-
-    Raises:
-        ValueError: If there is no such policy, or it cannot drive this camera.
+    `light` is one of `LIGHTS`: `AutoExposure-v0` where it stays, else `AutoExposureVideo-v0`.
     """
-    task: dict[str, Any] = {"id": "ae_env/AutoExposure-v0"}
     fitted_on: dict[str, Any] = {"scenes": "bundled"}
+    options: dict[str, Any] = {"scenes": [scene], "camera": scene.camera}
+    options |= {"resolution": scene.light.shape[-1], "max_episode_steps": frames + 1}
+    options |= {"render_mode": "rgb_array", "with_oracle": True}
     if light != STILL:
-        moving = {"kind": "moving", "kinds": light}
-        task = {"id": "ae_env/AutoExposureVideo-v0", "lighting": moving}
+        options["lighting"] = {"kind": "moving", "kinds": light}
         fitted_on["grid"] = "video"
-    envs = gym.make_vec(
-        **task,
-        num_envs=1,
-        scenes=[scene],
-        camera=scene.camera,
-        resolution=scene.light.shape[-1],
-        max_episode_steps=frames + 1,
-        render_mode="rgb_array",
-        with_oracle=True,
-    )
-    with closing(envs):
+    task = f"ae_env/AutoExposure{'' if light == STILL else 'Video'}-v0"
+    with closing(gym.make_vec(task, num_envs=1, **options)) as envs:
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in names}
         fit_policies(policies, fitted_on)

@@ -159,9 +159,7 @@ class ExposurePage(Tab):
     async def show_scene(self, viewed: ViewedScene, before: CameraSettings) -> None:
         """Shows another scene, at its best state or at what was chosen since it was asked for.
 
-        Args:
-            viewed: The scene.
-            before: Settings on the page when it was asked for.
+        `before` are the settings on the page when it was asked for.
         """
         self.viewed, self._marks, self._centre = viewed, {}, None
         self._names.value = []

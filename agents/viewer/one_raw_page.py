@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -34,14 +35,7 @@ _NO_RAW = "Only a raw can be opened or fused: this scene is no photograph. Open 
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """A picture of a raw, or of a result from it.
-
-    Args:
-        jpeg: The picture on the page.
-        aspect: Its width by its height.
-        text: A line about it.
-        files: By ending, functions that write it to a path.
-    """
+    """A picture on the page of a raw or of a result from it, and functions that write its files."""
 
     jpeg: bytes
     aspect: float
@@ -134,7 +128,8 @@ class OneRawPage(Tab):
                 ).classes("note")
                 ui.label("HDR").classes("title")
                 with ui.element("div").classes("bar"):
-                    self._fuse = ui.button("Fuse a bracket", icon="hdr_on", on_click=self._fuses)
+                    fuse = partial(self._render, "fusing", fused)
+                    self._fuse = ui.button("Fuse a bracket", icon="hdr_on", on_click=fuse)
                     self._save_button("png")
                     self._save_button("exr")
                 ui.label(
@@ -191,9 +186,6 @@ class OneRawPage(Tab):
 
     async def _opens(self) -> None:
         await self._render("opening the aperture", opened, self._f_numbers[int(self._slider.value)])
-
-    async def _fuses(self) -> None:
-        await self._render("fusing", fused)
 
     async def _render(
         self, doing: str, function: Callable[..., RenderedImage], *options: Any

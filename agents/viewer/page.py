@@ -27,7 +27,6 @@ from simulator.camera_simulator import Depth
 _LARGEST_UPLOAD = 300_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
-#: Names of the tabs.
 _TABS = ("Exposure", "Episode", "Refocus, HDR")
 _STYLE = Path(__file__).with_name("page.css")
 
@@ -57,17 +56,9 @@ class PictureStore:
 
 @dataclass
 class Options:
-    """What `ae-env view` was asked for.
+    """What `ae-env view` was asked for; all tabs of the browser share it.
 
-    Args:
-        library: The scenes.
-        simulator: Shared by all tabs of the browser.
-        depth: See `ViewedScene`.
-        tolerance: See `ViewedScene`.
-        scorer: See `ViewedScene`.
-        thumbnails: JPEGs of scenes that were asked for, by name.
-        folder: For uploads and downloads; None for the system's.
-        pictures: Where the browser fetches pictures.
+    `thumbnails` are JPEGs of scenes that were asked for; in `folder` lie uploads and downloads.
     """
 
     library: Library
@@ -94,11 +85,7 @@ async def show_page(options: Options) -> None:
 
 
 class Page:
-    """One tab of the browser.
-
-    Args:
-        options: What is shown.
-    """
+    """One tab of the browser."""
 
     def __init__(self, options: Options) -> None:
         self._options = options
@@ -108,7 +95,10 @@ class Page:
         ui.context.client.on_delete(lambda: shutil.rmtree(folder, ignore_errors=True))
         with ui.element("header").classes("bar"):
             self._title = ui.label("ae-env view").classes("title")
-            self._picker = self._scene_picker()
+            with ui.dialog() as self._picker, ui.card().classes("w-full"):
+                ui.label("Scenes").classes("title")
+                self._thumbs = ui.element("div").classes("thumbs w-full")
+            self._listed: set[str] = set()
             ui.button("Scenes", icon="photo_library", on_click=self._open_picker).props("dense")
             most = f"a raw may have {_LARGEST_UPLOAD // 10**6} MB at most"
             upload = ui.upload(
@@ -132,13 +122,6 @@ class Page:
                 self._episode = EpisodePage(*shared)
             with ui.tab_panel(_TABS[2]).classes("p-0"):
                 self._one_raw = OneRawPage(*shared, options.simulator)
-
-    def _scene_picker(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card().classes("w-full"):
-            ui.label("Scenes").classes("title")
-            self._thumbs = ui.element("div").classes("thumbs w-full")
-        self._listed: set[str] = set()
-        return dialog
 
     async def _open_picker(self) -> None:
         self._picker.open()

@@ -29,11 +29,6 @@ class TokenGuard:
     The printed address contains the token in its query; a cookie keeps it for later requests of
     the page. Requests to or from other names are refused, too: a foreign page may make its own
     name lead here, and whoever reaches the page can name a Python file as a policy.
-
-    Args:
-        app: The application behind it (ASGI).
-        token: The token.
-        port: Where the page is served.
     """
 
     def __init__(self, app: Any, token: str, port: int) -> None:
@@ -75,31 +70,19 @@ class TokenGuard:
 
 
 def free_port(port: int) -> int:
-    """`port`, or any free one for 0.
-
-    Raises:
-        ValueError: If something listens there already.
-    """
+    """`port`, or any free one for 0; a `ValueError` if something listens there already."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, port))
         except OSError as error:
-            raise ValueError(
-                f"`port` (={port}) must be free: {error.strerror}; 0 takes any"
-            ) from None
+            text = f"`port` (={port}) must be free: {error.strerror}; 0 takes any"
+            raise ValueError(text) from None
         return int(probe.getsockname()[1])
 
 
 def serve(options: Options, port: int, open_browser: bool, announce: Callable[[str], None]) -> None:
-    """Serves the page until it is stopped.
-
-    Args:
-        options: What the page shows.
-        port: From `free_port`.
-        open_browser: Whether to open the page in the default browser.
-        announce: Called with the address once it is served.
-    """
+    """Serves the page at a free port until it is stopped; `announce` gets the address then."""
     token = secrets.token_urlsafe(16)
     path = f"/?token={token}"
     app.add_middleware(TokenGuard, token=token, port=port)
@@ -108,15 +91,9 @@ def serve(options: Options, port: int, open_browser: bool, announce: Callable[[s
     ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
     # Uploads and downloads are gone with the program, however its pages were left.
     with tempfile.TemporaryDirectory(prefix="ae-env-view-") as options.folder:
-        ui.run(
-            host=HOST,
-            port=port,
-            reload=False,
-            show=path if open_browser else False,
-            show_welcome_message=False,
-            uvicorn_logging_level="error",
-            reconnect_timeout=10.0,
-        )
+        how: dict[str, Any] = {"host": HOST, "port": port, "show": path if open_browser else False}
+        how |= {"show_welcome_message": False, "uvicorn_logging_level": "error"}
+        ui.run(reload=False, reconnect_timeout=10.0, **how)
 
 
 async def _announce_when_served(announce: Callable[[str], None], address: str, port: int) -> None:

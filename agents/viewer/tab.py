@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,7 @@ _DIVIDE = (
 class Tab:
     """One tab of the page, put together where it is made.
 
-    Args:
-        address: Gives a picture an address that the browser can fetch it from.
-        folder: For files that are downloaded.
+    `address` gives a picture an address for the browser; files to download lie in `folder`.
     """
 
     def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
@@ -40,10 +38,7 @@ class Tab:
         image.update()
 
     async def work(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """What `function` returns, in another thread.
-
-        None if another scene was opened meanwhile, or the program ends.
-        """
+        """What `function` returns in another thread; None if another scene was opened meanwhile."""
         viewed = self.viewed
         found = await run.io_bound(function, *arguments, **options)
         return found if viewed is self.viewed else None
@@ -85,12 +80,8 @@ def complain(error: Exception | str) -> None:
 class Stage:
     """A picture, and another one over it on the right of a divider.
 
-    It is put together where it is made, within an element of class ``columns``.
-
-    Args:
-        tab: The tab that it is on.
-        alt: What the picture is.
-        divider: What the divider divides.
+    It is put together where it is made, within an element of class ``columns``; `alt` and `divider`
+    say what the picture is, and what is divided.
     """
 
     def __init__(self, tab: Tab, alt: str, divider: str) -> None:
@@ -128,20 +119,13 @@ class Stage:
         self._tab.show(self._image, None)
 
 
-def curves(
-    lines: Iterable[tuple[str, Sequence[float] | np.ndarray]],
-    low: float,
-    high: float,
-    height: int,
-) -> str:
+def curves(lines: Iterable[tuple[str, Any]], low: float, high: float, height: int) -> str:
     """An SVG of lines, pairs of a colour and values from `low` to `high`: numbers alone."""
     scale, drawn = (height - 4) / max(high - low, 1e-9), []
     for colour, values in lines:
         step = _CHART_WIDTH / max(len(values) - 1, 1)
-        points = " ".join(
-            f"{i * step:.1f},{height - 2 - (float(value) - low) * scale:.1f}"
-            for i, value in enumerate(values)
-        )
+        heights = height - 2 - (np.asarray(values, float) - low) * scale
+        points = " ".join(f"{i * step:.1f},{y:.1f}" for i, y in enumerate(heights))
         drawn.append(
             f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2" '
             'vector-effect="non-scaling-stroke"/>'

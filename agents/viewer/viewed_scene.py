@@ -8,8 +8,10 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
+from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,24 +66,14 @@ _THUMBNAIL = (96, 64)
 
 @dataclass(frozen=True)
 class OpenedScene:
-    """A scene to look at.
-
-    Args:
-        scene: At its finest resolution.
-        raw: The photograph that it is; None for a scene that is none.
-    """
+    """A scene to look at, at its finest resolution, and the photograph that it is, if it is one."""
 
     scene: Scene
     raw: RawImage | None = None
 
 
 class Library:
-    """Scenes by name, each read when it is opened.
-
-    Args:
-        readers: By the name of each scene, a function that reads it; at least one.
-        first: Name of the one to open first; that of the first one by default.
-    """
+    """Scenes by name, each read when it is opened; `first` is the one to open first."""
 
     def __init__(
         self, readers: Mapping[str, Callable[[], OpenedScene]], first: str | None = None
@@ -90,16 +82,10 @@ class Library:
         self.first = first or next(iter(self.readers))
 
     def add(self, path: Path, name: str) -> str:
-        """Adds the raw at `path`; returns the name it got, `name` with a number where taken.
-
-        Raises:
-            ValueError: If the file is no raw that can be read.
-        """
+        """Adds the raw at `path`; returns the name it got, `name` with a number where taken."""
         _read_raw(path, name)
-        own, number = name, 1
-        while own in self.readers:
-            number += 1
-            own = f"{name} ({number})"
+        numbered = (f"{name} ({number})" for number in count(2))
+        own = next(text for text in chain([name], numbered) if text not in self.readers)
         self.readers[own] = partial(_read_raw, path, name)
         return own
 
@@ -163,9 +149,9 @@ def _first_readable(what: str, readers: Mapping[str, Callable[[], OpenedScene]])
             broken.append(f"{name}: {error}")
         else:
             return name
-    named = "; ".join(broken[:_MOST_NAMED])
     if len(broken) > _MOST_NAMED:
-        named += f"; and {len(broken) - _MOST_NAMED} more"
+        broken[_MOST_NAMED:] = [f"and {len(broken) - _MOST_NAMED} more"]
+    named = "; ".join(broken)
     raise ValueError(f"`what` (={what!r}) must hold a raw that can be read, but none can: {named}")
 
 
@@ -181,15 +167,11 @@ def _bundled() -> dict[str, Callable[[], OpenedScene]]:
     def draw(scenes: SceneSet, index: int) -> OpenedScene:
         return OpenedScene(scenes[index])
 
-    sets = [
-        bundled_scenes(SceneRequest(split, get_camera(CAMERA), resolution=None))
-        for split in ("train", "test")
-    ]
-    return {
-        name: partial(draw, scenes, index)
-        for scenes in sets
-        for index, name in enumerate(scenes.scene_ids)
-    }
+    found: dict[str, Callable[[], OpenedScene]] = {}
+    for split in ("train", "test"):
+        scenes = bundled_scenes(SceneRequest(split, get_camera(CAMERA), resolution=None))
+        found |= {name: partial(draw, scenes, i) for i, name in enumerate(scenes.scene_ids)}
+    return found
 
 
 @dataclass(frozen=True)
@@ -214,56 +196,30 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """A simulated capture, developed.
-
-    Args:
-        jpeg: The picture.
-        aspect: Its width by its height.
-        capture: (4, H, W) the capture.
-        milliseconds: Time the capture took, and its development.
-    """
+    """A simulated capture, developed; `aspect` is its width by its height."""
 
     jpeg: bytes
     aspect: float
-    capture: torch.Tensor
-    milliseconds: tuple[float, float]
+    capture: torch.Tensor  # (4, H, W)
+    milliseconds: tuple[float, float]  # of the capture, and of its development
 
 
 @dataclass(frozen=True)
 class Readout:
-    """Numbers about a capture.
-
-    Args:
-        plan: How it was simulated.
-        score: Expected score.
-        snr: Signal to noise of mid grey, of one photosite [dB].
-        motion: Length of the motion streak [packed pixel of the sensor].
-        defocus: Diameter of the defocus disc [packed pixel of the sensor].
-        white: Share of the samples at white.
-        black: Share of the samples at or below black.
-        histogram: (4, `BINS`) share of each plane's samples, from black to white.
-    """
+    """Numbers about a capture; lengths in packed pixels of the sensor, shares of the samples."""
 
     plan: SimulationPlan
-    score: float
-    snr: float
-    motion: float
-    defocus: float
+    score: float  # expected
+    snr: float  # of mid grey, of one photosite [dB]
+    motion: float  # length of the streak
+    defocus: float  # diameter of the disc
     white: float
     black: float
-    histogram: np.ndarray
+    histogram: np.ndarray  # (4, BINS) of each plane, from black to white
 
 
 class ViewedScene:
-    """One scene, ready to be shown at any settings.
-
-    Args:
-        opened: The scene.
-        simulator: The simulator; its networks run where a plan asks for them.
-        depth: See `CameraSimulator.prepare`.
-        tolerance: See `CameraSimulator.prepare`.
-        scorer: Name of the scorer, as `make_scorer` takes it.
-    """
+    """One scene, ready to be shown at any settings; options as of `CameraSimulator.prepare`."""
 
     def __init__(
         self,
@@ -348,10 +304,9 @@ class ViewedScene:
         """Writes the full frame at the settings of `view`, at the sensor's resolution."""
         with self._lock:
             defocus = view.defocus * self.scene.light.shape[1] / SCORED_PIXELS
+            moves: dict[str, Any] = {"image_speed": view.speed, "defocus": defocus}
             prepared = self._prepare(self.scene)
-            raw = self._simulator.simulate(
-                prepared, view.settings, image_speed=view.speed, defocus=defocus
-            )
+            raw = self._simulator.simulate(prepared, view.settings, **moves)
         write_dng(path, raw)
         return path
 
@@ -390,13 +345,13 @@ class ViewedScene:
         down, right = centre
         for _ in range(self.turns % 4):  # from the upright picture to the frame
             down, right = right, 1.0 - down
-        found = []
-        for share, side, size in zip(
-            (down, right), self.scene.light.shape[1:], WINDOW_SIZE, strict=True
-        ):
+
+        def part(share: float, side: int, size: int) -> slice:
             start = round(min(max(share * side - size / 2, 0), max(side - size, 0)))
-            found.append(slice(start, min(start + size, side)))
-        return found[0], found[1]
+            return slice(start, min(start + size, side))
+
+        height, width = self.scene.light.shape[1:]
+        return part(down, height, WINDOW_SIZE[0]), part(right, width, WINDOW_SIZE[1])
 
     def _to_srgb(self, capture: torch.Tensor, view: View) -> np.ndarray:
         raw = _raw(self.scene, view.settings, capture)

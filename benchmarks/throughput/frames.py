@@ -28,7 +28,7 @@ from benchmarks.harness import RUNS, Part, Row, data_root
 from benchmarks.isolated import forget_peak, peak_memory, timed
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.discs import disc_blur
-from simulator.radiance.procedural import dead_leaves
+from simulator.radiance.procedural import LeafStyle, dead_leaves
 from simulator.raw.dng import SOFTWARE_NAME
 
 # -- growth ---------------------------------------------------------------------------------------
@@ -106,7 +106,7 @@ def noisy_raw(height: int, width: int) -> RawImage:
     """
     settings = CameraSettings(400, 1 / 64, 8.0)
     camera, rng = get_camera("nikon_z6"), np.random.default_rng(0)
-    red, green, blue = dead_leaves(rng, _TILE)
+    red, green, blue = dead_leaves(rng, _TILE, LeafStyle())
     tile = torch.from_numpy(np.stack([red * 0.5, green, green, blue * 0.6]))  # a sensor's, roughly
     tile[..., _TILE // 2 :] = disc_blur(tile, _DEFOCUS)[..., _TILE // 2 :]
     noise, more = camera.nlf(settings.iso), [(0, max(0, n - _TILE)) for n in (height, width)]

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import Pool
@@ -27,7 +26,6 @@ from simulator.capture.sensor import (
     exposure_table,
     noise_keys,
     record,
-    single_normals,
 )
 from simulator.capture.statistics import LightStatistics
 from simulator.optics.discs import Blur, blur_many
@@ -68,10 +66,6 @@ class FrameStatistics:
     source_noise: np.ndarray
     keys: np.ndarray
 
-    def sensor_normals(self, count: int) -> np.ndarray:
-        """(B, count) standard normals of each frame, apart from those of its pixels."""
-        return single_normals(self.keys, count)
-
 
 class FrameSource(Protocol):
     """Frames of n scenes, each at any of S states: simulated, or looked up if they were recorded.
@@ -98,13 +92,10 @@ class FrameSource(Protocol):
         states: np.ndarray,
         seeds: np.ndarray,
         frames: np.ndarray,
-        *,
         row_gain: np.ndarray | None = None,
-        codes: np.ndarray | None = None,
-        numbers: np.ndarray | None = None,
-        signals: np.ndarray | None = None,
+        **outputs: np.ndarray,
     ) -> FrameStatistics:
-        """Records scenes that are prepared, and fills every output that is given.
+        """Records scenes that are prepared, and fills the outputs.
 
         Args:
             indices: (B,) of the scenes.
@@ -113,9 +104,8 @@ class FrameSource(Protocol):
             frames: (B,) numbers that the noise of one seed differs by.
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None
                 where all rows have the same.
-            codes: (B, 4, H, W) uint8, companded (`simulator.capture.exposure.PEDESTAL`).
-            numbers: (B, 4, H, W) uint16, digital numbers.
-            signals: (B, 4, H, W) float32, on the scale where white is 1.
+            outputs: Any of ``codes``, ``numbers`` and ``signals`` of `simulator.capture.sensor`,
+                each (B, 4, H, W).
         """
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -208,11 +198,8 @@ class CaptureBatch:
         states: np.ndarray,
         seeds: np.ndarray,
         frames: np.ndarray,
-        *,
         row_gain: np.ndarray | None = None,
-        codes: np.ndarray | None = None,
-        numbers: np.ndarray | None = None,
-        signals: np.ndarray | None = None,
+        **outputs: np.ndarray,
     ) -> FrameStatistics:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
@@ -228,10 +215,8 @@ class CaptureBatch:
             noise=self.noise or "bank",
             read_noise=read_noise,
             row_gain=row_gain,
-            codes=codes,
-            numbers=numbers,
-            signals=None if signals is None else torch.from_numpy(signals),
             count=True,
+            **outputs,
         )
         samples = transitions.light[0].numel()
         return FrameStatistics(
@@ -252,9 +237,6 @@ class CaptureBatch:
             # Scenes that are shown several times share their light, but not what is blurred of it.
             light = scene.blurred_light.copy(pool=self._pool)
             scene = self._scenes[index] = scene.changed(blurred_light=light)
-            if len(scene.targets) < len(self.states):  # else another episode asked for them
-                for settings in self.states:
-                    scene.targets[settings]
         return scene
 
     # -- planning -----------------------------------------------------------------------------
@@ -319,8 +301,7 @@ class CaptureBatch:
         """Computes the excess variance where it depends on the pixels."""
         exposure = self._exposure[row]
         if np.isnan(self._excess_variance[row]):
-            balance = noise_balance(self._light[row], exposure)
-            self._excess_variance[row] = balance.relative_excess_variance
+            self._excess_variance[row], _ = noise_balance(self._light[row], exposure)
         aperture_blur = self._scenes[index].aperture_blur
         if exposure.opened_to is not None and aperture_blur is not None and not self._cache_light:
             aperture_blur.forget()

@@ -21,7 +21,7 @@ from simulator.capture.statistics import DenoisedLight
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import kernel_energy
 from simulator.optics.motion import Path
-from simulator.settings import CameraSettings, exposure_ratio
+from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
 
 if TYPE_CHECKING:
@@ -45,39 +45,11 @@ PEDESTAL = 1.0 / 1024.0
 MAX_DISC_PX = 512.0
 #: Second moment of a streak over that of a disc of the same extent, per axis: (1/12) / (1/16).
 _STREAK_TO_DISC = 4.0 / 3.0
-#: Settings whose targets are remembered for a scene at a time.
-_MOST_TARGETS = 4096
 
 
 def check_tolerance(tolerance: float) -> float:
-    """`tolerance` as a float.
-
-    Raises:
-        ValueError: Unless it is a finite number >= 0.
-    """
+    """`tolerance` as a float; a `ValueError` unless it is a finite number >= 0."""
     return check_number("tolerance", tolerance, 0.0, sys.float_info.max)
-
-
-class Target(NamedTuple):
-    """Exposure ratio from a scene's reference to the settings of a capture, and its noise."""
-
-    ratio: float
-    nlf: NoiseLevelFunction
-
-
-class Targets(dict[CameraSettings, Target]):
-    """`Target` of each settings in front of one scene, worked out when it is first asked for."""
-
-    def __init__(self, reference: CameraSettings, camera: CameraProfile, box_factor: int) -> None:
-        super().__init__()
-        self._reference, self._camera, self._box_factor = reference, camera, box_factor
-
-    def __missing__(self, settings: CameraSettings) -> Target:
-        if len(self) >= _MOST_TARGETS:
-            self.clear()
-        nlf = _averaged_nlf(self._camera, settings.iso, self._box_factor)
-        self[settings] = found = Target(exposure_ratio(self._reference, settings), nlf)
-        return found
 
 
 @functools.lru_cache(maxsize=4096)
@@ -211,7 +183,9 @@ def decide(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
 ) -> Exposure:
     """The exposure of a capture; see `PreparedScene.exposure`."""
-    (ratio, target), f_number = scene.targets[settings], settings.effective_f_number
+    target = _averaged_nlf(scene.camera, settings.iso, scene.box_factor)
+    f_number = settings.effective_f_number
+    ratio = 2.0 ** (settings.log2_exposure - scene.reference.log2_exposure)
     ratio = min(scene.gain * gain * ratio, RATIO_LIMIT)
     motion_px, path, subject_path = _motion(scene, settings.exposure_time)
     blur = scene.aperture_blur
@@ -248,10 +222,8 @@ def decide(
 
 
 def _motion(scene: PreparedScene, time: float) -> tuple[float, Path | None, Path | None]:
-    """Length of the longest path in an exposure [pixel], and both paths.
-
-    That of the background is None for a streak along the rows, that of the subject where it does
-    not move on its own.
+    """Length of the longest path in an exposure [pixel]; the background's, None for a streak along
+    the rows; and the subject's, None where it does not move on its own.
     """
     layout, movement, height = scene.layout, scene.movement, scene.light.shape[-2]
     apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0

@@ -71,7 +71,9 @@ class SimulationPlan:
         exposure: The exposure that was decided for them.
         errors: The parts of the error by what they come from; ``"left out"``, ``"network"``,
             ``"clipped highlights"``, ``"unknown depth"``, ``"ISO"``, ``"rounding"``.
-        balance: The source's noise against the target's.
+        excess_noise: Variance of the source's noise beyond the target's, relative to the target's:
+            mean over the pixels. 0 means that the noise is exact.
+        lacks_noise: Whether any pixel has less noise than the target.
         clipped_source: Share of the pixels that are saturated in the source: what they would show
             at a darker exposure is unknown.
         tolerance: Error that the capture may have.
@@ -81,7 +83,8 @@ class SimulationPlan:
     settings: CameraSettings
     exposure: Exposure
     errors: Mapping[str, float]
-    balance: NoiseBalance
+    excess_noise: float
+    lacks_noise: bool
     clipped_source: float
     tolerance: float
     samples: int
@@ -89,7 +92,7 @@ class SimulationPlan:
     @functools.cached_property
     def steps(self) -> tuple[Step, ...]:
         """Every step in order, with the reason why it runs or not."""
-        wanted, lacks, reason = self.exposure.noise, self.balance.lacks_noise, _ONLY_LIGHT
+        wanted, lacks, reason = self.exposure.noise, self.lacks_noise, _ONLY_LIGHT
         if wanted:
             reason = "" if lacks else _ENOUGH_NOISE
         steps = (
@@ -110,14 +113,6 @@ class SimulationPlan:
         """Name of the noise module that runs; None for none."""
         denoised = self.exposure.denoised
         return None if denoised is None else denoised.name
-
-    @property
-    def excess_noise(self) -> float:
-        """Variance of the source's noise beyond the target's, relative to the target's.
-
-        Mean over the pixels; 0 means that the noise is exact.
-        """
-        return self.balance.relative_excess_variance
 
     @property
     def extrapolated(self) -> float:
@@ -307,33 +302,14 @@ def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Expos
     return math.hypot(disc * MISSED_BLUR**2 * (wider - 1.0), DEPTH_ERROR * added)
 
 
-# -- the source's noise against the target's --------------------------------------------------
+def noise_balance(light: torch.Tensor, exposure: Exposure) -> tuple[float, bool]:
+    """`SimulationPlan.excess_noise` and `lacks_noise` of `light` (4, H, W) in an `exposure`.
 
-
-@dataclass(frozen=True)
-class NoiseBalance:
-    """The source's noise in a capture against the noise that the capture should have.
-
-    Args:
-        relative_excess_variance: Mean over the pixels of the variance beyond the target's,
-            relative to it.
-        lacks_noise: Whether any pixel has less noise than the target.
-    """
-
-    relative_excess_variance: float
-    lacks_noise: bool
-
-
-def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
-    """Compares the source's noise in one image with the target's.
-
-    Args:
-        light: (4, H, W) at the exposure of the prepared scene.
-        exposure: Its exposure; neither its ratio nor its noise are in `light` yet.
+    Neither the ratio of the exposure nor its noise are in `light` yet.
     """
     target, remaining = exposure.target, exposure.remaining_variance
     if exposure.source_noise.is_zero:
-        return NoiseBalance(0.0, not target.is_zero)
+        return 0.0, not target.is_zero
     table = exposure_table([exposure])[0, 1:]
     height, width = light.shape[-2:]
     rows = max(1, _BALANCED // width)
@@ -356,4 +332,4 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
 
     parallel_ranges(balance, 4, threads=None if len(parts) > 4 else 1)
     share = abs(float(relative.sum())) / light.numel()
-    return NoiseBalance(min(share, VARIANCE_LIMIT), bool(lacks.any()))  # finite over no noise, too
+    return min(share, VARIANCE_LIMIT), bool(lacks.any())  # finite over no noise, too

@@ -20,7 +20,6 @@ from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.exposure import (
     DEFAULT_TOLERANCE,
     Exposure,
-    Targets,
     check_tolerance,
     decide,
     disc_px,
@@ -220,7 +219,6 @@ class PreparedScene:
     layout: Layout | None = None
     tolerance: float = DEFAULT_TOLERANCE
     blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
-    targets: Targets = field(init=False)
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
@@ -250,8 +248,6 @@ class PreparedScene:
                 f"width of `light`, {tuple(self.light.shape[-2:])}"
             )
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
-        targets = Targets(self.reference, self.camera, self.box_factor)
-        object.__setattr__(self, "targets", targets)
 
     def changed(self, **values: Any) -> PreparedScene:
         """A copy of the same light and camera with other values, which are known to be right.
@@ -303,11 +299,13 @@ class PreparedScene:
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
+        excess_noise, lacks_noise = noise_balance(light, exposure)
         return SimulationPlan(
             settings=settings,
             exposure=exposure,
             errors=predict_errors(self, settings, exposure),
-            balance=noise_balance(light, exposure),
+            excess_noise=excess_noise,
+            lacks_noise=lacks_noise,
             clipped_source=self.saturated_share,
             tolerance=self.tolerance,
             samples=self.light.numel(),
@@ -375,8 +373,7 @@ class PreparedScene:
         """
         exposure = self.exposure(settings)
         (frame,) = self.expose([settings], seed=seed, noise=noise)
-        balance = noise_balance(self.blurred_light.blurred(exposure), exposure)
-        return frame, balance.relative_excess_variance
+        return frame, noise_balance(self.blurred_light.blurred(exposure), exposure)[0]
 
     def expose(
         self,

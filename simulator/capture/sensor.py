@@ -332,7 +332,7 @@ def record(
     noise: Noise = "exact",
     read_noise: Sequence[ReadNoise] | None = None,
     row_gain: np.ndarray | None = None,
-    signals: torch.Tensor | None = None,
+    signals: torch.Tensor | np.ndarray | None = None,
     codes: np.ndarray | None = None,
     numbers: np.ndarray | None = None,
     count: bool = False,
@@ -361,6 +361,7 @@ def record(
     if row_gain is not None:
         transitions = transitions.in_bands(row_gain)
     transitions = transitions.before_rounding(camera)
+    signals = None if signals is None else torch.as_tensor(signals)
     frames, on_cpu = len(transitions.light), transitions.light[0].is_cpu
     if read_noise is not None and keys is not None:
         if signals is None:

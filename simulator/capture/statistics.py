@@ -389,16 +389,16 @@ class Residual:
             ValueError: If they are not such numbers.
         """
         try:
-            tables = tuple(np.asarray(values[n], np.float64) for n in _TABLES)
-            spread = float(values["spread"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"`residual` (={values!r}) must be a calibration: {error}") from None
-        if len({t.shape for t in tables}) != 1 or tables[0].ndim != 1 or len(tables[0]) < 2:
-            raise ValueError(f"`residual` (={values!r}) must be three lists of one length")
-        finite = all(np.isfinite(t).all() and (t >= 0).all() for t in tables)
-        if not finite or not 1.0 <= spread < math.inf:
-            raise ValueError(f"`residual` (={values!r}) must be finite and >= 0, its spread >= 1")
-        return cls(tables[0], tables[1], tables[2], spread)
+            tables, spread = np.array([values[n] for n in _TABLES], float), float(values["spread"])
+        except (KeyError, TypeError, ValueError):
+            tables, spread = np.full((3, 1), math.nan), math.nan
+        known = tables.ndim == 2 and tables.shape[1] > 1 and bool((tables >= 0.0).all())
+        if not known or not max(tables.max(), spread) < math.inf or not spread >= 1.0:
+            raise ValueError(
+                f"`residual` (={values!r}) must have {', '.join(_TABLES)}, of one length, finite "
+                "and >= 0, and a spread >= 1"
+            )
+        return cls(*tables, spread)
 
     def to_card(self) -> dict[str, Any]:
         """JSON values of a model card."""

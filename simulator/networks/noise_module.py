@@ -14,7 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from simulator.capture.sensor import frame_normals, noise_keys
 from simulator.capture.statistics import Residual
-from simulator.networks.unet import UNet
+from simulator.networks.unet import UNet, padded
 from simulator.optics.discs import box_mean
 from simulator.utils.checks import check_word
 
@@ -130,7 +130,9 @@ class Denoiser(nn.Module):
     def surroundings(self, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """The stabilised picture's mean over 65 x 65 pixels, (B, 4, H, W), of the whole frame."""
         height, width = image.shape[-2:]
-        far = _coarse_mean(Stabiliser.of(shot, read).forward(_padded(image)), _FAR // _CELL | 1)
+        far = _coarse_mean(
+            Stabiliser.of(shot, read).forward(padded(image.float(), _CELL)), _FAR // _CELL | 1
+        )
         return far[..., :height, :width]
 
     def uncorrected(self, image: Tensor, far: Tensor, shot: Tensor, read: Tensor) -> Tensor:
@@ -140,7 +142,7 @@ class Denoiser(nn.Module):
         """
         height, width = image.shape[-2:]
         stabiliser = Stabiliser.of(shot, read)
-        z, far = stabiliser.forward(_padded(image)), _padded(far)
+        z, far = stabiliser.forward(padded(image.float(), _CELL)), padded(far.float(), _CELL)
         near = box_mean(z, _NEAR)
         features = (
             _LEVEL * _asinh((z - near) / _LEVEL),
@@ -159,7 +161,7 @@ class Denoiser(nn.Module):
         root = Stabiliser.of(shot, read).root
         sigma = (shot.float()[:, :, None, None] * clean.clamp(min=0.0)).add_(root.square()).sqrt_()
         taken = ((image.float() - clean) / sigma).clamp_(-2.0 * _LARGEST, 2.0 * _LARGEST)
-        mean = _coarse_mean(_padded(taken), _MEAN_CELLS)[..., :height, :width]
+        mean = _coarse_mean(padded(taken, _CELL), _MEAN_CELLS)[..., :height, :width]
         # Windows are smaller at the borders, so these count more than their share: made up for.
         rest = (sigma * (taken - mean)).mean(dim=(2, 3), keepdim=True)
         return clean + sigma * (mean + rest / sigma.mean(dim=(2, 3), keepdim=True))
@@ -185,12 +187,6 @@ def _asinh(x: Tensor) -> Tensor:
     size = x.abs().clamp(max=1e18)  # whose square is finite
     square = size.square()
     return torch.log1p(size + square / (1.0 + (1.0 + square).sqrt())).copysign(x)
-
-
-def _padded(image: Tensor) -> Tensor:
-    """`image` with borders repeated to a multiple of 8 pixels, float32."""
-    height, width = image.shape[-2:]
-    return F.pad(image.float(), (0, -width % _CELL, 0, -height % _CELL), mode="replicate")
 
 
 def _coarse_mean(x: Tensor, cells: int) -> Tensor:

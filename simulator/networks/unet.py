@@ -52,10 +52,10 @@ def resize_to(x: Tensor, skip: Tensor) -> Tensor:
     return F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def _padded(image: Tensor) -> Tensor:
-    """`image` (B, C, H, W), its last row and column repeated up to a multiple of `MULTIPLE`."""
+def padded(image: Tensor, multiple: int) -> Tensor:
+    """`image` (B, C, H, W), its last row and column repeated up to a multiple of pixels."""
     height, width = image.shape[-2:]
-    return F.pad(image, (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")
+    return F.pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 
 
 def convolution(inputs: int, outputs: int, *, bias: bool = True) -> nn.Conv2d:
@@ -150,7 +150,7 @@ class UNet(nn.Module):
         raw and the same with a sample of its noise.
         """
         paper, (height, width) = self.variant == "paper", x.shape[-2:]
-        x = x if paper else _padded(x)
+        x = x if paper else padded(x, MULTIPLE)
         skips: list[Tensor] = []
         for level in self.encoder:
             x = level(halve(x) if skips else x)
@@ -359,7 +359,7 @@ class AttentionUNet(nn.Module):
         `f_numbers` (B, 2) are the effective ones of source and target, in [0.5, 1024].
         """
         paper, (height, width) = self.variant == "paper", image.shape[-2:]
-        x = image if paper else _padded(image)
+        x = image if paper else padded(image, MULTIPLE)
         if paper:
             aperture = f_numbers.to(image) / F_NUMBER_UNIT
         else:

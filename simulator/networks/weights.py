@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from safetensors import SafetensorError
@@ -16,9 +16,9 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from simulator.capture.statistics import Residual
-from simulator.networks.aperture_module import ApertureModule
+from simulator.networks.aperture_module import ApertureModule, AperturePreset
 from simulator.networks.exposure_module import ExposureModule
-from simulator.networks.noise_module import NoiseModule
+from simulator.networks.noise_module import NoiseModule, Preset
 from simulator.utils.checks import check_type, check_word, did_you_mean
 from simulator.utils.files import sibling, write_atomically
 
@@ -37,11 +37,8 @@ def _noise_alone(preset: Any) -> nn.ModuleDict:
 #: the paper's, and those of its authors' released code. `benchmarks.paper_baselines` adds the
 #: paper's two baselines.
 BUILDERS: dict[str, Callable[[], nn.ModuleDict]] = {
-    "nano": partial(_noise_alone, "nano"),
-    "compact": partial(_all_three, "compact"),
-    "large": partial(_noise_alone, "large"),
-    "paper": partial(_all_three, "paper"),
-    "ncs": partial(_all_three, "ncs"),
+    preset: partial(_all_three if preset in get_args(AperturePreset) else _noise_alone, preset)
+    for preset in get_args(Preset)
 }
 #: Increased when the networks change such that older weights no longer fit.
 FORMAT_VERSION = 2

@@ -1,7 +1,4 @@
-"""Normals drawn by counting: each block of a frame from its number and the frame's key.
-
-This module imports numba.
-"""
+"""Normals drawn by counting: each block of a frame from its number and the frame's key."""
 
 from __future__ import annotations
 
@@ -155,9 +152,6 @@ def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     out = np.empty((planes, samples), np.float32)
-    parallel_ranges(
-        lambda first, last: _draw(first, last, np.uint64(key), blocks, out),
-        planes * blocks,
-        least=1024,
-    )
+    fixed = (np.uint64(key), blocks, out)
+    parallel_ranges(lambda a, b: _draw(a, b, *fixed), planes * blocks, least=1024)
     return out.reshape(shape)

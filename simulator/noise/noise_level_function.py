@@ -101,21 +101,14 @@ def _four_variances(name: str, given: Any) -> tuple[float, ...]:
     return values
 
 
-def nlf_tensors(
-    nlf: NoiseLevelFunction, device: torch.device | str = "cpu"
-) -> tuple[Tensor, Tensor]:
-    """(shot, read), each (4, 1, 1) float32: variances reach 5e-9, so never a narrower dtype."""
-    return plane_tensor(nlf.shot, device), plane_tensor(nlf.read, device)
-
-
 def plane_tensor(values: Sequence[float] | np.ndarray, device: torch.device | str) -> Tensor:
-    """One number for each plane as (4, 1, 1) float32."""
+    """One number for each plane as (4, 1, 1) float32: variances reach 5e-9, so never narrower."""
     return torch.tensor(values, dtype=torch.float32, device=device)[:, None, None]
 
 
 def noise_variance(signal: Tensor, nlf: NoiseLevelFunction) -> Tensor:
     """Variance ``read + shot * max(signal, 0)`` of each pixel, (..., 4, H, W) float32."""
-    shot, read = nlf_tensors(nlf, signal.device)
+    shot, read = (plane_tensor(values, signal.device) for values in (nlf.shot, nlf.read))
     return signal.float().clamp(min=0.0) * shot + read
 
 

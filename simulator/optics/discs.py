@@ -180,13 +180,9 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
         quadrant, reach = _quadrant(disc_radius(diameter_px))
-        most = np.float32(math.inf)
-        return by_rows(
-            light,
-            None,
-            lambda a, b, rows, out: _disc(a, b, height, rows, quadrant, reach, most, out),
-            cost=len(quadrant) ** 2,
-        )
+        disc = (quadrant, reach, np.float32(math.inf))
+        cost = len(quadrant) ** 2
+        return by_rows(light, None, lambda a, b, i, o: _disc(a, b, height, i, *disc, o), cost)
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
@@ -416,11 +412,8 @@ class DiscBank:
         out = new_frame(light) if out is None else out
         fixed = (diameters, knots, addresses(levels), out.numel())
         result, (height, width) = out.numpy().reshape(-1, *out.shape[-2:]), out.shape[-2:]
-        parallel_ranges(
-            lambda first, last: _blend(first, last, *fixed, result),
-            height,
-            least=1 + _WORTH_A_THREAD // width,
-        )
+        least = 1 + _WORTH_A_THREAD // width
+        parallel_ranges(lambda a, b: _blend(a, b, *fixed, result), height, least=least)
         return out
 
 
@@ -465,11 +458,8 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
     frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
     out = torch.empty(frame.shape)
     fixed = (frame.contiguous().numpy(), _KNOTS.astype(np.float32), ends.astype(np.float32))
-    parallel_ranges(
-        lambda first, last: _evaluate(first, last, *fixed, out.numpy()),
-        len(frame),
-        least=1 + _WORTH_A_THREAD // frame.shape[1],
-    )
+    least = 1 + _WORTH_A_THREAD // frame.shape[1]
+    parallel_ranges(lambda a, b: _evaluate(a, b, *fixed, out.numpy()), len(frame), least=least)
     return out.reshape(diameter.shape).to(diameter)
 
 

@@ -223,11 +223,8 @@ def by_rows(
     out = torch.empty(light.shape) if out is None else out
     width = light.shape[-1]
     rows, result = light.contiguous().reshape(-1, width).numpy(), out.reshape(-1, width).numpy()
-    parallel_ranges(
-        lambda first, last: task(first, last, rows, result),
-        len(rows),
-        least=1 + _WORTH_A_THREAD // (cost * width),
-    )
+    least = 1 + _WORTH_A_THREAD // (cost * width)
+    parallel_ranges(lambda a, b: task(a, b, rows, result), len(rows), least=least)
     return out
 
 
@@ -446,14 +443,7 @@ def _blur_rows(planes, rows, columns, weights, limit, out):  # type: ignore[no-u
         reach = max(reach, abs(column))
     padded = np.empty((height, width + 2 * reach), np.float32)
     for plane in range(len(planes)):
-        for y in range(height):
-            for x in range(width):
-                value = planes[plane, y, x]
-                value = value if value < limit else limit
-                padded[y, np.uint64(reach + x)] = value if value > -limit else -limit
-            for x in range(reach):
-                padded[y, x] = padded[y, reach]
-                padded[y, np.uint64(reach + width + x)] = padded[y, reach + width - 1]
+        pad_rows(planes[plane], 0, 0, height, reach, limit, padded)
         for y in range(height):
             total = out[plane, y]
             total[:] = np.float32(0)
@@ -503,16 +493,8 @@ def path_blur(
         out: Contiguous tensor on the CPU to write to, instead of a new one.
         limit: Light beyond it, on either side of 0, is clipped before it is blurred.
     """
-    out = torch.empty(light.shape) if out is None else out
-    planes, result = light.cpu().contiguous().numpy(), out.numpy()
-    parallel_ranges(
-        lambda first, last: _blur_rows(
-            planes[first:last], *taps, np.float32(limit), result[first:last]
-        ),
-        len(planes),
-        least=1 + _PATH_WORTH_A_THREAD // planes[0].size,
-    )
-    return out.to(light.device)
+    most = np.float32(limit)
+    return _by_planes(light, out, lambda planes, to: _blur_rows(planes, *taps, most, to))
 
 
 def path_blur_apart(
@@ -538,12 +520,16 @@ def path_blur_apart(
         own: Of the subject's, K_s.
         out, limit: See `path_blur`.
     """
+    fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
+    return _by_planes(light, out, lambda planes, to: _blur_apart(planes, *fixed, to))
+
+
+def _by_planes(
+    light: Tensor, out: Tensor | None, task: Callable[[np.ndarray, np.ndarray], None]
+) -> Tensor:
+    """`light` (P, H, W) by `task` on shares of its planes, into `out`."""
     out = torch.empty(light.shape) if out is None else out
     planes, result = light.cpu().contiguous().numpy(), out.numpy()
-    fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
-    parallel_ranges(
-        lambda first, last: _blur_apart(planes[first:last], *fixed, result[first:last]),
-        len(planes),
-        least=1 + _PATH_WORTH_A_THREAD // planes[0].size,
-    )
+    least = 1 + _PATH_WORTH_A_THREAD // planes[0].size
+    parallel_ranges(lambda a, b: task(planes[a:b], result[a:b]), len(planes), least=least)
     return out.to(light.device)

@@ -6,8 +6,6 @@ dead leaves of its own. Wherever several cover a pixel, the nearest is seen.
 
 Depth is drawn as the signed circle of confusion at f/11, because that is what decides how much
 such a scene can teach about defocus, and then converted to metres for a lens of 50 mm.
-
-`draw_layout` gives a picture without depth such surfaces: it draws their layout and paints nothing.
 """
 
 from __future__ import annotations
@@ -19,13 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.random import Generator
 
 from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import temperature_tint
 from simulator.radiance.procedural import (
     Drawing,
     LeafStyle,
+    Range,
     dead_leaves,
+    draw_lux,
     fractal_noise,
     log_uniform,
     paint_leaves,
@@ -55,12 +56,9 @@ _SIDES, _LAYOUT_SIDES = (0.25, 0.75), (0.4, 1.0)
 class DepthDrawing:
     """A procedural picture, the light it stands in, and how it lies before the lens.
 
-    Args:
-        drawing: Light and illuminance.
-        blur: (H, W) float32 signed circle of confusion at `F_NUMBER` [packed pixels], above 0
-            behind the plane of focus; its size is at most `LARGEST_BLUR`.
-        far: Inverse distance [1/m] of a thing with the largest `blur` of this picture.
-        surface: (H, W) int, number of the thing that each pixel shows: 0 is the background.
+    `blur` (H, W) float32 is the signed circle of confusion at `F_NUMBER` [packed pixels], above 0
+    behind the plane of focus and at most `LARGEST_BLUR`; `far` the inverse distance [1/m] where it
+    is largest; `surface` (H, W) the number of the thing that each pixel shows, 0 the background.
     """
 
     drawing: Drawing
@@ -69,14 +67,8 @@ class DepthDrawing:
     surface: np.ndarray
 
 
-def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> DepthDrawing:
-    """A picture with depth.
-
-    Args:
-        rng: Source of all randomness; the same state gives the same picture.
-        size: Height and width [packed pixels], at least 16.
-        focus: One of `FOCUSES`.
-    """
+def draw_depth(rng: Generator, size: int, focus: str = "middle") -> DepthDrawing:
+    """A picture with depth, `size` packed pixels a side, focused on one of `FOCUSES`."""
     check_word("focus", focus, FOCUSES)
     check_integer("size", size, 16, more=" packed pixels")
     levels = _levels(rng, int(rng.integers(1, 6)), focus)
@@ -93,17 +85,16 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     if rng.random() < 1.0 / 3.0:
         _add_highlights(rng, picture, surface)
     light = _soften(picture, rng.uniform(0.05, 0.09))
-    illuminance = float(f"{log_uniform(rng, 1.0, 20_000.0):.4g}")
-    drawing = Drawing(light, illuminance, temperature_tint(rng.uniform(-0.1, 1.0)))
+    lux = draw_lux(rng, 1.0, 20_000.0)
+    drawing = Drawing(light, lux, temperature_tint(rng.uniform(-0.1, 1.0)))
     far = math.exp(rng.uniform(math.log(0.02), math.log(1.0)))
     return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
 
 
 def draw_layout(name: str, height: int, width: int) -> Layout:
-    """The layout of a picture of so many packed pixels, as if it lay over procedural depth.
+    """The layout of a picture of so many packed pixels over procedural depth; `name` decides it.
 
-    `name` decides it. The subject is the nearest thing. Focus is on it in eight of ten layouts, in
-    the others on something behind it.
+    The subject is the nearest thing. Focus is on it in eight of ten layouts, else behind it.
     """
     rng = np.random.default_rng([zlib.crc32(f"layout {name}".encode()), 0])
     focus = str(rng.choice(_LAYOUT_FOCUSES, p=_LAYOUT_SHARES))
@@ -127,12 +118,8 @@ def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[fl
     """Focus distance [m] and depth (H, W) float32 [m] at which a scene has `blur`.
 
     Solves the thin-lens relation ``c = f**2 / (N (s - f)) * (z - s) / z`` (c signed, on the sensor)
-    for the focus distance s and the depths z, at `FOCAL_LENGTH` and `F_NUMBER`.
-
-    Args:
-        blur: (H, W) signed circle of confusion [packed pixels].
-        far: Inverse distance [1/m] where `blur` is largest.
-        pixel_pitch: Distance between packed pixels [m].
+    for the focus distance s and the depths z, at `FOCAL_LENGTH` and `F_NUMBER`; `blur` and `far`
+    are those of a `DepthDrawing`, `pixel_pitch` is that of packed pixels [m].
     """
     # With inverse distances D = 1/z, F = 1/s: c = f^2 / N * (F - D) / (1 - f F).
     scale = FOCAL_LENGTH**2 / (F_NUMBER * pixel_pitch)
@@ -142,7 +129,7 @@ def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[fl
     return 1.0 / focus, (1.0 / inverse).astype(np.float32)
 
 
-def _levels(rng: np.random.Generator, things: int, focus: str) -> np.ndarray:
+def _levels(rng: Generator, things: int, focus: str) -> np.ndarray:
     """Signed blur of the background and then of each thing, from far to near; one of them is 0."""
     sizes = rng.uniform(*_LARGEST_RANGE) * rng.uniform(0.2, 1.0, things)
     sign = {"front": 1.0, "back": -1.0}.get(focus)
@@ -152,7 +139,7 @@ def _levels(rng: np.random.Generator, things: int, focus: str) -> np.ndarray:
     return np.sort(np.append(sizes * signs, 0.0))[::-1]
 
 
-def _plane(rng: np.random.Generator, side: int, level: float, slant: float) -> np.ndarray:
+def _plane(rng: Generator, side: int, level: float, slant: float) -> np.ndarray:
     """(side, side) blur of a plane through `level` at its middle that rises by up to `slant`."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.linspace(-0.5, 0.5, side, dtype=np.float32)
@@ -161,7 +148,7 @@ def _plane(rng: np.random.Generator, side: int, level: float, slant: float) -> n
     return np.asarray(plane.astype(np.float32))
 
 
-def _background(rng: np.random.Generator, size: int, level: float, span: float) -> np.ndarray:
+def _background(rng: Generator, size: int, level: float, span: float) -> np.ndarray:
     """(size, size) blur of the background: a wall, frontal or slanted, or the ground.
 
     The ground comes nearer towards the lower edge, by at most the `span` of all levels.
@@ -176,13 +163,13 @@ def _background(rng: np.random.Generator, size: int, level: float, span: float) 
 
 
 def _put_thing(
-    rng: np.random.Generator,
+    rng: Generator,
     blur: np.ndarray,
     surface: np.ndarray,
     number: int,
     level: float,
-    sides: tuple[float, float] = _SIDES,
-) -> tuple[tuple[slice, slice], tuple[slice, slice], np.ndarray, np.ndarray]:
+    sides: Range = _SIDES,
+) -> tuple[tuple[slice, ...], tuple[slice, ...], np.ndarray, np.ndarray]:
     """Adds one thing: its place in the frame and in itself, where it is seen, its tone."""
     size = blur.shape[0]
     side = int(rng.uniform(*sides) * size)
@@ -194,20 +181,16 @@ def _put_thing(
         mask = _bush(rng, side) if kind < 0.6 else _board(rng, side)
         depth = _plane(rng, side, level, 0.0 if rng.random() < 0.4 else 2.5)
         tone = np.ones((side, side), np.float32)
-    rows = slice(max(top, 0), min(top + side, size))
-    columns = slice(max(left, 0), min(left + side, size))
-    place = (rows, columns)
-    inside = (
-        slice(rows.start - top, rows.stop - top),
-        slice(columns.start - left, columns.stop - left),
-    )
+    bounds = [(at, max(at, 0), min(at + side, size)) for at in (top, left)]
+    place = tuple(slice(first, last) for _, first, last in bounds)
+    inside = tuple(slice(first - at, last - at) for at, first, last in bounds)
     seen = mask[inside] & (depth[inside] < blur[place])
     blur[place][seen] = depth[inside][seen]
     surface[place][seen] = number
     return place, inside, seen, tone
 
 
-def _board(rng: np.random.Generator, side: int) -> np.ndarray:
+def _board(rng: Generator, side: int) -> np.ndarray:
     """(side, side) bool: an ellipse or a rectangle at an angle."""
     angle, elongation = rng.uniform(0, np.pi), 2.0 ** rng.uniform(-0.6, 0.6)
     shape = np.array([[angle], [elongation], [rng.random() < 0.5]])
@@ -215,7 +198,7 @@ def _board(rng: np.random.Generator, side: int) -> np.ndarray:
     return paint_leaves(side, radius, middle, middle, shape) > 0
 
 
-def _bush(rng: np.random.Generator, side: int) -> np.ndarray:
+def _bush(rng: Generator, side: int) -> np.ndarray:
     """(side, side) bool: a blob with a fractal outline."""
     axis = np.linspace(-1.0, 1.0, side, dtype=np.float32)
     distance = np.hypot(axis[:, None], axis[None, :])
@@ -223,9 +206,7 @@ def _bush(rng: np.random.Generator, side: int) -> np.ndarray:
     return (distance + ragged < rng.uniform(0.6, 0.85)) & (distance < 0.97)
 
 
-def _foliage(
-    rng: np.random.Generator, side: int, level: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _foliage(rng: Generator, side: int, level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mask, blur and tone of leaves that float at depths of their own, the nearer in front."""
     number = int(rng.integers(8, 50))
     radius = side * np.exp(rng.uniform(np.log(0.03), np.log(0.16), number))
@@ -240,11 +221,11 @@ def _foliage(
     return label > 0, depth[label], tone[label]
 
 
-def _leaves(rng: np.random.Generator, size: int) -> np.ndarray:
+def _leaves(rng: Generator, size: int) -> np.ndarray:
     """(3, size, size) reflectance: dead leaves, most with texture at all scales, some nearly bare.
 
-    Defocus shows only where there is texture. The exponent of the additional texture varies, so
-    that smoothness alone does not tell that something is out of focus.
+    The exponent of the additional texture varies, so that smoothness alone does not tell that
+    something is out of focus.
     """
     style = LeafStyle(
         smallest=float(log_uniform(rng, 1.5, 12.0)),
@@ -260,7 +241,7 @@ def _leaves(rng: np.random.Generator, size: int) -> np.ndarray:
     return np.asarray(np.clip(light * grain, 0.003, 0.97).astype(np.float32))
 
 
-def _add_highlights(rng: np.random.Generator, light: np.ndarray, surface: np.ndarray) -> None:
+def _add_highlights(rng: Generator, light: np.ndarray, surface: np.ndarray) -> None:
     """Adds small discs of 5 to 100 times white to `light`, each on one thing only, at its depth."""
     size = surface.shape[0]
     for _ in range(int(rng.integers(3, 30))):

@@ -42,10 +42,8 @@ def mean_anchor(green: torch.Tensor) -> float:
     values = green.double().clamp(min=0.0).flatten()
     lit = float((values > 0).double().mean())
     if lit <= MEAN_SIGNAL:
-        raise ValueError(
-            f"`light` is 0 in all but {lit:.1%} of its pixels: no exposure brings its mean to "
-            f"{MEAN_SIGNAL}; give `illuminance`"
-        )
+        reason = f"no exposure brings its mean to {MEAN_SIGNAL}; give `illuminance`"
+        raise ValueError(f"`light` is 0 in all but {lit:.1%} of its pixels: {reason}")
     low, high = -40.0, 40.0  # log2 of the factor, found by bisection
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -59,18 +57,11 @@ def mean_anchor(green: torch.Tensor) -> float:
 def camera_from_srgb(
     camera: CameraProfile, illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix from reflectance in linear sRGB to raw R, G, B under `illuminant`.
+    """Matrix (3, 3) from reflectance in linear sRGB to raw R, G, B, and the raw R, G, B of white.
 
-    Args:
-        camera: Its `colour_matrix` (XYZ to camera); the identity on sRGB where it has none.
-        illuminant: Colour of the light, linear sRGB; its brightness does not matter.
-
-    Returns:
-        The matrix, 3 x 3, scaled so that white gives 1 in green, and the raw R, G, B of white.
-        White balance gains are ``1 / white``.
-
-    Raises:
-        ValueError: If white is not positive in every raw channel.
+    It is scaled so that white gives 1 in green; white balance gains are ``1 / white``. A camera
+    without a `colour_matrix` sees sRGB. `illuminant` is the light's colour in linear sRGB; its
+    brightness does not matter.
     """
     tint = np.asarray(illuminant, np.float64)
     if tint.shape != (3,) or not (np.isfinite(tint).all() and (tint > 0).all()):
@@ -82,21 +73,15 @@ def camera_from_srgb(
     matrix = matrix * tint
     white = matrix.sum(axis=1)
     if not (white > 0).all():
-        raise ValueError(
-            f"`colour_matrix` of camera {camera.name!r} takes white to {white.tolist()}, which "
-            "must be positive in R, G and B"
-        )
+        rule = f"takes white to {white.tolist()}, which must be positive in R, G and B"
+        raise ValueError(f"`colour_matrix` of camera {camera.name!r} {rule}")
     return matrix / white[1], white / white[1]
 
 
 def temperature_tint(log2_red_over_green: float) -> tuple[float, float, float]:
     """Colour of a light along the daylight to tungsten line, linear sRGB.
 
-    Args:
-        log2_red_over_green: 0 is D65, 0.6 about 4000 K, 1.16 tungsten (2856 K), -0.15 open shade.
-
-    >>> temperature_tint(0.0)
-    (1.0, 1.0, 1.0)
+    0 is D65, 0.6 about 4000 K, 1.16 tungsten (2856 K), -0.15 open shade.
     """
     # Planck's locus in linear sRGB: illuminant A is (2.23, 1, 0.28), 4000 K (1.53, 1, 0.58).
     return (2.0**log2_red_over_green, 1.0, 2.0 ** (-1.5 * log2_red_over_green))
@@ -119,28 +104,21 @@ def camera_light(
             reflectances); without, the scale is arbitrary.
         camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
         illuminance: Light on the subject [lux]; None where the scale is unknown.
-        ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped at
-            white, is set to 0.12.
-        illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`; decides the white
-            balance.
+        ev100: Without `illuminance`, where the mean of green, clipped at white, is set to 0.12.
+        illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`.
         sampled: Whether the pixels of `rgb`, (3, 2H, 2W), are photosites: they go through a lens
             that is sharp to about a pixel and the camera's colour filter array. Otherwise each
             becomes a packed pixel, all four planes of it at one place.
 
     Returns:
-        (4, H, W) float32 packed planes R, G1, G2, B, 1.0 at sensor white and not clipped; the
-        settings at which they are; and the gains of R, G, B that make a grey card grey.
-
-    Raises:
-        ValueError: If `rgb` is not linear light, or black nearly everywhere and of unknown scale.
+        (4, H, W) float32 packed planes, not clipped; the settings at which 1.0 is sensor white; and
+        the gains of R, G, B that make a grey card grey.
     """
     image = torch.as_tensor(rgb)
-    if image.ndim != 3 or image.shape[0] != 3 or not image.dtype.is_floating_point:
-        raise ValueError(
-            f"`rgb` ({image.dtype}, shape {tuple(image.shape)}) must be float, (3, H, W)"
-        )
-    if not bool((torch.isfinite(image) & (image >= 0)).all()) or not image.numel():
-        raise ValueError("`rgb` must be light, finite and at least 0 everywhere")
+    is_float = image.ndim == 3 and image.shape[0] == 3 and image.dtype.is_floating_point
+    if not is_float or not image.numel() or not (image.isfinite() & (image >= 0)).all():
+        found = f"{image.dtype}, shape {tuple(image.shape)}"
+        raise ValueError(f"`rgb` ({found}) must be float light, (3, H, W), finite and at least 0")
     image = image.float()
     matrix, white = camera_from_srgb(camera, illuminant)
     planes = torch.from_numpy(matrix).float() @ image.reshape(3, -1)

@@ -37,10 +37,8 @@ def read_radiance(path: str | Path) -> np.ndarray:
 
     Values that are not light are repaired, and the repair is logged: NaN and negative values
     (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
-
-    Args:
-        path: The file. Its primaries are taken to be sRGB's, as those files usually have; alpha and
-            further channels are ignored; a file with luminance only is grey.
+    Primaries are taken to be sRGB's, as those files usually have; alpha and further channels are
+    ignored; a file with luminance only is grey.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -79,17 +77,10 @@ def map_views(
 
     A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
     with a field of view of 60 degrees; any other gives its central square. Both have about 256
-    packed pixels a side. Where the map has at least as many pixels there as photosites (512 x 512)
-    the views have twice as many, for a colour filter array to sample.
-
-    Args:
-        image: (3, H, W) linear light.
-        resolution: Packed pixels a side that the views are for; see `native_size`.
-        native: Whether the middle is to be cut out: then a coarser map is sampled, too, if it has
-            the photosites of that middle.
-
-    Returns:
-        The views by the ending of their names, and whether they are to be sampled.
+    packed pixels a side (`native_size`). Where the map has at least as many pixels there as
+    photosites (512 x 512) the views have twice as many, for a colour filter array to sample;
+    `native` samples a coarser map, too, if it has the photosites of a middle of `resolution`.
+    The views are by the ending of their names.
     """
     height, width = image.shape[1:]
     is_panorama = abs(width / height - 2.0) <= 0.01
@@ -143,14 +134,9 @@ def perspective(
     """A pin-hole view (3, size, size) into an equirectangular panorama (gnomonic).
 
     Sampled bilinearly at least as densely as the panorama has pixels, then box-averaged, so that
-    small lamps keep their energy.
-
-    Args:
-        panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
-            latitudes from +90 degrees.
-        azimuth, pitch: Longitude and latitude of the view's middle [degrees].
-        size: Height and width of the view [pixels].
-        field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
+    small lamps keep their energy. Columns of `panorama`, (3, H, W) with W = 2 H, are longitudes
+    from -180 degrees, rows latitudes from +90 degrees; `azimuth` and `pitch` are those of the
+    view's middle. `field_of_view` is horizontal and vertical, in (0, 150] degrees.
     """
     half = math.tan(math.radians(field_of_view) / 2.0)
     per_radian = panorama.shape[2] / (2.0 * math.pi)
@@ -163,10 +149,8 @@ def perspective(
     latitude = np.arctan2(up, np.hypot(forward, right))
     column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
     row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
-    view = _bilinear(panorama, row, column)
-    return np.asarray(
-        view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
-    )
+    view = _bilinear(panorama, row, column).reshape(3, size, dense, size, dense)
+    return np.asarray(view.mean(axis=(2, 4)).astype(np.float32))
 
 
 def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -246,16 +230,13 @@ def _read_exr(path: Path) -> np.ndarray:
     except (RuntimeError, ValueError) as error:
         if "radiance map" in str(error):
             raise
-        raise ValueError(
-            f"radiance map {str(path)!r} must be a complete OpenEXR file, but OpenEXR says: {error}"
-        ) from error
+        rule = f"must be a complete OpenEXR file, but OpenEXR says: {error}"
+        raise ValueError(f"radiance map {str(path)!r} {rule}") from error
     names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
     planes = [np.asarray(channels[n], np.float32) for n in names if n in channels]
     if len(planes) != 3 or len({p.shape for p in planes}) != 1:
-        raise ValueError(
-            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G and B of the "
-            "same size, or Y"
-        )
+        rule = f"(channels {sorted(channels)}) must have R, G and B of the same size, or Y"
+        raise ValueError(f"radiance map {str(path)!r} {rule}")
     return np.stack(planes)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from simulator.radiance.light import temperature_tint
-from simulator.radiance.procedural import NATIVE_SIZE, Drawing, log_uniform
+from simulator.radiance.procedural import NATIVE_SIZE, Drawing, Range, draw_lux
 
 #: Scenes made of each photograph: crops, mirrored or not, under lights of their own.
 SCENES_PER_PHOTOGRAPH = 3
@@ -24,23 +24,14 @@ _CLIPPED = 0.97
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph inside scikit-image's wheel.
+    """A photograph inside scikit-image's wheel."""
 
-    Args:
-        name: Its name there, and the name of its source group.
-        file: File name in ``skimage/data``.
-        split: ``"train"`` or ``"test"``; fixed.
-        illuminance: Range of the light assumed for it [lux].
-        tint: Range of the light's colour, see `temperature_tint`.
-        credit: Photographer or institution and licence, as scikit-image states them.
-    """
-
-    name: str
-    file: str
-    split: str
-    illuminance: tuple[float, float]
-    tint: tuple[float, float]
-    credit: str
+    name: str  # there, and of its source group
+    file: str  # in ``skimage/data``
+    split: str  # "train" or "test"
+    illuminance: Range  # of the light assumed for it [lux]
+    tint: Range  # of the light's colour, see `temperature_tint`
+    credit: str  # photographer or institution and licence, as scikit-image states them
 
     @property
     def scene_ids(self) -> list[str]:
@@ -83,7 +74,7 @@ def photograph_drawings(photograph: Photograph) -> Iterator[Drawing]:
         crop = light[:, top : top + NATIVE_SIZE, left : left + NATIVE_SIZE]
         if index and rng.random() < 0.5:
             crop = crop[:, :, ::-1]
-        illuminance = float(f"{log_uniform(rng, *photograph.illuminance):.4g}")
+        illuminance = draw_lux(rng, *photograph.illuminance)
         tint = temperature_tint(rng.uniform(*photograph.tint))
         yield Drawing(np.ascontiguousarray(crop), illuminance, tint)
 
@@ -98,12 +89,8 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     4. Clipped highlights: where the photograph is at 0.97 of white or above, the light is raised
        by a factor drawn once per photograph from 1 to 2**2.5, fading in between 0.97 and 1.
 
-    Args:
-        image: (H, W, 3) or (H, W) uint8.
-        rng: Source of the dither and the factor.
-
-    Returns:
-        (3, H, W) float32, at least 0; 1.0 at the photograph's white, above in the highlights.
+    `image` is (H, W, 3) or (H, W) uint8; the result (3, H, W) float32, at least 0, 1.0 at the
+    photograph's white and above in the highlights.
     """
     colour = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
     codes = colour[:, :, :3].transpose(2, 0, 1).astype(np.float64)

@@ -1,9 +1,8 @@
 """Seeded procedural scenes: the easy kinds and the five that fool a reflected-light meter.
 
 Every kind returns light on the reflectance scale: 1.0 is what a perfectly white surface sends
-under the stated illuminance, so that surfaces stay below 1 and lamps, sky and glints exceed it.
-The illuminance is what an incident-light meter reads where a photographer would hold it; the
-docstring of each kind says where that is.
+under the stated illuminance, which is what an incident-light meter reads where a photographer would
+hold it; the docstring of each kind says where that is.
 
 Most are dead leaves: occluding shapes of power-law size, the standard model of natural images.
 Sizes distributed as ``r**-3`` make the image scale invariant, with a power spectrum close to
@@ -18,10 +17,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from simulator.radiance.light import temperature_tint
 from simulator.utils.checks import check_word
 from simulator.utils.compute import kernel
+
+Range = tuple[float, float]
 
 #: Part of every cache key: raise it with any change of the drawings.
 GENERATOR_VERSION = 1
@@ -42,29 +44,18 @@ _SQUARE_HALF_SIDE = 0.886
 
 @dataclass(frozen=True)
 class LeafStyle:
-    """Appearance of dead leaves.
+    """Appearance of dead leaves."""
 
-    Args:
-        smallest: Smallest radius [pixels].
-        largest: Largest radius, fraction of the frame height.
-        contrast: Standard deviation of a leaf's natural-log reflectance.
-        chroma: Standard deviation of the log2 of red and of blue over green, between palette
-            colours.
-        texture: Largest standard deviation of the natural-log texture on a leaf.
-        mean: Mean reflectance of the picture (green).
-        palette: Number of base colours that leaves share.
-    """
-
-    smallest: float = 1.2
-    largest: float = 0.35
-    contrast: float = 0.75
-    chroma: float = 0.45
-    texture: float = 0.35
-    mean: float = 0.17
-    palette: int = 5
+    smallest: float = 1.2  # radius [pixels]
+    largest: float = 0.35  # radius, fraction of the frame height
+    contrast: float = 0.75  # standard deviation of a leaf's natural-log reflectance
+    chroma: float = 0.45  # the same of log2 red and blue over green, between palette colours
+    texture: float = 0.35  # largest standard deviation of the natural-log texture on a leaf
+    mean: float = 0.17  # reflectance of the picture (green)
+    palette: int = 5  # number of base colours that leaves share
 
 
-def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np.ndarray:
+def fractal_noise(rng: Generator, size: int, slope: float = 1.0) -> np.ndarray:
     """Periodic noise (size, size) float32 of amplitude ``1 / f**slope``, mean 0, deviation 1."""
     white = np.fft.rfft2(rng.standard_normal((size, size), dtype=np.float32))
     fy, fx = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :]
@@ -74,9 +65,8 @@ def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np
     return np.asarray((field / field.std()).astype(np.float32))
 
 
-def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = None) -> np.ndarray:
+def dead_leaves(rng: Generator, size: int, style: LeafStyle) -> np.ndarray:
     """Reflectance of dead leaves, (3, size, size) float32 linear sRGB in [0.005, 0.97]."""
-    style = LeafStyle() if style is None else style
     leaves = _draw_leaves(rng, size, style)
     label = paint_leaves(size, *leaves)
     number = len(leaves[0]) + 1  # label 0 is the ground
@@ -93,26 +83,19 @@ def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = N
     position = np.arange(size * size).reshape(size, size)
     texture = strength[label] * field.ravel()[(position + shift[label]) % (size * size)]
     shading = _shading(rng, size, label, *leaves[:3])
-    luminance = np.exp(tone[label] + texture + shading)
-    reflectance = luminance * gain[:, label]
-    return scale_to_mean(reflectance, style.mean)
+    reflectance = np.exp(tone[label] + texture + shading) * gain[:, label]
 
-
-def scale_to_mean(reflectance: np.ndarray, mean: float) -> np.ndarray:
-    """`reflectance` (3, H, W) scaled so that green has `mean`, kept inside [0.005, 0.97].
-
-    Bright colours are compressed smoothly towards 0.97 instead of being cut off.
-    """
-    scaled = reflectance * np.float32(mean / reflectance[1].mean())
+    # Bright colours are compressed smoothly towards 0.97 instead of being cut off.
+    scaled = reflectance * np.float32(style.mean / reflectance[1].mean())
     for _ in range(3):  # the compression lowers the mean a little: two corrections settle it
         bright = np.maximum(scaled - 0.5, 0.0)
         pressed = np.minimum(scaled, 0.5) + 0.47 * bright / (0.47 + bright)
-        scaled *= np.float32(mean / pressed[1].mean())
+        scaled *= np.float32(style.mean / pressed[1].mean())
     return np.asarray(np.clip(pressed, 0.005, 0.97).astype(np.float32))
 
 
 def _draw_leaves(
-    rng: np.random.Generator, size: int, style: LeafStyle
+    rng: Generator, size: int, style: LeafStyle
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Radii from the density r**-3, centres over the frame and a margin around it, shapes."""
     low, high = style.smallest, max(style.largest * size, 2.0 * style.smallest)
@@ -123,29 +106,25 @@ def _draw_leaves(
     radius = low / np.sqrt(1.0 - ratio * rng.random(number))
     centre_y = rng.uniform(-margin, size + margin, number)
     centre_x = rng.uniform(-margin, size + margin, number)
-    shape = np.stack(
-        [
-            rng.uniform(0.0, np.pi, number),  # orientation
-            np.exp2(rng.uniform(-0.7, 0.7, number)),  # elongation
-            rng.random(number) < 0.3,  # boxes among the ellipses
-        ]
-    )
-    return radius, centre_y, centre_x, shape
+    angle, elongation = rng.uniform(0.0, np.pi, number), np.exp2(rng.uniform(-0.7, 0.7, number))
+    is_box = rng.random(number) < 0.3
+    return radius, centre_y, centre_x, np.stack([angle, elongation, is_box])
 
 
 def paint_leaves(
     size: int, radius: np.ndarray, centre_y: np.ndarray, centre_x: np.ndarray, shape: np.ndarray
 ) -> np.ndarray:
-    """(size, size) label of the topmost leaf at each pixel, 0 for the ground."""
+    """(size, size) label of the topmost leaf at each pixel, 0 for the ground.
+
+    `shape` (3, N) holds the orientation, the elongation, and whether it is a box or an ellipse.
+    """
     angle, elongation, is_box = shape
     cosine, sine = np.abs(np.cos(angle)), np.abs(np.sin(angle))
     along, across = radius * elongation, radius / elongation  # semi-axes
     boxes = is_box.astype(bool)
     reach_x, reach_y = (
-        np.where(
-            boxes, _SQUARE_HALF_SIDE * (along * a + across * b), np.hypot(along * a, across * b)
-        )
-        for a, b in ((cosine, sine), (sine, cosine))
+        np.where(boxes, _SQUARE_HALF_SIDE * (width + height), np.hypot(width, height))
+        for width, height in ((along * cosine, across * sine), (along * sine, across * cosine))
     )
     top = np.clip(np.ceil(centre_y - reach_y), 0, size).astype(np.int32)
     bottom = np.clip(np.floor(centre_y + reach_y) + 1, 0, size).astype(np.int32)
@@ -162,14 +141,10 @@ def paint_leaves(
 
 @kernel(boundscheck=False)
 def _paint(label, bounds, centre, turned, boxes):  # type: ignore[no-untyped-def]
-    """Writes the number of each leaf, from 1, over those before it.
+    """Writes the number of each leaf, from 1, over those before it into `label` (H, W) int32.
 
-    Args:
-        label: (H, W) int32, changed in place.
-        bounds: (4, N) first row, end of the rows, first column, end of the columns.
-        centre: (2, N) float32 row and column.
-        turned: (4, N) float32 factors of dx and dy along the leaf, and of dy and dx across it.
-        boxes: (N,) whether it is a box.
+    `bounds` (4, N) are first and end of rows and of columns, `centre` (2, N) float32 row and
+    column, `turned` (4, N) float32 factors of dx and dy along the leaf, and of dy and dx across it.
     """
     for leaf in range(len(boxes)):
         u_x, u_y, v_y, v_x = turned[0, leaf], turned[1, leaf], turned[2, leaf], turned[3, leaf]
@@ -188,7 +163,7 @@ def _paint(label, bounds, centre, turned, boxes):  # type: ignore[no-untyped-def
 
 
 def _shading(
-    rng: np.random.Generator,
+    rng: Generator,
     size: int,
     label: np.ndarray,
     radius: np.ndarray,
@@ -198,10 +173,8 @@ def _shading(
     """Natural-log shading: brightness falls off across a leaf in a direction of its own."""
     angle = rng.uniform(0.0, 2.0 * np.pi, len(radius))
     steepness = rng.uniform(0.0, 0.35, len(radius)) / radius
-    slope = np.zeros((2, len(radius) + 1), np.float32)
-    slope[:, 1:] = np.stack([np.sin(angle), np.cos(angle)]) * steepness
-    centre = np.zeros((2, len(radius) + 1), np.float32)
-    centre[:, 1:] = np.stack([centre_y, centre_x])
+    by_leaf = np.stack([np.sin(angle), np.cos(angle)]) * steepness, np.stack([centre_y, centre_x])
+    slope, centre = (np.pad(v, ((0, 0), (1, 0))).astype(np.float32) for v in by_leaf)
     axis = np.arange(size, dtype=np.float32)
     dy = axis[:, None] - centre[0][label]
     dx = axis[None, :] - centre[1][label]
@@ -213,75 +186,62 @@ def _shading(
 
 @dataclass(frozen=True)
 class Drawing:
-    """A procedural picture and the light it stands in.
+    """A procedural picture and the light it stands in."""
 
-    Args:
-        light: (3, H, W) float32, linear sRGB on the reflectance scale, before `illuminant`.
-        illuminance: Incident light [lux].
-        illuminant: Colour of the light, linear sRGB.
+    light: np.ndarray  # (3, H, W) float32, linear sRGB on the reflectance scale
+    illuminance: float  # incident light [lux]
+    illuminant: tuple[float, float, float]  # its colour, linear sRGB, not yet in `light`
+
+
+def draw(kind: str, rng: Generator, size: int = NATIVE_SIZE, *, lens: bool = True) -> Drawing:
+    """A picture of `kind`, one of `KINDS`, of `size` pixels a side.
+
+    `lens` gives it a lens's softness, a binomial blur over 3 x 3 pixels, edges repeated; without,
+    it is for a camera that has a lens of its own.
     """
-
-    light: np.ndarray
-    illuminance: float
-    illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-def draw(
-    kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE, *, lens: bool = True
-) -> Drawing:
-    """A picture of `kind`, one of `list_kinds()`.
-
-    Args:
-        kind: Its kind.
-        rng: Source of all randomness; the same state gives the same picture.
-        size: Height and width [pixels].
-        lens: Whether it has the softness of a lens; without, it is for a camera that has its own.
-    """
-    check_word("kind", kind, tuple(_KINDS))
-    drawing = _KINDS[kind](rng, size)
-    return replace(drawing, light=_lens(drawing.light)) if lens else drawing
+    check_word("kind", kind, tuple(KINDS))
+    drawing = KINDS[kind](rng, size)
+    if not lens:
+        return drawing
+    padded = np.pad(drawing.light, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    rows = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
+    light = 0.25 * rows[:, :, :-2] + 0.5 * rows[:, :, 1:-1] + 0.25 * rows[:, :, 2:]
+    return replace(drawing, light=light)
 
 
-def list_kinds() -> list[str]:
-    """Names of the procedural kinds, the easy ones first."""
-    return list(_KINDS)
-
-
-def day(rng: np.random.Generator, size: int) -> Drawing:
+def day(rng: Generator, size: int) -> Drawing:
     """Dead leaves outdoors, 300 to 100,000 lux, some with cast shadows; metered in the sun."""
     light = dead_leaves(rng, size, _varied_style(rng))
-    illuminance = _lux(rng, 300.0, 100_000.0)
+    illuminance = draw_lux(rng, 300.0, 100_000.0)
     if rng.random() < 0.5:
         # The lower the sun's share of the light, the milder its shadows.
         depth = rng.uniform(0.12, 0.5)
         light = light * _shadows(rng, size, share=rng.uniform(0.05, 0.4), depth=depth)
     if rng.random() < 0.5:
-        _add_lamps(
-            rng, light, number=int(rng.integers(1, 9)), radius=(0.003, 0.008), value=(2.0, 60.0)
-        )
+        number = int(rng.integers(1, 9))
+        _add_lamps(rng, light, number, radius=(0.003, 0.008), value=(2.0, 60.0))
     return Drawing(light, illuminance, temperature_tint(rng.normal(0.05, 0.12)))
 
 
-def indoor(rng: np.random.Generator, size: int) -> Drawing:
+def indoor(rng: Generator, size: int) -> Drawing:
     """Dead leaves in a room, 10 to 2000 lux with fall-off; metered at the middle brightness."""
     style = _varied_style(rng)
     light = dead_leaves(rng, size, style) * _falloff(rng, size, stops=rng.uniform(0.3, 1.5))
     if rng.random() < 0.7:
-        _add_lamps(
-            rng, light, number=int(rng.integers(1, 5)), radius=(0.01, 0.035), value=(5.0, 120.0)
-        )
+        number = int(rng.integers(1, 5))
+        _add_lamps(rng, light, number, radius=(0.01, 0.035), value=(5.0, 120.0))
     tint = temperature_tint(rng.uniform(0.1, 1.1))
-    return Drawing(light, _lux(rng, 10.0, 2000.0), tint)
+    return Drawing(light, draw_lux(rng, 10.0, 2000.0), tint)
 
 
-def motion(rng: np.random.Generator, size: int) -> Drawing:
+def motion(rng: Generator, size: int) -> Drawing:
     """Dead leaves, 20 to 20,000 lux; hard because such a scene moves fast, not by its light."""
     style = _varied_style(rng)
     light = dead_leaves(rng, size, style) * _falloff(rng, size, stops=rng.uniform(0.0, 0.8))
-    return Drawing(light, _lux(rng, 20.0, 20_000.0), temperature_tint(rng.uniform(-0.1, 0.7)))
+    return Drawing(light, draw_lux(rng, 20.0, 20_000.0), temperature_tint(rng.uniform(-0.1, 0.7)))
 
 
-def snow(rng: np.random.Generator, size: int) -> Drawing:
+def snow(rng: Generator, size: int) -> Drawing:
     """Snow under 1500 to 100,000 lux with a few dark things on it; metered on the lit snow."""
     drifts = np.clip(0.84 + 0.045 * fractal_noise(rng, size, 1.5), 0.6, 0.95)
     grain = np.exp(0.02 * fractal_noise(rng, size, 0.3))
@@ -294,10 +254,10 @@ def snow(rng: np.random.Generator, size: int) -> Drawing:
         blue = np.array([0.85, 1.0, 1.25], np.float32)[:, None, None]
         light = light * (shade + (1.0 - shade) * (blue - 1.0) * 0.5).clip(0.2, 1.0)
     _add_lamps(rng, light, number=int(rng.integers(0, 25)), radius=(0.002, 0.003), value=(1.5, 8.0))
-    return Drawing(light, _lux(rng, 1500.0, 100_000.0), temperature_tint(rng.normal(0.0, 0.1)))
+    return Drawing(light, draw_lux(rng, 1500.0, 100_000.0), temperature_tint(rng.normal(0.0, 0.1)))
 
 
-def back_light(rng: np.random.Generator, size: int) -> Drawing:
+def back_light(rng: Generator, size: int) -> Drawing:
     """A subject before a sky or window 3 to 6 EV brighter, in 20 to 8000 lux; metered at it.
 
     The incident light is what falls on the side that faces the camera. The background's mean
@@ -317,11 +277,11 @@ def back_light(rng: np.random.Generator, size: int) -> Drawing:
     light = np.where(background, colour * contrast * clouds, subject).astype(np.float32)
     if not room and rng.random() < 0.3:
         _add_lamps(rng, light, number=1, radius=(0.012, 0.02), value=(2000.0, 20_000.0), top=0.3)
-    lux = _lux(rng, 20.0, 800.0) if room else _lux(rng, 300.0, 8000.0)
+    lux = draw_lux(rng, 20.0, 800.0) if room else draw_lux(rng, 300.0, 8000.0)
     return Drawing(light, lux, temperature_tint(rng.normal(0.0, 0.1)))
 
 
-def night(rng: np.random.Generator, size: int) -> Drawing:
+def night(rng: Generator, size: int) -> Drawing:
     """Lamps in the dark, 1 to 50 lux; metered in the brightest pool of light on the ground.
 
     Most of the frame has 1 to 8 % of that light. Lamps and neon are 20 to 1000 times white, lit
@@ -344,10 +304,10 @@ def night(rng: np.random.Generator, size: int) -> Drawing:
     for y, x in zip(lamp_y, lamp_x, strict=True):
         value = log_uniform(rng, 20.0, 1000.0)
         _add_lamp(light, y, x, rng.uniform(0.004, 0.013), value, _warm(rng))
-    return Drawing(light, _lux(rng, 1.0, 50.0), temperature_tint(rng.uniform(0.2, 1.0)))
+    return Drawing(light, draw_lux(rng, 1.0, 50.0), temperature_tint(rng.uniform(0.2, 1.0)))
 
 
-def spot_light(rng: np.random.Generator, size: int) -> Drawing:
+def spot_light(rng: Generator, size: int) -> Drawing:
     """A lit performer on a dark stage, 20 to 2000 lux; metered inside the spot light.
 
     The beam covers 4 to 15 % of the frame, often off centre; the rest has 1.5 to 6 % of its light.
@@ -367,10 +327,11 @@ def spot_light(rng: np.random.Generator, size: int) -> Drawing:
             value = log_uniform(rng, 5.0, 200.0)
             position = rng.uniform(0.03, 0.2), rng.uniform(0.05, 0.95)
             _add_lamp(light, *position, rng.uniform(0.004, 0.012), value, _neon_colour(rng))
-    return Drawing(light, _lux(rng, 20.0, 2000.0), temperature_tint(rng.uniform(-0.1, 0.8)))
+    return Drawing(light, draw_lux(rng, 20.0, 2000.0), temperature_tint(rng.uniform(-0.1, 0.8)))
 
 
-_KINDS: dict[str, Callable[[np.random.Generator, int], Drawing]] = {
+#: The procedural kinds, the easy ones first.
+KINDS: dict[str, Callable[[Generator, int], Drawing]] = {
     "dead_leaves": day,
     "indoor": indoor,
     "back_light": back_light,
@@ -381,12 +342,12 @@ _KINDS: dict[str, Callable[[np.random.Generator, int], Drawing]] = {
 }
 
 
-def log_uniform(rng: np.random.Generator, low: float, high: float) -> Any:
-    """A number between `low` and `high` whose logarithm is uniform."""
+def log_uniform(rng: Generator, low: float, high: float) -> Any:
+    """A number whose logarithm is uniform."""
     return np.exp(rng.uniform(np.log(low), np.log(high)))
 
 
-def _lux(rng: np.random.Generator, low: float, high: float) -> float:
+def draw_lux(rng: Generator, low: float, high: float) -> float:
     """Log-uniform illuminance, to 4 digits."""
     return float(f"{log_uniform(rng, low, high):.4g}")
 
@@ -396,7 +357,7 @@ def _soft_step(values: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 + np.exp(np.clip(-values / 0.06, -60, 60)))
 
 
-def _varied_style(rng: np.random.Generator, mean: float | None = None) -> LeafStyle:
+def _varied_style(rng: Generator, mean: float | None = None) -> LeafStyle:
     """Leaves of varied size; the default `mean` is that of nature, 17 % give or take 0.3 EV."""
     if mean is None:
         mean = float(np.clip(0.17 * np.exp(rng.normal(0.0, 0.2)), 0.1, 0.3))
@@ -410,21 +371,14 @@ def _varied_style(rng: np.random.Generator, mean: float | None = None) -> LeafSt
     )
 
 
-def _lens(light: np.ndarray) -> np.ndarray:
-    """A lens's softness: binomial blur over 3 x 3 pixels, edges repeated."""
-    padded = np.pad(light, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    rows = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
-    return 0.25 * rows[:, :, :-2] + 0.5 * rows[:, :, 1:-1] + 0.25 * rows[:, :, 2:]
-
-
-def _shadows(rng: np.random.Generator, size: int, share: float, depth: float) -> np.ndarray:
+def _shadows(rng: Generator, size: int, share: float, depth: float) -> np.ndarray:
     """Illumination: 1 in the light, `depth` in soft-edged shadows that cover `share`."""
     field = fractal_noise(rng, size, 1.6)
     lit = _soft_step(field - np.quantile(field, share))
     return np.asarray((depth + (1.0 - depth) * lit).astype(np.float32))
 
 
-def _falloff(rng: np.random.Generator, size: int, stops: float) -> np.ndarray:
+def _falloff(rng: Generator, size: int, stops: float) -> np.ndarray:
     """Illumination that falls by about `stops` across the frame, its median 1."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.linspace(-0.5, 0.5, size, dtype=np.float32)
@@ -433,7 +387,7 @@ def _falloff(rng: np.random.Generator, size: int, stops: float) -> np.ndarray:
     return np.asarray(np.exp2(field - np.median(field)).astype(np.float32))
 
 
-def _scatter(rng: np.random.Generator, size: int, share: float) -> np.ndarray:
+def _scatter(rng: Generator, size: int, share: float) -> np.ndarray:
     """(size, size) bool: upright things (trunks, rocks, people) that cover about `share`."""
     axis = np.linspace(0.0, 1.0, size, dtype=np.float32)
     mask = np.zeros((size, size), bool)
@@ -454,7 +408,7 @@ def _person(y: np.ndarray, x: np.ndarray, top: float, middle: float, scale: floa
     return head | ((across < 1.0) & (down > across**3))
 
 
-def _sky_above_skyline(rng: np.random.Generator, size: int) -> np.ndarray:
+def _sky_above_skyline(rng: Generator, size: int) -> np.ndarray:
     """(size, size) bool, True in the sky over an uneven horizon in the lower part of the frame."""
     ridge = np.cumsum(rng.standard_normal(size))
     ridge = (ridge - np.linspace(ridge[0], ridge[-1], size)) / (np.abs(ridge).max() + 1e-6)
@@ -462,7 +416,7 @@ def _sky_above_skyline(rng: np.random.Generator, size: int) -> np.ndarray:
     return np.asarray(np.linspace(0.0, 1.0, size)[:, None] < skyline[None, :])
 
 
-def _windows(rng: np.random.Generator, size: int) -> np.ndarray:
+def _windows(rng: Generator, size: int) -> np.ndarray:
     """(size, size) bool, True in the panes of one window or two."""
     axis = np.linspace(0.0, 1.0, size)
     mask = np.zeros((size, size), bool)
@@ -484,8 +438,7 @@ def _add_lamp(
 ) -> None:
     """Add a disc of `value` with a soft edge and a faint veil of glare, in place.
 
-    The veil's size at distance d is ``0.3 value (radius / d)**2 / 100``, the order of what lenses
-    scatter (ISO 9358 veiling glare of about 1 %).
+    The veil has the order of what lenses scatter (ISO 9358 veiling glare of about 1 %).
     """
     size = light.shape[-1]
     axis = np.linspace(0.0, 1.0, size, dtype=np.float32)
@@ -496,32 +449,27 @@ def _add_lamp(
 
 
 def _add_lamps(
-    rng: np.random.Generator,
-    light: np.ndarray,
-    number: int,
-    radius: tuple[float, float],
-    value: tuple[float, float],
-    top: float = 1.0,
+    rng: Generator, light: np.ndarray, number: int, radius: Range, value: Range, top: float = 1.0
 ) -> None:
     """Add `number` near-white lamps or glints at random places above `top`, in place."""
     for _ in range(number):
         y, x = rng.uniform(0.02, 0.98) * top, rng.uniform(0.02, 0.98)
-        strength = log_uniform(rng, value[0], value[1])
+        strength = log_uniform(rng, *value)
         _add_lamp(light, y, x, rng.uniform(*radius), strength, np.ones(3, np.float32))
 
 
-def _warm(rng: np.random.Generator) -> np.ndarray:
+def _warm(rng: Generator) -> np.ndarray:
     """Colour of a lamp relative to the light it casts elsewhere."""
     return np.array([rng.uniform(0.9, 1.4), 1.0, rng.uniform(0.5, 1.1)], np.float32)
 
 
-def _neon_colour(rng: np.random.Generator) -> np.ndarray:
+def _neon_colour(rng: Generator) -> np.ndarray:
     colour = np.array([0.08, 0.08, 0.08])
     colour[rng.integers(0, 3)] = 1.0
     return np.asarray(np.maximum(colour, rng.uniform(0.0, 0.6, 3)).astype(np.float32))
 
 
-def _add_lit_windows(rng: np.random.Generator, light: np.ndarray) -> None:
+def _add_lit_windows(rng: Generator, light: np.ndarray) -> None:
     """Set a grid of small rectangles, some of them lit to 1 to 8 times white, in place."""
     size = light.shape[-1]
     pitch, left, right = int(rng.integers(10, 18)), *np.sort(rng.integers(0, size, 2))
@@ -533,7 +481,7 @@ def _add_lit_windows(rng: np.random.Generator, light: np.ndarray) -> None:
                 light[:, row : row + side, column : column + side] = value[:, None, None]
 
 
-def _add_neon(rng: np.random.Generator, light: np.ndarray) -> None:
+def _add_neon(rng: Generator, light: np.ndarray) -> None:
     """Add one to three thin coloured tubes, 20 to 80 times white, in place."""
     axis = np.linspace(0.0, 1.0, light.shape[-1], dtype=np.float32)
     for _ in range(int(rng.integers(1, 4))):

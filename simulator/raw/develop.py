@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from simulator.camera import BayerPattern
 from simulator.raw.image import RawImage, check_packed
@@ -136,10 +137,6 @@ def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
     Each pixel becomes a packed one, its planes at one place. What a camera's own processing did
     besides (its tone curve, sharpening, compression) stays in. `pictures` are (B, 3, H, W) sRGB,
     uint8 or floating point in [0, 1].
-
-    >>> picture = torch.tensor([0, 17, 118, 255], dtype=torch.uint8).expand(1, 3, 1, 4)
-    >>> develop(develop_inverse(picture)).mul(255.0).round()[0, 0, 0]
-    tensor([  0.,  17., 118., 255.])
     """
     if pictures.is_floating_point():
         return _decoded(pictures.float())[:, [0, 1, 1, 2]]
@@ -166,12 +163,10 @@ def _decoded(encoded: torch.Tensor) -> torch.Tensor:
 def _plane_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:
     """Gains of the four planes, the smallest 1, as (B, 4, 1, 1)."""
     gains = torch.as_tensor(white_balance, dtype=torch.float32, device=images.device)
-    if gains.shape not in ((3,), (len(images), 3)):
-        raise ValueError(
-            f"`white_balance` (shape {tuple(gains.shape)}) must be (3,) or ({len(images)}, 3)"
-        )
-    if not bool((torch.isfinite(gains) & (gains > 0)).all()):
-        raise ValueError(f"`white_balance` (={gains.tolist()}) must be positive and finite")
+    positive = bool((torch.isfinite(gains) & (gains > 0)).all())
+    if gains.shape not in ((3,), (len(images), 3)) or not positive:
+        rule = f"must be (3,) or ({len(images)}, 3), positive and finite"
+        raise ValueError(f"`white_balance` (={gains.tolist()}) {rule}")
     gains = (gains / gains.amin(dim=-1, keepdim=True)).clamp_(max=_LARGEST_GAIN)
     return gains[..., [0, 1, 1, 2]].expand(len(images), 4)[..., None, None]
 
@@ -179,10 +174,9 @@ def _plane_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:
 def _balance(images: torch.Tensor, gains: torch.Tensor) -> torch.Tensor:
     """White-balanced packed raws (B, 4, H, W), their highlights clipped to white.
 
-    The smallest gain is 1, so a saturated pixel reaches at least 1 in every channel; then
-    everything is clipped at 1. Without that clip the gains would turn saturated areas magenta.
-    Negative values stay: clipping them here would lift the black level of noisy shadows. No sensor
-    goes below -1; the bound keeps infinities out of the sums that follow.
+    The smallest gain is 1, so a saturated pixel reaches at least 1 in every channel. Without the
+    clip the gains would turn saturated areas magenta. Negative values stay: clipping them here
+    would lift the black level of noisy shadows; the bound keeps infinities out of what follows.
     """
     return torch.mul(images, gains).clamp_(-1.0, 1.0)
 
@@ -207,8 +201,6 @@ def srgb_from_camera(colour_matrix: Matrix) -> torch.Tensor:
     So (1, 1, 1) maps to (1, 1, 1). This is what dcraw's ``cam_xyz_coeff`` does, and what the DNG
     specification 1.4, chapter 6, does for a scene lit by the matrix's own illuminant.
 
-    Raises:
-        ValueError: If `colour_matrix` is not 3 x 3 and finite, or has no such inverse.
     """
     matrix = torch.as_tensor(colour_matrix, dtype=torch.float64)
     if matrix.shape != (3, 3) or not bool(torch.isfinite(matrix).all()):
@@ -221,11 +213,10 @@ def srgb_from_camera(colour_matrix: Matrix) -> torch.Tensor:
 def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
     camera_from_srgb = np.array(rows) @ np.array(XYZ_FROM_SRGB)
     white = camera_from_srgb.sum(axis=1, keepdims=True)
-    if not (white > 0).all():
-        raise ValueError(f"`colour_matrix` (={rows}) must see white in every channel")
+    if not (white > 0).all() or np.linalg.cond(camera_from_srgb / white) > 1e6:
+        rule = "must see white in every channel, and be invertible"
+        raise ValueError(f"`colour_matrix` (={rows}) {rule}")
     camera_from_srgb /= white
-    if np.linalg.cond(camera_from_srgb) > 1e6:
-        raise ValueError(f"`colour_matrix` (={rows}) must be invertible")
     inverse: list[list[float]] = np.linalg.inv(camera_from_srgb).tolist()
     return inverse
 
@@ -233,11 +224,9 @@ def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
 def apply_tone(linear: torch.Tensor, tone: str) -> torch.Tensor:
     """The tone curve on linear light in [0, 1]; monotone, 0 to 0 and 1 to 1.
 
-    ``"photographic"`` is Schlick's rational curve ``p x / ((p - 1) x + 1)`` with p = 1.618, which
-    maps 0.119 to 0.18. Its slope falls from p at black to 1 / p at white.
-
-    Source: C. Schlick, "Quantization techniques for visualization of high dynamic range pictures",
-    Eurographics Workshop on Rendering 1994 (uniform rational quantization).
+    ``"photographic"`` is the rational curve ``p x / ((p - 1) x + 1)`` with p = 1.618, which maps
+    0.119 to 0.18 (C. Schlick, "Quantization techniques for visualization of high dynamic range
+    pictures", Eurographics Workshop on Rendering 1994). Its slope falls from p to 1 / p at white.
     """
     if tone == "linear":
         return linear
@@ -246,11 +235,7 @@ def apply_tone(linear: torch.Tensor, tone: str) -> torch.Tensor:
 
 
 def srgb_encode(linear: torch.Tensor) -> torch.Tensor:
-    """Linear light in [0, 1] to sRGB values in [0, 1] (IEC 61966-2-1:1999).
-
-    >>> srgb_encode(torch.tensor([0.0, 0.0031308, 0.18, 1.0]))
-    tensor([0.0000, 0.0404, 0.4614, 1.0000])
-    """
+    """Linear light in [0, 1] to sRGB values in [0, 1] (IEC 61966-2-1:1999)."""
     toe = linear.sub(_SRGB_TOE).clamp_(max=0.0)  # the straight part, 0 above it
     # exp2(log2(x) / 2.4) is twice as fast as pow and as exact.
     curved = linear.clamp(min=_SRGB_TOE).log2_().mul_(1.0 / 2.4).exp2_()
@@ -263,11 +248,7 @@ def srgb_encode(linear: torch.Tensor) -> torch.Tensor:
 def demosaic_half(packed: torch.Tensor) -> torch.Tensor:
     """RGB (B, 3, H, W) at half the sensor's resolution: R, the mean of both greens, B of each tile.
 
-    Nothing is interpolated, so noise stays white and no artefact can be mistaken for detail; R and
-    B lie half a packed pixel apart, which nobody sees at this size.
-
-    >>> demosaic_half(torch.tensor([0.5, 0.2, 0.4, 0.1]).reshape(1, 4, 1, 1)).flatten()
-    tensor([0.5000, 0.3000, 0.1000])
+    Nothing is interpolated, so noise stays white and no artefact can be mistaken for detail.
     """
     rgb = packed.new_empty(packed.shape[0], 3, *packed.shape[2:])
     rgb[:, RED] = packed[:, 0]
@@ -285,10 +266,8 @@ def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tens
     mirrored about its last pixel, so every colour stays on its own rows and columns. The result may
     overshoot the input's range at edges.
 
-    Args:
-        packed: (B, 4, H, W), planes R, G1, G2, B, H, W >= 2, floating point, any range. White
-            balance it first: the filters take the planes' detail to be alike.
-        cfa: Where in the 2 x 2 tile each plane lies.
+    `packed` (B, 4, H, W), H, W >= 2, has any range. White balance it first: the filters take the
+    planes' detail to be alike.
 
     Source: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
     Bayer-patterned color images", ICASSP 2004, figure 2.
@@ -298,7 +277,7 @@ def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tens
     mosaic = packed.new_empty(packed.shape[0], 2 * height, 2 * width)
     for plane, (row, column) in enumerate(offsets):
         mosaic[:, row::2, column::2] = packed[:, plane]
-    padded = _mirror(_mirror(mosaic, 1), 2)
+    padded = F.pad(mosaic[:, None], (2, 2, 2, 2), mode="reflect")[:, 0]
 
     rgb = packed.new_empty(packed.shape[0], 3, 2 * height, 2 * width)
     for plane, (row, column) in enumerate(offsets):
@@ -340,14 +319,6 @@ def _neighbours(padded: torch.Tensor, row: int, column: int) -> tuple[torch.Tens
         at(-2, 0) + at(2, 0),
         (at(-1, -1) + at(-1, 1)) + (at(1, -1) + at(1, 1)),
     )
-
-
-def _mirror(mosaic: torch.Tensor, dim: int) -> torch.Tensor:
-    """`mosaic` with two more pixels at both ends of `dim`, mirrored about the last pixel."""
-    size = mosaic.shape[dim]
-    index = torch.arange(-2, size + 2, device=mosaic.device).abs()
-    index = torch.where(index < size, index, 2 * (size - 1) - index)
-    return mosaic.index_select(dim, index)
 
 
 # -- clipped highlights ---------------------------------------------------------------------------

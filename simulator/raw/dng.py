@@ -43,8 +43,6 @@ DEFAULT_COLOUR_MATRIX = (
 )
 #: A field to write: its type and its values (rationals as numbers, text as ``str``).
 Tag = tuple[DATATYPE, Sequence[float] | str | bytes]
-#: How EXIF spells a date that is not known.
-_NO_DATE = "    :  :     :  :  "
 _CFA_BYTE = {"R": 0, "G": 1, "B": 2}
 _UNCOMPRESSED, _COLOUR_FILTER_ARRAY, _RECTANGULAR = 1, 32803, 1
 #: Packed rows that are converted and written at a time: few, so that they stay in the CPU's cache.
@@ -66,9 +64,8 @@ class OwnRecord:
         """Value of the EXIF tag UserComment."""
         names = ("iso", "exposure_time", "f_number")
         fields = {name: getattr(self.settings, name) for name in names}
-        fields["box_factor"] = self.box_factor
-        fields["colour_matrix_source"] = self.colour_matrix_source
-        return COMMENT_PREFIX + json.dumps(fields).encode("ascii")
+        own = {"box_factor": self.box_factor, "colour_matrix_source": self.colour_matrix_source}
+        return COMMENT_PREFIX + json.dumps(fields | own).encode("ascii")
 
 
 def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
@@ -109,11 +106,11 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
     camera = raw.camera
     height, width = 2 * raw.data.shape[1], 2 * raw.data.shape[2]
     matrix = camera.colour_matrix or DEFAULT_COLOUR_MATRIX
-    make, model = camera.make, camera.model
-    if model == "unknown":
-        model = camera.name
+    make, model = camera.make, camera.name if camera.model == "unknown" else camera.model
     aspect = raw.metadata.get("pixel_aspect", 1.0)
     unique = model if model.lower().startswith(make.lower()) else f"{make} {model}"
+    # A grey card's values: one over the gains, to the 12 digits that matter.
+    neutral = [float(f"{1.0 / gain:.12g}") for gain in raw.white_balance]
     return {
         "NewSubfileType": (DATATYPE.LONG, [0]),  # a full-resolution image
         "ImageWidth": (DATATYPE.LONG, [width]),
@@ -139,11 +136,7 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
         "WhiteLevel": (DATATYPE.LONG, [round(camera.white_level)]),
         "ColorMatrix1": (DATATYPE.SRATIONAL, [v for row in matrix for v in row]),
         "CalibrationIlluminant1": (DATATYPE.SHORT, [D65]),
-        # A grey card's values: one over the gains, to the 12 digits that matter.
-        "AsShotNeutral": (
-            DATATYPE.RATIONAL,
-            [float(f"{1.0 / gain:.12g}") for gain in raw.white_balance],
-        ),
+        "AsShotNeutral": (DATATYPE.RATIONAL, neutral),
         "BaselineExposure": (DATATYPE.SRATIONAL, [0.0]),
         **_black_tags(raw),
         **({} if aspect == 1.0 else {"DefaultScale": (DATATYPE.RATIONAL, [aspect, 1])}),
@@ -195,11 +188,11 @@ def _exif_tags(raw: RawImage) -> dict[str, Tag]:
 
 
 def _date(raw: RawImage) -> str:
-    """When the photograph was taken, as EXIF spells it; blanks where not known."""
+    """When the photograph was taken, as EXIF spells it."""
     try:
         moment = datetime.fromisoformat(str(raw.metadata.get("datetime", "")))
     except ValueError:
-        return _NO_DATE
+        return "    :  :     :  :  "  # as EXIF spells a date that is not known
     return moment.strftime("%Y:%m:%d %H:%M:%S")
 
 

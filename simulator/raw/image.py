@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -90,11 +91,8 @@ class RawImage:
 
         data = self.data.detach().contiguous().numpy()
         marks = np.empty(data.shape[1:], np.bool_)
-        parallel_ranges(
-            lambda first, last: mark_saturated(data, limits, first, last, marks),
-            len(marks),
-            least=_SHARE,
-        )
+        mark = functools.partial(mark_saturated, data, limits, marks)
+        parallel_ranges(mark, len(marks), least=_SHARE)
         return torch.from_numpy(marks)
 
     def __repr__(self) -> str:
@@ -103,20 +101,14 @@ class RawImage:
 
 
 def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
-    """Bayer mosaic of digital numbers to a packed raw.
+    """Bayer mosaic (2H, 2W) of digital numbers, of any dtype, to a packed raw (4, H, W) float32.
 
     The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
 
         R  G1
         G2 B
 
-    Args:
-        mosaic: (2H, 2W) digital numbers, any integer or float dtype. An odd last row or column is
-            dropped.
-        camera: Gives the CFA order and the black and white levels.
-
-    Returns:
-        (4, H, W) float32, planes R, G1, G2, B; black-subtracted, 1.0 at sensor white.
+    An odd last row or column is dropped.
     """
     if mosaic.ndim != 2 or min(mosaic.shape) < 2:
         raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
@@ -140,10 +132,7 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
 def unpack_mosaic(
     data: torch.Tensor, camera: CameraProfile, first: int = 0, last: int | None = None
 ) -> np.ndarray:
-    """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`.
-
-    Of packed rows `first` to `last`, by default of all.
-    """
+    """Packed rows `first` to `last` of (4, H, W) to a mosaic (2H, 2W); inverts `pack_mosaic`."""
     planes = data.detach().float().cpu().contiguous().numpy()
     _, height, width = planes.shape
     count = (height if last is None else last) - first
@@ -171,8 +160,7 @@ def _tile(camera: CameraProfile) -> np.ndarray:
 def new_frame(like: torch.Tensor) -> torch.Tensor:
     """Uninitialised float32 memory for a frame of the shape of `like`.
 
-    For large arrays NumPy asks the system for huge pages, which torch does not: the first write of
-    a full frame then takes a quarter of the time.
+    NumPy's has huge pages, unlike torch's: the first write takes a quarter of the time.
     """
     if like.device.type != "cpu":
         return torch.empty(like.shape, device=like.device)
@@ -184,20 +172,16 @@ def check_packed(name: str, data: object, *, ndim: int = 3) -> torch.Tensor:
     if isinstance(data, np.ndarray) and data.dtype.kind in "biuf":
         data = torch.from_numpy(np.ascontiguousarray(data))
     if not isinstance(data, torch.Tensor) or data.layout != torch.strided:
-        kind = data.layout if isinstance(data, torch.Tensor) else type(data).__name__
-        raise ValueError(
-            f"`{name}` (={kind}) must be a dense torch tensor or numpy array of numbers"
-        )
+        kind = getattr(data, "layout", type(data).__name__)
+        rule = "must be a dense torch tensor or numpy array of numbers"
+        raise ValueError(f"`{name}` (={kind}) {rule}")
     shape = "(4, H, W)" if ndim == 3 else "(B, 4, H, W)"
     if data.ndim != ndim or data.shape[-3] != 4 or min(data.shape) < 1:
-        raise ValueError(
-            f"`{name}` (shape {tuple(data.shape)}) must be {shape}, not empty: R, G1, G2, B"
-        )
+        rule = f"must be {shape}, not empty: R, G1, G2, B"
+        raise ValueError(f"`{name}` (shape {tuple(data.shape)}) {rule}")
     if not data.dtype.is_floating_point:
-        raise ValueError(
-            f"`{name}` (dtype {data.dtype}) must be floating point with white at 1.0; digital "
-            "numbers go through RawImage.from_mosaic"
-        )
+        rule = "must be floating point, white at 1.0; for digital numbers see RawImage.from_mosaic"
+        raise ValueError(f"`{name}` (dtype {data.dtype}) {rule}")
     data = data.float()
     low, high = torch.aminmax(data.detach())  # passes NaN on; 20 times faster than isfinite().all()
     if not (math.isfinite(low.item()) and math.isfinite(high.item())):
@@ -254,7 +238,7 @@ def unpack_rows(planes, tile, black, span, white, first, last, mosaic):  # type:
 
 
 @kernel()
-def mark_saturated(planes, limits, first, last, marks):  # type: ignore[no-untyped-def]
+def mark_saturated(planes, limits, marks, first, last):  # type: ignore[no-untyped-def]
     """Set `marks` (H, W) in rows `first` to `last` where a plane reaches its limit (4,) float32."""
     r, g1, g2, b = limits
     for y in range(first, last):

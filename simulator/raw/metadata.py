@@ -112,11 +112,7 @@ def _read_entries(file: SimpleNamespace, offset: int) -> tuple[dict[int, bytes],
 @contextmanager
 def _silent_tifffile() -> Iterator[None]:
     """Keep tifffile from logging what is unusual about a raw, or damaged."""
-
-    def nothing(_: logging.LogRecord) -> bool:
-        return False
-
-    logger = logging.getLogger("tifffile")
+    logger, nothing = logging.getLogger("tifffile"), logging.Filter("nothing of this name")
     logger.addFilter(nothing)
     try:
         yield
@@ -145,11 +141,7 @@ def first(directories: Sequence[Directory], name: str) -> tuple[Any, ...] | None
 
 
 def numbers(tags: Directory, name: str) -> tuple[float, ...]:
-    """The values of a tag; empty where it is missing or any value is no finite number.
-
-    >>> numbers({"ExposureTime": (0.5,), "FNumber": (math.nan,), "Make": ("X",)}, "ExposureTime")
-    (0.5,)
-    """
+    """The values of a tag; empty where it is missing or any value is no finite number."""
     values = tags.get(name, ())
     return values if all(isinstance(v, int | float) and math.isfinite(v) for v in values) else ()
 
@@ -257,11 +249,7 @@ def normalised_model(make: str, model: str) -> str:
 
 #: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
 LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
-_EXPOSURE = {
-    "iso": "RecommendedExposureIndex",
-    "exposure_time": "ExposureTime",
-    "f_number": "FNumber",
-}
+_EXPOSURE = {"iso": LONG_ISO[0], "exposure_time": "ExposureTime", "f_number": "FNumber"}
 #: Beyond these a file is damaged.
 _MAX_BOX_FACTOR, _LARGEST_FACTOR = 4096, 1000.0
 

@@ -14,7 +14,7 @@ import torch
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
-from simulator.utils.compute import kernel, parallel_ranges
+from simulator.utils.compute import parallel_ranges
 
 _BLOCK, _STEP = 8, 4
 #: Share of each level's blocks that is used: those with the least slope.
@@ -66,7 +66,15 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
     floor = float(planes.min())
     if np.mean(planes == floor) < 1e-3:
         floor = -np.inf  # the lowest value, not a clip
-    mean, energy, slope = _block_statistics(planes, white, floor)
+    found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3] * len(planes)
+
+    def look(first: int, last: int) -> None:
+        for index in range(first, last):
+            found[index] = _blocks_of(planes[index], white, floor)
+
+    if min(planes.shape[1:]) >= _BLOCK + 2:
+        parallel_ranges(look, len(planes))
+    mean, energy, slope = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(mean) < _MIN_BLOCKS:
         raise ValueError(
             f"`data` (shape {tuple(planes.shape)}, {len(mean)} unclipped blocks) must have "
@@ -97,25 +105,9 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
-@kernel()
-def summed_area(image, total):  # type: ignore[no-untyped-def]
-    """Fill `total` (H + 1, W + 1) by the sums over all pixels above and to the left of a corner."""
-    height, width = image.shape
-    columns = np.zeros(width)
-    total[0] = 0.0
-    for y in range(height):
-        columns += image[y]
-        row, value = total[y + 1], 0.0
-        row[0] = 0.0
-        for x in range(width):
-            value += columns[x]
-            row[x + 1] = value
-
-
 def _sums(image: np.ndarray) -> np.ndarray:
-    total = np.empty((image.shape[0] + 1, image.shape[1] + 1))
-    summed_area(image, total)
-    return total
+    """(H + 1, W + 1) sums over all pixels above and to the left of each corner."""
+    return np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
 
 def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.ndarray:
@@ -127,21 +119,7 @@ def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.n
         for j in (0, size)
     ]
     first, right, below, last = corners
-    mean: np.ndarray = (last - right - below + first) / (size * size)
-    return mean
-
-
-def _block_statistics(planes: np.ndarray, white: float, floor: float) -> list[np.ndarray]:
-    """`_blocks_of` all planes."""
-    found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3] * len(planes)
-
-    def look(first: int, last: int) -> None:
-        for index in range(first, last):
-            found[index] = _blocks_of(planes[index], white, floor)
-
-    if min(planes.shape[1:]) >= _BLOCK + 2:
-        parallel_ranges(look, len(planes))
-    return [np.concatenate(parts) for parts in zip(*found, strict=True)]
+    return np.asarray((last - right - below + first) / (size * size))
 
 
 def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarray, ...]:
@@ -156,7 +134,7 @@ def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarra
     high_pass = (rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]) / 6.0
     inner = plane[1:-1, 1:-1]
     clipped = ((inner >= white) | (inner <= floor)).astype(np.float64)
-    half, total = _BLOCK // 2, _sums(np.ascontiguousarray(inner))
+    half, total = _BLOCK // 2, _sums(inner)
     quarters = [_box_mean(total, half, i, j) for i in (0, half) for j in (0, half)]
     slope = np.maximum.reduce(quarters) - np.minimum.reduce(quarters)
     keep = _box_mean(_sums(clipped), _BLOCK) <= _CLIPPED

@@ -125,9 +125,6 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
     """``iso``, ``exposure_time`` [s] and ``f_number`` that a raw file states, where it does.
 
     No pixel is read; the exposure time is the exact stop that the recorded one stands for.
-
-    Raises:
-        RawFileError: (a `ValueError`) If the file is no raw that can be read.
     """
     path = as_path(path)
     with _errors_name(path):
@@ -169,9 +166,11 @@ def _read(
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
     if float(packed.max()) > _WHITE_TOLERANCE:
-        text = "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: "
-        text += "give `camera` with the right one"
-        logger.warning(text, path.name, float(packed.max()), profile.white_level)
+        logger.warning(
+            "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: give "
+            "`camera` with the right one",
+            *(path.name, float(packed.max()), profile.white_level),
+        )
     box_factor = own.box_factor if own is not None else 1
     noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
@@ -198,9 +197,8 @@ def _check_structure(directories: Sequence[Directory], known_kind: bool, size: i
     """Raises unless a file of `size` bytes can be a whole Bayer raw, as its structure tells."""
     if not known_kind:
         raise RawFileError(
-            "must be a camera raw that LibRaw reads, but names no camera: it is a file of another "
-            "kind, truncated or damaged; read a bare array with numpy.fromfile and "
-            "RawImage.from_mosaic"
+            "must be a camera raw that LibRaw reads, but names no camera: another kind of file, "
+            "truncated or damaged; for bare arrays see numpy.fromfile and RawImage.from_mosaic"
         )
     lost = missing_bytes(directories, size)
     if lost:
@@ -250,7 +248,11 @@ def _profile(
         _check_profile(path, decoded, camera)
         return camera
     check_type("camera", camera, str, CameraProfile, None)
-    base = get_camera(camera) if camera is not None else _match(make, model)
+    if camera is not None:
+        base: CameraProfile | None = get_camera(camera)
+    else:
+        built_in = {normalised_model(p.make, p.model): p for p in map(get_camera, list_cameras())}
+        base = built_in.get(normalised_model(make, model))
     matrix, source = decoded.colour_matrix, decoded.colour_matrix_source
     if own is not None:
         source = own.colour_matrix_source
@@ -279,27 +281,17 @@ def _profile(
     )
 
 
-def _match(make: str, model: str) -> CameraProfile | None:
-    wanted = normalised_model(make, model)
-    profiles = (get_camera(name) for name in list_cameras())
-    return next((p for p in profiles if normalised_model(p.make, p.model) == wanted), None)
-
-
 def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None:
-    hint = "; dataclasses.replace(camera, ...) adapts a profile"
-    if camera.cfa != decoded.cfa:
+    brightest, ratio = int(decoded.mosaic.max()), camera.white_level / decoded.white_level
+    # Where pixels are brighter than the file's own level, that is wrong.
+    corrected = ratio > 1.0 and decoded.white_level < brightest <= camera.white_level
+    fits = corrected or 1 / _WHITE_TOLERANCE <= ratio <= _WHITE_TOLERANCE
+    if camera.cfa != decoded.cfa or not fits:
         raise ValueError(
-            f"`camera` (={camera.name!r}, {camera.cfa.value}) must have the colour filter order of "
-            f"{path.name!r}, {decoded.cfa.value}{hint}"
-        )
-    ratio = camera.white_level / decoded.white_level
-    if not 1 / _WHITE_TOLERANCE <= ratio <= _WHITE_TOLERANCE:
-        brightest = int(decoded.mosaic.max())
-        if ratio > 1.0 and decoded.white_level < brightest <= camera.white_level:
-            return  # the pixels show that the file's own level is wrong
-        raise ValueError(
-            f"`camera` (={camera.name!r}, white level {camera.white_level:g}) must have the levels "
-            f"of {path.name!r}, white {decoded.white_level:g}, black {decoded.black_level}{hint}"
+            f"`camera` (={camera.name!r}, {camera.cfa.value}, white {camera.white_level:g}) must "
+            f"have colour filters and levels of {path.name!r}, {decoded.cfa.value}, white "
+            f"{decoded.white_level:g}, black {decoded.black_level}; dataclasses.replace(camera, "
+            "...) adapts a profile"
         )
 
 
@@ -359,9 +351,8 @@ def _decode_own_dng(
     tile = first_numbers(directories, "CFAPattern")
     letters = "".join(_LETTERS.get(int(colour), "?") for colour in tile)
     if letters not in {p.value for p in BayerPattern}:
-        raise RawFileError(
-            f"must have a Bayer tile of 0 (R), 1 (G), 2 (B), but its CFAPattern is {tile}: damaged",
-        )
+        rule = "must have a Bayer tile of 0 (R), 1 (G), 2 (B)"
+        raise RawFileError(f"{rule}, but its CFAPattern is {tile}: damaged")
     black = read_black_level(directories, BayerPattern(letters), (0, 0))
     if black is None:
         return None
@@ -402,7 +393,7 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
     if any(len(values) != 1 for values in layout):
         return None
     height, width, start, size = (int(values[0]) for values in layout)
-    if min(height, width) < 2 or size != 2 * width * height or start + size > os.stat(path).st_size:
+    if min(height, width) < 2 or size != 2 * width * height or start + size > path.stat().st_size:
         return None
     with path.open("rb") as stream:
         order = "<u2" if stream.read(2) == b"II" else ">u2"
@@ -419,7 +410,7 @@ def _decode_with_libraw(
     try:
         raw = opened.enter_context(rawpy.imread(str(path)))
         # No pixel is decoded before one is asked for.
-        bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, os.stat(path).st_size)
+        bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, path.stat().st_size)
         if bomb:
             raise RawFileError(bomb)
         return _from_libraw(path, raw, directories)
@@ -430,8 +421,9 @@ def _decode_with_libraw(
 def _from_libraw(path: Path, raw: rawpy.RawPy, directories: Sequence[Directory]) -> _Decoded:
     sizes = raw.sizes
     if raw.raw_type != rawpy.RawType.Flat:
-        text = "must be a Bayer raw, but has every colour at every pixel (linear or Foveon)"
-        raise RawFileError(text)
+        raise RawFileError(
+            "must be a Bayer raw, but has every colour at every pixel (linear or Foveon)"
+        )
     indices = _tile_indices(raw)
     cfa = BayerPattern("".join(raw.color_desc.decode()[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
@@ -485,8 +477,7 @@ def _tile_indices(raw: rawpy.RawPy) -> list[int]:
             return indices
         description = letters
     array = f"{description or 'monochrome'} in {shape or 'no'} tile"
-    text = f"must be a Bayer raw (R, G, B in a 2 x 2 tile), but its colour array is {array}"
-    raise RawFileError(text)
+    raise RawFileError(f"must be a Bayer raw (R, G, B in a 2 x 2 tile), but is {array}")
 
 
 def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
@@ -529,10 +520,8 @@ def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileEr
     compression = next(iter(tags.get("Compression", ())), 1)
     if "WhiteLevel" in tags and compression not in _COMPRESSIONS:
         kind = " (VC-5, GoPro's)" if compression == _VC5 else ""
-        return RawFileError(
-            f"cannot be decoded: LibRaw lacks its compression, {compression}{kind}; convert it to "
-            "an uncompressed DNG"
-        )
+        lacking = f"LibRaw lacks its compression, {compression}{kind}"
+        return RawFileError(f"cannot be decoded: {lacking}; convert it to an uncompressed DNG")
     reason = error.args[0] if error.args else error
     reason = reason.decode() if isinstance(reason, bytes) else reason
     rule = "it is a file of another kind, truncated or damaged"
@@ -580,11 +569,10 @@ def _white_level(
     if largest < stated < 2**16 and int(mosaic.max()) > largest:  # samples hold more than the bits
         largest = 2**16 - 1
     if not 0 < stated <= largest:
-        text = f"its white level (={stated:.10g}) must be in [1, {largest}]; {largest} is used"
-        logger.warning("%s: %s", path.name, text)
+        text = "%s: its white level (=%.10g) must be in [1, %d]; %d is used"
+        logger.warning(text, path.name, stated, largest, largest)
         white = float(largest)
     if white <= max(black):
         levels = f"white {white:g}, black {tuple(black)}"
-        text = f"must have a white level above its black levels, but says {levels}"
-        raise RawFileError(text)
+        raise RawFileError(f"must have a white level above its black levels, but says {levels}")
     return float(white)

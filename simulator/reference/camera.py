@@ -22,7 +22,7 @@ from simulator.camera import BayerPattern, CameraProfile
 from simulator.capture.exposure import SIGNAL_LIMIT
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.generator import noise_generator
-from simulator.noise.noise_level_function import nlf_tensors
+from simulator.noise.noise_level_function import plane_tensor
 from simulator.optics.flicker_integral import Lamp
 from simulator.optics.motion import motion_blur
 from simulator.optics.thin_lens import Lens, defocus
@@ -45,12 +45,7 @@ MOSAIC = "mosaic"
 
 
 def lens_blur(light: Tensor, sigma: float = LENS_SIGMA) -> Tensor:
-    """Gaussian blur of a lens in focus, borders repeated.
-
-    Args:
-        light: (C, H, W) linear light at the pitch of the photosites.
-        sigma: Standard deviation [photosite]; 0 changes nothing.
-    """
+    """Gaussian blur of a lens in focus, borders repeated; `sigma` is in pixels of (C, H, W)."""
     if sigma == 0.0:
         return light
     reach = max(1, math.ceil(3.0 * sigma))
@@ -68,26 +63,23 @@ def lens_blur(light: Tensor, sigma: float = LENS_SIGMA) -> Tensor:
 
 
 def sample_mosaic(light: Tensor, cfa: BayerPattern = BayerPattern.RGGB) -> Tensor:
-    """The planes R, G1, G2, B that photosites behind a colour filter array take of `light`.
+    """The planes R, G1, G2, B (4, H, W) that photosites behind colour filters take of `light`.
 
-    Args:
-        light: (3, 2H, 2W) red, green and blue at every photosite; a last odd row or column is cut.
-        cfa: Order of the filters.
-
-    Returns:
-        (4, H, W).
-
-    >>> ramp = torch.arange(16.0).reshape(1, 4, 4).expand(3, 4, 4)
-    >>> sample_mosaic(ramp)[:, 0, 0].tolist()
-    [0.0, 1.0, 4.0, 5.0]
+    `light` is (3, 2H, 2W) red, green and blue at every photosite; a last odd row or column is cut.
     """
     height, width = (n // 2 * 2 for n in light.shape[-2:])
-    colours = (0, 1, 1, 2)
     planes = [
         light[..., colour, row:height:2, column:width:2]
-        for colour, (row, column) in zip(colours, cfa.offsets, strict=True)
+        for colour, (row, column) in zip((0, 1, 1, 2), cfa.offsets, strict=True)
     ]
     return torch.stack(planes, dim=-3)
+
+
+def packed_pitch(camera: CameraProfile) -> float:
+    """Distance between packed pixels of `camera` [m], twice the sensor's, which must be known."""
+    if camera.pixel_pitch_um is None:
+        raise ValueError(f"`camera` (={camera.name!r}) must have a pixel pitch")
+    return 2e-6 * camera.pixel_pitch_um
 
 
 def average_planes(planes: Tensor, k: int) -> Tensor:
@@ -97,44 +89,29 @@ def average_planes(planes: Tensor, k: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceScene:
-    """A scene before the camera, without noise and in focus throughout.
-
-    Args:
-        scene_id: Unique name.
-        group: Source group, the unit of splitting (photograph, panorama, physical subject).
-        kind: Kind of source, such as ``"procedural"``.
-        light: Float32 >= 0, linear, in camera colours, at `reference`; 1.0 is sensor white, not
-            clipped. (3, 2H, 2W): red, green and blue at the pitch of the photosites, which the
-            camera samples. (4, H, W): planes that are recorded as they are, those of a real mosaic
-            or of a scene too coarse to be sampled.
-        reference: Settings at which `light` is on that scale.
-        depth: Distance from the lens [m] at each pixel of `light`, float32, above its focal length,
-            inf allowed; None if all is in focus.
-        lens: The lens that it is photographed with.
-        illuminance: Incident light [lux], if known.
-        white_balance: Gains of R, G, B of the scene's light.
-        source: Where the light comes from.
-        sampled: Whether it has the detail of a sensor, each plane at its own place. Always so where
-            `light` is at the pitch of the photosites; planes that share their places, G1 equal to
-            G2, say nothing about detail.
-        in_focus: Whether `light` itself is sharp throughout. A photograph with a blur of its own
-            says nothing about what a wider aperture does.
-
-    Raises:
-        ValueError: If light or depth has the wrong shape or values out of range.
-    """
+    """A scene before the camera, without noise and in focus throughout."""
 
     scene_id: str
-    group: str
-    kind: str
+    group: str  # the unit of splitting: a photograph, panorama or physical subject
+    kind: str  # of source, such as "dead_leaves"
+    #: Float32 >= 0, linear, in camera colours, at `reference`; 1.0 is sensor white, not clipped.
+    #: (3, 2H, 2W): red, green and blue at the pitch of the photosites, which the camera samples.
+    #: (4, H, W): planes that are recorded as they are, those of a real mosaic or of a scene too
+    #: coarse to be sampled.
     light: Tensor
     reference: CameraSettings
+    #: Distance from the lens [m] at each pixel of `light`, float32, above the focal length, inf
+    #: allowed; None if all is in focus.
     depth: Tensor | None = None
     lens: Lens = field(default_factory=Lens)
-    illuminance: float | None = None
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    source: str = ""
+    illuminance: float | None = None  # incident light [lux], if known
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gains of R, G, B
+    source: str = ""  # where the light comes from
+    #: Whether it has the detail of a sensor, each plane at its own place. Always so where `light`
+    #: is at the pitch of the photosites; planes that share their places say nothing about detail.
     sampled: bool = False
+    #: Whether `light` itself is sharp throughout. A photograph with a blur of its own says nothing
+    #: about what a wider aperture does.
     in_focus: bool = True
 
     def __post_init__(self) -> None:
@@ -152,17 +129,11 @@ class ReferenceScene:
         object.__setattr__(self, "light", light)
         if self.depth is None:
             return
-        if self.depth.shape != light.shape[-2:]:
-            raise ValueError(
-                f"`depth` (shape {tuple(self.depth.shape)}) must have the shape of `light`'s "
-                f"planes, {tuple(light.shape[-2:])}"
-            )
-        nearest = self.lens.focal_length
-        if not bool((self.depth > nearest).all()):  # also refuses NaN
-            raise ValueError(
-                f"`depth` (minimum {float(self.depth.min()):g} m) must be above the focal length "
-                f"({nearest:g} m)"
-            )
+        size, nearest = light.shape[-2:], self.lens.focal_length
+        if self.depth.shape != size or not bool((self.depth > nearest).all()):  # also refuses NaN
+            found = f"shape {tuple(self.depth.shape)}, minimum {float(self.depth.min()):g} m"
+            rule = f"must be {tuple(size)} and above the focal length ({nearest:g} m)"
+            raise ValueError(f"`depth` ({found}) {rule}")
         object.__setattr__(self, "depth", self.depth.to(torch.float32))
 
     @property
@@ -179,19 +150,13 @@ class ReferenceScene:
 
 @dataclass(frozen=True)
 class BodyError:
-    """Hidden errors of one body: how far its exposures are from what its settings promise.
+    """Hidden errors of one body: how far its exposures are from what its settings promise."""
 
-    Args:
-        shutter_delay: Added to every exposure time [s].
-        shutter_scale: Relative error of every exposure time.
-        transmission: Relative error of the light by aperture stop (`CameraSettings.aperture_stop`);
-            stops that are not listed have no error.
-        black_offset: Error of the black level on the packed scale, R, G1, G2, B.
-    """
-
-    shutter_delay: float = 0.0
-    shutter_scale: float = 0.0
+    shutter_delay: float = 0.0  # added to every exposure time [s]
+    shutter_scale: float = 0.0  # relative error of every exposure time
+    #: Relative error of the light by aperture stop (`CameraSettings.aperture_stop`), 0 for others.
     transmission: Mapping[int, float] = field(default_factory=dict)
+    #: Error of the black level on the packed scale, R, G1, G2, B.
     black_offset: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod
@@ -212,17 +177,11 @@ class BodyError:
         )
 
     def exposure_time(self, nominal: float) -> float:
-        """True exposure time [s] of a `nominal` one.
-
-        Raises:
-            ValueError: If this body's shutter would not open at all.
-        """
+        """True exposure time [s] of a `nominal` one; an error if the shutter would not open."""
         time = nominal * (1.0 + self.shutter_scale) + self.shutter_delay
         if time <= 0.0:
-            raise ValueError(
-                f"`exposure_time` (={nominal!r}) must be above this body's shutter error "
-                f"({self.shutter_delay:g} s and {self.shutter_scale:.1%})"
-            )
+            rule = f"must be above this body's shutter error ({self})"
+            raise ValueError(f"`exposure_time` (={nominal!r}) {rule}")
         return time
 
     def light_error(self, settings: CameraSettings) -> float:
@@ -233,33 +192,20 @@ class BodyError:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceCapture:
-    """One capture and its ground truth.
+    """One capture and its ground truth."""
 
-    Args:
-        mean: (4, H, W) without noise, clipped as the capture is, not quantised.
-        sample: (4, H, W) with noise, clipped, whole digital numbers (or averages of them).
-        settings: Nominal settings, as the file would state them.
-    """
-
-    mean: Tensor
-    sample: Tensor
-    settings: CameraSettings
+    mean: Tensor  # (4, H, W) without noise, clipped as the capture is, not quantised
+    sample: Tensor  # (4, H, W) with noise, clipped, whole digital numbers (or averages of them)
+    settings: CameraSettings  # nominal, as the file would state them
 
 
 class ReferenceCamera:
     """A body that photographs `ReferenceScene`.
 
-    Args:
-        camera: Sensor, with a noise calibration and, for scenes with depth, a pixel pitch.
-        body: Hidden error of this body.
-        box_factor: Samples k that are averaged per side and plane after they were recorded, each
-            with noise of its own: captures then have H // k x W // k pixels, their values whole
-            multiples of 1/k^2 digital numbers.
-        sensor_noise: Whether the read noise has the camera's rows and tails
-            (`CameraProfile.read_noise`); else it is normal and independent.
-
-    Raises:
-        ValueError: If the camera has no such noise calibration or `box_factor` is below 1.
+    Its sensor has a noise calibration and, for scenes with depth, a pixel pitch; `box_factor` are
+    the samples k that are averaged per side and plane after they were recorded, each with noise of
+    its own: captures then have H // k x W // k pixels. With `sensor_noise` the read noise has the
+    camera's rows and tails (`CameraProfile.read_noise`); else it is normal and independent.
     """
 
     def __init__(
@@ -270,8 +216,7 @@ class ReferenceCamera:
         box_factor: int = 1,
         sensor_noise: bool = False,
     ) -> None:
-        if not camera.nlf_by_iso:
-            raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
+        camera.nlf(100.0)  # raises where there is no noise calibration
         self.camera = camera
         self.body = BodyError() if body is None else body
         self.box_factor = check_integer("box_factor", box_factor, 1)
@@ -280,16 +225,10 @@ class ReferenceCamera:
             camera.read_noise(min(camera.nlf_by_iso))  # raises where there is none
 
     def blur_diameter(self, scene: ReferenceScene, f_number: float) -> Tensor:
-        """Diameter of the circle of confusion in the pixels of a capture, >= 0.
+        """Diameter of the circle of confusion (H, W) in the pixels of a capture, >= 0.
 
-        Where depth is finer than that it is the root of the mean square, as second moments add.
-
-        Args:
-            scene: The scene to photograph, of H x W packed pixels.
-            f_number: As marked on the lens; the blur is that of the stop that it stands for.
-
-        Returns:
-            (H // k, W // k), k the `box_factor`.
+        Where depth is finer than that it is the root of the mean square, as second moments add. The
+        blur is that of the stop that the marked `f_number` stands for.
         """
         diameter, pixels = self._signed_diameter(scene, f_number), scene.pitch * self.box_factor
         if pixels == 1:
@@ -301,17 +240,14 @@ class ReferenceCamera:
         """The same with its sign, at and in the pixels of ``scene.light``."""
         if scene.depth is None:
             return torch.zeros_like(scene.light[0], dtype=torch.float64)
-        if self.camera.pixel_pitch_um is None:
-            raise ValueError(f"`camera` (={self.camera.name!r}) must have a pixel pitch")
         exact = CameraSettings(100.0, 1.0, f_number).effective_f_number
-        pitch = 2e-6 * self.camera.pixel_pitch_um / scene.pitch
+        pitch = packed_pitch(self.camera) / scene.pitch
         return scene.lens.circle_of_confusion(scene.depth.double(), exact) / pitch
 
     def blurred_light(self, scene: ReferenceScene, f_number: float) -> Tensor:
         """Light on the photosites behind the aperture `f_number`, (4, H, W).
 
-        It is at the exposure of ``scene.reference``, unclipped, without noise and not averaged: one
-        result serves every ISO and exposure time.
+        It is at the exposure of ``scene.reference``, unclipped, without noise and not averaged.
         """
         light = scene.light
         if scene.depth is not None:
@@ -334,8 +270,7 @@ class ReferenceCamera:
 
         Args:
             light: (..., 4, H, W) at the exposure of `reference`, from `blurred_light`.
-            reference: Settings of `light`.
-            settings: Nominal settings of the capture.
+            reference, settings: Settings of `light`, and nominal ones of the capture.
             image_speed: Speed of the image along the rows [frame heights per second].
             lamp: The scene's lamp, whose long-term mean `light` is; None for steady light.
                 Rows are read one after the other (`CameraProfile.row_time`).
@@ -353,17 +288,13 @@ class ReferenceCamera:
         return torch.tensor(self.body.black_offset).to(signal)[:, None, None]
 
     def record(self, signal: Tensor, iso: float, generator: torch.Generator) -> Tensor:
-        """Digital numbers of `signal`, on the scale where sensor white is 1; averaged after that.
+        """Digital numbers of `signal` (..., 4, H, W), sensor white is 1; averaged after that.
 
         The variance of a sample is that of the camera's noise level function: the noise of the
         rounding to whole numbers is part of the calibrated read noise, and is not counted twice.
-
-        Args:
-            signal: (..., 4, H, W), from `expose`.
-            iso: ISO speed.
-            generator: Source of the noise, on the device of `signal`.
         """
-        shot, read = nlf_tensors(self.camera.nlf(iso), signal.device)
+        nlf = self.camera.nlf(iso)
+        shot, read = (plane_tensor(values, signal.device) for values in (nlf.shot, nlf.read))
         black, well = self._black_offset(signal), self._well(signal, iso)
         # Light far above a full well fills it in any case; its photon count would overflow.
         light = torch.minimum((signal - black).clamp(min=0.0), 2.0 * well)
@@ -410,15 +341,10 @@ class ReferenceCamera:
         lamp: Lamp | None = None,
         start: float = 0.0,
     ) -> ReferenceCapture:
-        """Photograph a scene that stands still.
+        """Photograph a scene that stands still, with noise that `seed` and the settings decide.
 
-        Args:
-            scene: The scene to photograph.
-            settings: Nominal settings.
-            seed: Seed of the noise, >= 0; the noise is a function of it and of the settings.
-            light: Result of ``blurred_light(scene, settings.f_number)`` if known: it serves every
-                capture at that f-number.
-            lamp, start: As in `expose`.
+        `light` is the result of ``blurred_light(scene, settings.f_number)`` if known, which serves
+        every capture at that f-number; `lamp` and `start` are those of `expose`.
         """
         if light is None:
             light = self.blurred_light(scene, settings.f_number)

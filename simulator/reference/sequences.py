@@ -47,7 +47,7 @@ _APERTURE_CENTRES, _APERTURE_SPREAD = (1.0, 4.0), 2.0
 _ISO_BEYOND = 2.5
 
 #: Highest ISO of a target with little noise (paper, section 4.2: 100, 200 and 400).
-_LOW_ISO = 400.0
+LOW_ISO = 400.0
 #: Its noise variance, relative to the source's at the same exposure, is at most this.
 _LOW_NOISE = 0.25
 #: Exposure error [EV] of a target that is neither grossly dark nor grossly clipped.
@@ -90,11 +90,7 @@ class Pair:
 def exposure_error(illuminance: float, settings: CameraSettings) -> float:
     """Exposure error of `settings` against an incident-light meter [EV], > 0 if too bright.
 
-    The light on the scene is `illuminance` [lux]; f-numbers count as the exact stops that they
-    stand for.
-
-    >>> exposure_error(2.5 * 2**13, CameraSettings(iso=100, exposure_time=1 / 64, f_number=8))
-    1.0
+    The light on the scene is `illuminance` [lux].
     """
     return incident_ev100(illuminance) + settings.log2_exposure
 
@@ -109,25 +105,13 @@ def draw_settings(
     3 EV) and with its distance from an ISO and an aperture that depend on the light: the brighter
     the scene, the lower the ISO, the shorter the time and the smaller the aperture on average.
 
-    Args:
-        illuminance: Light on the scene [lux], 1 to 20,000 in the paper.
-        rng: Source of the randomness.
-        camera: The body. ISOs above 2.5 times its highest calibrated one are not drawn.
-
-    Returns:
-        The settings in ascending order (ISO, then time, then f-number).
+    `illuminance` is the light on the scene [lux], 1 to 20,000 in the paper. ISOs above 2.5 times
+    the highest calibrated one of `camera` are not drawn. The settings are in ascending order (ISO,
+    then time, then f-number).
 
     Raises:
-        ValueError: If `camera` has no noise calibration, or fewer than 25 triples expose such a
-            scene to within 3 EV.
-
-    >>> from simulator import get_camera
-    >>> sequence = draw_settings(320.0, np.random.default_rng(0), get_camera("nikon_z6"))
-    >>> 20 <= len(sequence) <= 25
-    True
+        ValueError: If fewer than 25 triples expose such a scene to within 3 EV.
     """
-    if not camera.nlf_by_iso:
-        raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
     candidates, stops = _candidates(min(camera.nlf_by_iso), _ISO_BEYOND * max(camera.nlf_by_iso))
     weights = _weights(stops, incident_ev100(illuminance))
     if np.count_nonzero(weights) < CAPTURES[1]:
@@ -175,22 +159,15 @@ def select_pairs(
 ) -> list[Pair]:
     """Select the pairs that a stage of the training uses (paper, section 4.2, "Pair selection").
 
-    Args:
-        sequences: The sequences to choose from.
-        stage: ``"exposure"`` or ``"all"``: any two captures of a sequence, in either direction.
-            ``"noise"``: the same f-number, so that defocus does not differ; a target with little
-            noise: ISO 400 or less, and at mid grey at most a quarter of the source's noise variance
-            once both are at the same exposure; the target exposed to within -3 to +2 EV.
-            ``"aperture"``: a target with a smaller f-number than the source, and up to a tenth of
-            pairs with the same one, for which nothing should change.
-        camera: The body that takes the sequences; "little noise" is measured by its noise.
+    They are in ascending order. By `stage`:
 
-    Returns:
-        The pairs in ascending order; the same arguments give the same pairs.
-
-    Raises:
-        ValueError: If there is no such stage, or `camera` has no noise calibration and `stage` is
-            ``"noise"``.
+    - ``"exposure"`` or ``"all"``: any two captures of a sequence, in either direction.
+    - ``"noise"``: the same f-number, so that defocus does not differ; a target with little noise:
+      ISO 400 or less, and at mid grey at most a quarter of the source's noise variance, by the
+      noise of `camera`, once both are at the same exposure; the target exposed to within
+      -3 to +2 EV.
+    - ``"aperture"``: a target with a smaller f-number than the source, and up to a tenth of pairs
+      with the same one, for which nothing should change.
     """
     check_word("stage", stage, get_args(Stage))
     if stage == "noise":
@@ -224,18 +201,23 @@ def _has_little_noise(sequences: SequenceOf[Sequence], pair: Pair, camera: Camer
     right = sensor_signal(_GREY * 2.5 / math.pi, CameraSettings(100, 1.0, 1.0))
     sequence = sequences[pair.sequence]
     source, target = sequence.settings[pair.source], sequence.settings[pair.target]
-    if source.aperture_stop != target.aperture_stop or target.iso > _LOW_ISO:
+    if source.aperture_stop != target.aperture_stop or target.iso > LOW_ISO:
         return False
     grey = grey_signal(sequence.scene, target)
     error = math.log2(grey / right) if grey > 0 else -math.inf
     if not _FAIR_ERROR[0] <= error <= _FAIR_ERROR[1]:
         return False
     exposed = camera.nlf(source.iso).exposed(exposure_ratio(source, target))
-    return _variance(camera.nlf(target.iso), grey) <= _LOW_NOISE * _variance(exposed, grey)
+    return is_cleaner(camera.nlf(target.iso), exposed, grey)
 
 
-def _variance(nlf: NoiseLevelFunction, signal: float) -> float:
-    return sum(r + s * signal for r, s in zip(nlf.read, nlf.shot, strict=True)) / 4
+def is_cleaner(target: NoiseLevelFunction, source: NoiseLevelFunction, signal: float) -> bool:
+    """Whether the target's noise variance at `signal` is at most a quarter of the source's."""
+    target_variance, source_variance = (
+        sum(r + s * signal for r, s in zip(nlf.read, nlf.shot, strict=True))
+        for nlf in (target, source)
+    )
+    return target_variance <= _LOW_NOISE * source_variance
 
 
 def opening_pairs(sequences: SequenceOf[HasSettings]) -> list[Pair]:

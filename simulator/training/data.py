@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,6 +42,8 @@ _WEIGHTS = {"radiance": 3.0, "photograph": 3.0, "leaves": 1.5, "linear": 0.7, "c
 _CLEAN_RATIO = 16.0
 
 _CLEAN = NoiseLevelFunction.zero()
+#: See `DetailCrops._draw`.
+_Crop = tuple[Tensor, Tensor, Tensor, CameraProfile, int]
 
 
 def no_progress(*_: object) -> None:
@@ -49,31 +51,18 @@ def no_progress(*_: object) -> None:
 
 
 class Batch(NamedTuple):
-    """B pairs of captures of the same crop.
+    """B pairs of captures of the same crop."""
 
-    Args:
-        source: (B, 4, H, W) the input capture, noisy.
-        target: (B, 4, H, W) the target capture without noise, clipped.
-        sample: (B, 4, H, W) the target capture, noisy.
-        ratio: (B,) nominal exposure ratio from source to target.
-        shot: (B, 4) slope of the source's noise variance, on the source's scale.
-        read: (B, 4) its noise variance at zero signal.
-        f_source: (B,) effective f-number of the source.
-        f_target: (B,) effective f-number of the target.
-        parameters: (B, 6) log2 of ISO / 100, exposure time and f-number, source then target.
-        defocus: (B, H, W) true circle of confusion of the source [pixel].
-    """
-
-    source: Tensor
-    target: Tensor
-    sample: Tensor
-    ratio: Tensor
-    shot: Tensor
-    read: Tensor
-    f_source: Tensor
-    f_target: Tensor
-    parameters: Tensor
-    defocus: Tensor
+    source: Tensor  # (B, 4, H, W) the input capture, noisy
+    target: Tensor  # (B, 4, H, W) the target capture without noise, clipped
+    sample: Tensor  # (B, 4, H, W) the target capture, noisy
+    ratio: Tensor  # (B,) nominal exposure ratio from source to target
+    shot: Tensor  # (B, 4) slope of the source's noise variance, on the source's scale
+    read: Tensor  # (B, 4) its noise variance at zero signal
+    f_source: Tensor  # (B,) effective f-number of the source
+    f_target: Tensor  # (B,) effective f-number of the target
+    parameters: Tensor  # (B, 6) log2 of ISO / 100, exposure time, f-number, source then target
+    defocus: Tensor  # (B, H, W) true circle of confusion of the source [pixel]
 
 
 def draw_sequences(
@@ -82,10 +71,8 @@ def draw_sequences(
     """One sequence of 20 to 25 captures of each scene, as the paper took its own."""
     sequences = []
     for index, scene in enumerate(scenes):
-        if scene.illuminance is None:
-            raise ValueError(f"scene {scene.scene_id!r}: `illuminance` must be known to expose it")
-        rng = np.random.default_rng([seed, index])
-        settings = draw_settings(scene.illuminance, rng, camera)
+        assert scene.illuminance is not None
+        settings = draw_settings(scene.illuminance, np.random.default_rng([seed, index]), camera)
         sequences.append(CaptureSequence(scene, tuple(settings)))
     return sequences
 
@@ -95,9 +82,6 @@ class ReferencePairs:
 
     Light behind every aperture is rendered once, into `blurred_light`, which stages may share. The
     noise is new every time: a pair that is shown twice was photographed twice.
-
-    Raises:
-        ValueError: If the sequences hold no pair for this stage.
     """
 
     def __init__(
@@ -128,13 +112,9 @@ class ReferencePairs:
         progress(1.0, {})
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch:
-        """The pairs of one step.
+        """`size` pairs of one step, their crops `crop` packed pixels a side.
 
-        Args:
-            step: Number of the step.
-            size: Pairs.
-            crop: Height and width of the crops [packed pixel].
-            process: Rank among several processes, each of which gets pairs of its own.
+        Each of several processes, numbered by `process`, gets pairs of its own.
         """
         rng = np.random.default_rng([self.seed, len(self.stage), step, process])
         chosen = rng.integers(len(self.pairs), size=size)
@@ -148,11 +128,7 @@ class ReferencePairs:
         scene = sequence.scene
         source, target = sequence.settings[pair.source], sequence.settings[pair.target]
         k = self.camera.box_factor
-        height, width = (n // k for n in scene.size)
-        if crop > min(height, width):
-            most = f"the {height} x {width} pixels of scene {scene.scene_id!r}"
-            raise ValueError(f"`crop` (={crop}) must not exceed {most}")
-        top, left = (int(rng.integers(n - crop + 1)) for n in (height, width))
+        top, left = (int(rng.integers(n // k - crop + 1)) for n in scene.size)
         # The one symmetry of a mosaic: transposed, G1 and G2 change places. Mirrored, its planes
         # would lie where no photosites are.
         transposed = rng.random() < 0.5
@@ -170,15 +146,14 @@ class ReferencePairs:
 
         _, noisy = record(source)
         signal, sample = record(target)
-        defocus = scene.scene_id, source.aperture_stop
-        if defocus not in self._defocus:
-            diameter = self.camera.blur_diameter(scene, source.effective_f_number)
-            self._defocus[defocus] = diameter
+        known = scene.scene_id, source.aperture_stop
+        if known not in self._defocus:
+            self._defocus[known] = self.camera.blur_diameter(scene, source.effective_f_number)
         return {
             "source": noisy,
             "target": self.camera.clip(signal, target.iso),
             "sample": sample,
-            "defocus": cut(self._defocus[defocus]),
+            "defocus": cut(self._defocus[known]),
             **stated_fields(source, target, self.camera.camera.nlf(source.iso).scaled(1.0 / k**2)),
         }
 
@@ -220,20 +195,15 @@ def settings_parameters(settings: CameraSettings) -> tuple[float, float, float]:
 class DetailPicture:
     """A sharp picture with little noise.
 
-    Args:
-        name: Unique name.
-        group: Source group, the unit of splitting.
-        kind: Kind of source, which decides how often it is drawn.
-        light: (3, H, W) linear light in camera colours at the pitch of the photosites, or
-            (4, H, W) the planes of a recorded mosaic; float32, >= 0 but for noise.
-        nlf: Noise left in it, on the scale of `light`.
+    Its light, float32 and >= 0 but for noise, is (3, H, W) in camera colours at the pitch of the
+    photosites, or (4, H, W) the planes of a recorded mosaic.
     """
 
     name: str
-    group: str
-    kind: str
+    group: str  # source group, the unit of splitting
+    kind: str  # of source, which decides how often it is drawn
     light: Tensor
-    nlf: NoiseLevelFunction = _CLEAN
+    nlf: NoiseLevelFunction = _CLEAN  # noise left in it, on the scale of `light`
 
     @property
     def photosites(self) -> int:
@@ -255,15 +225,10 @@ class NoiseBatch(NamedTuple):
 
 
 class DetailCrops:
-    """Batches of the noise stage, at ISO 50 to 25,600 of one of the cameras.
+    """Batches of the noise stage: crops of `pictures` at ISO 50 to 25,600 of one of `cameras`.
 
     Half of the crops have read noise of 0.4 to 7 times as much, as other sensors have. Averages
     over k x k samples of a plane, as of a frame that was reduced, are among the crops.
-
-    Args:
-        pictures: Sources, at least one of 16 packed pixels a side or more.
-        cameras: Cameras whose noise is added.
-        seed: Seed of everything drawn.
     """
 
     def __init__(
@@ -284,19 +249,15 @@ class DetailCrops:
         """`size` crops of one step, see `ReferencePairs.batch`."""
         rng = np.random.default_rng([self.seed, 0xDE7A, step, process])
         generator = noise_generator(self.seed, step, process, 0xDE7A)
-        items = [_recorded(*self._draw(crop, rng), generator) for _ in range(size)]
-        return NoiseBatch(*(torch.stack(parts) for parts in zip(*items, strict=True)))
+        return _recorded((self._draw(crop, rng) for _ in range(size)), generator)
 
     def captures(self, index: int, count: int, crop: int) -> NoiseBatch:
         """`count` captures of crop number `index`, which differ by their noise."""
         generator = noise_generator(self.seed, index, 0xCA9)
         drawn = self._draw(crop, np.random.default_rng([self.seed, 0xCA9, index]))
-        items = [_recorded(*drawn, generator) for _ in range(count)]
-        return NoiseBatch(*(torch.stack(parts) for parts in zip(*items, strict=True)))
+        return _recorded([drawn] * count, generator)
 
-    def _draw(
-        self, crop: int, rng: np.random.Generator
-    ) -> tuple[Tensor, Tensor, Tensor, CameraProfile, int]:
+    def _draw(self, crop: int, rng: np.random.Generator) -> _Crop:
         """Light, shot and read noise, camera and averaged samples of a crop."""
         if crop > self.largest:
             raise ValueError(f"`crop` (={crop}) must not exceed the largest, {self.largest}")
@@ -317,11 +278,9 @@ class DetailCrops:
             shot, read = shot / k**2, read / k**2
             level = float(np.exp2(rng.uniform(*_LEVEL)))
             scale = level / max(float(planes.mean()), 1e-12)
-            if not nlf.is_zero:
-                own = nlf.exposed(scale)
-                quiet = _CLEAN_RATIO * np.array([own.read, own.shot]) <= np.stack([read, shot])
-                if not quiet.all():
-                    continue
+            own = nlf.exposed(scale)
+            if (_CLEAN_RATIO * np.array([own.read, own.shot]) > np.stack([read, shot])).any():
+                continue
             shots, reads = (torch.from_numpy(v.astype(np.float32)) for v in (shot, read))
             return planes * scale, shots, reads, camera, k
 
@@ -345,7 +304,7 @@ def _planes(
         part = part.transpose(-2, -1)
     light = _other_colours(part, rng)
     if rng.random() < _COINCIDING:
-        return average_planes(light[[0, 1, 1, 2]], 2 * k), NoiseLevelFunction.zero()
+        return average_planes(light[[0, 1, 1, 2]], 2 * k), _CLEAN
     sigma = 0.0 if rng.random() < 0.25 else float(rng.uniform(0.3, 0.9))
     return average_planes(sample_mosaic(lens_blur(light, sigma)), k), NoiseLevelFunction.zero()
 
@@ -361,25 +320,21 @@ def _other_colours(light: Tensor, rng: np.random.Generator) -> Tensor:
     return torch.einsum("ij,jhw->ihw", matrix, light).clamp(min=0.0)
 
 
-def _recorded(
-    light: Tensor,
-    shot: Tensor,
-    read: Tensor,
-    camera: CameraProfile,
-    k: int,
-    generator: torch.Generator,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`light` as it is recorded, and the other fields of a `NoiseBatch`.
+def _recorded(crops: Iterable[_Crop], generator: torch.Generator) -> NoiseBatch:
+    """The crops as they are recorded: photons, read noise, rounding, clip.
 
-    Photons, read noise, rounding, clip. An average of k x k samples is rounded to 1/k^2 of a
-    digital number; rounding is part of the calibrated read noise.
+    An average of k x k samples is rounded to 1/k^2 of a digital number; rounding is part of the
+    calibrated read noise.
     """
-    shots, reads = shot[:, None, None], read[:, None, None]
-    step = 1.0 / (torch.tensor(camera.span, dtype=torch.float32)[:, None, None] * k**2)
-    electrons = 1.0 / shots
-    counted = torch.poisson(light.clamp(0.0, 2.0) * electrons, generator=generator) / electrons
-    normal = torch.empty_like(light).normal_(generator=generator)
-    noisy = counted + (reads - step.square() / 12.0).clamp(min=0.0).sqrt() * normal
-    pedestal = torch.tensor(camera.pedestal, dtype=torch.float32)[:, None, None]
-    rounded = torch.maximum((noisy / step).round() * step, -pedestal).clamp(max=1.0)
-    return rounded, light.clamp(max=1.0), shot, read
+    items = []
+    for light, shot, read, camera, k in crops:
+        shots, reads = shot[:, None, None], read[:, None, None]
+        step = 1.0 / (torch.tensor(camera.span, dtype=torch.float32)[:, None, None] * k**2)
+        electrons = 1.0 / shots
+        counted = torch.poisson(light.clamp(0.0, 2.0) * electrons, generator=generator) / electrons
+        normal = torch.empty_like(light).normal_(generator=generator)
+        noisy = counted + (reads - step.square() / 12.0).clamp(min=0.0).sqrt() * normal
+        pedestal = torch.tensor(camera.pedestal, dtype=torch.float32)[:, None, None]
+        rounded = torch.maximum((noisy / step).round() * step, -pedestal).clamp(max=1.0)
+        items.append((rounded, light.clamp(max=1.0), shot, read))
+    return NoiseBatch(*(torch.stack(parts) for parts in zip(*items, strict=True)))

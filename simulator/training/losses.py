@@ -104,10 +104,8 @@ class ApertureLoss(nn.Module):
             truth = torch.log(batch.defocus + LOG_OFFSET)
             values["map"] = (log_blur - truth).abs().mean()
             diameter = dead_zone(to_diameter(log_blur))
-            ratio = added_blur(
-                diameter, batch.f_source[:, None, None], batch.f_target[:, None, None]
-            )
-            output = DiscBank(denoised).blurred(ratio[:, None])
+            stops = (f[:, None, None] for f in (batch.f_source, batch.f_target))
+            output = DiscBank(denoised).blurred(added_blur(diameter, *stops)[:, None])
         else:
             output = self.aperture(denoised, deviation, batch.f_source, batch.f_target)
         used = away_from_clipping(batch.source, batch.target)

@@ -10,7 +10,6 @@ aperture on the output of the stages before. The target is the capture itself, w
 
 from __future__ import annotations
 
-import csv
 import functools
 import io
 import logging
@@ -30,7 +29,7 @@ from simulator.camera import CameraProfile, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
-from simulator.reference.sequences import Pair, any_pairs, opening_pairs
+from simulator.reference.sequences import LOW_ISO, Pair, any_pairs, is_cleaner, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.training.data import Batch, no_progress, stacked, stated_fields
 from simulator.training.losses import expose
@@ -55,15 +54,12 @@ PARAMETERS, DEVELOPING = "camera_params.csv", "camera_isp_params.csv"
 COLUMNS = ("path", "time", "iso", "aperture")
 #: Black and white level that the authors' preprocessing takes, per camera.
 LEVELS = {"nikon_z6": (1008.0, 15520.0), "canon_70d": (2048.0, 15000.0)}
-#: From R, G1, B, G2 of the ``.npy`` files to R, G1, G2, B, and back: it inverts itself.
-_PLANES = [0, 1, 3, 2]
 #: Stages in the order of the paper.
 STAGES = ("exposure", "noise", "aperture", "baseline")
 #: Share of the sequences that is held out (paper, section 4.2).
 TEST_SHARE = 0.1
-#: Highest ISO of a target of the noise stage (section 4.2: 100, 200 and 400), and its noise
-#: variance at mid grey relative to the source's at the same exposure, at most.
-_LOW_ISO, _LOW_NOISE, _GREY = 400.0, 0.25, 0.119
+#: Signal of a grey card in the light that a camera meters.
+_GREY = 0.119
 #: Most bytes of captures in memory; one of 4 x 512 x 768 takes 6 million.
 _CACHED = 2**31
 
@@ -77,11 +73,7 @@ Balance = tuple[float, float, float]
 
 
 def packed_camera(name: str) -> CameraProfile:
-    """The built-in camera ``"nikon_z6"`` or ``"canon_70d"`` with the levels of the dataset.
-
-    >>> packed_camera("canon_70d").black_level
-    (2048.0, 2048.0, 2048.0, 2048.0)
-    """
+    """The built-in camera ``"nikon_z6"`` or ``"canon_70d"`` with the levels of the dataset."""
     check_word("camera", name, tuple(LEVELS))
     camera = get_camera(name)
     black, white = LEVELS[name]
@@ -90,16 +82,13 @@ def packed_camera(name: str) -> CameraProfile:
 
 @dataclass(frozen=True)
 class PackedCapture:
-    """One capture: a row of the table.
-
-    `white_balance` (gains, green 1) and `nlf` are None where the row does not state them.
-    """
+    """One capture: a row of the table."""
 
     file: Path
     camera: CameraProfile
     settings: CameraSettings
-    white_balance: Balance | None
-    nlf: NoiseLevelFunction | None
+    white_balance: Balance | None  # gains, green 1; None where the row does not state them
+    nlf: NoiseLevelFunction | None  # likewise
 
     @property
     def noise(self) -> NoiseLevelFunction:
@@ -113,29 +102,21 @@ class PackedCapture:
             ValueError: If the file is not a finite (4, H, W) array of floating-point numbers.
         """
         try:
-            array = np.load(self.file, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise ValueError(
-                f"`{self.file}` must be a whole .npy file of numbers: {error}"
-            ) from None
-        if not isinstance(array, np.ndarray) or array.ndim != 3 or array.shape[0] != 4:
-            shape = getattr(array, "shape", type(array).__name__)
-            raise ValueError(f"`{self.file}` (shape {shape}) must be (4, H, W): R, G1, B, G2")
-        stated = self.nlf is not None
-        return RawImage(
-            torch.from_numpy(array[_PLANES]),
-            self.settings,
-            self.camera,
-            self.nlf,
-            self.white_balance or (1.0, 1.0, 1.0),
-            metadata={
-                "path": self.file.name,
-                "make": self.camera.make,
-                "model": self.camera.model,
-                "nlf_source": PARAMETERS if stated else f"camera calibration ({self.camera.name})",
-                "white_balance_source": "camera" if self.white_balance else "none",
-            },
-        )
+            red, green_1, blue, green_2 = np.load(self.file, allow_pickle=False)
+            planes = torch.from_numpy(np.stack([red, green_1, green_2, blue]))
+        except (ValueError, TypeError, EOFError) as error:
+            rule = "must be a whole .npy file of numbers, (4, H, W): R, G1, B, G2"
+            raise ValueError(f"`{self.file}` {rule}: {error}") from None
+        camera = self.camera
+        metadata = {
+            "path": self.file.name,
+            "make": camera.make,
+            "model": camera.model,
+            "nlf_source": PARAMETERS if self.nlf else f"camera calibration ({camera.name})",
+            "white_balance_source": "camera" if self.white_balance else "none",
+        }
+        balance = self.white_balance or (1.0, 1.0, 1.0)
+        return RawImage(planes, self.settings, camera, self.nlf, balance, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -157,19 +138,15 @@ def read_dataset(
     """Every sequence that a ``camera_params.csv`` in `root` or below lists, sorted by name.
 
     Rows whose ``.npy`` file is not there are left out, with a warning in the log: a copy of the
-    dataset may be partial.
+    dataset may be partial. Of the paths in a table only the last two parts count, and the last
+    alone if the files lie beside the table: they begin where the preprocessing ran.
 
-    Args:
-        root: A folder. The paths in its tables begin where the preprocessing ran: only their last
-            two parts count, and the last alone if the files lie beside the table.
-        camera: The body: a profile, or a name that `packed_camera` knows. Without it, a table with
-            a column ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors'
-            scripts write them.
+    `camera` is a profile, or a name that `packed_camera` knows; without it a table with a column
+    ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors' scripts write them.
 
     Raises:
         FileNotFoundError: If there is no such folder.
-        ValueError: If there is no table, a column is missing, a cell is no number, or no file is
-            there.
+        ValueError: If there is no table, no file, no such column, or a cell is no number.
     """
     found = (s for table in _tables("root", root) for s in _read_table(table, camera))
     return sorted(found, key=lambda sequence: sequence.name)
@@ -234,13 +211,13 @@ def _capture(
     camera: CameraProfile,
     developing: Balance | None,
 ) -> PackedCapture:
-    values = {}
+    values = []
     for name in ("iso", "time", "aperture"):
         try:
-            values[name] = float(row[name])
+            values.append(float(row[name]))
         except ValueError:
             raise ValueError(f"`{name}` (={row[name]!r}) must be a number") from None
-    settings = CameraSettings.from_exif(values["iso"], values["time"], values["aperture"])
+    settings = CameraSettings.from_exif(*values)
     gains, noise = _numbers(row.get("wb", "")), _numbers(row.get("noiseprofile", ""))
     balance = (gains[0] / gains[1], 1.0, gains[2] / gains[1]) if _positive(gains) else developing
     stem = f"{path.stem}.npy"
@@ -292,35 +269,34 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
     folder = Path(folder).expanduser()
     if folder.exists() and any(folder.iterdir()):
         raise ValueError(f"`folder` (={str(folder)!r}) must be new or empty")
-    if not raws:
-        raise ValueError("`raws` (=[]) must hold at least one capture")
-    name = raws[0].camera.name
-    known, nikon = packed_camera(name), name == "nikon_z6"
-    for camera in (raw.camera for raw in raws):
-        if _LAYOUT(camera) != _LAYOUT(known):
-            raise ValueError(f"`raws` (one of {_LAYOUT(camera)}) must all be of {_LAYOUT(known)}")
-    rows: list[list[object]] = [[*COLUMNS, *(["wb"] if nikon else []), "noiseprofile"]]
+    layouts = {_LAYOUT(raw.camera) for raw in raws}
+    if len(layouts) != 1 or layouts != {_LAYOUT(packed_camera(raws[0].camera.name))}:
+        raise ValueError(f"`raws` (of {layouts or None}) must be captures of one `packed_camera`")
+    nikon = raws[0].camera.name == "nikon_z6"
+    # The Nikon's noise profile has its greens averaged, the Canon's all planes.
+    groups: list[tuple[int, ...]] = [(0,), (1, 2), (3,)] if nikon else [(0, 1, 2, 3)]
+    rows: list[dict[str, object]] = []
     for index, raw in enumerate(raws):
-        stem = f"capture_{index:03d}"
-        content = io.BytesIO()
-        np.save(content, raw.data.detach().cpu().numpy()[_PLANES], allow_pickle=False)
+        stem, settings, content = f"capture_{index:03d}", raw.settings, io.BytesIO()
+        np.save(content, raw.data.detach().cpu().numpy()[[0, 1, 3, 2]], allow_pickle=False)
         write_atomically(folder / f"{stem}.npy", content.getvalue())
-        settings, noise = raw.settings, _profile_text(raw.noise, colours=nikon)
-        row = [f"{folder.name}/{stem}.jpg", settings.exposure_time, settings.iso, settings.f_number]
-        rows.append([*row, *([[*raw.white_balance, 0.0]] if nikon else []), noise])
-    text = io.StringIO()
-    csv.writer(text).writerows(rows)
-    write_atomically(folder / PARAMETERS, text.getvalue())
-
-
-def _profile_text(nlf: NoiseLevelFunction, *, colours: bool) -> str:
-    """A DNG NoiseProfile of `nlf`: greens averaged, or without `colours` all averaged."""
-    groups: list[tuple[int, ...]] = [(0,), (1, 2), (3,)] if colours else [(0, 1, 2, 3)]
-    return " ".join(
-        repr(sum(values[i] for i in planes) / len(planes))
-        for planes in groups
-        for values in (nlf.shot, nlf.read)
-    )
+        values = (
+            f"{folder.name}/{stem}.jpg",
+            settings.exposure_time,
+            settings.iso,
+            settings.f_number,
+        )
+        row: dict[str, object] = dict(zip(COLUMNS, values, strict=True))
+        if nikon:
+            row["wb"] = [*raw.white_balance, 0.0]
+        means = [
+            sum(values[i] for i in planes) / len(planes)
+            for planes in groups
+            for values in (raw.noise.shot, raw.noise.read)
+        ]
+        rows.append(row | {"noiseprofile": " ".join(map(repr, means))})
+    table = pd.DataFrame(rows).to_csv(index=False, lineterminator="\r\n")
+    write_atomically(folder / PARAMETERS, table)
 
 
 # -- training -------------------------------------------------------------------------------------
@@ -378,11 +354,7 @@ def _is_cleaner(sequence: CapturedSequence, pair: Pair) -> bool:
     if source.settings.aperture_stop != target.settings.aperture_stop:
         return False
     exposed = source.noise.exposed(exposure_ratio(source.settings, target.settings))
-    wanted, present = (
-        sum(read + shot * _GREY for shot, read in zip(nlf.shot, nlf.read, strict=True))
-        for nlf in (target.noise, exposed)
-    )
-    return target.settings.iso <= _LOW_ISO and wanted <= _LOW_NOISE * present
+    return target.settings.iso <= LOW_ISO and is_cleaner(target.noise, exposed, _GREY)
 
 
 class CapturedPairs:
@@ -394,10 +366,7 @@ class CapturedPairs:
         self._data: LruCache[Tensor] = LruCache(_CACHED)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch:
-        """The pairs of one step; see `simulator.training.data.ReferencePairs.batch`.
-
-        Pictures smaller than `crop` are taken whole.
-        """
+        """As `ReferencePairs.batch`; pictures smaller than `crop` are taken whole."""
         rng = np.random.default_rng([self.seed, STAGES.index(self.stage), step, process])
         chosen = rng.integers(len(self.pairs), size=size)
         items = [self._pair(self.pairs[i], crop, rng) for i in chosen]
@@ -462,14 +431,8 @@ def train_on_captures(
 ) -> Path:
     """Trains the stages of `config` on real captures, as `train_and_save` does on simulated ones.
 
-    The preset is ``"paper"``, ``"pc"`` or ``"dl"``; camera, body and scenes of `config` do not
-    matter.
-
-    Returns:
-        The file of the weights.
-
-    Raises:
-        ValueError: If the preset needs what captures do not tell, or a stage has no pairs.
+    The preset is ``"paper"``, ``"pc"`` or ``"dl"``: captures do not tell what the others need.
+    Camera, body and scenes of `config` do not matter.
     """
     check_word("preset", config.preset, ("paper", "pc", "dl"))
     accelerator = make_accelerator(config, device, None)
@@ -480,7 +443,7 @@ def train_on_captures(
     for number, name in enumerate(names, start=1):
         pairs = CapturedPairs(sequences, name, seed=config.seed)
         entries = ("preset", "seed", "precision", *names[:number])
-        clock = train_stage(
+        stages[name] = train_stage(
             name,
             CapturedNoiseLoss(modules) if name == "noise" else stage_loss(name, modules),
             modules[name],
@@ -491,7 +454,6 @@ def train_on_captures(
             identity=[{entry: values[entry] for entry in entries}, start, known],
             progress=functools.partial(progress, name),
         )
-        stages[name] = clock.card(len(pairs.pairs))
     done = {"start": start, "sequences": len(sequences), "stages": stages}
     save_trained(path, modules, config, command, **done)
     return sibling(path, ".safetensors")

@@ -1,17 +1,14 @@
 """Scenes for the reference camera, and pictures of real detail, that train and test the networks.
 
 All of it is light at the pitch of the photosites: some is drawn there; photographs, radiance maps
-and raws of a folder of real files (see docs/networks.md) are cut out at it and never enlarged.
-
-The split by source group is fixed: drawn groups by their index, files by name (`detail_split`). The
-same place, subject or photographer's series is in one split only, and the scenes of a split stay
-when `number` grows.
+and raws of a folder of real files (see docs/networks.md) are cut out at it and never enlarged. The
+same place, subject or photographer's series is in one split only (`detail_split`).
 """
 
 from __future__ import annotations
 
 import csv
-import hashlib
+import itertools
 import json
 import logging
 import math
@@ -39,12 +36,20 @@ from simulator.radiance.maps import (
     EV100_RANGE,
     RADIANCE_SUFFIXES,
     assumed_ev100,
+    hash_fraction,
     read_radiance,
 )
 from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
-from simulator.radiance.procedural import LeafStyle, dead_leaves, draw, fractal_noise, list_kinds
+from simulator.radiance.procedural import (
+    KINDS,
+    LeafStyle,
+    dead_leaves,
+    draw,
+    draw_lux,
+    fractal_noise,
+)
 from simulator.raw.read import read_raw
-from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene, packed_pitch
 from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
 from simulator.training.data import DetailPicture
@@ -54,7 +59,6 @@ logger = logging.getLogger(__name__)
 
 Split = Literal["train", "validation", "test"]
 
-#: Index of the first procedural group of each split.
 #: Index of the first procedural group of each split.
 FIRST_INDEX = {"train": 0, "validation": 100_000, "test": 200_000}
 #: Groups whose split was fixed before the hash decided; all others follow `detail_split`.
@@ -94,8 +98,7 @@ FOCUS_CYCLE = (
 )
 #: The photograph of the bundled training split that validates.
 VALIDATION_PHOTOGRAPH = "coffee"
-#: Pictures that give fewer packed pixels a side than this are left out, unless smaller scenes are
-#: asked for.
+#: Fewest packed pixels a side of a picture, unless smaller scenes are asked for.
 LEAST_VIEW = 128
 #: Photographs (by file) with a blur of their own, by depth of field or motion.
 _BLURRED = {
@@ -118,15 +121,11 @@ _PHOTOGRAPH_BLUR = 6.0
 
 
 def detail_split(group: str) -> Split:
-    """The split of a source group, by a stable hash of its name.
-
-    >>> detail_split("quarry_02") == detail_split("quarry_02")
-    True
-    """
+    """The split of a source group, by a stable hash of its name."""
     for split, names in _FIXED.items():
         if group in names:
             return split
-    draw = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+    draw = hash_fraction(group)
     return "train" if draw < _TRAIN else "validation" if draw < _VALIDATION else "test"
 
 
@@ -136,7 +135,6 @@ def detail_pictures(
     """The pictures of a split: of the folder of real files `data`, if given, and drawn ones.
 
     Of each kind (dead leaves, charts, smooth pictures) `drawn` are drawn; 60 to train on, else 8.
-    What is missing in the folder is logged.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     pictures: list[DetailPicture] = []
@@ -155,11 +153,9 @@ def detail_pictures(
 
             frame = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
             light = np.ascontiguousarray(frame[:, :, ::-1].transpose(2, 0, 1), np.float32)
-            pictures.append(
-                DetailPicture(path.stem, group, "linear", torch.from_numpy(light / 65535.0))
-            )
-    pictures += _drawings(split, _DRAWN[split] if drawn is None else drawn, seed)
-    return pictures
+            linear = torch.from_numpy(light / 65535.0)
+            pictures.append(DetailPicture(path.stem, group, "linear", linear))
+    return [*pictures, *_drawings(split, _DRAWN[split] if drawn is None else drawn, seed)]
 
 
 def radiance_files(data: Path, split: Split) -> Iterator[tuple[Path, str]]:
@@ -310,16 +306,11 @@ def reference_scenes(
     Args:
         split: ``"train"``, ``"validation"`` or ``"test"``.
         camera: Camera in whose colours light is stated, and in whose pixels blur is.
-        number: Procedural groups, one scene each, at most `MOST_GROUPS`; the first are the same
-            whatever `number` is.
+        number: Procedural groups, one scene each; the first are the same whatever `number` is.
         size: Height and width [packed pixels], half as many as photosites; pictures that are
-            smaller keep their size, and are left out below 128 and below `size`, which is logged.
-        data: Folder of real files (see docs/networks.md), for radiance maps and more photographs.
-        seed: Seed of the procedural groups; part of their names.
-
-    Raises:
-        FileNotFoundError: If there is no folder `data`.
-        ValueError: If another argument is invalid.
+            smaller keep their size, and are left out below 128 and below `size`.
+        data: Folder of real files (see docs/networks.md).
+        seed: Of the procedural groups; part of their names.
     """
     check_word("split", split, tuple(FIRST_INDEX))
     check_integer("number", number, 0, MOST_GROUPS)
@@ -335,12 +326,11 @@ def reference_scenes(
 def _procedural(
     camera: CameraProfile, first: int, position: int, size: int, seed: int
 ) -> ReferenceScene:
-    """The scene at `position` of the split that begins at index `first`."""
     block, within = divmod(position, _FLAT_EVERY)
     rng = np.random.default_rng([zlib.crc32(b"reference"), seed, first + position])
     depth, lens = None, Lens()
     if within == _FLAT_EVERY - 1:
-        kind = list_kinds()[block % len(list_kinds())]
+        kind = list(KINDS)[block % len(KINDS)]
         drawing = draw(kind, rng, 2 * size, lens=False)
     else:
         kind, focus = "depth", FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
@@ -348,10 +338,19 @@ def _procedural(
         drawing = drawn.drawing
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
         depth, lens = torch.from_numpy(depths), Lens(FOCAL_LENGTH, distance)
-    name, source = f"reference-{seed}-{first + position:06d}-{kind}", "procedural, ae-env (MIT)"
-    about: dict[str, Any] = {"scene_id": name, "group": name, "kind": kind, "source": source}
-    light: dict[str, Any] = {"lux": drawing.illuminance, "illuminant": drawing.illuminant}
-    return _scene(drawing.light, camera, **light, **about, depth=depth, lens=lens)
+    name = f"reference-{seed}-{first + position:06d}-{kind}"
+    return _scene(
+        drawing.light,
+        camera,
+        lux=drawing.illuminance,
+        illuminant=drawing.illuminant,
+        scene_id=name,
+        group=name,
+        kind=kind,
+        source="procedural, ae-env (MIT)",
+        depth=depth,
+        lens=lens,
+    )
 
 
 def _scene(
@@ -390,15 +389,6 @@ def _scene(
     )
 
 
-def packed_pitch(camera: CameraProfile) -> float:
-    """Distance between packed pixels of `camera` [m], twice the sensor's, which must be known."""
-    if camera.pixel_pitch_um is None:
-        raise ValueError(
-            f"`pixel_pitch_um` (=None) of camera {camera.name!r} must be known where there is depth"
-        )
-    return 2e-6 * camera.pixel_pitch_um
-
-
 # -- pictures without depth -----------------------------------------------------------------------
 
 
@@ -411,13 +401,11 @@ def _bundled_photographs(
         if split != ("validation" if validates else photograph.split):
             continue
         rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
-        light = unprocess(read_photograph(photograph.file), rng)
-        low, high = (math.log(v) for v in photograph.illuminance)
         yield from _cut_out(
-            light,
+            unprocess(read_photograph(photograph.file), rng),
             camera,
             size,
-            lux=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
+            lux=draw_lux(rng, *photograph.illuminance),
             illuminant=temperature_tint(rng.uniform(*photograph.tint)),
             scene_id=photograph.name,
             group=photograph.name,
@@ -433,28 +421,23 @@ def _real_pictures(
     """Radiance maps and photographs of a folder of real files."""
     if not data.is_dir():
         raise FileNotFoundError(f"`data` (={str(data)!r}) must be an existing folder")
+    about: dict[str, Any]
     for path, group in radiance_files(data, split):
         about = {"group": group, "kind": "radiance", "source": path.name}
         for name, view in _views(path.stem, read_radiance(path)):
             yield from _cut_out(view, camera, size, scene_id=name, **about)
     for photograph in photograph_pictures(data, split):
-        yield from _cut_out(
-            _sharpened(photograph.light.numpy()),
-            camera,
-            size,
-            scene_id=photograph.name,
-            group=photograph.group,
-            kind="photograph",
-            source=f"photo_pool {photograph.name}",
-            in_focus=photograph.name not in _BLURRED,
-        )
+        name, view = photograph.name, _sharpened(photograph.light.numpy())
+        about = {"group": photograph.group, "kind": "photograph", "source": f"photo_pool {name}"}
+        about["in_focus"] = name not in _BLURRED
+        yield from _cut_out(view, camera, size, scene_id=name, **about)
 
 
 def _views(name: str, image: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Four square cuts out of a panorama's band of 45 degrees around the horizon; other pictures as
-    they are.
+    """Other pictures as they are, and four square cuts out of a panorama's horizon, by name.
 
-    A perspective view has its edges enlarged; the band is stretched by 1.41 at most, sideways.
+    A perspective view has its edges enlarged; this band of 45 degrees is stretched by 1.41 at most,
+    sideways.
     """
     height, width = image.shape[1:]
     if abs(width / height - 2.0) > 0.01:
@@ -496,9 +479,13 @@ def _cut_out(
     if side < 2 * min(size, LEAST_VIEW):
         logger.info("%s: too coarse (%d photosites a side), left out", scene_id, side)
         return
-    top, left = ((n - side) // 2 for n in view.shape[1:])
-    part = view[:, top : top + side, left : left + side]
-    yield _scene(part, camera, scene_id=scene_id, **fields)
+    yield _scene(_middle(view, side), camera, scene_id=scene_id, **fields)
+
+
+def _middle(image: Any, side: int) -> Any:
+    """The square in the middle of `image`, (C, H, W) of numpy or torch."""
+    top, left = ((n - side) // 2 for n in image.shape[1:])
+    return image[:, top : top + side, left : left + side]
 
 
 def mosaic_scenes(
@@ -507,14 +494,10 @@ def mosaic_scenes(
     """The middle of real raws at low ISO: flat art and far views, in focus throughout.
 
     For the aperture: their noise is small, but it is there, so they are no truth to denoise. They
-    cannot be defocused, as each plane has but a quarter of the photosites. At most `size` packed
-    pixels a side; colours are left as they were recorded.
+    cannot be defocused, as each plane has but a quarter of the photosites.
     """
     for picture in recorded_mosaics(data, split):
-        height, width = picture.light.shape[1:]
-        side = min(size, height, width)
-        top, left = (height - side) // 2, (width - side) // 2
-        light = picture.light[:, top : top + side, left : left + side].clamp(min=0.0)
+        light = _middle(picture.light, min(size, *picture.light.shape[1:])).clamp(min=0.0)
         lux = assumed_illuminance(picture.name)
         yield ReferenceScene(
             scene_id=picture.name,
@@ -529,10 +512,7 @@ def mosaic_scenes(
 
 
 def assumed_illuminance(name: str) -> float:
-    """Light [lux] assumed for a picture of unknown scale, in `ILLUMINANCE`, by a hash of its name.
-
-    The assumption is log-uniform, and drawn for each view, so that a few maps cover the range.
-    """
+    """Light [lux] of a picture of unknown scale: log-uniform in `ILLUMINANCE` by a name's hash."""
     low, high = EV100_RANGE
     fraction = (assumed_ev100(name) - low) / (high - low)
     darkest, brightest = ILLUMINANCE
@@ -546,28 +526,20 @@ def draped_scenes(
 
     A network that learns the map of defocus from dead leaves alone, which have texture everywhere,
     takes smooth surfaces for blurred. Real pictures that are in focus, laid over depth, show what
-    defocus does to such surfaces. Every third has everything in focus. Passed over are scenes with
-    depth, those with a blur of their own, and those that are not at the pitch of the photosites.
+    defocus does to such surfaces. Passed over are scenes with depth, those with a blur of their
+    own, and those that are not at the pitch of the photosites.
     """
-    number = 0
-    for scene in scenes:
-        if scene.depth is not None or not scene.in_focus or scene.pitch == 1:
-            continue
-        for copy in range(copies):
-            focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
-            number += 1
-            rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed, copy])
-            height, width = scene.light.shape[1:]
-            drawn = draw_depth(rng, max(height, width), focus)
-            blur = drawn.blur[:height, :width]
-            distance, depth = lens_and_depth(blur, drawn.far, packed_pitch(camera))
-            yield replace(
-                scene,
-                scene_id=f"{scene.scene_id}-draped-{copy}",
-                kind=DRAPED,
-                depth=torch.from_numpy(depth),
-                lens=Lens(FOCAL_LENGTH, distance),
-            )
+    flat = (s for s in scenes if s.depth is None and s.in_focus and s.pitch > 1)
+    pairs = ((scene, copy) for scene in flat for copy in range(copies))
+    for (scene, copy), focus in zip(pairs, itertools.cycle(FOCUS_CYCLE), strict=False):
+        rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed, copy])
+        height, width = scene.light.shape[1:]
+        drawn = draw_depth(rng, max(height, width), focus)
+        blur = drawn.blur[:height, :width]
+        distance, depth = lens_and_depth(blur, drawn.far, packed_pitch(camera))
+        name, lens = f"{scene.scene_id}-draped-{copy}", Lens(FOCAL_LENGTH, distance)
+        depths = torch.from_numpy(depth)
+        yield replace(scene, scene_id=name, kind=DRAPED, depth=depths, lens=lens)
 
 
 # -- photographs with depth -----------------------------------------------------------------------
@@ -576,11 +548,10 @@ def draped_scenes(
 def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> list[ReferenceScene]:
     """Photographs with measured depth, for testing only, each with two settings of the focus.
 
-    A pixel counts as a photosite. Where no disparity was measured it is that of the nearest pixel
-    that has one. The lens is focused on the front (95 % of the picture are farther) or on
-    the median depth, and its focal length chosen such that the circle of confusion at f/11 reaches
-    6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is the larger).
-    One is inside scikit-image's wheel, the other in ``depth_cones`` of the folder `data`.
+    A pixel counts as a photosite. The lens is focused on the front (95 % of the picture are
+    farther) or on the median depth, and its focal length chosen such that the circle of confusion
+    at f/11 reaches 6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is
+    the larger). One is inside scikit-image's wheel, the other in ``depth_cones`` of `data`.
     """
     wheel = resources.files("skimage.data")
     with wheel.joinpath("motorcycle_left.png").open("rb") as stream, Image.open(stream) as picture:
@@ -630,10 +601,6 @@ def fill_from_nearest(values: np.ndarray) -> np.ndarray:
     >>> fill_from_nearest(np.array([[1.0, np.nan, np.nan, 4.0]])).tolist()
     [[1.0, 1.0, 4.0, 4.0]]
     """
-    known = np.isfinite(values)
-    if known.all():
-        return values
-    if not known.any():
-        raise ValueError("`values` must have a finite value")
-    indices = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    missing = ~np.isfinite(values)
+    indices = distance_transform_edt(missing, return_distances=False, return_indices=True)
     return np.asarray(values[tuple(indices)])

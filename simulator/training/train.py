@@ -1,7 +1,6 @@
 """From a configuration to weights: the stages in turn, each on its own pairs of captures.
 
-Accelerate does the plumbing: devices, precision, several processes, logs. In the end the error that
-a noise module leaves is measured (`calibrate`), for the plan's predictions.
+Accelerate does the plumbing: devices, precision, several processes, logs.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -52,7 +51,7 @@ from simulator.training.scenes import (
 )
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.compute import check_bfloat16
-from simulator.utils.config_file import Configuration, load_yaml
+from simulator.utils.config_file import Configuration
 from simulator.utils.files import DATA_VARIABLE, data_folder, result_meta, sibling
 
 if TYPE_CHECKING:
@@ -83,24 +82,18 @@ _STAGES_OF = {"nano": ("noise",), "large": ("noise",), "pc": ("baseline",), "dl"
 
 
 class StageConfig(Configuration):
-    """One stage of the training.
+    """One stage of the training."""
 
-    Args:
-        steps: Optimiser steps; the whole budget, unless `minutes` is given.
-        minutes: Budget in time instead of in steps: processor minutes of the training process on a
-            CPU, so that other work on the machine does not count; wall-clock minutes on a GPU.
-        batch: Pairs per step and process.
-        crop: Height and width of the crops [packed pixel].
-        learning_rate: Peak of a one-cycle schedule (rise over 5 %, cosine fall to 0).
-        average: Decay of the running average of the weights that is kept in the end; 0 keeps the
-            last ones.
-    """
-
+    #: Optimiser steps: the whole budget, unless `minutes` is given.
     steps: int | None = Field(default=None, ge=1, le=10_000_000)
+    #: Budget in time instead: processor minutes of the training process on a CPU, so that other
+    #: work on the machine does not count; wall-clock minutes on a GPU.
     minutes: float | None = Field(default=None, gt=0, le=100_000)
-    batch: int = Field(default=8, ge=1, le=4096)
-    crop: int = Field(default=64, ge=16, le=4096)
+    batch: int = Field(default=8, ge=1, le=4096)  # pairs per step and process
+    crop: int = Field(default=64, ge=16, le=4096)  # height and width [packed pixel]
+    #: Peak of a one-cycle schedule (rise over 5 %, cosine fall to 0).
     learning_rate: float = Field(default=1e-3, gt=0, le=1.0)
+    #: Decay of the running average of the weights that is kept in the end; 0 keeps the last ones.
     average: float = Field(default=0.0, ge=0, lt=1)
 
     @model_validator(mode="after")
@@ -111,58 +104,42 @@ class StageConfig(Configuration):
 
 
 class SceneConfig(Configuration):
-    """Scenes that the reference camera photographs.
+    """Scenes that the reference camera photographs."""
 
-    Args:
-        procedural: Procedural scenes in the training split; three quarters of them have depth.
-        size: Height and width of a scene [packed pixel].
-        radiance: Folder of radiance maps, searched with its subfolders; null leaves them out.
-    """
-
-    procedural: int = Field(default=240, ge=1, le=100_000)
-    size: int = Field(default=256, ge=32, le=4096)
-    radiance: str | None = None
+    procedural: int = Field(default=240, ge=1, le=100_000)  # in the training split
+    size: int = Field(default=256, ge=32, le=4096)  # height and width [packed pixel]
+    radiance: str | None = None  # folder of real files; null leaves them out
 
 
 class SimulatorConfig(Configuration):
-    """A training of the three modules, or of a baseline.
+    """A training of the three modules, or of a baseline."""
 
-    Args:
-        preset: ``"compact"`` or ``"paper"``; ``"nano"`` and ``"large"`` are noise modules alone;
-            ``"pc"`` (parameter concatenation) and ``"dl"`` (decoupled learning) are the paper's
-            baselines, one network trained in one stage.
-        camera: Built-in camera that records the sequences. The noise stage adds the noise of every
-            built-in camera.
-        body: Seed of the hidden error of its body.
-        seed: Seed of everything that is random.
-        start: Weights of the same preset that the training goes on from: a name that comes with the
-            package or a file; by default it begins with random ones.
-        precision: Of the networks; weights, optimiser and losses stay float32.
-        scenes: Scenes of the sequences.
-        exposure, noise, aperture: The three stages of a simulator.
-        baseline: The stage of ``"pc"`` and ``"dl"``.
-    """
-
+    #: ``"compact"`` or ``"paper"``; ``"nano"`` and ``"large"`` are noise modules alone; ``"pc"``
+    #: (parameter concatenation) and ``"dl"`` (decoupled learning) are the paper's baselines, one
+    #: network trained in one stage.
     preset: Literal["nano", "compact", "large", "paper", "pc", "dl"]
+    #: Built-in camera that records the sequences; the noise stage adds the noise of every one.
     camera: str = "nikon_z6"
-    body: int = Field(default=1, ge=0)
-    seed: int = Field(default=0, ge=0)
+    body: int = Field(default=1, ge=0)  # seed of the hidden error of its body
+    seed: int = Field(default=0, ge=0)  # of everything that is random
+    #: Weights of the same preset that the training goes on from: a name that comes with the package
+    #: or a file; by default it begins with random ones.
     start: str | None = None
+    #: Of the networks; weights, optimiser and losses stay float32.
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     scenes: SceneConfig = SceneConfig()
     exposure: StageConfig | None = None
     noise: StageConfig | None = None
     aperture: StageConfig | None = None
-    baseline: StageConfig | None = None
+    baseline: StageConfig | None = None  # of "pc" and "dl"
 
     @model_validator(mode="after")
     def _check(self) -> SimulatorConfig:
         get_camera(self.camera)
         stages = _STAGES_OF.get(self.preset, ("exposure", "noise", "aperture"))
         for name in _STAGES:
-            wanted = name in stages
-            if wanted != (getattr(self, name) is not None):
-                rule = "must be given" if wanted else "must be left out"
+            if (name in stages) != (getattr(self, name) is not None):
+                rule = "must be given" if name in stages else "must be left out"
                 raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
         for name, stage in self.stages().items():
             if name != "noise" and stage.crop > self.scenes.size:
@@ -188,11 +165,6 @@ class SimulatorConfig(Configuration):
         return {name: value for name, value in values.items() if name not in later}
 
 
-def load_config(path: str | Path) -> SimulatorConfig:
-    """The configuration in a YAML file; see `simulator.utils.config_file.load_yaml`."""
-    return load_yaml(path, SimulatorConfig)
-
-
 # -- training -------------------------------------------------------------------------------------
 #: Makes the scenes of a split, ``"train"`` or ``"validation"``, of a training.
 SceneMaker = Callable[[SimulatorConfig, Split], Sequence[ReferenceScene]]
@@ -204,6 +176,8 @@ TrainingProgress = Callable[[str, float, dict[str, float]], None]
 
 class Batches(Protocol):
     """Pairs of captures as batches, by the number of the step."""
+
+    pairs: Sequence[Any]
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch | NoiseBatch:
         """The pairs of one step."""
@@ -243,24 +217,11 @@ def train_and_save(
     make_pictures: PictureMaker = pictures_of,
     progress: TrainingProgress = no_progress,
 ) -> Path:
-    """Trains the stages of `config` and writes the weights with their model card.
+    """Trains the stages of `config`, and returns the file of the weights, a model card beside it.
 
-    A stage that is done or half done resumes from its checkpoint.
-
-    Args:
-        config: The training.
-        path: File name of the weights; checkpoints and logs go into its folder.
-        command: The command line that does it again, for the card.
-        device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
-        tensorboard: Whether to log to ``tensorboard`` in that folder.
-        make_scenes, make_pictures: Give the scenes of a split, and its noise stage's pictures.
-        progress: Called while scenes are rendered and every few steps.
-
-    Returns:
-        The file of the weights.
-
-    Raises:
-        ValueError: If `config.start` is not weights of this preset.
+    A stage that is done or half done resumes from its checkpoint. Checkpoints and logs (in
+    ``tensorboard``) go into the folder of `path`; `command`, the command line that does it again,
+    into the card. Several GPUs or processes run it through ``accelerate launch``.
     """
     folder = path.parent
     accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
@@ -274,7 +235,7 @@ def train_and_save(
     for name, stage in config.stages().items():
         pairs = train.pairs(name, functools.partial(progress, f"{name}: rendering"))
         loss = stage_loss(name, modules)
-        clock = train_stage(
+        stages[name] = train_stage(
             name,
             loss,
             modules[name],
@@ -286,7 +247,7 @@ def train_and_save(
             progress=functools.partial(progress, f"{name}: training"),
         )
         values = validate(loss, validation.pairs(name), stage.crop, accelerator)
-        stages[name] = clock.card(len(pairs.pairs)) | {"validation": values}
+        stages[name]["validation"] = values
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
@@ -300,11 +261,7 @@ def train_and_save(
 
 
 def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any] | None]:
-    """The modules that a training begins with, and what the card of its start says, if any.
-
-    Raises:
-        ValueError: If `config.start` is not weights of this preset.
-    """
+    """The modules that a training begins with, and what the card of its start says, if any."""
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.default_generator.manual_seed(config.seed)
         modules = build_modules(config.preset)
@@ -342,11 +299,9 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
     # stay in force, or be refused.
     AcceleratorState._reset_state(reset_partial_state=True)
     precision = {"float32": "no", "bfloat16": "bf16", "float16": "fp16"}[config.precision]
+    to_logs: dict[str, Any] = {"log_with": "tensorboard", "project_dir": str(logs)}
     accelerator = Accelerator(
-        cpu=device == "cpu",
-        mixed_precision=precision,
-        log_with=None if logs is None else "tensorboard",
-        project_dir=None if logs is None else str(logs),
+        cpu=device == "cpu", mixed_precision=precision, **(to_logs if logs else {})
     )
     if precision == "bf16":
         check_bfloat16(accelerator.device)
@@ -355,33 +310,29 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
     return accelerator
 
 
+@dataclass
 class _Source:
     """Scenes, pictures and pairs of one split, made when a stage asks for them."""
 
-    def __init__(
-        self,
-        config: SimulatorConfig,
-        make_scenes: SceneMaker,
-        make_pictures: PictureMaker,
-        split: Split,
-    ) -> None:
-        self.config, self.split = config, split
-        self._make_scenes, self._make_pictures = make_scenes, make_pictures
-        self._blurred_light: dict[tuple[str, int], torch.Tensor] = {}
-        self.kinds: Counter[str] = Counter()
+    config: SimulatorConfig
+    make_scenes: SceneMaker
+    make_pictures: PictureMaker
+    split: Split
+    blurred_light: dict[tuple[str, int], torch.Tensor] = field(default_factory=dict)
+    kinds: Counter[str] = field(default_factory=Counter)
 
     @functools.cached_property
     def _sequences(self) -> tuple[ReferenceCamera, list[CaptureSequence]]:
         camera = get_camera(self.config.camera)
         body = ReferenceCamera(camera, body=BodyError.draw(camera, self.config.body))
-        scenes = self._make_scenes(self.config, self.split)
+        scenes = self.make_scenes(self.config, self.split)
         self.kinds.update(scene.kind for scene in scenes)
         return body, draw_sequences(scenes, camera, self.config.seed)
 
     @functools.cached_property
     def crops(self) -> DetailCrops:
         """Crops of the noise stage."""
-        pictures = self._make_pictures(self.config, self.split)
+        pictures = self.make_pictures(self.config, self.split)
         self.kinds.update(picture.kind for picture in pictures)
         cameras = [get_camera(name) for name in list_cameras()]
         return DetailCrops(pictures, cameras, self.config.seed)
@@ -396,7 +347,7 @@ class _Source:
             camera,
             _PAIRS[stage],
             seed=self.config.seed,
-            blurred_light=self._blurred_light,
+            blurred_light=self.blurred_light,
             progress=progress,
         )
 
@@ -416,13 +367,10 @@ def _is_useful_for(scene: ReferenceScene, stage: str) -> bool:
 def stage_loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
     """What a stage of the training minimises."""
     known: Any = modules
-    if stage == "exposure":
-        return ExposureLoss(known["exposure"])
-    if stage == "noise":
-        return NoiseLoss(known["noise"])
     if stage == "aperture":
-        return ApertureLoss(known["exposure"], known["noise"], known["aperture"])
-    return BaselineLoss(known["baseline"])
+        return ApertureLoss(**known)
+    makers = {"exposure": ExposureLoss, "noise": NoiseLoss, "baseline": BaselineLoss}
+    return makers[stage](known[stage])
 
 
 def train_stage(
@@ -436,8 +384,8 @@ def train_stage(
     checkpoint: Path,
     identity: Any,
     progress: Progress = no_progress,
-) -> Clock:
-    """Trains `trained`, which `loss` holds, until the stage's budget is used up.
+) -> dict[str, Any]:
+    """Trains `trained`, which `loss` holds, for the stage's budget; what a model's card says of it.
 
     A stage that was interrupted resumes from its last `checkpoint`, at most 20 s back, if that is
     of the same `identity` (a JSON value). Batches are drawn by step, so where the budget is in
@@ -482,7 +430,7 @@ def train_stage(
                 progress(clock.share, means)
             state.save_when_due()
     trained.load_state_dict(average.module.state_dict())
-    return clock
+    return {"pairs": len(pairs.pairs), "steps": clock.step, "seconds": round(clock.seconds, 1)}
 
 
 def _resume(
@@ -533,10 +481,6 @@ class Clock:
         assert self.stage.minutes is not None
         return min(self.seconds / (60.0 * self.stage.minutes), 1.0)
 
-    def card(self, pairs: int) -> dict[str, Any]:
-        """What a model's card says of a stage, trained on so many pairs."""
-        return {"pairs": pairs, "steps": self.step, "seconds": round(self.seconds, 1)}
-
     def _now(self) -> float:
         return time.process_time() if self.on_cpu else time.monotonic()
 
@@ -557,9 +501,8 @@ def _update_means(means: dict[str, float], values: dict[str, torch.Tensor], name
     for key, value in values.items():
         number = float(value.detach())
         if key == "loss" and not math.isfinite(number):
-            raise ValueError(
-                f"stage {name!r}: the loss (={number}) must be finite; lower `learning_rate`"
-            )
+            rule = "must be finite; lower `learning_rate`"
+            raise ValueError(f"stage {name!r}: the loss (={number}) {rule}")
         if math.isfinite(number):
             means[key] = _SMOOTHING * means.get(key, number) + (1.0 - _SMOOTHING) * number
 
@@ -611,10 +554,7 @@ def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
 def _measure(
     noise: NoiseModule, crops: DetailCrops, index: int
 ) -> tuple[list[np.ndarray], ResidualStatistics]:
-    """Wiener error, squared bias and variance of a network's output in the blocks of one crop.
-
-    The latter two are in units of the noise's variance.
-    """
+    """Wiener error, squared bias and variance [noise's variance] in the blocks of one crop."""
     batch = crops.captures(index, _CAPTURES, min(_SIDE, crops.largest))
     error = noise(batch.noisy, batch.shot, batch.read).double() - batch.clean.double()
     scale = variance_map(batch.clean, batch.shot, batch.read).double()[0]

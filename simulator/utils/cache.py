@@ -52,9 +52,6 @@ def cache_key(kind: str, parts: Any) -> str:
     """Key of a result: its kind (a folder), and a hash of the package's version and `parts`.
 
     These are a JSON value of all that the result depends on.
-
-    >>> cache_key("a", {"b": 1, "c": 2}) == cache_key("a", {"c": 2, "b": 1})
-    True
     """
     content = {"package": __version__, "parts": parts}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
@@ -62,12 +59,7 @@ def cache_key(kind: str, parts: Any) -> str:
 
 
 def content_digest(tensors: Mapping[str, torch.Tensor]) -> str:
-    """Hexadecimal SHA-256 of the tensors' names, types, shapes and values, whatever their layout.
-
-    >>> grey = torch.full((2, 3), 0.18)
-    >>> content_digest({"light": grey}) == content_digest({"light": grey.T.contiguous().T})
-    True
-    """
+    """SHA-256 of the tensors' names, types, shapes and values, whatever their layout, as text."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name].detach()
@@ -80,31 +72,17 @@ def content_digest(tensors: Mapping[str, torch.Tensor]) -> str:
 class LruCache(Generic[Value]):
     """The most recently used values in memory; safe to share between threads.
 
-    A pickled copy is empty.
-
-    Args:
-        max_bytes: Most bytes of all values together; a larger value is not stored.
-
-    >>> cache = LruCache(max_bytes=2)
-    >>> for name in "abc":
-    ...     cache.put(name, name.upper(), 1)
-    >>> cache.get("a"), cache.get("c"), len(cache), cache.nbytes
-    (None, 'C', 2, 2)
+    They have at most `max_bytes` together; a larger value is not stored. A pickled copy is empty.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = check_integer("max_bytes", max_bytes, 0)
         self._items: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
-        self._bytes = 0
+        self.nbytes = 0  # of all values together
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._items)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all values together."""
-        return self._bytes
 
     def get(self, key: Hashable) -> Value | None:
         """The value of `key`, now the most recently used; None where there is none."""
@@ -117,19 +95,19 @@ class LruCache(Generic[Value]):
     def put(self, key: Hashable, value: Value, size: int) -> None:
         """Store `value` of `size` bytes, and drop the least recently used beyond the bound."""
         with self._lock:
-            self._bytes -= self._items.pop(key, (None, 0))[1]
+            self.nbytes -= self._items.pop(key, (None, 0))[1]
             if size > self.max_bytes:
                 return
             self._items[key] = (value, size)
-            self._bytes += size
-            while self._bytes > self.max_bytes:
-                self._bytes -= self._items.popitem(last=False)[1][1]
+            self.nbytes += size
+            while self.nbytes > self.max_bytes:
+                self.nbytes -= self._items.popitem(last=False)[1][1]
 
     def clear(self) -> None:
         """Drop everything."""
         with self._lock:
             self._items.clear()
-            self._bytes = 0
+            self.nbytes = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.max_bytes,)
@@ -140,12 +118,9 @@ class Store:
 
     A result is one safetensors file without pickles, JSON values in its header. It is written whole
     or not at all; several processes may share the folder. A damaged file, or a folder that cannot
-    be read or written, is logged and costs time only.
-
-    Args:
-        folder: Made where missing.
-        max_bytes: Most bytes of all files together; beyond it those used longest ago are removed.
-            Several processes at once may exceed it by a sixteenth each. None sets no bound.
+    be read or written, is logged and costs time only. Beyond `max_bytes` of all files together, if
+    given, those used longest ago are removed; several processes at once may exceed it by a
+    sixteenth each.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int | None = None) -> None:
@@ -159,10 +134,7 @@ class Store:
         return self.folder / f"{key}.safetensors"
 
     def get(self, key: str) -> dict[str, Any] | None:
-        """The values under a `cache_key` as `put` got them, tensors on the CPU.
-
-        None if there are none, or they are damaged.
-        """
+        """The values under a `cache_key` as `put` got them; None if missing or damaged."""
         path = self.path(key)
         try:
             content = path.read_bytes()  # at once: another process may remove the file
@@ -207,11 +179,7 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Removes all results, and their folders where nothing else is in them.
-
-        Raises:
-            OSError: If a file cannot be removed.
-        """
+        """Removes all results, and their folders where nothing else is in them."""
         for path, _ in self._files():
             path.unlink(missing_ok=True)
             with suppress(OSError):  # while others are in it

@@ -32,8 +32,7 @@ class Checkpoint:
         path: The file; None writes and reads nothing.
         identity: JSON value that says what is trained and how. A checkpoint of another training, or
             of another version of this package, is not resumed but replaced.
-        state: Called for the state to write: tensors, numbers, text, and dicts and lists of them,
-            such as state dicts.
+        state: Gives the state to write: tensors, plain values, and dicts and lists of them.
         writes: False in the processes of a distributed training that only read.
     """
 
@@ -54,8 +53,7 @@ class Checkpoint:
     def load(self) -> dict[str, Any] | None:
         """The state to resume from, tensors on the CPU; None if there is no file that fits.
 
-        A warning in the log says why it does not. Nothing but tensors and plain values is
-        unpickled, so a checkpoint from somebody else runs no code.
+        Nothing but tensors and plain values is unpickled: a checkpoint of others runs no code.
         """
         if self.path is None or not self.path.is_file():
             return None
@@ -77,11 +75,7 @@ class Checkpoint:
         return state
 
     def save(self) -> None:
-        """Writes the state now, whole or not at all.
-
-        Where the file cannot be written, as on a full disk, a warning is logged, the previous
-        checkpoint stays, and the training goes on.
-        """
+        """Writes the state; on a full disk the previous one stays, with a warning in the log."""
         if self.path is not None and self.writes:
             content = io.BytesIO()
             torch.save({"identity": self.identity, "state": dict(self.state())}, content)

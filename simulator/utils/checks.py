@@ -31,12 +31,7 @@ def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -
 
 
 def check_type(name: str, value: Any, *kinds: type | None) -> None:
-    """Raises a `ValueError` unless `value` is an instance of one of `kinds`, of which None is one.
-
-    >>> check_type("raw", 3, str, None)
-    Traceback (most recent call last):
-    ValueError: `raw` (of type int) must be of type str or None
-    """
+    """Raises a `ValueError` unless `value` is of one of the types `kinds`, which None may be."""
     known = tuple(type(None) if kind is None else kind for kind in kinds)
     if not isinstance(value, known):
         rule = " or ".join("None" if kind is None else kind.__name__ for kind in kinds)
@@ -52,12 +47,7 @@ def check_flag(name: str, value: Any) -> None:
 def check_integer(
     name: str, value: Any, low: int, high: int | None = None, *, more: str = ""
 ) -> int:
-    """`value` as an int.
-
-    Raises:
-        ValueError: Unless it is an integer (no bool, no float) from `low` to `high`; `more` ends
-            the message.
-    """
+    """`value` as an int; a `ValueError`, which `more` ends, unless it is one in [`low`, `high`]."""
     if isinstance(value, Integral) and not isinstance(value, bool):
         number = int(value)
         if number >= low and (high is None or number <= high):
@@ -67,12 +57,7 @@ def check_integer(
 
 
 def check_number(name: str, value: Any, low: float, high: float, *, more: str = "") -> float:
-    """`value` as a float.
-
-    Raises:
-        ValueError: Unless it is a number (no bool, no text) from `low` to `high`, which NaN is not;
-            `more` ends the message.
-    """
+    """`value` as a float; a `ValueError`, which `more` ends, unless it is in [`low`, `high`]."""
     number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if low <= number <= high:
         return float(number)
@@ -80,9 +65,5 @@ def check_number(name: str, value: Any, low: float, high: float, *, more: str = 
 
 
 def check_seed(seed: Any, name: str = "seed") -> int | None:
-    """`seed` as an int, or None.
-
-    Raises:
-        ValueError: Unless it is an integer >= 0 or None.
-    """
+    """`seed` as an int >= 0, or None; a `ValueError` if it is neither."""
     return None if seed is None else check_integer(name, seed, 0)

@@ -175,14 +175,9 @@ def parallel_ranges(
 ) -> None:
     """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
 
-    The caller's thread takes the first share. A task that calls `parallel_ranges` itself gets one
-    share. Returns when all shares are done; an error in any of them is raised here.
-
-    Args:
-        task: Safe to run on several threads at once.
-        count: Number of items, >= 0.
-        least: Items below which another thread is not worth waking.
-        threads: Most threads to use; `thread_count()` by default.
+    The caller's thread takes the first share, of at least `least` items. A task that calls
+    `parallel_ranges` itself gets one share. Returns when all shares are done; an error in any of
+    them is raised here.
     """
     shares = min(thread_count() if threads is None else threads, count // max(least, 1))
     if shares <= 1 or getattr(_inside, "task", False):
@@ -233,11 +228,8 @@ def check_bfloat16(device: torch.device) -> None:
 def progress_bar(title: str, total: int, *, done: int = 0) -> Iterator[Callable[[], None]]:
     """A bar on standard error during work that the user did not ask for, wiped out at the end.
 
-    Nothing is shown where that is no terminal, or belongs to a bar of the program's own, or where
-    `total` is 0; `done` steps were done before.
-
-    Yields:
-        A function that counts a step; several threads may call it.
+    Yields a function that counts a step; several threads may call it. Nothing is shown where that
+    is no terminal, or belongs to a bar of the program's own, or where `total` is 0.
     """
     own = sys.__stderr__
     if not total or own is None or sys.stderr is not own or not own.isatty():

@@ -41,17 +41,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def load_yaml(path: str | Path, model: type[Model]) -> Model:
-    """The configuration in a YAML file.
-
-    Raises:
-        ValueError: As `read_yaml`, or if an entry is unknown or out of range; the message names the
-            file and the entry.
-    """
+    """The configuration in a YAML file; a `ValueError` names the file and the wrong entry."""
     name, content = f"`config` (={str(path)!r})", read_yaml(path)
     if not isinstance(content, dict):
         found = "is empty" if content is None else f"holds {_short.repr(content)}"
-        known = ", ".join(model.model_fields)
-        raise ValueError(f"{name} {found}: it must map entries to values; known entries: {known}")
+        rule = f"it must map entries to values; known entries: {', '.join(model.model_fields)}"
+        raise ValueError(f"{name} {found}: {rule}")
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -67,24 +62,22 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
         ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or not YAML, or
             gives an entry twice.
     """
-    file, given = Path(path).expanduser(), f"`{name}` (={str(path)!r})"
+    file = Path(path).expanduser()
+    cause: Exception | None = None
     try:
         if not file.is_file():
-            what = "is a folder, not a YAML file" if file.is_dir() else "there is no such file"
-            raise ValueError(f"{given}: {what}")
-        if file.stat().st_size > MAX_BYTES:
-            raise ValueError(f"{given}: must not be larger than {MAX_BYTES} bytes")
-        text = file.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{given} is not YAML: {error}") from error
+            fault = "is a folder, not a YAML file" if file.is_dir() else "there is no such file"
+        elif file.stat().st_size > MAX_BYTES:
+            fault = f"must not be larger than {MAX_BYTES} bytes"
+        else:
+            return yaml.load(file.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
-        raise ValueError(f"{given} cannot be read: {error.strerror}") from error
-    try:
-        return yaml.load(text, _Loader)
+        fault, cause = f"cannot be read: {error.strerror}", error
     except RecursionError:
-        raise ValueError(f"{given} is not YAML: it is nested too deeply") from None
+        fault = "is not YAML: it is nested too deeply"
     except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
-        raise ValueError(f"{given} is not YAML: {' '.join(str(error).split())}") from error
+        fault, cause = f"is not YAML: {' '.join(str(error).split())}", error
+    raise ValueError(f"`{name}` (={str(path)!r}): {fault}") from cause
 
 
 class _Loader(yaml.SafeLoader):

@@ -9,6 +9,7 @@ import datetime
 import functools
 import importlib.metadata
 import json
+import operator
 import os
 import platform
 import secrets
@@ -47,11 +48,8 @@ _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image"
 def data_folder() -> Path | None:
     """The folder of real files for tests and measurements.
 
-    It is what ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data`` beside the
-    checkout, or None if that is not there.
-
-    Raises:
-        FileNotFoundError: If the folder that is named is not there.
+    It is what ``AE_ENV_DATA`` names, which must be there; where that is unset or empty,
+    ``../shared/data`` beside the checkout, or None if that is not there.
     """
     named = os.environ.get(DATA_VARIABLE)
     if named and not Path(named).expanduser().is_dir():
@@ -80,23 +78,17 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
     if pixels > MAX_PIXELS:
         return f"claims {height} x {width} pixels, where at most {MAX_PIXELS} are read"
     if pixels > per_byte * size:
-        return (
-            f"claims {height} x {width} pixels in {size} bytes, where at most "
-            f"{per_byte} a byte are read"
-        )
+        claim = f"claims {height} x {width} pixels in {size} bytes"
+        return f"{claim}, where at most {per_byte} a byte are read"
     return ""
 
 
 def write_atomically(
     path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
 ) -> Path:
-    """Write bytes, text (as UTF-8), or pieces of bytes under a temporary name beside `path`, then
-    rename it; makes the folder, and returns `path`.
+    """Write bytes, text (as UTF-8), or pieces of bytes whole or not at all; returns `path`.
 
-    Raises:
-        ValueError: If `path` is not a file's name.
-        OSError: If the file cannot be written (no permission, a full disk); nothing half-written
-            stays.
+    They are written under a temporary name beside `path`, whose folder is made, and then renamed.
     """
     path = as_path(path)
     content = content.encode() if isinstance(content, str) else content
@@ -140,10 +132,8 @@ def sibling(path: str | Path, suffix: str) -> Path:
 def result_meta(command: str, seed: int | None) -> dict[str, Any]:
     """Where a measurement comes from: the ``meta`` of every result file, JSON-ready.
 
-    Its keys are ``command`` (the command line that writes the file again), ``commit`` (hash of the
-    checkout, ending in ``+changes`` where files differ from it; None outside a checkout), ``seed``,
-    ``date`` (UTC, ISO 8601), ``machine`` (``cpu``, ``cores``, ``threads``, ``gpu``) and
-    ``versions``.
+    `command` is the command line that writes the file again; the ``commit`` ends in ``+changes``
+    where files differ from it, and is None outside a checkout.
     """
     return {
         "command": command,
@@ -160,18 +150,15 @@ def write_results(
 ) -> Path:
     """Write ``{"meta": meta, "rows": rows}`` as JSON, whole or not at all.
 
-    Scalars and arrays of numpy and torch become numbers and lists. `meta` is that of `result_meta`,
-    and whatever else describes the measurement.
-
-    Raises:
-        ValueError: If a value is NaN or infinite (JSON has no such number; write None) or of a
-            type that JSON cannot hold.
+    Scalars and arrays of numpy and torch become numbers and lists; NaN and infinity, which JSON
+    does not have, raise a `ValueError`. `meta` is that of `result_meta` and whatever else.
     """
-    encode = functools.partial(json.dumps, allow_nan=False, default=_plain)
+    plain = operator.methodcaller("tolist")
+    encode = functools.partial(json.dumps, allow_nan=False, default=plain)
     try:
         lines = ",\n".join(encode(dict(row)) for row in rows)  # a row a line: differences are short
         text = f'{{"meta": {encode(dict(meta))},\n"rows": [\n{lines}\n]}}'
-    except (TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"`rows` and `meta` must hold finite JSON values: {error}") from None
     return write_atomically(path, text + "\n")
 
@@ -198,13 +185,6 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _plain(value: Any) -> Any:
-    """Scalars and arrays of numpy and torch as plain Python values."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} is not a JSON value")
-
-
 def _cpu_name() -> str:
     """Model name of the CPU; the architecture where the system does not say."""
     table = Path("/proc/cpuinfo")  # of Linux
@@ -217,19 +197,11 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     """Commit of the checkout that this package runs from; None where there is no checkout."""
     root = Path(__file__).resolve().parents[2]
-    top = _git(root, "rev-parse", "--show-toplevel")
-    # An installed copy may lie inside somebody else's repository.
-    if top is None or Path(top).resolve() != root:
+    if not (root / ".git").exists():  # an installed copy may lie in somebody else's repository
         return None
-    wanted = ("--always", "--abbrev=40", "--exclude=*", "--dirty=+changes")
-    return _git(root, "describe", *wanted)
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes"]
     try:
-        result = subprocess.run(
-            ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        text = subprocess.run(command, cwd=root, capture_output=True, timeout=10, check=True).stdout
+        return text.decode().strip()
+    except (OSError, subprocess.SubprocessError):
         return None
-    return result.stdout.strip() if result.returncode == 0 else None

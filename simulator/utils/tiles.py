@@ -27,10 +27,7 @@ _Index = tuple[EllipsisType, slice, slice]
 class Tile:
     """A rectangle of a frame, and the halo that a network must see around it [pixel].
 
-    Args:
-        top, bottom, left, right: First row and column, and those after the last.
-        height, width: Of the frame.
-        halo: Pixels on each side, as far as the frame reaches.
+    `bottom` and `right` are after the last row and column, `height` and `width` are the frame's.
     """
 
     top: int
@@ -156,14 +153,9 @@ def in_tiles(
 ) -> Tensor:
     """Apply `function` to `images` tile by tile, where it is needed.
 
-    Args:
-        function: Maps images (B, C, h, w) to one (B, D, h, w) or (B, h, w); an output pixel may
-            depend on input pixels at most `halo` away and on position only modulo 4.
-        *images: (B, C, H, W), all of one size.
-        halo: Multiple of 4 [pixel].
-        tile: Side of a tile, a multiple of 4 [pixel].
-        needed: (H, W) bool, the pixels that need the function; by default all.
-        fallback: Values of all other pixels, of the result's shape; given with `needed`.
+    It maps images (B, C, h, w) of one size to one (B, D, h, w) or (B, h, w); an output pixel may
+    depend on input pixels at most `halo` away and on position only modulo 4. `needed` (H, W) are
+    the pixels that need the function, by default all; `fallback` has the values of all others.
     """
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)

@@ -1,7 +1,9 @@
-"""The environment contract: spaces, info, seeding, rewards, and the checkers of its consumers."""
+"""The environment contract, the checkers of its consumers, its arguments and its pictures."""
 
 import gc
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,22 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from matplotlib import colormaps
+from PIL import Image
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
+from ae_env import AutoExposureEnv, AutoExposureVectorEnv, contact_sheet
+from ae_env.grid import ExposureGrid
+from ae_env.observation import decode_observation
+from ae_env.options import EnvOptions
+from ae_env.rendering import _Sheet
+from ae_env.scenes import Scene
 from ae_env.scenes.polyhaven import list_assets
-from tests.ae_env.environments import assert_equal, make_env, rollout
+from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTables
+from simulator import develop
+from tests.ae_env.environments import SMALL, assert_equal, make_env, make_envs, rollout
+from tests.ae_env.scorer_images import CAMERA, make_scene
 
 #: Pages of memory of this process.
 STATM = Path("/proc/self/statm")
@@ -24,15 +38,11 @@ INFO_KEYS = {
 
 
 @pytest.mark.parametrize("task", [name for name in gym.registry if name.startswith("ae_env/")])
-@pytest.mark.parametrize(
-    "arguments",
-    [{}, {"observation": "statistics"}, {"observation": "linear"}, {"observation": "dn"}],
-    ids=str,
-)
-def test_both_checkers_have_nothing_to_say(task: str, arguments: dict[str, Any]) -> None:
-    env = make_env(task, render_mode="rgb_array", **arguments).unwrapped
+@pytest.mark.parametrize("kind", ["uint8", "statistics", "linear", "dn"])
+def test_both_checkers_have_nothing_to_say(task: str, kind: str) -> None:
+    env = make_env(task, render_mode="rgb_array", observation=kind).unwrapped
     check_env(env)  # warnings are errors
-    if not arguments:
+    if kind == "uint8":
         check_sb3(env)
 
 
@@ -60,11 +70,9 @@ def test_a_long_run_takes_no_more_memory() -> None:
 
 def test_spaces_are_as_documented() -> None:
     env = make_env(resolution=40)
-    for name, low, high, shape, dtype in (
-        *(("raw", 0, 255, (4, 40, 40), np.uint8), ("sensors", -1, 1, (2,), np.float32)),
-        ("settings", -1, 1, (3,), np.float32),
-    ):
-        assert env.observation_space[name] == gym.spaces.Box(low, high, shape, dtype)
+    box, space = gym.spaces.Box, env.observation_space
+    assert space["raw"] == box(0, 255, (4, 40, 40), np.uint8)
+    assert (space["sensors"], space["settings"]) == (box(-1, 1, (2,)), box(-1, 1, (3,)))
     linear, dn = (make_env(observation=kind).observation_space["raw"] for kind in ("linear", "dn"))
     assert (linear.dtype, dn.dtype) == (np.float32, np.uint16)
     assert dn.high.max() == env.unwrapped.camera.white_level
@@ -155,25 +163,6 @@ def test_costs_are_subtracted_and_shown() -> None:
         before = mean
 
 
-def test_oracle_and_regret_agree_with_the_expected_scores() -> None:
-    env = make_env(with_oracle=True)
-    for seed in range(3):
-        env.reset(seed=seed)
-        info = env.step(30)[4]
-        scores = env.unwrapped.expected_scores()
-        assert scores[info["oracle_state"]] == pytest.approx(scores.max(), abs=1e-7)
-        assert info["regret"] == pytest.approx(scores.max() - scores[30])
-
-
-def test_clipped_fractions_are_those_of_the_frame() -> None:
-    env = make_env(observation="linear")
-    for state in (0, 63):  # the darkest but for ISO and aperture, and the brightest
-        observation, info = env.reset(seed=0, options={"state": state})
-        raw = observation["raw"]
-        assert info["clipped_high"] == pytest.approx((raw >= 1 - 1e-6).mean(), abs=1e-6)
-        assert info["clipped_low"] == pytest.approx((raw <= 2.0**-10).mean(), abs=1e-6)
-
-
 def test_motion_and_depth_can_be_switched_off() -> None:
     env = make_env(motion="none", depth="far", noise=False)
     for seed in range(4):
@@ -189,19 +178,15 @@ def test_motion_and_depth_can_be_switched_off() -> None:
 
 
 def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> None:
-    env = make_env(resolution=36).unwrapped
-    speeds, defocus = [], []
-    for seed in range(400):
-        env.core.begin(np.array([0]), [np.random.default_rng(seed)])
-        speeds.append((env.episode().speed, env.episode().subject_speed))
-        defocus.append(env.episode().defocus)
-    shakes, subject_moves = np.array(speeds).T > 0.0
+    core = make_envs(400).unwrapped.core
+    core.begin(np.arange(400), [np.random.default_rng(seed) for seed in range(400)])
+    episodes = core.episodes
+    shakes, subject_moves = episodes.speed > 0.0, episodes.subject_speed > 0.0
     assert np.mean(~shakes & ~subject_moves) == pytest.approx(1 / 3, abs=0.08)  # 3.4 sigma
     assert np.mean(subject_moves) == pytest.approx(1 / 3, abs=0.08)
     assert np.mean(subject_moves & ~shakes) == pytest.approx(0.1, abs=0.05)
-    assert min(defocus) >= 0.1
-    assert max(defocus) <= 8.0
-    assert np.median(defocus) == pytest.approx(1.0, rel=0.25)
+    assert 0.1 <= episodes.defocus.min() < episodes.defocus.max() <= 8.0
+    assert np.median(episodes.defocus) == pytest.approx(1.0, rel=0.25)
 
 
 @pytest.mark.slow
@@ -212,9 +197,8 @@ def test_oracle_is_spread_over_every_control(scenes: str) -> None:
         pytest.skip("needs the maps of Poly Haven (AE_ENV_DATA)")
     env = make_env(scenes=scenes, split="test", resolution=64).unwrapped
     states = []
-    for i in range(3 * len(env.scenes)):
-        wanted = [{"scene": i % len(env.scenes)}]
-        env.core.begin(np.array([0]), [np.random.default_rng(i)], wanted)
+    for i in range(len(env.scenes)):
+        env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
         states.append(env.score_table().oracle)
     for control in env.grid.controls(np.array(states)).T:
         assert np.bincount(control).max() <= 0.5 * len(states)
@@ -225,3 +209,257 @@ def test_cached_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     cached = rollout(5, depth=3.0, motion=0.5)
     monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
     assert_equal(rollout(5, depth=3.0, motion=0.5), cached)
+
+
+FEW = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
+
+
+def _env(**arguments: Any) -> gym.Env:
+    return make_env(**{"resolution": 64, "render_mode": "rgb_array", **arguments})
+
+
+def _scene() -> Scene:
+    return make_scene(np.random.default_rng(0).random((4, 64, 64)), 2560.0)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
+def test_frame_is_the_developed_capture_enlarged(kind: str) -> None:
+    env = _env(observation=kind)
+    raw = env.reset(seed=1, options={"state": 21})[0]["raw"]
+    picture, scene = env.render(), env.unwrapped.scene()
+    assert (picture.dtype, picture.shape) == (np.uint8, (256, 256, 3))
+    if kind == "uint8":
+        raw = decode_observation(raw)
+    elif kind == "dn":
+        black = np.array(CAMERA.black_level)[:, None, None]
+        raw = (raw - black) / (CAMERA.white_level - black)
+    signal = torch.from_numpy(raw.astype(np.float32))[None]
+    expected = develop(signal, scene.white_balance, CAMERA.colour_matrix)[0]
+    expected = (expected.permute(1, 2, 0).numpy() * 255).round()
+    above_the_caption = slice(2, 200, 4)
+    difference = picture[above_the_caption, 2::4].astype(int) - expected[: 200 // 4]
+    assert np.abs(difference).max() <= 1
+
+
+def test_paths_are_drawn_in_their_own_colours() -> None:
+    plain = np.asarray(contact_sheet(_scene(), grid=FEW))
+    drawn = contact_sheet(_scene(), grid=FEW, path={"first": [0, 7], "second": [3, 3, 4]})
+    colours = {(0xD5, 0x5E, 0x00), (0x56, 0xB4, 0xE9)}
+    assert colours <= {tuple(c) for c in np.asarray(drawn).reshape(-1, 3).tolist()}
+    assert not colours & {tuple(c) for c in plain.reshape(-1, 3).tolist()}
+    for path in ([0, 64], [], {"mine": [1.5]}):
+        with pytest.raises(ValueError, match=r"path|mine|states"):
+            contact_sheet(_scene(), path=path)
+    with pytest.raises(ValueError, match="at most 256"):
+        contact_sheet(_scene(), grid=ExposureGrid.third_stop())
+
+
+def test_caption_and_size_of_a_frame(caplog: pytest.LogCaptureFixture) -> None:
+    env = _env(resolution=40)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.render()
+    env.reset(seed=1, options={"state": 0})
+    first = env.render()
+    assert first.shape == (280, 280, 3)  # seven times 40
+    env.reset(seed=1, options={"state": 3})
+    band = slice(-20, None)
+    assert (first[band] != env.render()[band]).any()
+    assert first[band].max() > 200  # the ink
+    first[:] = 0  # the caller may write to it
+    assert env.render().max() > 0
+    without = make_env().unwrapped
+    without.reset(seed=0)
+    assert without.render() is None
+    assert "render_mode='rgb_array'" in caplog.text
+
+
+def test_border_shows_the_score_and_the_oracle_is_framed() -> None:
+    scene = _scene()
+    image = contact_sheet(scene, grid=FEW, seed=3)
+    sheet = np.asarray(image)
+    assert image.mode == "RGB"
+    np.testing.assert_array_equal(sheet, np.asarray(contact_sheet(scene, grid=FEW, seed=3)))
+    table = ScoreTables(FEW, CAMERA, make_scorer("balanced")).table(scene)
+    # Private: where each state's picture is.
+    layout = _Sheet(FEW, table, [Image.new("RGB", (64, 64))] * 8, {})
+    corners = np.array([layout.corner(state) for state in range(8)])
+    apart = np.abs(corners[:, None] - corners[None]).max(-1) >= min(layout.thumb)
+    assert (apart | np.eye(8, dtype=bool)).all()  # no picture covers another
+    for state, (x, y) in enumerate(corners):
+        assert (sheet[y - 1, x + 40].min() > 200) == (state == table.oracle)
+        if state != table.oracle:
+            expected = colormaps["viridis"](table.mean[state] / table.mean.max(), bytes=True)[:3]
+            assert sheet[y + 2, x + 40].tolist() == [int(v) for v in expected]
+
+
+NAN, INF, HUGE, ARRAY = math.nan, math.inf, 10**30, np.array([1, 2])
+ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], [0.5], ARRAY]
+#: Values of `ODD` that an argument takes.
+TAKES: dict[str, list[Any]] = {
+    **{key: [] for key in ("split", "scorer", "observation", "resolution", "crop")},
+    **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
+    **{key: [True] for key in ("sensors", "noise", "with_oracle")},
+    **{key: [1.5] for key in ("motion", "depth")},
+    **{key: [None] for key in ("grid", "simulator", "render_mode")},
+    "costs": [None, {}],
+    "tolerance": [1.5, HUGE],
+}
+TAKES_VECTOR = {"num_envs": [], "max_episode_steps": [None, HUGE], "autoreset_mode": []}
+
+
+def _cases(taken: bool) -> list[Any]:
+    return [
+        pytest.param(name, value, id=f"{name}-{i}")
+        for name, known in {**TAKES, **TAKES_VECTOR}.items()
+        for i, value in enumerate(ODD)
+        if any(type(k) is type(value) and k == value for k in known) == taken
+    ]
+
+
+class Work(Exception):
+    """Scenes were loaded."""
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(self: EnvOptions) -> None:
+        raise Work
+
+    monkeypatch.setattr(EnvOptions, "scenes_on_demand", load)
+
+
+def test_the_tables_have_every_argument() -> None:
+    assert {"scenes", *TAKES} == {*EnvOptions.__dataclass_fields__, "render_mode"}
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(("name", "value"), _cases(False))
+def test_odd_values(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"`{name}"):
+        AutoExposureVectorEnv(**{**SMALL, name: value})
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(("name", "value"), _cases(True))
+def test_values_that_are_fine(name: str, value: Any) -> None:
+    with pytest.raises(Work):
+        AutoExposureVectorEnv(**{**SMALL, name: value})
+
+
+GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
+BAD_AXES = [None, "100", [], [100, "x"], [True, 200], [NAN, 1], [2, 1], [1, 1], 100, [100, INF]]
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        *(
+            ({"costs": {"flicker": value}}, r"`costs\['flicker'\]`")
+            for value in (None, True, "x", -1, NAN, INF, [], [1.0])
+        ),
+        *(({"costs": {"flicer": 1.0}}, "did you mean 'flicker'"), ({"costs": {3: 1.0}}, "`costs`")),
+        *(({"grid": {**GRID, "isos": value}}, "`grid.*iso") for value in BAD_AXES),
+        *(({"grid": {**GRID, "f_numbers": [n]}}, "`grid.*f_number") for n in (0.1, 45)),
+        *(({"grid": {**GRID, **a}}, "`grid") for a in ({"isos": [25]}, {"exposure_times": [60]})),
+        *(({"grid": {"iso": [100]}}, "did you mean 'isos'"), ({"grid": {"isos": [100]}}, "`grid`")),
+        *(
+            ({name: wrong}, f"did you mean '{right}'")
+            for name, wrong, right in (
+                *(("camera", "nikon_z7", "nikon_z6"), ("grid", "third_stops", "third_stop")),
+                *(("lighting", "tunel", "tunnel"), ("simulator", "compcat", "compact")),
+                *(("depth", "unknwon", "unknown"), ("noise", "bnak", "bank")),
+                *(("scorer", {"niose": 1.0}, "noise"), ("autoreset_mode", "NEXT", "NEXT_STEP")),
+            )
+        ),
+        *(({"scorer": {"noise": v}}, "`scorer`") for v in (None, True, "x", 0, -1, NAN, INF, [1])),
+        ({"scorer": {"noise": 1.0, "mine:noise": 1.0}}, "differ behind the colon"),
+        ({"depth": 300.0, "resolution": 128}, "`depth`.*256"),
+        ({"depth": "unknown", "simulator": None}, "`depth`.*`simulator`"),
+        *(({"delay": {"iso": value}}, r"`delay\['iso'\]`") for value in (17, True)),
+        *(({"delay": 17}, "`delay`"), ({"delay": {"shutter": 1}}, "`delay`")),
+        *(({"resolution": 35}, "`resolution`"), ({"motion": 1e3 + 1}, "`motion`")),
+        *(({"num_envs": 2**16 + 1}, "`num_envs`"), ({"noise": ["bank"]}, "`noise`")),
+        ({"max_episode_steps": 0}, "`max_episode_steps`"),
+    ],
+)
+def test_what_else_is_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        AutoExposureVectorEnv(**{**SMALL, **arguments})
+
+
+BAD_SEEDS = [True, "x", 1.5, -1, NAN, {}, object(), b"x", np.array(3.0)]
+BAD_OPTIONS = [True, "x", 1.5, [], object(), ["state"], {"stat": 1}, {1: 1}]
+BAD_CHOICES = [True, 1.5, -1, NAN, {}, object(), HUGE, "x", b"x"]
+
+
+def _refused_resets(for_many: bool) -> list[tuple[dict[str, Any], str]]:
+    lists = [[0, 1], [0, 1, True], [0, 1, "x"], ARRAY, np.zeros(3)] if for_many else [[], [1, 2]]
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"seed": seed}, "`seed") for seed in [*BAD_SEEDS, *lists]
+    ]
+    refused += [({"options": options}, "`options`") for options in BAD_OPTIONS]
+    for name in ("scene", "state", "frame"):
+        match = rf"`options\['{name}'\]`"
+        refused += [({"options": {name: v}}, match) for v in [*BAD_CHOICES, *lists]]
+    masks = (True, [True] * 3, np.ones(2, bool), np.zeros(3, bool), np.ones(3)) if for_many else ()
+    refused += [({"options": {"reset_mask": mask}}, "reset_mask") for mask in masks]
+    return refused
+
+
+BAD_ACTIONS = [None, True, "x", 1.5, 2.0, -1, 64, NAN, [], {}, object(), HUGE, 2**63, [[1], [2, 3]]]
+
+
+@pytest.mark.parametrize("for_many", [False, True])
+def test_refused_resets_and_steps_change_nothing(for_many: bool) -> None:
+    """The twin is asked nothing odd; the episode and the one after it must be the same."""
+    make, many = AutoExposureEnv, {}
+    bad: list[Any] = [*BAD_ACTIONS, [1], np.zeros(1, int), np.True_]
+    if for_many:
+        make, many = AutoExposureVectorEnv, {"num_envs": 3}
+        rows = [[0, 1, action] for action in BAD_ACTIONS if action is not True]  # numpy makes it 1
+        bad = [*BAD_ACTIONS, *rows, [0, 1], [[0, 1, 2]], np.ones(3, bool)]
+    env, twin = (make(**SMALL, **many) for _ in range(2))
+    for one in (env, twin):
+        one.reset(seed=7)
+    for arguments, match in _refused_resets(for_many):
+        with pytest.raises(ValueError, match=match):
+            env.reset(**arguments)
+    for action in bad:
+        with pytest.raises(ValueError, match=r"`actions?`"):
+            env.step(action)
+    good = [5] * 3 if for_many else 5
+    assert_equal(env.step(good), twin.step(good))
+    assert_equal(env.reset(), twin.reset())
+    for seed in (np.int64(11), 2**64, 2**100):
+        first, second = ([0, s, 5] if for_many else s for s in (seed, int(seed)))
+        assert_equal(env.reset(seed=first), twin.reset(seed=second))
+
+
+def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
+    train = EnvOptions(**SMALL).load_scenes()
+    EnvOptions(**SMALL).load_scenes().clear()  # a list of one's own
+    again = EnvOptions(**SMALL).load_scenes()
+    assert all(a is b for a, b in zip(again, train, strict=True))
+    test, both = (EnvOptions(split=split, **SMALL).load_scenes() for split in ("test", "all"))
+    assert {s.group for s in train}.isdisjoint({s.group for s in test})
+    assert [s.scene_id for s in both] == [s.scene_id for s in train + test]
+
+
+def test_cameras_of_one_name_have_scenes_of_their_own() -> None:
+    other = replace(CAMERA, colour_matrix=CAMERA.colour_matrix[::-1])
+    for one in (CAMERA, other):
+        assert EnvOptions(camera=one, **SMALL).load_scenes()[0].camera == one
+    with pytest.raises(ValueError, match=r"unknown argument `scorrer`.*did you mean `scorer`"):
+        EnvOptions.from_kwargs({"scorrer": "noise"})
+
+
+def test_a_black_scene_in_unknown_light_is_refused_by_name() -> None:
+    black = make_scene(np.zeros((4, 40, 40)), None, scene_id="cap")
+    with pytest.raises(ValueError, match=r"scene 'cap': `light` is 0 .* give `illuminance`"):
+        EnvOptions(scenes=[black], resolution=36).load_scenes()
+    lit = replace(black, illuminance=10.0)
+    assert EnvOptions(scenes=[lit], resolution=36).load_scenes()[0].ev100 == 2.0
+    for value in ODD:
+        with pytest.raises(ValueError, match="scenes"):
+            AutoExposureEnv(scenes=value)

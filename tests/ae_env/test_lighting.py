@@ -94,11 +94,9 @@ def test_a_subclass_is_known_by_its_name() -> None:
         def gain(self, frame: int, exposure_time: float, phase: float) -> float:
             return 0.5
 
-    try:
-        assert _gains("test_dimmed", 2) == [0.5, 0.5]
-        assert _gains("static", 2) == [1.0, 1.0]
-    finally:
-        del KINDS["test_dimmed"]
+    found = _gains("test_dimmed", 2), _gains("static", 2)
+    del KINDS["test_dimmed"]
+    assert found == ([0.5, 0.5], [1.0, 1.0])
 
 
 @st.composite
@@ -194,8 +192,6 @@ def test_whole_periods_have_no_bands(frequency: float, times, duty: float | None
 
 
 PHASES = np.random.default_rng(0).random(60)
-
-
 #: Most stops away from where the light begins (sines begin anywhere), most stops between frames.
 BOUNDS = {"ramps": (6.0, 1.5), "sines": (3.5, np.pi), "tunnels": (7.0, 7.0 / 3.0)}
 BOUNDS |= {"steps": (3.0, 6.0), "drifts": (6.0, 1.5), "lamps": (0.0, 0.0), "shadows": (5.0, 5.0)}

@@ -20,13 +20,9 @@ SIZE = 64
 
 @pytest.fixture(scope="session")
 def context() -> PolicyContext:
-    space = gym.spaces.Dict(
-        {
-            "raw": gym.spaces.Box(0, 255, (4, SIZE, SIZE), np.uint8),
-            "settings": gym.spaces.Box(-1, 1, (3,), np.float32),
-            "sensors": gym.spaces.Box(-1, 1, (2,), np.float32),
-        }
-    )
+    raw = gym.spaces.Box(0, 255, (4, SIZE, SIZE), np.uint8)
+    settings, sensors = (gym.spaces.Box(-1, 1, (size,), np.float32) for size in (3, 2))
+    space = gym.spaces.Dict({"raw": raw, "settings": settings, "sensors": sensors})
     return PolicyContext(ExposureGrid.default(), get_camera("nikon_z6"), space)
 
 

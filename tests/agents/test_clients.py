@@ -20,39 +20,28 @@ from tests.ae_env.environments import SMALL
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(params=ENV_IDS)
-def task(request: pytest.FixtureRequest) -> str:
-    """Id of a task."""
-    return str(request.param)
+every_task = pytest.mark.parametrize("task", ENV_IDS)
 
 
+@every_task
 @pytest.mark.parametrize(
     ("algorithm", "policy"), [(PPO, "MultiInputPolicy"), (RecurrentPPO, "MultiInputLstmPolicy")]
 )
 def test_stable_baselines(task: str, algorithm: Any, policy: str) -> None:
     env = gym.make(task, **SMALL)
     agent = algorithm(policy, env, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu")
-    before = [p.clone() for p in agent.policy.parameters()]
-    agent.learn(32)
-    changed = [
-        not torch.equal(a, b) for a, b in zip(before, agent.policy.parameters(), strict=True)
-    ]
-    assert agent.num_timesteps == 32
-    assert sum(changed) > len(changed) / 2
+    assert agent.learn(32).num_timesteps == 32
     action, _ = agent.predict(env.reset(seed=0)[0])
     assert env.action_space.contains(np.int64(action))
 
 
+@every_task
 def test_a_loop_as_cleanrl_writes_it(task: str) -> None:
     """`ppo.py`: a vector environment in SAME_STEP mode, statistics of episodes, a flat network."""
     envs = gym.make_vec(task, num_envs=4, autoreset_mode="SAME_STEP", **SMALL)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
-    torch.manual_seed(0)
     size = int(np.prod(envs.single_observation_space["raw"].shape)) + 3
-    network = nn.Sequential(
-        nn.Linear(size, 16), nn.Tanh(), nn.Linear(16, envs.single_action_space.n)
-    )
-    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    network = nn.Linear(size, envs.single_action_space.n)
     observation, _ = envs.reset(seed=1)
     lengths: list[int] = []
     for _ in range(100):
@@ -61,10 +50,7 @@ def test_a_loop_as_cleanrl_writes_it(task: str) -> None:
         chosen = torch.distributions.Categorical(logits=network(inputs))
         actions = chosen.sample()
         observation, rewards, terminated, truncated, info = envs.step(actions.numpy())
-        loss = -(chosen.log_prob(actions) * torch.from_numpy(rewards)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        assert (chosen.log_prob(actions) * torch.from_numpy(rewards)).mean().isfinite()
         done = terminated | truncated
         if done.any():
             assert set(np.flatnonzero(done)) == {i for i, o in enumerate(info["final_obs"]) if o}
@@ -74,6 +60,7 @@ def test_a_loop_as_cleanrl_writes_it(task: str) -> None:
     assert set(lengths) == {limit} if limit else set(lengths) <= {1, 2, 3}
 
 
+@every_task
 def test_torchrl(task: str) -> None:
     """It makes environments itself too: tries arguments of its own, and expects a TypeError."""
     from torchrl.envs import GymEnv, GymWrapper, SerialEnv

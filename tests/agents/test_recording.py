@@ -1,5 +1,6 @@
 """Recorded episodes, and what policies are fitted on where the scenes are too few to train on."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ TASK = "ae_env/AutoExposure-v0"
 SMALL = {"scenes": "bundled:small", "resolution": 36, "split": "test"}
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    return tmp_path
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def context() -> PolicyContext:
 
 
 @pytest.mark.parametrize("name", ["centre_weighted:P", "oracle"])
-def test_recorded_episodes_happen_again(name: str, folder: Path, context: PolicyContext) -> None:
+def test_recorded_episodes_happen_again(name: str, context: PolicyContext) -> None:
     policy = make_policy(name, context)
     dataset = record_dataset(policy, name, TASK, SMALL, "ae/mine-v0", episodes=3, seed=5)
     assert (dataset.total_episodes, dataset.total_steps) == (3, 24)
@@ -65,11 +66,7 @@ def test_what_is_unfinished_is_removed_and_names_are_checked(
             record_dataset(policy, "random", TASK, SMALL, wrong, episodes=1)
 
 
-STATES = {
-    "isos": list(GRID.isos),
-    "exposure_times": list(GRID.exposure_times),
-    "f_numbers": list(GRID.f_numbers),
-}
+STATES = {name: list(values) for name, values in asdict(GRID).items()}
 
 
 def test_recorded_grids_are_trained_for_on_their_own_states(tmp_path: Path) -> None:
@@ -88,7 +85,6 @@ def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(
     ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     few: tuple[dict[str, Any], bool] = ({"scenes": "bundled:small", "grid": STATES}, True)
     monkeypatch.setattr("agents.rollouts.training_arguments", lambda *_: few)
     write_raws(tmp_path / "grid" / "a")

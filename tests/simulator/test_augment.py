@@ -7,7 +7,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, TensorDataset
 
 from simulator import NoiseLevelFunction, get_camera
-from simulator.augment import AugmentedDataset, DrawnSettings, ExposureAugmentation, sample_seeds
+from simulator.augment import AugmentedDataset, ExposureAugmentation, sample_seeds
 from simulator.raw.develop import GREY_CARD_SIGNAL
 
 CAMERA = get_camera("nikon_z6")
@@ -35,6 +35,9 @@ def test_a_seed_gives_the_same_picture_alone_in_a_batch_and_in_another_order(pla
     seeds = {sample_seeds(s, e, [i])[0] for s in range(3) for e in range(3) for i in range(3)}
     assert len(seeds) == 27
     assert augment(torch.zeros(0, 3, 4, 4), []).shape == (0, 3, 4, 4)
+    frozen = augment(given.requires_grad_(), [3, 1, 4, 15])
+    assert torch.equal(frozen, together)
+    assert not frozen.requires_grad
 
 
 def test_the_number_of_threads_does_not_matter() -> None:
@@ -42,17 +45,16 @@ def test_the_number_of_threads_does_not_matter() -> None:
     augment, given, threads = ExposureAugmentation(), pictures(1, 200), torch.get_num_threads()
     found = []
     try:
-        for count in (1, 2, 3):
+        for count in (1, 3):
             torch.set_num_threads(count)
             found.append(augment(given, [7]))
     finally:
         torch.set_num_threads(threads)
-    assert torch.equal(found[0], found[1])
-    assert torch.equal(found[0], found[2])
+    assert torch.equal(*found)
 
 
 class Numbered(Dataset):
-    """Pictures with their numbers; at the top of the module, for workers that are spawned."""
+    """Pictures with their numbers; at the top of the module, for workers of a server."""
 
     def __len__(self) -> int:
         return 6
@@ -61,16 +63,12 @@ class Numbered(Dataset):
         return pictures(6)[index], index
 
 
-@pytest.mark.parametrize(("context", "workers"), [("fork", 2), ("spawn", 1)])
-def test_workers_give_the_pictures_of_this_process(context: str, workers: int) -> None:
-    """And persistent workers see that an epoch has begun."""
+@pytest.mark.parametrize(("context", "workers"), [("fork", 2), ("forkserver", 1)])
+def test_workers_give_the_pictures_of_this_process(context: str, workers: int, forkserver) -> None:
+    """And persistent workers, forked or with imports of their own, see that an epoch has begun."""
     dataset = AugmentedDataset(Numbered(), ExposureAugmentation(), seed=2)
-    options = {
-        "num_workers": workers,
-        "multiprocessing_context": context,
-        "persistent_workers": True,
-    }
-    loader = DataLoader(dataset, batch_size=3, **options)
+    options = {"multiprocessing_context": context, "persistent_workers": True}
+    loader = DataLoader(dataset, batch_size=3, num_workers=workers, **options)
     epochs = []
     for epoch in (0, 1):
         dataset.set_epoch(epoch)
@@ -80,23 +78,20 @@ def test_workers_give_the_pictures_of_this_process(context: str, workers: int) -
         assert torch.equal(images, here)
         epochs.append(images)
     assert not torch.equal(*epochs)
-    del loader
 
 
 def test_samples_keep_what_they_hold_besides() -> None:
     labels = torch.arange(4)
     dataset = AugmentedDataset(TensorDataset(pictures(), labels), ExposureAugmentation())
     image, label = dataset[-1]
-    assert label == 3
-    assert image.shape == (3, 24, 24)
-    assert len(dataset) == 4
+    assert (label, image.shape, len(dataset)) == (3, (3, 24, 24), 4)
     named = namedtuple("named", "image label")(pictures()[0], 7)
     assert AugmentedDataset([named], ExposureAugmentation())[0].label == 7
     alone = AugmentedDataset(pictures(), ExposureAugmentation())  # a tensor is a data set, too
     assert torch.equal(alone[3], image)
     assert torch.equal(alone[torch.tensor(3)], image)
     assert torch.equal(alone[-4], alone[0])
-    with pytest.raises(IndexError, match=r"`index` \(=-5\) must be in \[-4, 3\]"):
+    with pytest.raises(IndexError, match="`index`"):
         alone[-5]
 
 
@@ -113,16 +108,13 @@ def test_nothing_asked_changes_nothing() -> None:
     assert (still(given, range(4)) - given).abs().max() <= 12.92 * 1.618 * step + 1e-5
 
 
-@pytest.mark.parametrize("stops", [-3.0, -1.0, 1.5])
-def test_raws_are_exposed_by_the_ratio_and_clipped(stops: float) -> None:
-    augment = ExposureAugmentation(stops=(stops, stops), modules=("exposure",))
+def test_raws_are_exposed_by_the_ratio_and_clipped_and_cards_two_stops_under() -> None:
+    """The latter by hand: light, Schlick's curve p x / ((p - 1) x + 1), the sRGB curve."""
     given = torch.linspace(0.0, 1.0, 64).reshape(1, 1, 8, 8).expand(1, 4, 8, 8)
-    wanted = (given.double() * 2.0**stops).clamp(max=1.0)
-    assert (augment(given, [0]) - wanted).abs().max() <= 0.51 / min(CAMERA.span)
-
-
-def test_a_grey_card_two_stops_under() -> None:
-    """By hand: light of a card, Schlick's curve p x / ((p - 1) x + 1), the sRGB curve."""
+    for stops in (-3.0, 1.5):
+        augment = ExposureAugmentation(stops=(stops, stops), modules=("exposure",))
+        wanted = (given.double() * 2.0**stops).clamp(max=1.0)
+        assert (augment(given, [0]) - wanted).abs().max() <= 0.51 / min(CAMERA.span)
     p = 0.18 * (1 - GREY_CARD_SIGNAL) / (GREY_CARD_SIGNAL * (1 - 0.18))
 
     def shown(light: float) -> float:
@@ -135,10 +127,10 @@ def test_a_grey_card_two_stops_under() -> None:
 
 
 def test_clipped_highlights_stay_white_where_their_light_is_above() -> None:
-    white = torch.ones(1, 3, 4, 4)
-    raised = ExposureAugmentation(stops=(-2.0, -2.0), highlights=(2.0, 2.0), modules=("exposure",))
+    white, darker = torch.ones(1, 3, 4, 4), {"stops": (-2.0, -2.0), "modules": ("exposure",)}
+    raised = ExposureAugmentation(**darker, highlights=(2.0, 2.0))
     assert raised(white, [0]).min().item() == pytest.approx(1.0, abs=1e-6)
-    grey = ExposureAugmentation(stops=(-2.0, -2.0), highlights=(0.0, 0.0), modules=("exposure",))
+    grey = ExposureAugmentation(**darker, highlights=(0.0, 0.0))
     assert grey(white, [0]).max() < 0.8
     codes = torch.full((1, 3, 4, 4), 255, dtype=torch.uint8)
     assert torch.allclose(raised(codes, [0]), raised(white, [0]))
@@ -164,9 +156,8 @@ def test_noise_has_the_variance_of_the_nlf(source: NoiseLevelFunction | None) ->
 
 def test_blur_keeps_light_and_has_the_moments_of_disc_and_streak() -> None:
     diameter, length = 6.0, 8.0
-    augment = ExposureAugmentation(
-        defocus=(diameter, diameter), motion=(length, length), modules=("blur",)
-    )
+    ranges = {"defocus": (diameter, diameter), "motion": (length, length)}
+    augment = ExposureAugmentation(**ranges, modules=("blur",))
     point = torch.zeros(1, 4, 33, 33)
     point[:, :, 16, 16] = 0.9
     spread = augment(point, [3])[0, 0].double()
@@ -181,18 +172,14 @@ def test_blur_keeps_light_and_has_the_moments_of_disc_and_streak() -> None:
 
 
 def test_settings_are_drawn_within_their_ranges_whatever_acts() -> None:
-    full = ExposureAugmentation()
-    exposure = ExposureAugmentation(modules=("exposure",))
-    drawn = [full.draw(seed) for seed in range(200)]
-    assert drawn == [exposure.draw(seed) for seed in range(200)]
-    columns = DrawnSettings(*np.array(drawn).T)
-    ranges = {"stops": (-4, 4), "iso": (100, 12800), "defocus": (0, 2), "motion": (0, 3)}
-    for name, (low, high) in ranges.items():
-        values = getattr(columns, name)
-        values, ends = (np.log2(v) if name == "iso" else v for v in (values, np.array([low, high])))
-        width = ends[1] - ends[0]
-        assert ends[0] <= values.min() < ends[0] + 0.05 * width
-        assert ends[1] - 0.05 * width < values.max() <= ends[1]
+    full, exposure = ExposureAugmentation(), ExposureAugmentation(modules=("exposure",))
+    drawn = np.array([full.draw(seed) for seed in range(200)])
+    np.testing.assert_array_equal(drawn, [exposure.draw(seed) for seed in range(200)])
+    drawn[:, 1] = np.log2(drawn[:, 1])
+    ranges = [(-4.0, 4.0), np.log2([100.0, 12800.0]), (0.0, 2.0), (0.0, 3.0)]
+    for values, (low, high) in zip(drawn.T, ranges, strict=False):
+        assert low <= values.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < values.max() <= high
 
 
 @pytest.mark.gpu
@@ -224,26 +211,18 @@ def test_bad_settings_and_images():
 
 
 def test_bad_samples_and_seeds() -> None:
+    augment = ExposureAugmentation()
     for seeds in ([0, 1], [-1], [0.5], 3):
         with pytest.raises(ValueError, match="`seeds`"):
-            ExposureAugmentation()(torch.zeros(1, 3, 4, 4), seeds)
+            augment(torch.zeros(1, 3, 4, 4), seeds)
     for sample in (np.zeros((3, 4, 4)), {"image": torch.zeros(3, 4, 4)}, ()):
-        with pytest.raises(ValueError, match="must hold tensors"):
-            AugmentedDataset([sample], ExposureAugmentation())[0]
-    with pytest.raises(ValueError, match="`seed`"):
-        AugmentedDataset([], ExposureAugmentation(), seed=-1)
-    with pytest.raises(ValueError, match="`epoch`"):
-        sample_seeds(0, -1, [0])
-    with pytest.raises(ValueError, match=r"`indices` \(=5\)"):
-        sample_seeds(0, 0, 5)
-    with pytest.raises(ValueError, match="`augmentation`"):
-        AugmentedDataset([], "x")
-
-
-def test_pictures_that_require_gradients_get_none() -> None:
-    augment = ExposureAugmentation()
-    for images in (pictures(), torch.rand(1, 4, 8, 8)):
-        seeds = range(len(images))
-        augmented = augment(images.clone().requires_grad_(), seeds)
-        assert torch.equal(augmented, augment(images, seeds))
-        assert not augmented.requires_grad
+        with pytest.raises(ValueError, match="`dataset`"):
+            AugmentedDataset([sample], augment)[0]
+    for call, name in (
+        (lambda: AugmentedDataset([], augment, seed=-1), "seed"),
+        (lambda: AugmentedDataset([], "x"), "augmentation"),
+        (lambda: sample_seeds(0, -1, [0]), "epoch"),
+        (lambda: sample_seeds(0, 0, 5), "indices"),
+    ):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            call()

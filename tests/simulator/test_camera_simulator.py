@@ -115,18 +115,6 @@ def test_an_uncalibrated_camera_uses_the_raws_own_noise(simulator: CameraSimulat
 # Sizes and extremes
 
 
-@pytest.mark.parametrize("nlf", [ZERO, Z6.nlf(100)])
-def test_the_longest_streak_takes_no_memory_of_its_length(nlf: NoiseLevelFunction) -> None:
-    """1000 frame heights a second for 1e5 s: 3 billion pixels, which leave the rows' ends alone."""
-    light = picture(8, 8)
-    prepared = PreparedScene(light, BASE, Z6, nlf, image_speed=1000.0, defocus=2.0)
-    settings = CameraSettings(100, 1e5, 1024.0)
-    ends = (light[..., :1] + light[..., -1:]) / 2
-    expected = prepared.expected(settings) / prepared.exposure(settings).ratio
-    torch.testing.assert_close(expected, ends.expand_as(expected), rtol=1e-4, atol=1e-4)
-    assert torch.isfinite(prepared.capture(settings, 0)[0]).all()
-
-
 # Errors
 
 

@@ -1,18 +1,23 @@
-"""Bundled scenes: statistics, splits, depth, cache, and what is drawn on demand."""
+"""Bundled scenes and Poly Haven's: statistics, splits, depth, light, cache, downloads."""
 
 import functools
+import hashlib
 import logging
+import math
 import pickle
+import threading
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes import Scene, load_scenes
+from ae_env.lighting.moving import read_pans
+from ae_env.scenes import Scene, polyhaven
 from ae_env.scenes.bundled import (
     DrawnScenes,
     SceneGroup,
@@ -20,20 +25,33 @@ from ae_env.scenes.bundled import (
     bundled_scenes,
     procedural_groups,
 )
-from ae_env.scenes.load import _LOADED
+from ae_env.scenes.load import _LOADED, load_scenes
 from ae_env.scenes.measured_depth import depth_scenes
+from ae_env.scenes.polyhaven import (
+    ILLUMINANCE,
+    Asset,
+    asset_views,
+    cut_values,
+    download,
+    incident_light,
+    light_around,
+    list_assets,
+    mixed_scenes,
+    polyhaven_scenes,
+    split_assets,
+)
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
 from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
+from simulator.radiance.light import WHITE_SIGNAL
+from simulator.radiance.maps import read_radiance
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
-from simulator.radiance.procedural import HARD_KINDS, dead_leaves, list_kinds
+from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
 from simulator.utils.cache import disk_cache
-from tests.ae_env.environments import assert_equal
+from tests.ae_env.environments import assert_equal, make_envs
 from tests.ae_env.scorer_images import make_scene
 
 CAMERA = get_camera("nikon_z6")
-
-
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
@@ -57,10 +75,10 @@ def slope(picture: np.ndarray) -> float:
 
 def test_dead_leaves_have_the_spectrum_of_nature() -> None:
     """Field 1987, Ruderman 1997: the power of natural pictures falls about as f**-2."""
-    slopes = [slope(dead_leaves(np.random.default_rng(i), 256)[1]) for i in range(8)]
+    slopes = [slope(dead_leaves(np.random.default_rng(i), 256, LeafStyle())[1]) for i in range(8)]
     assert np.mean(slopes) == pytest.approx(-2.0, abs=0.25)
     # A value of the first release: the bundled scenes must not change.
-    picture = dead_leaves(np.random.default_rng(7), 48)
+    picture = dead_leaves(np.random.default_rng(7), 48, LeafStyle())
     mean = [0.15036413232802362, 0.16999628065968864, 0.15176365238261902]
     np.testing.assert_allclose(picture.mean(axis=(1, 2), dtype=float), mean, rtol=1e-5)
 
@@ -86,7 +104,7 @@ def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> No
     """By how many EV one on the mean of the clipped frame would expose too little."""
     errors = {
         kind: np.log2([s.light[1].clamp(max=1.0).mean() / 0.12 for s in unseen if s.kind == kind])
-        for kind in (*list_kinds(), "photograph")
+        for kind in (*KINDS, "photograph")
     }
     for kind in ("dead_leaves", "indoor", "motion", "photograph"):
         assert abs(np.median(errors[kind])) < 0.35, kind
@@ -173,23 +191,6 @@ def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:
         assert low <= picture.blur.min() <= picture.blur.max() <= high
 
 
-def test_draped_pictures_are_laid_out() -> None:
-    """Most are focused on the nearest thing, and none without a subject that can be seen."""
-    scenes = [make_scene(np.ones((4, 40, 48)), 100.0, scene_id=f"{i}") for i in range(60)]
-    layouts = [add_layout(scene).layout for scene in scenes]
-    in_focus = 0
-    for layout in layouts:
-        assert layout is not None
-        assert layout.subject is not None
-        assert layout.defocus.shape == layout.subject.shape == (40, 48)
-        assert float(layout.defocus.max()) > 0.7  # the cut may miss the largest
-        in_focus += float(layout.defocus[layout.subject].median()) < 0.2
-    assert 0.6 * len(layouts) < in_focus < 0.95 * len(layouts)
-    shares = [float(layout.subject.float().mean()) for layout in layouts]
-    assert min(shares) > 0.0
-    assert 0.05 < np.mean(shares) < 0.5
-
-
 def test_layouts_depend_on_the_name_alone() -> None:
     """One scene has one layout at every resolution: the finer, averaged."""
     light = np.random.default_rng(0).random((4, 128, 128))
@@ -197,6 +198,7 @@ def test_layouts_depend_on_the_name_alone() -> None:
     fine, again, other, small = (
         add_layout(make_scene(picture, 100.0, scene_id=name)) for name, picture in named
     )
+    assert fine.layout.subject.any()
     assert torch.equal(fine.layout.defocus, again.layout.defocus)
     assert not torch.equal(fine.layout.defocus, other.layout.defocus)
     torch.testing.assert_close(fine.resized(64).layout.defocus, small.layout.defocus)
@@ -260,19 +262,16 @@ def test_no_more_are_drawn_than_are_asked_for_and_the_last_one_stores_them() -> 
 
 
 @pytest.mark.usefixtures("empty_cache")
-@pytest.mark.parametrize("name", ["AutoExposure-v0", "ExposureBracket-v0"])
-def test_episodes_do_not_depend_on_when_scenes_are_drawn(name: str) -> None:
+def test_episodes_do_not_depend_on_when_scenes_are_drawn() -> None:
     """Which scene an episode shows, too: the draw must not wait for what is drawn."""
 
     def episodes() -> list[tuple[object, ...]]:
         _LOADED.clear()
-        envs = gym.make_vec(
-            f"ae_env/{name}", num_envs=3, scenes="bundled:spot_light", split="test", resolution=36
-        )
+        envs = make_envs(3, scenes="bundled:spot_light", split="test")
         core = envs.unwrapped.core
         loaded.append(len(core.scenes.loaded))
         found: list[tuple[object, ...]] = [envs.reset(seed=5)]
-        found += [envs.step(np.full(3, action)) for action in range(0, 21, 3)]
+        found += [envs.step(np.full(3, action)) for action in range(0, 21, 7)]
         unpickled = pickle.loads(pickle.dumps(core))
         assert_equal(unpickled.episodes.columns(), core.episodes.columns())
         return found
@@ -282,3 +281,180 @@ def test_episodes_do_not_depend_on_when_scenes_are_drawn(name: str) -> None:
     load_scenes("bundled:spot_light", "test", camera=CAMERA, resolution=36)  # draws and stores all
     assert_equal(first, episodes())
     assert loaded[0] < loaded[1] == 10
+
+
+def test_the_list_splits_places_and_each_kind_is_tested():
+    splits = {}
+    for asset in list_assets():
+        assert splits.setdefault(asset.place, asset.split) == asset.split
+    assert len({a.name for a in list_assets()}) == len(list_assets()) >= 40
+    tested = {a.kind for a in list_assets() if a.split == "test"}
+    assert tested >= {"night", "indoor", "backlit", "forest", "sun", "overcast", "studio", "tunnel"}
+    assert list(splits.values()).count("test") >= 15  # enough for intervals
+
+
+def panorama(light) -> np.ndarray:
+    """(3, 256, 512) grey light as a function of longitude and latitude [radians]."""
+    longitude = (np.arange(512) + 0.5) / 512 * 2 * np.pi - np.pi
+    latitude = np.pi / 2 - (np.arange(256) + 0.5) / 256 * np.pi
+    grey = np.broadcast_to(light(longitude[None, :], latitude[:, None]), (256, 512))
+    return np.repeat(grey[None], 3, axis=0).astype(np.float32)
+
+
+def test_an_even_sky_gives_pi_times_its_luminance_and_a_dome_half_of_it_to_a_wall():
+    even = panorama(lambda lon, lat: 2.0 + 0.0 * lat + 0.0 * lon)
+    for azimuth, pitch in ((0, 90), (17, 0), (-120, 35), (0, -90)):
+        assert incident_light(even, azimuth, pitch) == pytest.approx(2.0 * math.pi, rel=1e-4)
+    dome = panorama(lambda lon, lat: (lat > 0) + 0.0 * lon)
+    assert incident_light(dome, 0, 90) == pytest.approx(math.pi, rel=1e-3)
+    for azimuth in (0, 45, 180):
+        assert incident_light(dome, azimuth, 0) == pytest.approx(math.pi / 2, rel=1e-3)
+    assert incident_light(dome, 0, -90) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_small_lamp_lights_a_surface_by_the_cosine():
+    at = math.radians(40), math.radians(20)
+
+    def lamp(longitude, latitude):
+        near = (abs(longitude - at[0]) < 0.03) & (abs(latitude - at[1]) < 0.03)
+        return 500.0 * near
+
+    light = panorama(lamp)
+    straight = incident_light(light, 40, 20)
+    for azimuth, pitch in ((40, 80), (70, 20), (40, -30), (-140, -20)):
+        a, p = math.radians(azimuth) - at[0], math.radians(pitch)
+        cosine = math.sin(p) * math.sin(at[1]) + math.cos(p) * math.cos(at[1]) * math.cos(a)
+        expected = straight * max(cosine, 0.0)
+        assert incident_light(light, azimuth, pitch) == pytest.approx(expected, abs=straight / 200)
+
+
+@pytest.fixture
+def an_asset(tmp_path, monkeypatch):
+    """Makes an asset of a panorama, as the file that a folder of real files holds."""
+
+    def make(light: np.ndarray, kind: str = "overcast") -> Asset:
+        import cv2
+
+        path = tmp_path / "hdri_pool" / "made.hdr"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), light.transpose(1, 2, 0)[:, :, ::-1])
+        monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        return Asset(name="made", kind=kind, split="test", bytes=len(content), sha256=digest)
+
+    return make
+
+
+def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
+    """A view of it is as bright as a white surface that it lights; each view has its own level."""
+    even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
+    views = list(asset_views(an_asset(even), CAMERA, size=16, views=50))
+    for scene in views:
+        assert scene.light[1:3].mean().item() == pytest.approx(WHITE_SIGNAL, rel=0.01)
+        assert (scene.sampled, scene.box_factor) == (True, 1)
+    low, high = np.log(ILLUMINANCE["overcast"])
+    levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
+    assert 0 <= levels.min() < levels.max() <= 1
+    assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
+    assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
+
+
+def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch):
+    """A bright half of the world: the view into it is lit from behind."""
+    monkeypatch.setitem(ILLUMINANCE, "overcast", (1e4, 1e4))
+    half = panorama(lambda lon, lat: np.where(np.abs(lon) < np.pi / 2, 1.0, 0.05) + 0.0 * lat)
+    lux, seen = [], []
+    for scene in asset_views(an_asset(half), CAMERA, size=16, views=16):
+        lux.append(scene.illuminance)
+        seen.append(scene.light[1].median().item())
+    order = np.argsort(lux)
+    assert lux[order[-1]] / lux[order[0]] == pytest.approx(20, rel=0.3)
+    assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
+
+
+def test_maps_that_are_cut_say_so(an_asset):
+    gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
+    assert cut_values(gradient) == []
+    assert cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
+    assert cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
+    asset = an_asset(np.minimum(gradient, 2.9))
+    assert "highlights are cut" in next(asset_views(asset, CAMERA, size=16)).source
+
+
+def test_real_scenes_alone_and_mixed(data_dir):
+    request = SceneRequest("test", CAMERA, 36)
+    real, again = (polyhaven_scenes(request, views=1) for _ in range(2))  # then from the cache
+    assert len({s.group for s in real}) >= 15
+    assert all(a.content == b.content for a, b in zip(real, again, strict=True))
+    for scene in real:
+        assert (scene.light.shape, scene.box_factor) == ((4, 36, 36), 7)
+        assert 1e-3 < scene.illuminance <= ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
+    mixed = mixed_scenes(request, list(bundled_scenes(request, part="snow")), len(real))
+    kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
+    assert kinds[True] == kinds[False] == 10
+    assert {s.group for s in mixed if s.source.startswith("Poly")} < {s.group for s in real}
+    # Pans of moving light are of places to test on, and of their maps.
+    places = read_pans()
+    assert set(places) == {asset.name for asset in list_assets() if asset.split == "test"}
+    assert {len(turn) for turn in places.values()} == {72}
+    asset = next(a for a in split_assets("polyhaven", "test") if a.name == "spree_bank")
+    found = light_around(read_radiance(asset.path))
+    np.testing.assert_allclose(places["spree_bank"], found, atol=6e-4)
+
+
+def test_missing_maps_name_the_command(tmp_path, monkeypatch):
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
+    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
+        load_scenes("polyhaven", "test", camera=CAMERA)
+    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
+        load_scenes("mixed", "train", camera=CAMERA)
+
+
+CONTENT = {f"map_{i}": bytes([i]) * (5000 + i) for i in range(3)}
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch):
+    """The address of a server of three maps, and its folder."""
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    for name, content in CONTENT.items():
+        (folder / f"{name}_1k.hdr").write_bytes(content)
+    handler = functools.partial(SimpleHTTPRequestHandler, directory=folder)
+    running = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=running.serve_forever, daemon=True).start()
+    known = {"kind": "sun", "split": "test"}
+    assets = tuple(
+        Asset(name=name, bytes=len(c), sha256=hashlib.sha256(c).hexdigest(), **known)
+        for name, c in CONTENT.items()
+    )
+    monkeypatch.setattr(polyhaven, "list_assets", lambda: assets)
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    yield f"http://127.0.0.1:{running.server_port}", folder
+    running.shutdown()
+    running.server_close()
+
+
+def test_a_download_fetches_what_is_missing_and_nothing_broken(server, tmp_path, monkeypatch):
+    (url, folder), total = server, sum(map(len, CONTENT.values()))
+    seen: list[tuple[int, int, str]] = []
+    assert len(download(url=url, progress=lambda *values: seen.append(values))) == 3
+    maps = {name: tmp_path / "cache" / "polyhaven" / f"{name}_1k.hdr" for name in CONTENT}
+    assert {name: path.read_bytes() for name, path in maps.items()} == CONTENT
+    assert (seen[0], seen[-1][:2]) == ((0, total, "map_0"), (total, total))
+    assert download(url=url, progress=None) == []
+    maps["map_1"].write_bytes(bytes(len(CONTENT["map_1"])))  # of the right length
+    assert download(url=url, progress=None) == [maps["map_1"]]
+    assert maps["map_1"].read_bytes() == CONTENT["map_1"]
+    maps["map_1"].unlink()
+    (folder / "map_1_1k.hdr").write_bytes(b"another file")
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    with pytest.raises(ConnectionError, match=r"map_1_1k.hdr cannot be fetched"):
+        download(url=url, progress=None)
+    assert not maps["map_1"].exists()  # no part of a file either
+    with pytest.raises(ValueError, match="`url`"):
+        download(url="ftp://a", progress=None)

@@ -202,15 +202,11 @@ def test_what_is_no_classifier_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
     fixed = write_network(tmp_path / "fixed.onnx", size=32)
     for model, arguments, name in (
         *((fixed, {"size": 224}, "size"), (fixed, {"std": (0, 1, 1)}, "std")),
-        *((fixed, {"mean": "abc"}, "mean"), (b"file.onnx", {}, "model")),
-        (torch.nn.Dropout(), {}, "model"),  # in training mode
+        *((b"file.onnx", {}, "model"), (torch.nn.Dropout(), {}, "model")),  # in training mode
     ):
         with pytest.raises(ValueError, match=f"`{name}`"):
             Classifier(model, **arguments)
-    for network in (
-        *(lambda x: "a cat", lambda x: x.mean(dim=(1, 2, 3))[:, None], lambda x: 1 / 0),
-        *(lambda x: [[1.0, 2.0], [3.0]], lambda x: torch.zeros(len(x), 3, dtype=torch.complex64)),
-    ):
+    for network in (lambda x: "a cat", lambda x: x.mean(dim=(1, 2, 3))[:, None], lambda x: 1 / 0):
         with pytest.raises(UserCodeError, match=r"returned|the classifier raised ZeroDivision"):
             Classifier(network)(pictures(2), None)
     other = write_network(tmp_path / "other.onnx", batch=1)  # not read before

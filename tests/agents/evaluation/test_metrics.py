@@ -107,15 +107,12 @@ def test_settling_is_the_frame_after_the_last_change(light, since):
     assert metrics.settling(scores).tolist() == [since]
 
 
-def test_settling_is_counted_from_the_step_and_does_not_ask_where():
+def test_settling_and_overshoot_are_those_of_the_answer_to_a_step():
     # Wrong but still from frame 6 on, the second that knows of a step in frame 4 (index 3).
     evs = np.array([9.0, 9, 9, 9, 9, 6, 5, 5, 5, 5, 5])
     assert metrics.frames_to_settle(evs, since=4) == 2
     assert metrics.frames_to_settle(evs + np.array([0.0, *[0.3] * 9, 0.0]), since=4) == 2
     assert metrics.frames_to_settle(np.tile([5.0, 6.0], 5), since=4) == 5  # as many as there are
-
-
-def test_overshoot_after_a_step_is_that_of_the_answer_to_it():
     # 9 -> 5 before the step; then 5 -> 8 by way of 10: two beyond. Counted from the start, the
     # way down from 9 would make it 2 in the other direction: 8 - 5 = 3.
     evs = np.array([[9.0, 5.0, 5.0, 5.0, 10.0, 8.0]])
@@ -126,9 +123,8 @@ def test_overshoot_after_a_step_is_that_of_the_answer_to_it():
 def test_ev_error_percentiles_and_share_of_a_known_trajectory():
     errors = np.array([[4, 2, 1, 1 / 3, 0, 0, 0, 0, 0, 0]], float)
     weights = np.full(errors.shape, 0.1)
-    assert weighted_quantile(errors, weights, 0.95) == 4.0  # the tenth of ten values
-    assert weighted_quantile(errors, weights, 0.9) == 2.0
-    assert weighted_quantile(errors, weights, 0.5) == 0.0
+    found = [weighted_quantile(errors, weights, share) for share in (0.95, 0.9, 0.5)]
+    assert found == [4.0, 2.0, 0.0]  # the first is the tenth of ten values
     assert (errors <= metrics.THIRD_EV).mean() == pytest.approx(0.7)
 
 
@@ -141,14 +137,10 @@ def test_flicker_counts_frames_of_the_same_light_only():
     np.testing.assert_allclose(once, [[0.3, 0.0]] * 2)
 
 
-def test_delayed_states_are_the_start_until_the_first_is_in_effect():
-    states, start = np.array([[0, 1, 2, 3]]), np.array([7])
+def test_delayed_states_are_the_start_until_the_first_is_in_effect_and_groups_count_alike():
     for delay, expected in ((0, [0, 1, 2, 3]), (1, [7, 0, 1, 2]), (9, [7, 7, 7, 7])):
-        found = metrics.delayed_states(states, start, delay)
+        found = metrics.delayed_states(np.array([[0, 1, 2, 3]]), np.array([7]), delay)
         np.testing.assert_array_equal(found, [expected])
-
-
-def test_group_means_weigh_episodes_within_a_group():
     values = np.array([[1.0, 3.0, 10.0], [0.0, 0.0, 1.0]])
     means = metrics.group_means(values, np.array(["b", "b", "a"]))  # "a" comes first
     np.testing.assert_allclose(means, [[10.0, 2.0], [1.0, 0.0]])

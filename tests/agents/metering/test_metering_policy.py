@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ae_env.grid import ExposureGrid
 from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.tuned import ScoreRegression
 from agents.policy import PolicyContext
@@ -29,24 +28,21 @@ def _run(policy, photograph, scene_ev, *, start=0, **blur):
     return path[1:]
 
 
-def _fitted(context):
+def _fitted():
     """Best state = (ISO by EV, shutter by speed, aperture by defocus): known by construction."""
     features = np.random.default_rng(0).uniform([0, -9, -3], [16, 3, 3], (4000, 3))
-    best = _best_state(context.grid, features)
-    scores = np.exp(-0.5 * (np.arange(64) != best[:, None]))
+    scores = np.exp(-0.5 * (np.arange(64) != _best_state(features)[:, None]))
     return ScoreRegression(features, scores, np.full(3, 0.3))
 
 
-def _best_state(grid: ExposureGrid, features):
-    iso = np.where(features[:, 0] > 8, 0, 3)
-    time = np.where(features[:, 1] > -3, 0, 3)
-    aperture = np.where(features[:, 2] > 0, 3, 0)
-    return np.array([grid.index(*c) for c in zip(iso, time, aperture, strict=True)])
+def _best_state(features):
+    controls = (features[:, 0] <= 8, features[:, 1] <= -3, features[:, 2] > 0)
+    return 3 * np.array([16, 4, 1]) @ controls  # 4 ISOs, times and apertures
 
 
 def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_path):
     weights = tmp_path / "tuned.safetensors"
-    _fitted(context).save(weights)
+    _fitted().save(weights)
     for ev, speed, defocus, option, looked_up in (
         (12.0, 2.0, 4.0, "", 12.0),
         (4.0, 0.004, 0.25, "", 4.0),
@@ -54,7 +50,7 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
         (9.0, 2.0, 4.0, "?compensation=2", 7.0),  # brighter: the best of a darker scene
     ):
         policy = make_policy(f"average:tuned{option}", context, weights=weights)
-        wanted = _best_state(context.grid, np.log2([[2.0**looked_up, speed, defocus]]))[0]
+        wanted = _best_state(np.array([[looked_up, np.log2(speed), np.log2(defocus)]]))[0]
         path = _run(policy, photograph, ev, speed=speed, defocus=defocus, start=wanted)
         assert path[-1] == wanted
     policy = make_policy("average:tuned?shutter_cap=1/100", context, weights=weights)

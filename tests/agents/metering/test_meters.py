@@ -94,10 +94,8 @@ def test_clipped_frames_are_lower_bounds_and_black_ones_upper_bounds(context, ph
 def test_every_kind_of_observation_reads_the_same(context, photograph, name):
     light = np.geomspace(0.2, 3.0, 64)[None] * np.ones((64, 1))
     frame = photograph(light, 9.0, context.grid.nearest(9.0))
-    signal = decode_observation(frame["raw"])
-    span, black = (
-        np.array(c)[:, None, None] for c in (context.camera.span, context.camera.black_level)
-    )
+    signal, body = decode_observation(frame["raw"]), context.camera
+    span, black = (np.array(levels)[:, None, None] for levels in (body.span, body.black_level))
     numbers = np.rint(signal * span + black).astype(np.uint16)
     meter = make_meter(name, context.camera)
     found = [meter({**frame, "raw": raw}).ev100[0] for raw in (frame["raw"], signal, numbers)]

@@ -150,9 +150,10 @@ def test_ranges_of_the_options(option, low, high):
     for value in (low - 0.1, high * 1.01, float("nan"), "half", True):
         with pytest.raises(ValueError, match=f"`{option}`"):
             ProgramOptions(**{option: value})
-    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
 
-    # Options belong to programs.
+
+def test_options_belong_to_programs():
+    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
     check_used("M", f_number=4.0, exposure_time=0.1, iso=100, weights=None)
     for program, option in (("A", "iso"), ("P", "f_number")):
         with pytest.raises(ValueError, match=f"`{option}`"):
@@ -169,11 +170,9 @@ def _samples(count=600, seed=0):
 
 def test_a_linear_surface_is_reproduced_away_from_the_data_edge():
     rng = np.random.default_rng(1)
-    features = rng.uniform(-2, 2, (4000, 2))
-    scores = np.stack([0.3 + 0.1 * features[:, 0], 0.5 - 0.05 * features[:, 1]], axis=1)
+    features, query = rng.uniform(-2, 2, (4000, 2)), rng.uniform(-1.5, 1.5, (50, 2))
+    scores, expected = (np.array([0.3, 0.5]) + x * [0.1, -0.05] for x in (features, query))
     model = ScoreRegression(features, scores, np.array([0.4, 0.4]))
-    query = rng.uniform(-1.5, 1.5, (50, 2))
-    expected = np.stack([0.3 + 0.1 * query[:, 0], 0.5 - 0.05 * query[:, 1]], axis=1)
     np.testing.assert_allclose(model.predict(query), expected, atol=0.01)
 
 

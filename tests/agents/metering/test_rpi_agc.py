@@ -98,10 +98,10 @@ def test_ladder_splits_as_published(context):
     # 100 us..10 ms at 1; gain to 2; to 30 ms; gain to 4; to 60 ms; gain to 6; to 66.666 ms; to 16.
     times = [0.004, 0.010, 0.010, 0.025, 0.030, 0.060, 0.066666, 0.066666]
     gains = [1.0, 1.0, 1.5, 2.0, 4.0, 5.0, 1.0 / 0.066666, 16.0]
-    np.testing.assert_allclose(policy.split(exposures), [times, gains], rtol=1e-6)
-    short = make_policy("rpi_agc?mode=short", context).split(np.array([0.008]))
+    np.testing.assert_allclose(policy.agc.split(exposures), [times, gains], rtol=1e-6)
+    short = make_policy("rpi_agc?mode=short", context).agc.split(np.array([0.008]))
     np.testing.assert_allclose(np.ravel(short), [0.005, 1.6])
-    long = make_policy("rpi_agc?mode=long&max_gain=64", context).split(np.array([9.0]))
+    long = make_policy("rpi_agc?mode=long&max_gain=64", context).agc.split(np.array([9.0]))
     np.testing.assert_allclose(np.ravel(long), [0.12, 64.0])  # 7.68 s at most
 
 

@@ -15,7 +15,6 @@ import torch
 from ae_env.observation import encode_observation, encode_settings
 from ae_env.scenes import load_scenes
 from agents import PolicyContext, make_policy
-from agents.learning.regression import observation_tensors
 from agents.onboard.controller import Controller, ExposureState
 from agents.onboard.export import export_agent
 from simulator.camera import get_camera
@@ -42,49 +41,24 @@ def exported(request: pytest.FixtureRequest, context: PolicyContext, tmp_path_fa
 def test_decisions_of_whole_episodes_are_those_of_torch(exported: Any) -> None:
     """In light that jumps, so that the memory is kept and forgotten; a batch is not frozen."""
     policy, file = exported
-    for num_envs in (1, 5):
-        envs = make_envs(num_envs, lighting={"kind": "step", "stops": 4, "at": 4})
+    for num_envs, stops in ((1, 4), (9, -2)):
+        envs = make_envs(num_envs, lighting={"kind": "step", "stops": stops, "at": 4})
         controller = Controller(file, num_envs)
         policy.reset(num_envs)
         shown, _ = envs.reset(seed=1)
         for _ in range(9):
             actions = policy.act(shown)
             assert controller.act(**shown).tolist() == actions.tolist()
+            if policy.kind == "regression":  # private: the memory rarely decides an action
+                np.testing.assert_allclose(controller._light, policy._light, atol=1e-4)
             shown, *_ = envs.step(actions)
-
-
-def test_numbers_are_those_of_torch(exported: Any) -> None:
-    policy, file = exported
-    rng = np.random.default_rng(0)
-    for count in (1, 2, 9):
-        shown = {
-            "raw": rng.integers(256, size=(count, 4, 64, 64), dtype=np.uint8),
-            "settings": rng.uniform(-1, 1, (count, 3)).astype(np.float32),
-            "sensors": rng.uniform(-1, 1, (count, 2)).astype(np.float32),
-        }
-        found = Controller(file, count)._session.run(None, shown)
-        with torch.inference_mode():
-            if policy.kind == "ppo":
-                tensors, _ = policy.network.obs_to_tensor(shown)
-                wanted = policy.network.get_distribution(tensors).distribution.logits.numpy()
-                wanted = wanted - wanted.max(axis=1, keepdims=True)  # torch has normalised its own
-                found = [found[0] - found[0].max(axis=1, keepdims=True)]
-            else:
-                scores, log_variance = policy.network(*observation_tensors(shown))
-                wanted = scores.numpy()
-                np.testing.assert_allclose(np.log(found[1]), -log_variance.numpy(), atol=1e-4)
-                reading = policy._meter(shown)
-                np.testing.assert_allclose(found[2], reading.ev100, atol=1e-4)
-        np.testing.assert_allclose(found[0], wanted, atol=1e-4)
 
 
 def test_it_needs_no_torch(exported: Any) -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r}); import numpy as np;"
-        "from agents.onboard.controller import Controller;"
-        f"c = Controller({str(exported[1])!r});"
-        "print(c.decide(np.full((4, 96, 128), 0.9), c.states[40]));"
-        "assert 'torch' not in sys.modules"
+        f"from agents.onboard.controller import Controller; c = Controller({str(exported[1])!r});"
+        "c.decide(np.full((4, 96, 128), 0.9), c.states[40]); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
@@ -116,26 +90,16 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> No
     camera = simulated.SimulatedCamera(
         scene, body, 4.0, delay=2, gains=gains, dropped=(5, 6, 21, 43)
     )
-    taken, asked, signal = [], [], []
-    make = camera.photograph
-
-    def seen(frame: int, given: dict[str, float]) -> Any:
-        request = make(frame, given)
-        numbers = request.make_array("raw").astype(float) - body.black_level[0]
-        signal.append(numbers.mean() / (body.white_level - body.black_level[0]))
-        return request
-
-    camera.photograph = seen
     levels = {"black": body.black_level[0], "white": body.white_level}
-    for now, wanted in loop.run(camera, Controller(exported[1]), 56, 4.0, **levels):
-        taken.append(now)
-        asked.append(wanted)
-    assert {state.f_number for state in asked} == {4.0}
-    assert all(state.exposure_time < 0.6 for state in taken)
-    assert len({round(1e6 * state.exposure_time) for state in taken}) > 1
-    for last in (17, 36, 55):  # frames that came through, at the end of each light
-        assert 0.02 < signal[last] < 0.7
-        assert abs(np.log2(taken[last].exposure_time / taken[last - 3].exposure_time)) < 0.1
+    steps = list(loop.run(camera, Controller(exported[1]), 56, 4.0, **levels))
+    assert {wanted.f_number for _, wanted in steps} == {4.0}
+    for last, frame in ((17, 19), (36, 39), (55, 59)):  # the last that came through of each light
+        (taken, _), (before, _) = steps[last], steps[last - 3]
+        assert abs(np.log2(taken.exposure_time / before.exposure_time)) < 0.1
+        controls = {"ExposureTime": 1e6 * taken.exposure_time, "AnalogueGain": taken.iso / 100}
+        numbers = camera.photograph(frame, controls).make_array("raw").astype(float)
+        signal = (numbers.mean() - body.black_level[0]) / (body.white_level - body.black_level[0])
+        assert 0.02 < signal < 0.7
 
 
 def test_what_cannot_be_exported_or_loaded_is_named(
@@ -155,9 +119,10 @@ def test_what_cannot_be_exported_or_loaded_is_named(
             Controller(path)
     controller = Controller(exported[1])
     frame = np.zeros((1, 4, 64, 64), np.uint8)
-    with pytest.raises(ValueError, match="`sensors`"):
-        controller.act(frame, np.zeros((1, 3)))
-    with pytest.raises(ValueError, match="`raw`"):
-        controller.act(np.zeros((2, 4, 64, 64)), np.zeros((1, 3)), np.zeros((1, 2)))
-    with pytest.raises(ValueError, match="`planes`"):
-        controller.decide(np.zeros((4, 8, 8)), controller.states[0])
+    for named, method, arguments in (
+        ("sensors", controller.act, (frame, np.zeros((1, 3)))),
+        ("raw", controller.act, (frame[[0, 0]], np.zeros((1, 3)), np.zeros((1, 2)))),
+        ("planes", controller.decide, (np.zeros((4, 8, 8)), controller.states[0])),
+    ):
+        with pytest.raises(ValueError, match=f"`{named}`"):
+            method(*arguments)

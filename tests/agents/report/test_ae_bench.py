@@ -49,14 +49,9 @@ def test_hash_notices_the_plan_and_the_light(plan, scenes):
     for other, own in ((plan.changed(frames=4), scenes), *((plan, own) for own in changed)):
         with pytest.raises(ValueError, match="`hash`"):
             ae_bench.check_hash(other, own)
-
-
-def test_signature_of_known_light(scenes):
-    scene = scenes[0]
     light = torch.full((4, 36, 36), 0.25)
     light[:, :9, :9] = 1.0  # the first of 4 x 4 blocks
-    found = ae_bench.scene_signature(replace(scene, light=light))
-    codes = np.array(found[-2])
+    codes = np.array(ae_bench.scene_signature(replace(scenes[0], light=light))[-2])
     assert codes.shape == (4, 4, 4)
     assert (codes[:, 0, 0] - codes[:, 3, 3] == 20).all()  # two stops in tenths
 
@@ -74,9 +69,7 @@ def test_plans_of_a_suite_have_one_hash_whatever_a_policy_sees(scenes, tmp_path)
     assert found == ae_bench.bench_hash(statistics, scenes)
     (tmp_path / "bracket.yaml").write_text(text.format(files, "budgets: [0.2]\n"))
     assert found != ae_bench.bench_hash(still, scenes)
-
-
-def test_the_published_suite_is_one():
+    # The published ones are one.
     plans = [load_plan(f"ae_bench_v2_{task}") for task in ("still", "video", "bracket")]
     assert {plan.task for plan in plans} == {"still", "video", "bracket"}
     assert len({(plan.suite, plan.scene_ids, plan.hash) for plan in plans}) == 1
@@ -109,7 +102,6 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
         *("random uint8 first", "random uint8 second"),
     ]
     assert tuple(rows[0]) == ae_bench.COLUMNS
-    assert {(row["task"], row["hash"]) for row in rows} == {("still", plan.hash)}
     assert float(rows[0]["score"]) == pytest.approx(ranking.normalised_score[0], abs=5e-5)
     assert rows[0]["real"] == rows[0]["unseen"] == ""  # no real places, no brackets
     assert float(rows[0]["procedural"]) == pytest.approx(float(rows[0]["score"]), abs=2e-4)
@@ -165,12 +157,7 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         (tmp_path / "a.md", ["random"], "me", "`append`"),
         (tmp_path / "notes.csv", ["random"], "me", r"`append` .*notes\.md"),
         (_table(tmp_path / "b.csv", plan, hash="0"), ["random"], "me", r"b\.csv .*hash"),
-        (
-            _table(tmp_path / "d.csv", plan, score="abc"),
-            ["random"],
-            "me",
-            r"d\.csv, line 2: `score`",
-        ),
+        (_table(tmp_path / "d.csv", plan, score="x"), ["random"], "me", r"d\.csv, line 2: `score`"),
         (broken, ["random"], "me", "broken.csv"),
         (columns, ["random"], "me", "columns.csv: its columns"),
     ):

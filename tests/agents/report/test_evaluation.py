@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from dataclasses import replace
 
 import gymnasium as gym
@@ -16,13 +17,12 @@ from agents.evaluation import result as made
 from agents.report.evaluation import code, code_block, escape, html_report, summary, to_markdown
 from agents.report.plots import CHART, GAP, PICTURE, TITLE, Recording, record, write_film
 from tests.agents.conftest import TINY
-from tests.agents.report.results import COLUMNS, made_brackets, made_result
+from tests.agents.report.results import made_brackets, made_result
 
 
-def test_rows_have_the_contracts_columns_and_values():
+def test_rows_have_the_values_of_their_episodes():
     result = made_result()
     rows = result_rows(result, source="bundled", split="test", resamples=500)
-    assert list(rows.columns)[: len(COLUMNS)] == COLUMNS
     assert len(rows) == 12
     by = {(r["policy"], r["condition"]): r for _, r in rows.iterrows()}
     oracle, hard = by["oracle", "all"], by["oracle", "hard"]
@@ -132,22 +132,17 @@ def test_files_of_a_report(tmp_path):
     following = ["ae-env quickstart --scenes my_raws"]
     files = write_report(made_result(), tmp_path / "out", **names, next_commands=following)
     assert {p.name for p in (tmp_path / "out").iterdir()} == set(files) == NAMES
-    results = json.loads(files["results.json"].read_text())
-    assert set(results) == {"meta", "rows"}
-    assert results["meta"]["command"] == "ae-env evaluate --seed 11"
-    assert results["meta"]["best_meter"] == "spot:P"
-    assert [row["policy"] for row in results["meta"]["ranking"]] == ["spot:P", "matrix:P", "ppo"]
+    meta = json.loads(files["results.json"].read_text())["meta"]
+    assert (meta["command"], meta["best_meter"]) == (names["command"], "spot:P")
+    assert [row["policy"] for row in meta["ranking"]] == ["spot:P", "matrix:P", "ppo"]
     text = files["report.md"].read_text()
-    for shown in ("ae-env quickstart --scenes my_raws", "best meter, `spot:P`", "ISO 6400"):
+    for shown in (*following, "best meter, `spot:P`", "ISO 6400", "1/125 s", "snow (10)"):
         assert shown in text
-    assert "1/125 s" in text
+    assert "\n\n\n" not in text
     for name in ("scores.png", "ev_error.png"):
-        assert files[name].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         data = base64.b64encode(files[name].read_bytes()).decode()
         assert data in files["report.html"].read_text()
-
-
-def test_several_conditions_no_meter_and_one_part(tmp_path):
+    # Several conditions, no meter, one part.
     result = made_result()
     result = replace(result, hard=np.zeros_like(result.hard), tracks={"ppo": result.tracks["ppo"]})
     files = write_report({"static": result, "sine": result}, tmp_path, command="x")
@@ -192,17 +187,10 @@ def test_the_terminal_shows_scores_or_every_group(tmp_path):
     assert frame.to_numpy().tolist() == [["a", "0.5000", "0.5000 to 0.5000", "0.5000"]]
 
 
-PNG = b"\x89PNG\r\n\x1a\n1234"
 #: Names that mean something to Markdown or HTML.
 HOSTILE = [
-    "![x](secret.png)",
-    "[x](http://example.org)",
-    "<script>alert(1)</script>",
-    "a | b",
-    "**bold** _it_ ~~no~~",
-    "`code` &lt; \\",
-    "line\n\n# heading",
-    "<http://example.org>",
+    *("![x](secret.png)", "[x](http://example.org)", "<script>alert(1)</script>", "a | b"),
+    *("**bold** _it_ ~~no~~", "`code` &lt; \\", "line\n\n# heading", "<http://example.org>"),
 ]
 
 
@@ -225,8 +213,8 @@ def test_names_are_shown_as_they_are(name):
 def test_cells_of_a_table_and_a_block_of_code():
     rows = pd.DataFrame({"a": ["x", "y"], "b": [[0.5, 0.25], None], "c": [{"d": 2}, {}], "n": 1e-3})
     columns = {"a": "{a}", "pair": "{b:+.1f}", "d": "{c[d]:.1f} %", "f": lambda r: r["n"] * 2}
-    found = [line.strip("|").split("|") for line in to_markdown(rows, columns).splitlines()]
-    cells = [[text.strip() for text in line] for line in found]
+    lines = to_markdown(rows, columns).splitlines()
+    cells = [[text.strip() for text in line.strip("|").split("|")] for line in lines]
     assert cells[0] == list(columns)
     assert cells[2:] == [["x", "+0.5 to +0.2", "2.0 %", "0.002"], ["y", "-", "-", "0.002"]]
     gaps = to_markdown(rows, {"a": "{a}", "none": "{b[3]}", "pair": "{b:.1f}"}, missing="")
@@ -239,24 +227,19 @@ def test_cells_of_a_table_and_a_block_of_code():
 
 def test_a_page_has_the_reports_pictures_and_no_others(tmp_path):
     for name in ("plot.png", "secret.png"):
-        (tmp_path / name).write_bytes(PNG)
+        (tmp_path / name).write_bytes(b"picture")
     text = "![A & plot](plot.png) ![a secret](secret.png) ![gone](none.png)\n\n<script>x</script>"
     page = html_report(text, {"plot.png": tmp_path / "plot.png"}, "A & B")
-    data = base64.b64encode(PNG).decode()
+    data = base64.b64encode(b"picture").decode()
     assert f'<img src="data:image/png;base64,{data}" alt="A &amp; plot"> a secret gone' in page
     assert page.count(data) == 1
     assert "<title>A &amp; B</title>" in page
-    assert "<script>" not in page
-    assert "http" not in page  # it needs no other file
+    assert not re.search("<script>|http", page)  # it needs no other file
 
 
-@pytest.fixture
-def envs():
+def test_a_film_shows_the_episode_of_each_policy_and_its_chart_up_to_now(tmp_path):
     options = {**TINY, "render_mode": "rgb_array", "with_oracle": True, "max_episode_steps": 9}
-    return gym.make_vec("ae_env/AutoExposureVideo-v0", num_envs=1, **options)
-
-
-def test_it_shows_the_episode_of_each_policy(envs, tmp_path):
+    envs = gym.make_vec("ae_env/AutoExposureVideo-v0", num_envs=1, **options)
     context = PolicyContext.from_envs(envs)
     found = record("oracle", make_policy("oracle", context), envs, 5, 3)
     envs.reset(seed=3)
@@ -274,9 +257,6 @@ def test_it_shows_the_episode_of_each_policy(envs, tmp_path):
         assert (image.format, image.n_frames) == ("GIF", 6)
         assert image.size == (2 * PICTURE + GAP, TITLE + PICTURE + CHART)
     assert done == [(n, 6) for n in range(1, 7)]
-
-
-def test_the_chart_draws_the_policy_up_to_now(tmp_path):
     picture = np.full((16, 16, 3), 200, np.uint8)
     flat = Recording("flat", [picture] * 3, [5.0] * 3, [9.0] * 3, [0.5] * 3)
     with Image.open(write_film(tmp_path / "f.gif", [flat])) as image:

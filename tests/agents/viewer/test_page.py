@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
-from simulator.optics.discs import disc_blur
+from tests.agents.viewer.test_viewed_scene import soft_raw
 
 playwright = pytest.importorskip("playwright.sync_api")
 expect = playwright.expect
@@ -58,24 +58,15 @@ def served(log, *arguments):
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """Address of a page that shows the bundled scenes."""
     log = tmp_path_factory.mktemp("view") / "log.txt"
     with served(log, "bundled:small", "--weights", "none") as found:
         yield found
 
 
-def soft_raw():
-    """A raw at f/5.6, sharp on the left, soft on the right."""
-    tiles = torch.rand(1, 24, 36, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.05
-    light = tiles.repeat_interleave(4, 1).repeat_interleave(4, 2).expand(4, 96, 144).clone()
-    light[..., 72:] = disc_blur(light, 6.0)[..., 72:]
-    return RawImage(light, CameraSettings(100, 1 / 64, 5.6), CAMERA, nlf=CAMERA.nlf(100))
-
-
 @pytest.fixture(scope="module")
 def address_of_soft_raw(tmp_path_factory):
     folder = tmp_path_factory.mktemp("soft")
-    write_dng(folder / "soft.dng", soft_raw())
+    write_dng(folder / "soft.dng", soft_raw(5.6))
     with served(folder / "log.txt", folder / "soft.dng", "--depth", "unknown") as found:
         yield found
 
@@ -102,11 +93,21 @@ def opened(address, browser):
     opened.on("request", lambda r: hosts.add(urlsplit(r.url).netloc or r.url[:5]))
     hosts: set[str] = set()
     opened.goto(address)
-    ready(opened)
+    opened.wait_for_selector(".state.shown")
     yield opened
     context.close()
     assert wrong == []
     assert hosts - {"data:", "blob:"} == {urlsplit(address).netloc}
+
+
+def saved(page, button, folder):
+    """The file that the button gives."""
+    with page.expect_download() as download:
+        page.get_by_role("button", name=button).click()
+    path = folder / download.value.suggested_filename
+    assert path.suffix == f".{button[-3:].lower()}"
+    download.value.save_as(path)
+    return path
 
 
 @pytest.fixture
@@ -124,11 +125,6 @@ def soft_page(address_of_soft_raw, browser):
         yield found
 
 
-def ready(page):
-    page.wait_for_selector(".stage img[src]")
-    page.wait_for_selector(".state.shown")
-
-
 def picture(page):
     return page.locator(".stage img").first.get_attribute("src")
 
@@ -141,12 +137,6 @@ def assert_another_picture(page, source):
 
 def slider(page, name):
     return page.locator(f"[aria-label='{name}'] [tabindex='0']")
-
-
-def assert_shows_the_clicked_state(page):
-    page.locator("button[aria-label^='ISO 6400, 1/2 s, f/4']").click()
-    expect(page.locator("button.shown[aria-label^='ISO 6400, 1/2 s, f/4']")).to_be_visible()
-    expect(page.get_by_text(re.compile(r"^\d+\.\d+% at white"))).to_be_visible()
 
 
 def test_starts_at_the_best_state_and_marks_where_a_policy_stands(page):
@@ -222,15 +212,14 @@ def test_plays_an_episode_of_two_policies(page):
     expect(page.get_by_text(re.compile("did you mean"))).to_be_visible()
 
 
-def test_a_bad_file_is_refused_and_the_page_lives(page, tmp_path):
-    bad = tmp_path / "holiday.dng"
-    bad.write_bytes(b"not a raw at all" * 100)
+def test_refuses_a_bad_file_and_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
+    (bad := tmp_path / "holiday.dng").write_bytes(b"not a raw at all" * 100)
     page.locator("input[type=file]").set_input_files(bad)
     expect(page.locator(".q-notification", has_text="holiday.dng")).to_be_visible()
-    assert_shows_the_clicked_state(page)
-
-
-def test_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
+    page.get_by_role("tab", name="Refocus, HDR").click()
+    expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
+    expect(page.get_by_role("button", name="Fuse a bracket")).to_be_disabled()
+    page.get_by_role("tab", name="Exposure").click()
     light = torch.linspace(0.02, 0.6, 96).repeat(4, 64, 1)
     raw = RawImage(light, CameraSettings(100, 1 / 64, 4), CAMERA, nlf=CAMERA.nlf(100))
     write_dng(tmp_path / "ramp.dng", raw)
@@ -238,28 +227,21 @@ def test_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
     page.get_by_text("ramp.dng", exact=True).first.wait_for()
     page.locator("button[aria-label^='ISO 400, 1/1000 s, f/8']").click()
     page.locator("button.shown[aria-label^='ISO 400, 1/1000 s, f/8']").wait_for()
-    with page.expect_download() as download:
-        page.get_by_role("button", name="DNG").click()
-    download.value.save_as(tmp_path / "back.dng")
-    back = read_raw(tmp_path / "back.dng")
+    back = read_raw(saved(page, "DNG", tmp_path))
     assert (back.settings.iso, back.settings.f_number) == (400, 8)
     assert back.data.shape == light.shape
     # 4 times the ISO, a quarter of the light by the aperture, 64/1000 of it by the time
     assert float(back.data.mean()) == pytest.approx(0.31 * 64 / 1000, rel=0.02)
+    # Without networks the aperture stays as it is, with a message.
+    page.get_by_role("tab", name="Refocus, HDR").click()
+    page.get_by_role("button", name="Open the aperture").click()
+    notice = page.locator(".q-notification", has_text="networks: they estimate the blur")
+    expect(notice).to_be_visible()
+    expect(page.get_by_role("button", name="Open the aperture")).to_be_enabled()
 
 
-def saved(page, ending, folder):
-    """The file that the button gives."""
-    with page.expect_download() as download:
-        page.get_by_role("button", name=f"save {ending.upper()}").click()
-    path = folder / download.value.suggested_filename
-    assert path.suffix == f".{ending}"
-    download.value.save_as(path)
-    return path
-
-
-def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
-    page = soft_page
+def test_opens_the_aperture_of_a_raw_and_fuses_its_bracket(soft_page, tmp_path):
+    openexr, page = pytest.importorskip("OpenEXR"), soft_page
     expect(page.get_by_role("button", name="save DNG")).to_be_disabled()
     page.get_by_text("f/1.4", exact=True).wait_for()  # the widest
     slider(page, "Wider aperture").focus()
@@ -271,48 +253,29 @@ def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
     over.wait_for()
     expect(page.get_by_text(re.compile(r"^right: f/1.6, blur estimated: the w"))).to_be_visible()
     expect(over).not_to_have_attribute("src", picture(page))
-    back = read_raw(saved(page, "dng", tmp_path))
+    back = read_raw(saved(page, "save DNG", tmp_path))
     assert back.settings.f_number == 1.6
     assert back.data.shape == (4, 96, 144)
     # Blur takes the contrast of the soft half; the sharp one is as it was recorded.
-    write_dng(tmp_path / "soft.dng", soft_raw())
+    write_dng(tmp_path / "soft.dng", soft_raw(5.6))
     raw = read_raw(tmp_path / "soft.dng")
     assert back.data[:, 8:-8, :60].equal(raw.data[:, 8:-8, :60])
     assert back.data[1, :, 84:].std() < 0.8 * raw.data[1, :, 84:].std()
+    # A bracket of it is fused.
+    page.get_by_role("button", name="Fuse a bracket").click()
+    shown = re.compile(r"^right: 17 simulated pictures, -4 to \+4 EV")
+    expect(page.get_by_text(shown)).to_be_visible()
+    with openexr.File(str(saved(page, "save EXR", tmp_path))) as file:
+        assert file.channels()["RGB"].pixels.shape == (96, 144, 3)
+    with Image.open(saved(page, "save PNG", tmp_path)) as fused:
+        assert fused.size == (288, 192)
     # The page lives while it is opened again.
     page.get_by_role("button", name="Open the aperture").click()
     expect(page.get_by_text(re.compile(r"^opening the aperture, 0\.1 megapix"))).to_be_visible()
     page.get_by_role("tab", name="Exposure").click()
-    assert_shows_the_clicked_state(page)
-
-
-def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
-    openexr = pytest.importorskip("OpenEXR")
-    soft_page.get_by_role("button", name="Fuse a bracket").click()
-    soft_page.locator(".stage .over[src]").wait_for()
-    expect(
-        soft_page.get_by_text(re.compile(r"^right: 17 simulated pictures, -4 to \+4 EV"))
-    ).to_be_visible()
-    with openexr.File(str(saved(soft_page, "exr", tmp_path))) as file:
-        assert file.channels()["RGB"].pixels.shape == (96, 144, 3)
-    with Image.open(saved(soft_page, "png", tmp_path)) as fused:
-        assert fused.size == (288, 192)
-
-
-def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
-    raw = RawImage(torch.full((4, 32, 48), 0.2), CameraSettings(100, 1 / 64, 4), CAMERA)
-    page.get_by_role("tab", name="Refocus, HDR").click()
-    expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
-    for name in ("Open the aperture", "Fuse a bracket"):
-        expect(page.get_by_role("button", name=name)).to_be_disabled()
-    write_dng(tmp_path / "flat.dng", raw)
-    page.locator("input[type=file]").set_input_files(tmp_path / "flat.dng")
-    page.wait_for_selector(".stage img[src]")
-    page.get_by_role("button", name="Open the aperture").click()
-    expect(
-        page.locator(".q-notification", has_text="networks: they estimate the blur")
-    ).to_be_visible()
-    expect(page.get_by_role("button", name="Open the aperture")).to_be_enabled()
+    page.locator("button[aria-label^='ISO 6400, 1/2 s, f/4']").click()
+    expect(page.locator("button.shown[aria-label^='ISO 6400, 1/2 s, f/4']")).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^\d+\.\d+% at white"))).to_be_visible()
 
 
 def test_fits_the_width_and_two_tabs_show_different_scenes(page, address):
@@ -324,7 +287,7 @@ def test_fits_the_width_and_two_tabs_show_different_scenes(page, address):
             page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
     other = page.context.new_page()
     other.goto(address)
-    ready(other)
+    other.wait_for_selector(".state.shown")
     other.get_by_role("button", name="Scenes").click()
     thumb = other.locator(".thumb").nth(3)
     thumb.locator("img[src]").wait_for()

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
-from simulator.capture.exposure import Exposure, Step, Target
+from simulator.capture.exposure import Exposure, Step
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
 from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT
@@ -197,14 +197,13 @@ def decided(
     scene = PreparedScene(
         LIGHT,
         SOURCE,
-        Z6,
+        Z6.with_nlf(SOURCE.iso, nlf[1]),
         nlf[0],
         denoised_lights=networks or (exact,),
         tolerance=tolerance,
         **given,
     )
     scene.blurred_light.statistics, scene.blurred_light.residuals = found, FLAT
-    scene.targets[SOURCE] = Target(1.0, nlf[1])
     return scene.exposure(SOURCE, noise=noise)
 
 

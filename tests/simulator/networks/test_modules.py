@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter
 from torch import Tensor, nn
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
-from simulator import CameraSettings, get_camera
+from simulator import get_camera
 from simulator.networks.aperture_module import (
     BLUR_FACTOR,
     DEAD_ZONE,
@@ -21,10 +21,8 @@ from simulator.networks.aperture_module import (
     DefocusMap,
     added_blur,
     band_features,
-    dead_zone,
     is_defocused,
     to_diameter,
-    usable_defocus,
 )
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
 from simulator.networks.noise_module import (
@@ -39,11 +37,6 @@ from simulator.networks.noise_module import (
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
 from simulator.optics.thin_lens import Lens
-from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
-from simulator.reference.sequences import Sequence
-from simulator.settings import exposure_ratio
-from simulator.training.data import ReferencePairs
-from simulator.training.losses import ExposureLoss
 
 
 def test_it_starts_as_the_plain_ratio() -> None:
@@ -81,45 +74,6 @@ def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None
     fit.add(source, target, ratio)
     with pytest.raises(ValueError, match="every plane"):
         fit.solve()
-
-
-def test_gradient_descent_and_closed_form_find_the_bodys_error() -> None:
-    """Reference captures f/8 -> f/4 at ratio 8. The stop f/4 lets 5 % more light through, and the
-    black level b0 is off: w = 1.05, and (x - b0) w r + b0 = w r (x + b) at b = b0 / (w r) - b0."""
-    camera = get_camera("nikon_z6")
-    source, target = CameraSettings(100, 1 / 64, 8), CameraSettings(200, 1 / 64, 4)
-    black = (0.002, -0.0015, 0.001, -0.002)
-    body = BodyError(transmission={target.aperture_stop: 0.05}, black_offset=black)
-    rng = np.random.default_rng(0)
-    light = torch.from_numpy(rng.uniform(0.01, 0.1, (4, 48, 48)).astype(np.float32))
-    scene = ReferenceScene("flat", "flat", "test", light, source)
-    pairs = ReferencePairs(
-        [Sequence(scene, (source, target))], ReferenceCamera(camera, body=body), "exposure"
-    )
-    pairs.pairs = [pair for pair in pairs.pairs if pair.source == 0]
-    ratio = exposure_ratio(source, target)
-    assert ratio == 8.0
-    truth = [b / (1.05 * ratio) - b for b in black]
-
-    fit = LinearFit()
-    batches = [pairs.batch(step, 4, 48) for step in range(3)]
-    for batch in batches:
-        fit.add(batch.source, batch.sample, batch.ratio)
-    closed = fit.solve()
-    assert float(closed.w) == pytest.approx(1.05, abs=2e-3)
-    assert closed.b.tolist() == pytest.approx(truth, abs=1.5e-4)
-
-    module = ExposureModule()
-    loss = ExposureLoss(module)
-    optimiser = torch.optim.Adam(module.parameters(), lr=5e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 300)
-    for step in range(300):
-        optimiser.zero_grad()
-        loss(batches[step % 3])["loss"].backward()
-        optimiser.step()
-        schedule.step()
-    assert float(module.w.detach()) == pytest.approx(float(closed.w), abs=2e-3)
-    assert module.b.tolist() == pytest.approx(closed.b.tolist(), abs=2e-4)
 
 
 # -- the aperture ----------------------------------------------------------------------------------
@@ -160,13 +114,6 @@ def test_only_the_images_that_open_change(preset: AperturePreset) -> None:
     assert torch.equal(output[1], image[1])
 
 
-def test_dead_zone_by_hand() -> None:
-    diameter = torch.tensor([0.0, 0.3, 0.5, 1.3, 5.0])
-    expected = [0.0, 0.0, 0.0, 1.2, np.sqrt(25 - 0.25)]  # 5, 12, 13 over ten
-    assert dead_zone(diameter, 0.5).tolist() == pytest.approx(expected, abs=1e-6)
-    assert float(dead_zone(torch.tensor(DEAD_ZONE))) == 0.0
-
-
 def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
     """3 px at f/8, less the dead zone z: 9 - z^2 squared, times a factor squared; f/4 adds 2^2 - 1
         times that. A point
@@ -203,19 +150,6 @@ def test_added_blur_is_the_thin_lens(source: float, target: float) -> None:
     np.testing.assert_allclose(np.hypot(at_source, added), at_target, rtol=1e-6, atol=1e-12)
     for same_or_closed in (source, 2 * source):
         assert not added_blur(torch.from_numpy(at_source), source, same_or_closed).any()
-
-
-def test_a_picture_in_focus_is_not_touched_by_a_stray_estimate() -> None:
-    """A twentieth of the detail must be blurred: 4 % of the pixels do not count, 50 % do."""
-    generator = torch.Generator().manual_seed(0)
-    image = 0.5 + 0.1 * torch.rand(2, 4, 50, 50, generator=generator)
-    diameter = torch.full((2, 50, 50), 0.3)
-    diameter[0, :2] = 6.0  # 4 %
-    diameter[1, :25] = 6.0
-    assert is_defocused(diameter, image).tolist() == [0.0, 1.0]
-    trusted = usable_defocus(diameter, image)
-    assert float(trusted[0].max()) == 0.0
-    assert float(trusted[1].max()) == pytest.approx(BLUR_FACTOR * (6.0**2 - DEAD_ZONE**2) ** 0.5)
 
 
 @pytest.mark.parametrize("spread", [0.2, 1.0, 3.0])
@@ -330,23 +264,6 @@ def noisy(height: int = 16, width: int = 18) -> Tensor:
     return torch.from_numpy(values.astype(np.float32))
 
 
-def test_variance_by_hand_and_below_zero() -> None:
-    """read + shot * max(x, 0): a negative pixel must not lower the variance, let alone below 0."""
-    signal = torch.tensor([-0.5, 0.0, 0.25, 1.5]).reshape(1, 1, 2, 2).expand(2, 4, 2, 2)
-    shot = torch.arange(1.0, 9.0).reshape(2, 4) * 1e-4
-    read = torch.arange(8.0, 0.0, -1.0).reshape(2, 4) * 1e-6
-    result = variance_map(signal, shot, read)
-    for item in range(2):
-        for plane in range(4):
-            s, r = float(shot[item, plane]), float(read[item, plane])
-            expected = [r, r, r + 0.25 * s, r + 1.5 * s]
-            assert result[item, plane].flatten().tolist() == pytest.approx(expected, rel=1e-6)
-    read = torch.full((1, 4), 5e-9)  # 0 in float16
-    tiny = variance_map(torch.zeros(1, 4, 2, 2, dtype=torch.float16), read * 0, read)
-    assert tiny.dtype == torch.float32
-    assert tiny.flatten().tolist() == pytest.approx([5e-9] * 16, rel=1e-5)
-
-
 def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> None:
     module, image = NoiseModule("paper"), noisy()
     module.network = Seen(0.125)
@@ -452,16 +369,6 @@ def test_the_generalised_anscombe_transform_exact_for_any_shot(shot: float, read
         cancelled = 1e-15 * np.sqrt(c) / slope
     found = stabiliser(shot, read).forward(torch.from_numpy(y).expand(1, 4, 1, -1))[0, 0, 0]
     np.testing.assert_allclose(found.double().numpy(), exact, rtol=1e-5, atol=cancelled)
-
-
-@pytest.mark.parametrize("electrons", [6, 40, 500])
-def test_it_makes_noise_of_variance_1_at_every_level(electrons: int) -> None:
-    """Poisson counts and 2 electrons of read noise; the error of 65,536 is 1 % at 3.6 of it."""
-    rng = np.random.default_rng(0)
-    counts = rng.poisson(electrons, (1, 4, 128, 128)) + rng.normal(0.0, 2.0, (1, 4, 128, 128))
-    gain = 1e-3
-    z = stabiliser(gain, (2 * gain) ** 2).forward(torch.from_numpy(counts * gain).float())
-    assert float(z.std()) == pytest.approx(1.0, abs=0.03)
 
 
 def test_the_inverse_and_other_exposures() -> None:

@@ -1,7 +1,6 @@
 """Packed raws, DNG files that come back, and blind estimates of noise that was put in."""
 
 import itertools
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -72,35 +71,20 @@ def test_unpack_clips_to_the_sensor_and_rounds():
     data = torch.tensor([-9.0, 9.0, 0.4 / 4031, 0.6 / 4031]).reshape(4, 1, 1)
     numbers = unpack_mosaic(data, camera(black=64))
     assert numbers.tolist() == [[0, 4095], [64, 65]]
+    for shape in ((4,), (1, 8), (2, 2, 2)):
+        with pytest.raises(ValueError, match="`mosaic`"):
+            pack_mosaic(np.zeros(shape, np.uint16), camera())
 
 
-@pytest.mark.parametrize("shape", [(4,), (1, 8), (8, 1), (2, 2, 2), (0, 4)])
-def test_bad_mosaic(shape):
-    with pytest.raises(ValueError, match="`mosaic`"):
-        pack_mosaic(np.zeros(shape, np.uint16), camera())
-
-
-BAD = {
-    "data": [
-        torch.zeros(3, 4, 4),
-        torch.zeros(4, 4),
-        torch.zeros(4, 0, 4),
-        torch.full((4, 2, 2), math.nan),
-        torch.full((4, 2, 2), 1e300, dtype=torch.float64),  # beyond float32
-    ],
-    "white_balance": [(1.0, 1.0), *((1.0, v, 1.0) for v in (0.0, -1.0, math.nan))],
-    "camera": ["nikon_z6"],
-    "settings": [(100, 0.01)],
-    "nlf": [(1e-4, 1e-6)],
-    "box_factor": [0, 1.5],
-}
-
-
-@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in BAD.items() for v in values])
-def test_bad_arguments(name, value):
+def test_bad_arguments():
     usual = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()}
-    with pytest.raises(ValueError, match=f"`{name}`"):
-        RawImage(**(usual | {name: value}))
+    bad = {"camera": ["nikon_z6"], "settings": [(100, 0.01)], "nlf": [(1e-4, 1e-6)]}
+    bad |= {"box_factor": [0, 1.5], "white_balance": [(1.0, 1.0), (1.0, 0.0, 1.0)]}
+    beyond_float32 = torch.full((4, 2, 2), 1e300, dtype=torch.float64)
+    bad["data"] = [*map(torch.zeros, [(3, 4, 4), (4, 4), (4, 0, 4)]), beyond_float32]
+    for name, value in ((name, value) for name, values in bad.items() for value in values):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            RawImage(**(usual | {name: value}))
 
 
 def test_noise_is_the_files_own_before_the_cameras():
@@ -195,19 +179,14 @@ def test_writing_and_reading_invert(tmp_path, mosaic, settings, white_balance, b
         assert getattr(back.noise, name) == pytest.approx((red, green, green, blue), rel=1e-12)
 
 
-def test_noise_of_box_averages_and_beyond_the_whole_range(path):
-    raw = make_raw(box_factor=4)
-    write_dng(path, raw)
-    with tifffile.TiffFile(path) as tiff:
-        assert tiff.pages.first.tags["NoiseProfile"].value[0] == pytest.approx(1.5e-4 / 16)
-    assert read_raw(path).noise.shot == pytest.approx(raw.noise.shot)
-    write_dng(path, make_raw(nlf=None))
-    with tifffile.TiffFile(path) as tiff:  # nothing is known of its noise
-        assert "NoiseProfile" not in tiff.pages.first.tags
+def test_noise_beyond_the_whole_range_and_none(path):
     nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))
     write_dng(path, make_raw(nlf=nlf, settings=CameraSettings(409_600, 4.0, 1.0)))
     back = read_raw(path)
     assert (back.noise.shot, back.noise.read) == (nlf.shot, nlf.read)
+    write_dng(path, make_raw(nlf=None))
+    with tifffile.TiffFile(path) as tiff:  # nothing is known of its noise
+        assert "NoiseProfile" not in tiff.pages.first.tags
 
 
 @pytest.mark.parametrize(
@@ -224,15 +203,10 @@ def test_libraw_reads_the_settings(path, values):
     assert known.aperture == pytest.approx(settings.f_number, rel=1e-6)
     # EXIF has 16 bits for the ISO speed; LibRaw does not look further.
     assert known.iso_speed == pytest.approx(min(settings.iso, 65535), abs=0.5)
-
-
-def test_exif_edited_by_others_wins(path):
-    write_dng(path, make_raw())
-    old, new = (np.array([1, n], "<u4").tobytes() for n in (60, 30))
-    content = path.read_bytes()
-    assert content.count(old) == 1
-    path.write_bytes(content.replace(old, new))
-    assert read_raw(path).settings.exposure_time == pytest.approx(1 / 30)
+    if values[1] == 1 / 60:  # what another program edits wins
+        content = path.read_bytes().replace(*(np.array([1, n], "<u4").tobytes() for n in (60, 30)))
+        path.write_bytes(content)
+        assert read_raw(path).settings.exposure_time == pytest.approx(1 / 30)
 
 
 def test_colour_matrix_and_camera_survive(path):
@@ -242,7 +216,6 @@ def test_colour_matrix_and_camera_survive(path):
     back = read_raw(path)
     assert (back.camera.name, back.camera.colour_matrix_source) == ("nikon_z6", "measured")
     assert back.camera.colour_matrix == matrix  # not LibRaw's own for this camera
-    assert back.noise.shot[1:3] == pytest.approx(z6.nlf(800).shot[1:3])
     assert back.camera.nlf(100) == z6.nlf(100)
 
 
@@ -287,10 +260,8 @@ def test_any_size_and_order_of_memory(path):
     """Rows are written a few at a time."""
     mosaic = np.random.default_rng(0).integers(0, 4096, (1300, 10), dtype=np.uint16)
     raw = RawImage.from_mosaic(mosaic, CameraSettings(100, 1, 4), make_raw().camera, nlf=NLF)
-    turned = replace(raw, data=raw.data.permute(2, 0, 1).contiguous().permute(1, 2, 0))
-    for each in (raw, turned):
-        write_dng(path, each)
-        np.testing.assert_array_equal(tifffile.imread(path), mosaic)
+    write_dng(path, replace(raw, data=raw.data.permute(2, 0, 1).contiguous().permute(1, 2, 0)))
+    np.testing.assert_array_equal(tifffile.imread(path), mosaic)
 
 
 def test_bad_arguments_leave_what_is_there(tmp_path, path):
@@ -300,7 +271,6 @@ def test_bad_arguments_leave_what_is_there(tmp_path, path):
         with pytest.raises(ValueError, match=f"`{name}`"):
             write_dng(target, raw)
     assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["a.dng"]
 
 
 # -- blind estimates of noise ----------------------------------------------------------------------
@@ -318,19 +288,20 @@ def patches() -> np.ndarray:
     return np.broadcast_to(row, (4, 200, 200))
 
 
-def photograph(name: str, *, soft: bool = True) -> np.ndarray:
-    """A photograph in linear light, a little softer than the pixel grid, as planes of one raw."""
-    encoded = getattr(skimage.data, name)() / 255.0
-    if not soft:
-        return np.moveaxis(encoded[::2, ::2] ** 2.2, -1, 0)[[0, 1, 1, 2]]
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    planes = np.moveaxis(linear * [0.5, 1.0, 0.65], -1, 0)[[0, 1, 1, 2]]
-    return gaussian_filter(planes, (0, 1, 1))
+def photograph(name: str) -> np.ndarray:
+    """A photograph in linear light as planes of one raw."""
+    linear = (getattr(skimage.data, name)() / 255.0) ** 2.2
+    return np.moveaxis(linear * [0.5, 1.0, 0.65], -1, 0)[[0, 1, 1, 2]]
 
 
-def with_noise(light: np.ndarray, nlf: NoiseLevelFunction, seed: int) -> np.ndarray:
+def soft(name: str) -> np.ndarray:
+    """The same a little softer than the pixel grid."""
+    return gaussian_filter(photograph(name), (0, 1, 1))
+
+
+def with_noise(light: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
     """Gaussian noise of the NLF's variance, clipped with a pedestal and quantised to 14 bits."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
     noisy = light + np.sqrt(shot * light + read) * rng.standard_normal(light.shape)
     return np.round(np.clip(noisy, -0.065, 1.0) * 15000) / 15000
@@ -343,9 +314,6 @@ def worst_ratio(estimate: NoiseLevelFunction, truth: NoiseLevelFunction) -> tupl
     return min(ratios), max(ratios)
 
 
-SHARP = photograph("astronaut", soft=False)
-
-
 @pytest.mark.parametrize(
     ("light", "camera", "iso", "least", "most"),
     [
@@ -354,21 +322,22 @@ SHARP = photograph("astronaut", soft=False)
         (patches(), "nikon_z6", 12800, 0.88, 1.12),
         (patches(), "canon_70d", 100, 0.88, 1.12),
         (np.tile(ramp(), (1, 6, 4)), "canon_70d", 800, 0.9, 1.1),  # so large that it is sampled
-        (SHARP, "canon_70d", 800, 0.9, 3.0),  # no level is smooth, and the bound is the docs'
-        *((photograph("astronaut"), "canon_70d", iso, 0.80, 1.25) for iso in (100, 6400)),
-        *((photograph("coffee"), "canon_70d", iso, 0.80, 1.25) for iso in (100, 6400)),
+        # No level is smooth, and the bound is the docs'.
+        (photograph("astronaut")[:, ::2, ::2], "canon_70d", 800, 0.9, 3.0),
+        *((soft("astronaut"), "canon_70d", iso, 0.80, 1.25) for iso in (100, 6400)),
+        *((soft("coffee"), "canon_70d", iso, 0.80, 1.25) for iso in (100, 6400)),
     ],
 )
 def test_noise_that_was_put_in_is_found(light, camera, iso, least, most):
     nlf = get_camera(camera).nlf(iso)
-    low, high = worst_ratio(estimate_nlf(with_noise(light, nlf, seed=1)), nlf)
+    low, high = worst_ratio(estimate_nlf(with_noise(light, nlf)), nlf)
     assert least < low <= high < most
 
 
 def test_clipped_half_does_not_count():
     nlf = get_camera("canon_70d").nlf(1600)
     sides = np.full((4, 256, 200), 1.2), np.zeros((4, 256, 90))
-    noisy = with_noise(np.concatenate([ramp(), *sides], axis=2), nlf, seed=4)
+    noisy = with_noise(np.concatenate([ramp(), *sides], axis=2), nlf)
     for clipped in (noisy, np.maximum(noisy, 0.0)):  # with a pedestal, and without one
         low, high = worst_ratio(estimate_nlf(clipped), nlf)
         assert 0.85 < low <= high < 1.15
@@ -384,17 +353,9 @@ def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level():
     assert 0.3 * card.shot[0] == pytest.approx(1e-4, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (np.zeros((3, 32, 32)), r"`data` \(shape"),
-        (np.full((4, 32, 32), np.nan), "finite"),
-        (np.random.default_rng(0).random((4, 8, 8)), "unclipped blocks"),
-        (np.ones((4, 64, 64)), "0 unclipped blocks"),
-    ],
-)
-def test_bad_input(data, words):
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize("data", [np.random.default_rng(0).random((4, 8, 8)), np.ones((4, 64, 64))])
+def test_what_tells_no_noise(data):
+    with pytest.raises(ValueError, match="`data`"):
         estimate_nlf(data)
 
 
@@ -402,7 +363,7 @@ def test_bad_input(data, words):
 def test_real_raws_of_one_camera_agree(data_dir):
     """Shot noise is the camera's, whatever the subject; a chart's patches are the reference."""
     folder = data_dir / "canon_crw_cc0"
-    raws = {n: read_raw(folder / f"CRW_{n}.CRW") for n in ("0101", "0105", "0113", "0118")}
+    raws = {n: read_raw(folder / f"CRW_{n}.CRW") for n in ("0101", "0113", "0118")}
     shots = [raw.noise.shot[1] for raw in raws.values()]
     assert max(shots) / min(shots) < 1.15
     nlf = raws["0101"].noise

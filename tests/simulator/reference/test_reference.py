@@ -1,7 +1,7 @@
 """The reference camera against closed forms, and sequences that it photographs."""
 
+import itertools
 import math
-import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -24,9 +24,7 @@ from simulator.reference.camera import (
 )
 from simulator.reference.sequences import (
     EXPOSURE_TIMES,
-    F_NUMBERS,
     ISO_SPEEDS,
-    Pair,
     Sequence,
     draw_settings,
     exposure_error,
@@ -103,6 +101,10 @@ def test_scene_without_depth_or_in_focus_is_left_as_it_is():
     far = scene(light, torch.full((7, 5), math.inf), lens=Lens(0.05, math.inf))
     for sharp in (scene(light), scene(light, torch.full((7, 5), 2.0)), far):
         assert torch.equal(camera.blurred_light(sharp, 4.0), light)
+    fine = torch.rand(3, 16, 16)  # through the lens, and sampled by the mosaic
+    expected = sample_mosaic(lens_blur(fine), BayerPattern.GBRG)
+    camera = ReferenceCamera(replace(sensor(1e-4, 1e-8), cfa=BayerPattern.GBRG))
+    torch.testing.assert_close(camera.blurred_light(scene(fine), 4.0), expected)
 
 
 def record(camera: ReferenceCamera, level: float, iso: float, size: int = 160) -> np.ndarray:
@@ -162,14 +164,6 @@ def test_rounding_and_box_average_in_the_variance():
     torch.testing.assert_close(average_planes(planes, 3), expected)
 
 
-def test_three_colours_are_blurred_by_the_lens_and_sampled_by_the_mosaic():
-    light = torch.rand(3, 16, 16)
-    for cfa in map(BayerPattern, ("RGGB", "GBRG")):
-        camera = ReferenceCamera(replace(sensor(1e-4, 1e-8), cfa=cfa))
-        expected = sample_mosaic(lens_blur(light), cfa)
-        torch.testing.assert_close(camera.blurred_light(scene(light), 4.0), expected)
-
-
 def test_no_noise_at_all_is_exact():
     camera = ReferenceCamera(sensor(0.0, 0.0, span=1000.0))
     signal = torch.tensor([-1.0, -0.2, -0.0012, 0.1234, 0.9996, 7.0]).expand(4, 1, 6)
@@ -178,15 +172,11 @@ def test_no_noise_at_all_is_exact():
     np.testing.assert_allclose(found, [[[0, 0, 0, 123, 1000, 1000]]] * 4, rtol=1.3e-6, atol=1e-5)
 
 
-@pytest.mark.parametrize("iso", [100.0, 400.0, 6400.0])
-def test_clipped_flat_field_is_white_at_every_iso(iso):
+def test_clipped_flat_fields_are_white_or_a_full_well_under_the_base_iso():
     camera = ReferenceCamera(Z6, body=BodyError(black_offset=(-1e-4, -1e-4, 1e-4, 1e-4)))
-    for level in (3.0, 1e30):
+    for iso, level in itertools.product((100.0, 400.0, 6400.0), (3.0, 1e30)):
         bright = camera.capture(scene(flat(level, 32)), replace(BASE, iso=iso), 1)
         assert float(bright.sample.min()) == float(bright.mean.min()) == 1.0
-
-
-def test_full_well_ends_the_signal_below_white_under_the_base_iso():
     # At ISO 50 a number stands for twice the electrons: the well is full at half of white.
     camera = ReferenceCamera(sensor(1e-4, 0.0))
     capture = camera.capture(scene(flat(8.0, 16)), replace(BASE, iso=50), 0)
@@ -224,15 +214,13 @@ def test_drawn_bodies():
     assert BodyError().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
     bodies = [BodyError.draw(Z6, seed) for seed in range(300)]
     assert bodies[5] == BodyError.draw(Z6, 5) != bodies[6]
-    assert pickle.loads(pickle.dumps(bodies[5])) == bodies[5]  # for workers of a data loader
     assert min(b.exposure_time(1 / 8000) for b in bodies) > 0
     assert np.std([b.shutter_delay for b in bodies]) == pytest.approx(15e-6, rel=0.2)
     assert 1.8 < np.abs([b.black_offset for b in bodies]).max() * 14512 <= 2.0
     light = np.array([list(b.transmission.values()) for b in bodies])
     assert light.std() == pytest.approx(0.02, rel=0.1)
     assert np.abs(light).max() <= 0.06
-    stops = {CameraSettings(100, 1, f).aperture_stop for f in (1, 1.4, 2.8, 4, 5.6, 11, 22, 32)}
-    assert stops <= set(bodies[5].transmission)
+    assert CameraSettings(100, 1, 22).aperture_stop in bodies[5].transmission
 
 
 def test_moving_image_is_smeared_over_the_true_exposure_time():
@@ -255,13 +243,13 @@ def test_same_seed_same_capture():
     assert torch.equal(first.sample, again.sample)
     assert again.settings == BASE
     # Captures of a sequence do not repeat each other's noise, whatever seed or setting differs.
-    dark = scene(flat(0.0, 40))
-    changes = [{}, {"iso": 200}, {"exposure_time": 1 / 128}, {"f_number": 8}]
-    drawn = [camera.capture(dark, replace(BASE, **c), 4) for c in changes]
-    drawn.append(camera.capture(dark, BASE, 5))
-    noise = torch.stack([capture.sample.flatten() for capture in drawn])
-    correlation = torch.corrcoef(noise) - torch.eye(5)
-    assert float(correlation.abs().max()) < 5 / math.sqrt(4 * 40 * 40)
+    changes = [{}, {"iso": 200}, {"exposure_time": 1 / 128}, {"f_number": 8}, {}]
+    dark, settings = scene(flat(0.0, 40)), [replace(BASE, **change) for change in changes]
+    drawn = [
+        camera.capture(dark, s, seed) for s, seed in zip(settings, (4, 4, 4, 4, 5), strict=True)
+    ]
+    correlation = torch.corrcoef(torch.stack([capture.sample.flatten() for capture in drawn]))
+    assert float((correlation - torch.eye(5)).abs().max()) < 5 / math.sqrt(4 * 40 * 40)
 
 
 def test_bad_input_is_refused():
@@ -272,15 +260,12 @@ def test_bad_input_is_refused():
     brief = replace(BASE, exposure_time=1 / 2000)
     bad = [torch.where(torch.eye(8) > 0, z, depth) for z in (0.0, -1.0, 0.04, math.nan)]
     for call, arguments, message in (
-        (scene, (flat(-0.1),), r"`light`.*must be >= 0"),
-        (scene, (torch.zeros(5, 8, 8),), "`light`"),
-        (scene, (torch.zeros(3, 7, 8),), "`light`.*even sides"),
-        (scene, (flat(0.1), depth[:, :4]), r"`depth` .*shape"),
-        *((scene, (flat(0.1), each), "above the focal length") for each in bad),
+        *((scene, (light,), "`light`") for light in (flat(-0.1), torch.zeros(3, 7, 8))),
+        *((scene, (flat(0.1), each), "`depth`") for each in (*bad, depth[:, :4])),
         (partial(ReferenceCamera, plain, box_factor=0), (), "`box_factor`"),
         (ReferenceCamera, (replace(plain, nlf_by_iso={}),), "noise calibration"),
         (blind.blurred_light, (scene(flat(0.1), depth + 1), 4.0), "pixel pitch"),
-        (late.capture, (scene(flat(0.1)), brief, 0), r"`exposure_time`.*shutter error"),
+        (late.capture, (scene(flat(0.1)), brief, 0), "`exposure_time`"),
     ):
         with pytest.raises(ValueError, match=message):
             call(*arguments)
@@ -329,9 +314,8 @@ def test_planes_are_sampled_by_their_colour_and_place(cfa: BayerPattern) -> None
 EXACT_F = {4.0: 4.0, 5.6: 2**2.5, 8.0: 8.0, 11.0: 2**3.5, 16.0: 16.0, 22.0: 2**4.5}
 
 
-def lit_scene(illuminance=320.0, reference=None, light=0.1):
-    frame, reference = torch.full((4, 2, 3), light), reference or CameraSettings(100, 0.01, 4)
-    return ReferenceScene("s", "g", "k", frame, reference, illuminance=illuminance)
+def lit_scene(illuminance=320.0, reference=BASE, light=0.1):
+    return scene(flat(light, 2), reference=reference, illuminance=illuminance)
 
 
 def ideal(table: dict[float, tuple[float, float]]) -> CameraProfile:
@@ -355,30 +339,6 @@ def drawn(illuminance: float, count: int, camera: CameraProfile = Z6) -> list[Ca
     return [s for _ in range(count) for s in draw_settings(illuminance, rng, camera)]
 
 
-@pytest.mark.parametrize("illuminance", [1.0, 300.0, 20_000.0])
-def test_a_sequence_has_20_to_25_different_captures_in_the_papers_ranges(illuminance):
-    rng = np.random.default_rng(1)
-    sequences = [draw_settings(illuminance, rng, Z6) for _ in range(40)]
-    assert {20, 25} <= {len(settings) for settings in sequences} <= set(range(20, 26))
-    for settings in sequences:
-        assert settings == sorted(set(settings))
-        for s in settings:
-            assert 100 <= s.iso <= 16_000
-            assert 2.0**-13 <= s.exposure_time <= 4.0  # 1/8000 s stands for 2**-13
-            assert s.f_number in EXACT_F
-
-
-def test_levels_are_what_cameras_offer():
-    assert tuple(EXACT_F) == F_NUMBERS
-    assert (ISO_SPEEDS[0], ISO_SPEEDS[-1]) == (100, 16_000)
-    np.testing.assert_allclose(np.diff(np.log2(ISO_SPEEDS)), 1 / 3, atol=0.04)
-    np.testing.assert_allclose(np.diff(np.log2(EXPOSURE_TIMES)), 1 / 3)
-    # A raw file that states one of these times, rounded or not, brings back the same number.
-    for time in EXPOSURE_TIMES:
-        assert CameraSettings.from_exif(100, time, 4).exposure_time == time
-    assert (EXPOSURE_TIMES[0], EXPOSURE_TIMES[-1]) == (2.0**-13, 4.0)
-
-
 def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
     means = []
     for illuminance in (1.0, 20.0, 400.0, 4000.0, 20_000.0):
@@ -391,10 +351,16 @@ def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
     assert (min(isos), max(isos)) == (200, 4000)
 
 
-@pytest.mark.parametrize("illuminance", [10.0, 320.0, 20_000.0])
-def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
+@pytest.mark.parametrize("illuminance", [10.0, 20_000.0])
+def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
+    rng = np.random.default_rng(1)
+    sequences = [draw_settings(illuminance, rng, Z6) for _ in range(40)]
+    assert {20, 25} <= {len(settings) for settings in sequences} <= set(range(20, 26))
+    assert all(settings == sorted(set(settings)) for settings in sequences)
+    every = list(itertools.chain(*sequences))
+    assert all(s.iso in ISO_SPEEDS and s.exposure_time in EXPOSURE_TIMES for s in every)
     # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
-    states = [(s.iso, s.exposure_time, EXACT_F[s.f_number]) for s in drawn(illuminance, 40)]
+    states = [(s.iso, s.exposure_time, EXACT_F[s.f_number]) for s in every]
     iso, time, f_number = np.array(states).T
     errors = math.log2(illuminance / 2.5) - np.log2(f_number**2 / time) + np.log2(iso / 100)
     assert np.abs(errors).max() <= 3 + 1e-9
@@ -403,14 +369,12 @@ def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
 
 
 def test_bad_arguments_are_refused():
-    for light, camera, name in ((100.0, ideal({}), "camera"), (0, Z6, "illuminance")):
-        with pytest.raises(ValueError, match=f"`{name}`"):
-            draw_settings(light, np.random.default_rng(0), camera)
-    with pytest.raises(ValueError, match="`illuminance`"):  # no exposure of the levels suits it
-        draw_settings(1e-3, np.random.default_rng(0), Z6)
-    with pytest.raises(ValueError, match="at least 2"):
+    for light in (0.0, 1e-3):  # no exposure of the levels suits it
+        with pytest.raises(ValueError, match="`illuminance`"):
+            draw_settings(light, np.random.default_rng(0), Z6)
+    with pytest.raises(ValueError, match="`settings`"):
         Sequence(lit_scene(), (CameraSettings(100, 1, 4),))
-    with pytest.raises(ValueError, match=r"`stage` \(='noises'\).*did you mean 'noise'"):
+    with pytest.raises(ValueError, match="`stage`"):
         select_pairs([], "noises", Z6)
 
 
@@ -425,15 +389,6 @@ def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
     assert grey_signal(lit_scene(640.0), settings) == pytest.approx(2 * card)
     dark = lit_scene(None, CameraSettings(100, 1 / 4, 4), light=0.3)
     assert grey_signal(dark, settings) == pytest.approx(0.15)
-
-
-@pytest.mark.parametrize("stage", ["exposure", "all"])
-def test_any_two_captures_of_one_sequence_train_the_exposure(stage):
-    settings = tuple(CameraSettings(100, t, 4) for t in (0.1, 0.2, 0.4))
-    sequences = [Sequence(lit_scene(), settings), Sequence(lit_scene(), settings[:2])]
-    expected = [(0, 0, 1), (0, 0, 2), (0, 1, 0), (0, 1, 2), (0, 2, 0), (0, 2, 1)]
-    expected += [(1, 0, 1), (1, 1, 0)]
-    assert select_pairs(sequences, stage, Z6) == [Pair(*p) for p in expected]
 
 
 def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
@@ -451,14 +406,11 @@ def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
     assert targets(SHOT_ONLY, 9, source, *candidates) == {1, 3}
 
 
-def test_noise_targets_are_neither_black_nor_white():
+def test_noise_targets_are_neither_black_nor_white_and_read_noise_counts():
     source = CameraSettings(6400, 1 / 8192, 8)  # an eighth of the light of any target
     # EV 12 is ISO 100, 1/64 s, f/8; 3 EV below and 2 EV above are the limits.
     times = (2.0**-9 * 0.98, 2.0**-9 * 1.02, 2.0**-4 * 0.98, 2.0**-4 * 1.02)
     assert targets(SHOT_ONLY, 12, source, *(CameraSettings(100, t, 8) for t in times)) == {2, 3}
-
-
-def test_read_noise_counts_in_dim_light():
     # Source and target differ in exposure by 2 and in gain not at all: brought to the target's
     # exposure the source's read variance is 4 times as large.
     reads = ideal({100.0: (1e-12, 4e-6)})

@@ -1,15 +1,26 @@
-"""Tiny scenes to train on."""
+"""Tiny scenes to train on, and a small dataset of them in the layout of the paper's."""
+
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from simulator import CameraSettings
+from simulator import CameraSettings, RawImage
 from simulator.optics.thin_lens import Lens
-from simulator.reference.camera import ReferenceScene
+from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.training.paper_dataset import packed_camera, write_packed_sequence
 
 #: 640 lux is EV100 8: a white card gives 0.663 of sensor white here.
 LUX = 640.0
 REFERENCE = CameraSettings(100, 1 / 16, 4)
+
+#: All expose a white card to 0.17 to 0.66 of sensor white.
+SETTINGS = (
+    CameraSettings(100, 1 / 16, 8),
+    CameraSettings(1600, 1 / 256, 8),
+    CameraSettings(400, 1 / 64, 5.6),
+    CameraSettings(200, 1 / 8, 16),
+)
 
 
 def scene(name: str = "a", *, size: int = 32, depth: bool = True, seed: int = 0) -> ReferenceScene:
@@ -27,3 +38,15 @@ def scene(name: str = "a", *, size: int = 32, depth: bool = True, seed: int = 0)
         lens=Lens(focal_length=0.035, focus_distance=2.0),
         illuminance=LUX,
     )
+
+
+def write_dataset(folder: Path, *, sequences: int = 3, size: int = 32) -> Path:
+    """Writes ``scene_NNN/NAME.npy`` and a table beside them."""
+    camera = packed_camera("nikon_z6")
+    body = ReferenceCamera(camera, body=BodyError.draw(camera, 1))
+    for number in range(sequences):
+        shown = scene(f"s{number}", size=size, seed=number)
+        captures = [body.capture(shown, settings, seed=number) for settings in SETTINGS]
+        raws = [RawImage(capture.sample, capture.settings, camera) for capture in captures]
+        write_packed_sequence(folder / f"scene_{number:03d}", raws)
+    return folder

@@ -11,11 +11,11 @@ import torch
 from PIL import Image
 
 from simulator import CameraSettings, get_camera
+from simulator.radiance.procedural import KINDS
 from simulator.reference.camera import DRAPED, ReferenceScene
 from simulator.training import scenes as pictures
 from simulator.training.data import DetailPicture
 from simulator.training.scenes import (
-    _edge_ratio,
     depth_photographs,
     detail_pictures,
     detail_split,
@@ -35,23 +35,29 @@ def scenes() -> dict[str, list[ReferenceScene]]:
     return {split: reference_scenes(split, CAMERA, number=28, size=48) for split in SPLITS}
 
 
-def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
-    """Circle of confusion at f/11 [packed pixels] by the thin-lens formula."""
+def blur(scene: ReferenceScene) -> np.ndarray:
+    """Circle of confusion at f/11 [packed pixels of 11.88 um] by the thin-lens formula."""
     f, s, z = scene.lens.focal_length, scene.lens.focus_distance, scene.depth.double().numpy()
-    return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
+    return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / 11.88e-6
+
+
+def assert_no_group_is_shared(made: dict[str, list]) -> None:
+    groups = [{each.group for each in own} for own in made.values()]
+    assert all(groups)
+    assert sum(map(len, groups)) == len(set().union(*groups))
+    names = [getattr(e, "scene_id", None) or e.name for own in made.values() for e in own]
+    assert len(set(names)) == len(names)
 
 
 def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
-    groups = [{s.group for s in scenes[split]} for split in SPLITS]
-    assert all(groups)
-    assert sum(map(len, groups)) == len(set().union(*groups))
-    ids = [s.scene_id for split in SPLITS for s in scenes[split]]
-    assert len(ids) == len(set(ids))
+    assert_no_group_is_shared(scenes)
     fewer = reference_scenes("test", CAMERA, number=5, size=48)[:5]
     for scene, again in zip(scenes["test"], fewer, strict=False):
         assert (scene.scene_id, scene.lens) == (again.scene_id, again.lens)
         for field in ("light", "depth"):
             torch.testing.assert_close(getattr(again, field), getattr(scene, field), rtol=0, atol=0)
+    with pytest.raises(ValueError, match="`split`"):
+        reference_scenes("trian", CAMERA)
     other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
     assert other.group != fewer[0].group
     assert not torch.equal(other.light, fewer[0].light)
@@ -61,14 +67,9 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
     train = scenes["train"]
     kinds = [s.kind for s in train]
     assert kinds.count("depth") == 21
-    assert set(kinds) == {
-        *("depth", "photograph", "dead_leaves", "indoor", "back_light", "snow", "night"),
-        *("spot_light", "motion"),
-    }
+    assert set(kinds) == {"depth", "photograph", *KINDS}
     for scene in train:
         assert (scene.light.shape, scene.size) == ((3, 96, 96), (48, 48))
-        assert scene.light.dtype == torch.float32
-        assert bool((scene.light >= 0).all())
         assert (scene.depth is not None) == (scene.kind == "depth")
         assert 1.0 <= scene.illuminance <= 20_000.0
         # The incident-light exposure, E = 2.5 * 2**EV100, with ISO 12232's 120 for white.
@@ -93,9 +94,7 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
     assert {s.group for s in views} == {"city"}
     for view in views:
         assert (view.depth, view.size, view.light.shape) == (None, (64, 64), (3, 128, 128))
-        assert f"{view.illuminance:g} lux assumed" in view.source
         assert view.reference.log2_exposure == pytest.approx(-np.log2(view.illuminance / 2.5))
-        assert bool(view.sampled and view.in_focus)
     # A quarter of the circle each, its pixels as they are: every one looks the same here.
     assert len({float(v.light.sum()) for v in views}) == 1
     with pytest.raises(FileNotFoundError, match="`data`"):
@@ -103,17 +102,13 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
 
 
 @pytest.mark.real_data
-def test_real_pictures_share_no_group_between_splits(data_dir: Path) -> None:
-    made = {s: reference_scenes(s, CAMERA, number=0, size=128, data=data_dir) for s in SPLITS}
-    for split, scenes in made.items():
-        scenes += mosaic_scenes(split, CAMERA, data_dir, size=128)
-    groups = [{s.group for s in made[split]} for split in SPLITS]
-    assert len(groups[2]) >= 25
-    assert sum(map(len, groups)) == len(set().union(*groups))
-    assert all(s.sampled and s.size == (128, 128) for scenes in made.values() for s in scenes)
-    names = [{s.scene_id for s in scenes} for scenes in made.values()]
-    assert "CRW_0112" in names[0]
-    assert {"CRW_0117", "CRW_0119", "chelsea"} <= names[2]
+def test_real_pictures_become_scenes(data_dir: Path) -> None:
+    """Of the smallest split; that no two share a group, small files show below."""
+    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
+    assert {s.kind for s in made} == {"photograph", "radiance"}
+    mosaics = list(mosaic_scenes("test", CAMERA, data_dir, size=128))
+    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
+    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
 
 
 def test_motorcycle_has_the_depth_of_its_calibration() -> None:
@@ -123,32 +118,18 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     _, _, disparity = stereo_motorcycle()
     front, middle = depth_photographs(CAMERA)
     assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
-    assert front.group == middle.group == "motorcycle"
     assert (front.light.shape, front.size) == ((3, 500, 740), (250, 370))
     assert torch.equal(front.depth, middle.depth)
     depth = 0.193001 * 994.978 / (np.where(np.isfinite(disparity), disparity, np.nan) + 31.086)
     known = np.isfinite(depth[:500, :740])
     np.testing.assert_allclose(front.depth.numpy()[known], depth[:500, :740][known], rtol=1e-5)
     assert 1.8 < front.depth.min() < front.depth.max() < 6.0
-    assert bool((front.light >= 0).all())
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("split", "trian"), ("number", -1), ("size", 8), ("seed", -1)]
-)
-def test_errors_name_the_argument(field: str, value: object) -> None:
-    arguments = {"split": "train", "number": 1, "size": 32, "seed": 0} | {field: value}
-    with pytest.raises(ValueError, match=f"`{field}` "):
-        reference_scenes(arguments.pop("split"), CAMERA, **arguments)
 
 
 @pytest.mark.real_data
 def test_real_cones(data_dir: Path) -> None:
-    cones = depth_photographs(CAMERA, data=data_dir)[2:]
-    assert [s.scene_id for s in cones] == ["cones-front", "cones-middle"]
-    for scene in cones:
-        assert scene.size == (187, 225)
-        assert bool(torch.isfinite(scene.depth).all())
+    for scene in depth_photographs(CAMERA, data=data_dir)[2:]:
+        assert (scene.group, scene.size) == ("cones", (187, 225))
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
 
 
@@ -168,17 +149,16 @@ def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:
 
 
 def test_softness_is_that_of_edges() -> None:
-    # Edges anywhere in a pixel: 2/3 of the square lies between neighbours, 5/3 between second ones.
+    """Edges anywhere in a pixel: 2/3 of the square is between neighbours, 5/3 between second ones.
+
+    Private: the whole path would need a picture of every softness.
+    """
     rng = np.random.default_rng(0)
     edge = np.repeat(rng.uniform(1.0, 2.0, (256, 64)), 400, axis=1)  # 50 steps to a pixel
-    offset = rng.integers(0, 400, 256)
-    rows = np.stack([np.roll(r, o) for r, o in zip(edge, offset, strict=True)])
+    rows = np.stack([np.roll(r, int(rng.integers(400))) for r in edge])
     pixels = rows.reshape(256, -1, 50).mean(axis=2)
-    assert _edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
-    assert _edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
-    assert _edge_ratio(rows) == pytest.approx(0.5, abs=0.01)
-    smooth = np.exp(np.sin(np.arange(512) / 20) * 0.1)[None].repeat(4, axis=0)
-    assert _edge_ratio(smooth) == pytest.approx(0.25, abs=0.01)
+    assert pictures._edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
+    assert pictures._edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
 
 
 def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
@@ -188,13 +168,6 @@ def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]
 def the_only(folder: Path, name: str) -> DetailPicture:
     (found,) = (p for own in by_split(folder).values() for p in own if p.name == name)
     return found
-
-
-def assert_no_group_is_shared(pictures: dict[str, list[DetailPicture]]) -> None:
-    groups = [{p.group for p in own} for own in pictures.values()]
-    assert len(set.union(*groups)) == sum(map(len, groups))
-    names = [p.name for own in pictures.values() for p in own]
-    assert len(set(names)) == len(names)
 
 
 def test_groups_of_files_stay_together(tmp_path: Path) -> None:
@@ -210,7 +183,6 @@ def test_groups_of_files_stay_together(tmp_path: Path) -> None:
     pictures = by_split(tmp_path)
     assert_no_group_is_shared(pictures)
     found = [p for own in pictures.values() for p in own if p.kind == "photograph"]
-    assert len(found) == 60
     assert {p.group for p in found} == {f"series{i}" for i in range(20)}
     assert len({p.group for p in pictures["train"]}) > len({p.group for p in pictures["test"]}) > 1
     assert [p.name for p in pictures["train"] if p.kind == "radiance"] == ["bridge"]
@@ -263,27 +235,10 @@ def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptu
     for own in drawn.values():
         assert [p.kind for p in own] == ["leaves"] * 8 + ["chart"] * 8 + ["smooth"] * 8
         for each in own:
-            assert each.light.shape == (3, 64, 64)
-            assert each.light.dtype == torch.float32
+            assert (each.light.shape, each.light.dtype) == ((3, 64, 64), torch.float32)
             assert bool(((each.light >= 0) & each.light.isfinite()).all())
     again, other = (detail_pictures("train", data=None, drawn=8, seed=s) for s in (0, 1))
     for first, same, new in zip(drawn["train"], again, other, strict=True):
         assert torch.equal(first.light, same.light)
         assert not torch.equal(first.light, new.light)
         assert first.group != new.group
-    with pytest.raises(ValueError, match=r"`split` \(='tests'\)"):
-        detail_pictures("tests", data=None)
-
-
-@pytest.mark.real_data
-def test_recorded_mosaics_of_one_subject_are_on_one_side(data_dir: Path) -> None:
-    drawn = {s: list(pictures.recorded_mosaics(data_dir, s)) for s in SPLITS}
-    assert_no_group_is_shared(drawn)
-    found = {p.name: (split, p) for split, own in drawn.items() for p in own}
-    assert [found[f"CRW_{n}"][0] for n in ("0101", "0112", "0117", "0119")] == 2 * ["train"] + 2 * [
-        "test"
-    ]
-    for _, each in found.values():
-        assert each.light.shape[0] == 4
-        assert 0 < each.nlf.shot[1] < 1e-3
-        assert -0.1 < float(each.light.min()) <= float(each.light.max()) < 1.5

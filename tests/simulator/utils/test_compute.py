@@ -6,7 +6,6 @@ import threading
 from functools import partial
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -19,7 +18,7 @@ from simulator.networks.aperture_module import DefocusMap
 from simulator.networks.noise_module import NoiseModule
 from simulator.utils import compute as jit
 from simulator.utils.compute import kernel, parallel_ranges
-from simulator.utils.tiles import in_tiles, make_tiles, varying
+from simulator.utils.tiles import in_tiles, varying
 
 
 def add(a: int, b: int) -> int:
@@ -28,7 +27,6 @@ def add(a: int, b: int) -> int:
 
 def test_kernels_run_without_the_lock_and_are_cached_where_they_can(monkeypatch, caplog):
     compiled = kernel(fastmath=True)(add)
-    assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
     assert compiled(1, 2) == 3
     assert {"nogil": True, "fastmath": True}.items() <= compiled.targetoptions.items()
     assert compiled.stats.cache_path is not None
@@ -67,15 +65,13 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_every_item_is_done_once(count, threads):
-    done = np.zeros((count, 10), int)
+    done = np.zeros(count, int)
 
-    def task(first: int, last: int) -> None:
-        for row in done[first:last]:  # a task may ask for shares itself
+    def add_one(first: int, last: int) -> None:
+        done[first:last] += 1
 
-            def inner(a: int, b: int, row: np.ndarray = row) -> None:
-                row[a:b] += 1
-
-            parallel_ranges(inner, 10, threads=2)
+    def task(first: int, last: int) -> None:  # a task may ask for shares itself
+        parallel_ranges(lambda a, b: add_one(first + a, first + b), last - first, threads=2)
 
     parallel_ranges(task, count, threads=threads)
     assert (done == 1).all()
@@ -109,24 +105,15 @@ def test_errors_of_any_share_are_raised_once_all_are_done(bad):
     assert done == [3 - bad]
 
 
-def _sum_in_child(queue: multiprocessing.Queue) -> None:
-    totals = np.zeros(2)
-
-    def task(first: int, last: int) -> None:
-        totals[first:last] = last
-
-    parallel_ranges(task, 2, threads=2)
-    queue.put(totals.tolist())
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
 def test_child_processes_make_threads_of_their_own():
     parallel_ranges(lambda *_: None, 2, threads=2)  # this process has some already
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
-    child = context.Process(target=_sum_in_child, args=(queue,))
+    task = partial(parallel_ranges, lambda *share: queue.put(share), 2, threads=2)
+    child = context.Process(target=task)
     child.start()
-    assert queue.get(timeout=60) == [1.0, 2.0]
+    assert sorted(queue.get(timeout=60) for _ in range(2)) == [(0, 1), (1, 2)]
     child.join(timeout=60)
 
 
@@ -152,9 +139,7 @@ def patches(height: int, width: int) -> Tensor:
     return needed
 
 
-@pytest.mark.parametrize(
-    "size", [(1, 1), (12, 16), (16, 17), (40, 41), (5, 93), (93, 5), (61, 203), (200, 130)]
-)
+@pytest.mark.parametrize("size", [(1, 1), (12, 16), (16, 17), (5, 93), (93, 5), (61, 203)])
 @pytest.mark.parametrize("tile", [12, 64, 512])
 def test_tiles_of_a_function_of_neighbourhood_and_phase(size, tile):
     """Everywhere; and where only some pixels are needed, the fallback elsewhere."""
@@ -192,11 +177,8 @@ def test_the_halo_covers_what_the_networks_see(size):
     else:
         noise = NoiseModule(size).eval().requires_grad_(False).network
         torch.nn.init.normal_(noise.tail.weight)
-        shot, read, far = (
-            torch.full((1, 4), 1e-2),
-            torch.full((1, 4), 1e-4),
-            torch.zeros(1, 4, 1, 1),
-        )
+        shot, read = torch.full((1, 4), 1e-2), torch.full((1, 4), 1e-4)
+        far = torch.zeros(1, 4, 1, 1)
         halo = camera_simulator._NOISE_HALO
         network = lambda x: noise.uncorrected(x, far.expand_as(x), shot, read)  # noqa: E731
     image, (top, bottom) = frame(256, 256), (120, 128)
@@ -212,21 +194,6 @@ def test_the_halo_covers_what_the_networks_see(size):
     tile = (..., *2 * [slice(top - halo, bottom + halo)])
     alone = network(image[tile])[..., halo:-halo, halo:-halo]
     torch.testing.assert_close(alone, found[0], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
-def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density):
-    needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
-    tiles = make_tiles(333, 270, halo=12, tile=128, needed=needed)
-    count = torch.zeros(333, 270)
-    for each in tiles:
-        count[each.inner] += 1
-        assert each.top % 4 == each.left % 4 == 0
-        assert count[each.outer][each.core].shape == count[each.inner].shape
-    assert bool((count[needed] == 1).all())
-    assert bool((count <= 1).all())
-    whole = make_tiles(333, 270, halo=12, tile=128)
-    assert sum(t.area for t in tiles) <= sum(t.area for t in whole)
 
 
 def test_constant_parts_do_not_vary():
