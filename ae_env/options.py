@@ -240,11 +240,8 @@ def takes_env_arguments(
     """Decorates a constructor that passes `EnvArguments` on: its signature shows all of them.
 
     An unknown one stays Python's own `TypeError` with its wording, which Gymnasium's consumers look
-    for; the message proposes the nearest name.
-
-    Args:
-        without: Arguments that the task does not have.
-        defaults: Other defaults than those of `EnvOptions` and of the constructor.
+    for; the message proposes the nearest name. The task does not have the arguments `without`;
+    `defaults` are other ones than those of `EnvOptions` and of the constructor.
     """
 
     def decorate(init: Callable[P, None]) -> Callable[P, None]:

@@ -39,14 +39,9 @@ _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
 def render_frame(
     raw: np.ndarray, scene: Scene, camera: CameraProfile, settings: CameraSettings, score: float
 ) -> np.ndarray:
-    """A capture, developed, with its settings and score written on it.
+    """A capture of `scene`, developed, with its settings and score written on it.
 
-    Args:
-        raw: (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals.
-        scene: The scene that it shows.
-        camera: The body.
-        settings: Settings of the capture.
-        score: Its score.
+    `raw` is (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals.
 
     Returns:
         (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.

@@ -307,8 +307,6 @@ class ExposureBracket(Task):
             self._truths[scene] = _Truth(own.clean_light, LOG_FLOOR * white, known)
         return self._truths[scene]
 
-    # -- a subject that moves between frames --------------------------------------------------
-
     def _offsets(self, env_indices: np.ndarray) -> np.ndarray:
         """(B, 2) int64: rows and columns by which the subject has moved since the first frame."""
         episodes, size = self.episodes, self.episodes.options.resolution

@@ -158,11 +158,10 @@ def checked_states(name: str, actions: Any, masks: Bools) -> Ints:
             f"policy {name!r}: `act` must return {masks.shape[0]} integers, one per camera, not "
             f"{type(actions).__name__} of shape {array.shape} and dtype {array.dtype}"
         )
-    outside = (array < 0) | (array >= masks.shape[1])
+    count = masks.shape[1]
+    outside = (array < 0) | (array >= count)
     if outside.any():
-        raise UserCodeError(
-            f"policy {name!r}: state {array[outside][0]} is not in [0, {masks.shape[1]})"
-        )
+        raise UserCodeError(f"policy {name!r}: state {array[outside][0]} is not in [0, {count})")
     forbidden = ~np.take_along_axis(masks, array[:, None], axis=1)[:, 0]
     if forbidden.any():
         raise UserCodeError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")

@@ -67,13 +67,8 @@ class SimulatedCamera:
         gain_steps: int = 1024,
         seed: int = 0,
     ) -> None:
-        self.camera, self.f_number, self.gains = camera, f_number, gains
-        self.dropped, self.line_time, self.gain_steps, self.seed = (
-            dropped,
-            line_time,
-            gain_steps,
-            seed,
-        )
+        self.camera, self.f_number, self.gains, self.seed = camera, f_number, gains, seed
+        self.dropped, self.line_time, self.gain_steps = dropped, line_time, gain_steps
         self.frame = 0
         self._prepared = prepare_scene(scene, camera)
         first = {"ExposureTime": 1e4, "AnalogueGain": 1.0}

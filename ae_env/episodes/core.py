@@ -65,10 +65,9 @@ class Frames:
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Frames that were just recorded, of B environments.
+    """Frames that were just recorded, of the B environments `env_indices`.
 
     Args:
-        env_indices: (B,) of the environments.
         statistics: Of the frames.
         outputs: The frames (B, 4, R, R), by the names of `Task.outputs`.
         gains: (B,) light relative to the scenes' own.
@@ -380,8 +379,6 @@ class EpisodeCore:
             if prepared.aperture_blur is None:  # which caches too much light to stay for long
                 self._at_rest[scene] = prepared
         return prepared
-
-    # -- what is known of an episode ----------------------------------------------------------
 
     def episode(self, env_index: int) -> Episode:
         """The episode of environment `env_index` as it is now."""

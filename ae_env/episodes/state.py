@@ -144,8 +144,6 @@ class Episodes:
         if options.recorded is not None:
             self._shown_state = np.stack([nearest_recorded(s, self.grid) for s in self.scenes])
 
-    # -- the scenes ---------------------------------------------------------------------------
-
     def _learn_about_scenes(self) -> None:
         count = len(self.scenes)
         self.allowed = np.ones((count, len(self.grid)), bool)
@@ -274,8 +272,7 @@ class Episodes:
     def act(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Advances the episodes of `env_indices` by one frame, each with its action.
 
-        Returns:
-            Those of `env_indices` that show another scene now, the next of their sequence.
+        Returns those that show another scene now, the next of their sequence.
         """
         self.previous[env_indices] = self.state[env_indices]
         self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
@@ -331,8 +328,6 @@ class Episodes:
 
     def __getitem__(self, env_index: int) -> Episode:
         return Episode(**{name: getattr(self, name).item(env_index) for name in _FIELDS})
-
-    # -- the light of the current frames ------------------------------------------------------
 
     def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
         """Light of an exposure [s] in an episode's current frame, relative to its scene's own.

@@ -155,9 +155,6 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     return kind(**options)
 
 
-# -- by a rule -------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StepLighting(Lighting):
     """The light changes by `stops` at frame `at` and stays."""

@@ -316,17 +316,10 @@ def radiance_scenes(
     """The scenes of one radiance map, all in one source group; see `map_views`.
 
     A radiance map is linear but relative: nothing in it says how many lux it shows. Unless that is
-    known, its views are put at the `assumed_ev100` of the source group, as each scene's `source`
-    says.
-
-    Args:
-        path: The file.
-        request: Camera and size.
-        name: Prefix of the scene ids.
-        group: Source group.
-        ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
-            their relative brightness), if known.
-        **fields: Further arguments of `Scene.from_radiance`.
+    known, its views are put at `ev100` or the `assumed_ev100` of the source group, as each scene's
+    `source` says: the mean of the views is 0.12 there, on average over the views, which keep their
+    relative brightness. `name` begins the scene ids; `fields` are further arguments of
+    `Scene.from_radiance`.
     """
     file = Path(path).name
     image = read_radiance(path)
@@ -352,9 +345,6 @@ def radiance_scenes(
             view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
         )
         yield request.sized(scene)
-
-
-# -- source groups and the split ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)

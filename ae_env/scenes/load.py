@@ -200,9 +200,6 @@ def _sized_list(found: Any, name: str, request: SceneRequest) -> list[Scene]:
     return [request.sized(scene) for scene in found]
 
 
-# -- the scenes of an environment -----------------------------------------------------------------
-
-
 def environment_scenes(
     spec: SceneSpec,
     split: Split,
@@ -289,14 +286,14 @@ def simulate_source_raw(
     ev: float | None = None,
     iso_range: tuple[float, float] = ISO_RANGE,
 ) -> Scene:
-    """`scene` as one simulated raw of it tells; its illuminance stays known.
+    """`scene`, without noise, as one simulated raw of it tells; its illuminance stays known.
 
     The reference camera takes the raw as an average meter would have it, at an ISO drawn between
     100 and 6400: noise, white highlights and all. Captures are simulated from it by the neural
     simulator, as in the paper.
 
     Args:
-        scene: Without noise.
+        scene: The scene.
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
         iso: ISO of the raw; drawn by default from `iso_range`, log-uniformly.
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by

@@ -147,9 +147,6 @@ class Captures:
         return self.scene_light.shape[-2]
 
 
-# -- a scene in an episode ------------------------------------------------------------------------
-
-
 def prepare_scene(
     scene: Scene,
     camera: CameraProfile,
@@ -208,12 +205,10 @@ def describe_captures(
     source_noise: Sequence[NoiseLevelFunction] | None = None,
     noisy: bool = True,
 ) -> Captures:
-    """`Captures` of one state each of `scenes`, all (B,) long.
+    """`Captures` of one state each of `scenes`, all (B,) long, by one body.
 
     Args:
-        scenes: Scene of each capture.
-        settings: Settings of each capture.
-        camera: The body.
+        scenes, settings, camera: Scene and settings of each capture, and the body.
         speed, defocus: (B,) each, see `prepare_scene`.
         movements: Of each capture, see `prepare_scene`; None for along the rows.
         gain: (B,) light relative to the scenes' own.
@@ -320,8 +315,7 @@ class SceneCaptures:
     ) -> Captures:
         """Captures of some of the states, `part`, of a scene that is `prepared` as in the episode.
 
-        `gain` is the light relative to the scene's own, one or (S,), `row_gain` (S, H) that of each
-        row relative to that, see `Captures`.
+        For `gain` and `row_gain` see `ScoreTables.table`.
         """
         states, count = self.states[part], len(self.states[part])
         blur, alike = self.blur(scene, prepared, part)
@@ -351,11 +345,11 @@ class SceneCaptures:
     def blur(
         self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)
     ) -> tuple[torch.Tensor | PixelBlur, torch.Tensor]:
-        """The extents of blur that there are, of few states: the ISO blurs nothing.
+        """The extents of blur that there are, of few states: the ISO blurs nothing. See `describe`.
 
         Returns:
             (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
-            of the K each state has. The arguments are those of `describe`.
+            of the K each state has.
         """
         few, alike = np.unique(self._which[part], return_inverse=True)
         times, f_numbers = self._blurs[few].T

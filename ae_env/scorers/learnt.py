@@ -184,10 +184,8 @@ class Nima:
     """Mean rating of people as a MobileNet expects it: (mean of 1..10 - 1) / 9.
 
     Talebi and Milanfar, NIMA: Neural Image Assessment, 2018. The weights do not come with the
-    package: `file`, else what the scorer's environment variable names, else in the cache folder.
-
-    Args:
-        file: Weights (.safetensors) that ``examples/convert_nima.py`` made from the published ones.
+    package: `file` (.safetensors), which ``examples/convert_nima.py`` made from the published ones,
+    else what the scorer's environment variable names, else in the cache folder.
 
     Raises:
         ValueError: If the file is not there or does not fit.

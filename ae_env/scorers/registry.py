@@ -76,13 +76,12 @@ def register_scorer(name: str) -> Callable[[Factory], Factory]:
     >>> "constant" in list_scorers()
     True
     """
-    if not isinstance(name, str) or not name.isidentifier():
-        raise ValueError(f"`name` (={name!r}) must be a Python identifier")
+    fits = isinstance(name, str) and name.isidentifier()
+    if not fits or getattr(_REGISTRY.get(name), "__module__", "").startswith("ae_env."):
+        rule = "must be a Python identifier, and not that of a built-in scorer"
+        raise ValueError(f"`name` (={name!r}) {rule}")
 
     def register(factory: Factory) -> Factory:
-        known = _REGISTRY.get(name)
-        if known is not None and known.__module__.startswith("ae_env."):
-            raise ValueError(f"`name` (={name!r}) must not be that of a built-in scorer")
         _REGISTRY[name] = factory
         return factory
 

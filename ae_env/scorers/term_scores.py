@@ -106,15 +106,10 @@ class TermScores:
         self._size = int(_FINE * (2.0 + 255.0 * math.sqrt(light + PEDESTAL)))
         self._tables: LruCache[np.ndarray] = LruCache(_BYTES)
 
-    # -- parts that torch evaluates -----------------------------------------------------------
-
     def torch_scores(
         self, images: torch.Tensor | None, captures: Captures, *kinds: DependsOn
     ) -> dict[str, np.ndarray]:
-        """Scores (B,) of those of `torch_terms` that depend on `kinds`.
-
-        `images` are (B, 4, H, W) in [0, 1]; None where the kinds look at none.
-        """
+        """Scores (B,) of `torch_terms` that depend on `kinds`, as of `score_parts`."""
         if self.torch_terms is None:
             return {}
         scores = self.torch_terms.score_parts(images, captures, kinds)
@@ -151,9 +146,9 @@ class TermScores:
     def _noise_shares(
         self, shot_read: np.ndarray, source_noise: np.ndarray | None = None
     ) -> np.ndarray:
-        """(K, 4, 256) float32 `Noise.shares` of each code.
+        """(K, 4, 256) float32 `Noise.shares` of each code, for noise (K, 2, 4) of native pixels.
 
-        The noise of native pixels is (K, 2, 4), as is that of the source, where it may be greater.
+        That of the source is (K, 2, 4), too; the greater of both counts.
         """
         light = _SIGNALS.double().numpy()
         variance = np.zeros((len(shot_read), 4, 256))
@@ -166,10 +161,7 @@ class TermScores:
         return shares
 
     def score(self, means: np.ndarray, captures: Captures | None) -> dict[str, np.ndarray]:
-        """Scores (B,) float64 by part, from the `means` (B, 3) of `measured` or `expected`.
-
-        `captures` may be None unless `reads_captures`.
-        """
+        """Scores (B,) float64 by part, from the `means` (B, 3) of `measured` or `expected`."""
         return {name: _score(part, means, captures) for name, part in self.parts.items()}
 
     def _shares_of_frames(

@@ -39,11 +39,9 @@ def depends_on(scorer: Scorer) -> DependsOn:
 
 
 class CompositeScorer:
-    """Weighted mean of several scorers.
+    """Weighted mean of several scorers by name, equally weighted by default.
 
-    Args:
-        parts: Scorers by name.
-        weights: Weight of each part, > 0; they are divided by their sum. Equal by default.
+    The weights, which must be positive, are divided by their sum.
 
     Raises:
         ValueError: If a part is no scorer, or a weight is missing or not positive.
@@ -162,9 +160,6 @@ def check_part(name: str, part: Any) -> None:
             *others, last = map(repr, known)
             rule = f"{', '.join(others)} or {last}"
             raise ValueError(f"scorer {name!r} has `{attribute}` (={value!r}); it must be {rule}")
-
-
-# -- calling one scorer, which may be the user's own ----------------------------------------------
 
 
 def scores_of(

@@ -64,11 +64,11 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
     """The object that a Python file calls `name`, a class or a function.
 
     The file is run once, and again after it has changed. It may import modules beside it, as a
-    script may; files in different folders may have helpers of the same name.
+    script may; files in different folders may have helpers of the same name. A relative `path` is
+    looked for in the current folder, ``~`` is the home.
 
     Args:
-        path: The file; a relative one is looked for in the current folder, ``~`` is the home.
-        name: The object's name.
+        path, name: The file, and the object's name.
         argument: How errors begin, such as ``"`scorer` (='my_scorer.py:MyScore')"``.
         example: A name that the error proposes where there is none.
 
@@ -169,9 +169,7 @@ def list_presets(kind: str = "env") -> list[str]:
 
 
 def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
-    """The YAML file of a preset of one `kind`, a folder of ``configs/``.
-
-    `name` is that of a preset, or the path of a ``.yaml`` file.
+    """The YAML file of a preset's name in a folder of ``configs/``, `kind`, or of its own path.
 
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.

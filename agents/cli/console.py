@@ -208,14 +208,13 @@ def check_outputs(*read: Path | None, **files: tuple[Path | None, str]) -> None:
     `read` are files that are read, the raw first; `files`, by the name of the option, have their
     endings. It makes nothing: whoever writes a file makes its folder, and an error leaves none.
     """
-    names = ("the raw itself", "a file that is read")
     for name, (path, suffix) in files.items():
         if path is None:
             continue
         rules = [] if path.suffix.lower() == suffix else [f"must end in {suffix}"]
-        for own, what in zip(read, names, strict=False):
+        for i, own in enumerate(read):
             if own is not None and path.resolve() == own.resolve():
-                rules.append(f"must not be {what}")
+                rules.append(f"must not be {'a file that is read' if i else 'the raw itself'}")
         if rules:
             raise ValueError(f"`{name}` (={str(path)!r}) {rules[0]}")
         make_folder(path.parent, name=name, file=path, make=False)

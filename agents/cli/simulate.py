@@ -250,7 +250,7 @@ def _lens(
     from simulator.utils.checks import check_number
 
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length
-    more = " mm; the file does not say it" if focal_length is None else " mm"
+    more = " mm; the file does not say it" if millimetres is None else " mm"
     millimetres = check_number("focal-length", millimetres, 1e-3, 1e6, more=more)
     with console.option_names(focus_distance="focus", focal_length="focal-length"):
         return Lens(millimetres / 1000.0, _focus_distance(focus, metres))

@@ -101,14 +101,9 @@ def train_simulator(
                 tasks[name] = stack.enter_context(progress(name))
             tasks[name](share, 1.0, values)
 
-        weights = train_and_save(
-            training,
-            folder / training.preset,
-            command=console.command_line(),
-            device=device,
-            tensorboard=tensorboard,
-            progress=report,
-        )
+        how: dict[str, Any] = {"device": device, "tensorboard": tensorboard, "progress": report}
+        how["command"] = console.command_line()
+        weights = train_and_save(training, folder / training.preset, **how)
     print_files({"weights": weights, "model card": weights.with_suffix(".json")})
     if training.preset in ("compact", "paper"):
         command = shlex.join(["ae-env", "simulate", "RAW", "--weights", str(weights)])

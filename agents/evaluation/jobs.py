@@ -186,10 +186,8 @@ class Jobs(EvaluationRun):
         policy = self.fitted(job.trained, conditions[0])
         for condition in conditions:
             light = self.light(condition) if getattr(policy, "privileged", False) else {}
-            track = self.run_policy(
-                *(job.trained.name, policy, condition, light),
-                report=lambda frames: report(frames * _FRAME_MS),
-            )
+            given = (job.trained.name, policy, condition, light)
+            track = self.run_policy(*given, report=lambda frames: report(frames * _FRAME_MS))
             others = {key: value for key, value in vars(track).items() if key != "arrays"}
             self.store.put(self.policy_key(job.trained, condition), {**track.arrays, **others})
 

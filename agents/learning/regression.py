@@ -53,6 +53,8 @@ SAME_LIGHT_EV = 0.35
 HYSTERESIS = 0.01
 #: Past frames come in so many parts, each from another step.
 _CHUNKS = 4
+#: Observed frames, and the scores of all states in them.
+Batch = tuple[dict[str, NDArray[Any]], Floats]
 
 
 class ScoreRegressor(nn.Module):
@@ -265,9 +267,8 @@ def train_regression(
     """A regression agent, trained on the scenes of `envs` (autoreset mode SAME_STEP)."""
     context = PolicyContext.from_envs(envs)
     with _seeded("cpu", training.seed):
-        network = ScoreRegressor(
-            context.observation_space, context.grid, training.width, training.dropout
-        )
+        space, grid = context.observation_space, context.grid
+        network = ScoreRegressor(space, grid, training.width, training.dropout)
     network.to(session.device)
     steps = max(2, training.frames // envs.num_envs)
     run = Optimisation(network, training, session, steps=steps, warm_up=0.1)
@@ -288,7 +289,7 @@ def train_regression(
 
 def rollout(
     envs: gym.vector.VectorEnv, policy: RegressionPolicy, training: RegressionTraining, step: int
-) -> Iterator[tuple[dict[str, NDArray[Any]], Floats]]:
+) -> Iterator[Batch]:
     """Each frame with the scores of all states, and some earlier ones; the policy itself drives.
 
     The training begins, or goes on, after `step` steps: every start draws other episodes.
@@ -315,9 +316,7 @@ class Replay:
         self.training, self.rng = training, rng
         self.memory: list[dict[str, NDArray[Any]]] = []
 
-    def batch(
-        self, observations: Observations, target: Floats
-    ) -> tuple[dict[str, NDArray[Any]], Floats]:
+    def batch(self, observations: Observations, target: Floats) -> Batch:
         """The new frames and some old ones; remembers the new ones and forgets the oldest."""
         new = {**observations, "target": target}
         parts = [new]

@@ -197,10 +197,9 @@ class LearningCurve:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        known = load_curve(path) if path.is_file() else {}
-        self._rows = [
-            dict(zip(known, row, strict=True)) for row in zip(*known.values(), strict=True)
-        ]
+        old = load_curve(path) if path.is_file() else {}
+        rows = zip(*old.values(), strict=True)
+        self._rows = [dict(zip(old, row, strict=True)) for row in rows]
         self._recent: list[dict[str, float]] = []
 
     def __call__(self, done: int, total: int, values: dict[str, float]) -> None:

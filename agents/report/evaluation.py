@@ -173,13 +173,10 @@ def _fence(text: str, least: int) -> str:
 
 
 def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
-    """The page of a report.
+    """The page of a report, CommonMark with tables; raw HTML in it is shown as text.
 
-    Args:
-        markdown: CommonMark with tables; raw HTML in it is shown as text.
-        pictures: The picture files that may be shown, by their names in `markdown`; they are put
-            into the page. Of any other only the caption is shown.
-        title: Of the page.
+    `pictures`, by their names in `markdown`, are put into the page; of any other only the caption
+    is shown.
     """
     from markdown_it import MarkdownIt
 

@@ -25,11 +25,7 @@ DEFAULT_EV100 = 10.0
 
 
 def reference_settings(ev100: float) -> CameraSettings:
-    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`.
-
-    >>> reference_settings(10.0)
-    CameraSettings(iso=100.0, exposure_time=0.015625, f_number=4.0)
-    """
+    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`."""
     unit = CameraSettings(_REFERENCE_ISO, 1.0, _REFERENCE_F_NUMBER)
     return replace(unit, exposure_time=2.0 ** (-unit.log2_exposure - ev100))
 

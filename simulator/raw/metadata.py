@@ -277,7 +277,8 @@ def read_own_record(directories: Sequence[Directory]) -> OwnRecord | None:
             written, rounding = max(1.0, stated), 0.5
         if abs(value - written) > rounding:
             with suppress(ValueError):
-                settings = replace(settings, **{key: float(value)})
+                changed: Any = {key: float(value)}
+                settings = replace(settings, **changed)
     return OwnRecord(settings, min(max(1, box_factor), _MAX_BOX_FACTOR), source)
 
 

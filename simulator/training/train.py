@@ -177,7 +177,7 @@ TrainingProgress = Callable[[str, float, dict[str, float]], None]
 class Batches(Protocol):
     """Pairs of captures as batches, by the number of the step."""
 
-    pairs: Sequence[Any]
+    pairs: Any  # a sequence of them
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch | NoiseBatch:
         """The pairs of one step."""

@@ -46,7 +46,7 @@ ROWS, COLUMNS = 32, 128  # pixels of one flat patch
 
 
 def sensor_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
-    lights = BlurredLight(light, (), ZERO, None)
+    lights = BlurredLight(light, ZERO, None)
     return exposed_light(lights.blurred(exposure), exposure)
 
 
