@@ -30,8 +30,8 @@ _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 Preset = Annotated[
     str | None,
     Option(
-        help="quick, standard, video, bracket, ae_bench_v2_still (_video, _bracket), or a .yaml "
-        "file of one's own."
+        help="quick, standard, video, convergence, ablation, bracket, ae_bench_v2_still (_video, "
+        "_bracket), or a .yaml file of one's own."
     ),
 ]
 Environment = Annotated[
