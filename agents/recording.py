@@ -64,8 +64,6 @@ def record_dataset(
         progress: Called with the episodes that are done, and all.
 
     Raises:
-        ValueError: See `check_dataset_id`.
-        ImportError: If the extra ``minari`` is not installed.
         UserCodeError: If the policy raises, or chooses what is no allowed state.
     """
     check_dataset_id(dataset_id)

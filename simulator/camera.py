@@ -42,9 +42,8 @@ class BayerPattern(StrEnum):
         ((0, 1), (0, 0), (1, 1), (1, 0))
         """
         red, blue = self.value.index("R"), self.value.index("B")
-        green_with_red = red ^ 1  # the other column of red's row
-        green_with_blue = blue ^ 1
-        return tuple(divmod(i, 2) for i in (red, green_with_red, green_with_blue, blue))
+        # Each green is in the other column of a row.
+        return tuple(divmod(i, 2) for i in (red, red ^ 1, blue ^ 1, blue))
 
 
 @dataclass(frozen=True)

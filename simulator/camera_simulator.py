@@ -1,8 +1,4 @@
-"""The camera simulator: plans which steps a change of settings needs, and runs those.
-
-A raw or a scene is prepared once (`CameraSimulator.prepare`): everything that does not depend on
-the target settings, the networks included. Exposing it at any settings is a few element-wise steps.
-"""
+"""The camera simulator: plans which steps a change of settings needs, and runs those."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack, cast, get_args
+from typing import Any, Literal, TypedDict, TypeVar, Unpack, cast, get_args
 
 import torch
 from torch import nn
@@ -52,6 +48,7 @@ from simulator.utils.checks import check_word
 from simulator.utils.compute import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 
+Module = TypeVar("Module", bound=nn.Module)
 #: Depth of a scene: it is far or in focus throughout, or it is not known.
 Depth = Literal["far", "unknown"]
 #: Sources of a simulation.
@@ -92,11 +89,7 @@ class Stages:
 
 
 def prepared_of(source: Source, device: torch.device) -> PreparedScene:
-    """The light of `source` as it was recorded, or a prepared scene as it is, on `device`.
-
-    Raises:
-        ValueError: If `source` is neither a raw nor a prepared scene nor a scene.
-    """
+    """The light of `source` as it was recorded, or a prepared scene as it is, on `device`."""
     if isinstance(source, RawImage):
         marks, camera = source.saturated, source.camera
         if source.nlf is not None and not camera.nlf_by_iso:
@@ -131,6 +124,13 @@ def _for_the_map(prepared: PreparedScene) -> torch.Tensor | None:
     validation scenes was 2 % larger than with the largest at ISO 6400, and the same at ISO 100.
     """
     return prepared.denoised_lights[0].light if prepared.denoised_lights else None
+
+
+def _required(kind: str, module: Module | None) -> Module:
+    """`module`, which the caller needs."""
+    if module is None:
+        raise ValueError(f"there is no {kind} module: use CameraSimulator.from_pretrained")
+    return module
 
 
 class CameraSimulator:
@@ -263,11 +263,6 @@ class CameraSimulator:
         Raises:
             ValueError: If an argument is out of range, or `depth` needs networks that are not here.
         """
-        if tolerance is None:
-            raise ValueError(
-                "`tolerance` (=None) must be a number here: what is prepared is shared between "
-                "transitions; ask `simulate` for the full run of one"
-            )
         check_word("depth", depth, get_args(Depth))
         if depth == "unknown" and self.aperture is None:
             raise ValueError(
@@ -298,10 +293,10 @@ class CameraSimulator:
         self, source: Source, image_speed: float | None, defocus: float | None
     ) -> PreparedScene:
         """The source's light, with its motion and blur unless they are None."""
+        given = {"image_speed": image_speed, "defocus": defocus}
+        known: Any = {name: value for name, value in given.items() if value is not None}
         prepared = prepared_of(source, self.device)
-        if image_speed is not None:
-            prepared = replace(prepared, image_speed=image_speed)
-        return prepared if defocus is None else replace(prepared, defocus=defocus)
+        return replace(prepared, **known) if known else prepared
 
     @torch.no_grad()
     def denoise(self, prepared: PreparedScene, noise: NoiseModule | None = None) -> torch.Tensor:
@@ -313,9 +308,7 @@ class CameraSimulator:
         Raises:
             ValueError: If this simulator has no noise module.
         """
-        noise = self.noise if noise is None else noise
-        if noise is None:
-            raise ValueError("there is no noise module: use CameraSimulator.from_pretrained")
+        noise = _required("noise", self.noise if noise is None else noise)
         image, (shot, read) = prepared.light[None], self._noise_of(prepared)
         if not noise.commutes:
             with self._autocast():
@@ -341,9 +334,7 @@ class CameraSimulator:
         Raises:
             ValueError: If this simulator's aperture module has no such map.
         """
-        if self.aperture is None:
-            raise ValueError("there is no aperture module: use CameraSimulator.from_pretrained")
-        aperture = self.aperture
+        aperture = _required("aperture", self.aperture)
         shot, read = self._noise_of(prepared)
         light = prepared.light[None]
         clean = _for_the_map(prepared)
@@ -440,14 +431,11 @@ class CameraSimulator:
     ) -> SimulationPlan:
         """Which steps the change to `settings` takes, why others are left out, error and cost.
 
-        Args:
-            source: A raw, a prepared scene, or a scene.
-            settings: Target settings.
-            noise: False plans the light on the sensor alone (`PreparedScene.expected`).
-            tolerance, scene: See `prepare`.
+        Without `noise`, of the light on the sensor alone; see `prepare` for the other arguments.
         """
         return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 
+    @torch.no_grad()
     def stages(
         self,
         source: Source,
@@ -462,59 +450,40 @@ class CameraSimulator:
         presets ``"paper"`` and ``"ncs"`` clip to [0, 1] after the exposure, as the paper does.
 
         Args:
-            source: A raw, a prepared scene, or a scene.
+            source, scene: See `prepare`; by default the depth is unknown.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-            scene: See `prepare`; by default the depth is unknown.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.
         """
-        if self.noise is None or self.aperture is None:
-            raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
+        noise, aperture = _required("noise", self.noise), _required("aperture", self.aperture)
         depth = scene.get("depth", "unknown")
         check_word("depth", depth, get_args(Depth))
-        prepared = self._seen(source, scene.get("image_speed"), scene.get("defocus"))
-        opens = depth == "unknown" or prepared.aperture_blur is not None
-        # A prepared scene may be corrected already; a scene is no recording of this body.
-        exposure = self.exposure
-        if not isinstance(source, RawImage):
-            exposure = ExposureModule().requires_grad_(False).to(self.device)
-        return self._full_run(prepared, settings, exposure, opens, seed)
-
-    @torch.no_grad()
-    def _full_run(
-        self,
-        prepared: PreparedScene,
-        settings: CameraSettings,
-        module: ExposureModule,
-        opens: bool,
-        seed: int,
-    ) -> Stages:
-        """The paper's pipeline; `opens` says whether the aperture module runs."""
-        assert self.noise is not None
-        assert self.aperture is not None
         keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
+        prepared = self._seen(source, scene.get("image_speed"), scene.get("defocus"))
+        # A prepared scene may be corrected already; a scene is no recording of this body.
+        module = self.exposure if isinstance(source, RawImage) else ExposureModule().to(self.device)
         # What networks found out about the scene is not used.
         bare = replace(prepared, denoised_lights=(), aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = module(prepared.light[None], exposure.ratio)
-        if not self.noise.commutes:
+        if not noise.commutes:
             exposed = exposed.clamp(0.0, 1.0)
         nlf = prepared.nlf.exposed(float(module.w) * exposure.ratio)
         shot, read = (torch.tensor([v]).to(exposed) for v in (nlf.shot, nlf.read))
         with self._autocast():
-            denoised = opened = self.noise(exposed, shot, read)
-            if opens:
+            denoised = opened = noise(exposed, shot, read)
+            if depth == "unknown" or prepared.aperture_blur is not None:
                 deviation = variance_map(smoothed(exposed), shot, read).sqrt()
                 f_numbers = (
                     torch.tensor([s.effective_f_number], device=exposed.device)
                     for s in (prepared.reference, settings)
                 )
-                opened = self.aperture(denoised, deviation, *f_numbers)
+                opened = aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        lights = BlurredLight(opened[0], (), at_target.source, None)
+        lights = BlurredLight(opened[0], at_target.source, None)
         light = exposed_light(lights.blurred(at_target), at_target)
         capture = torch.empty_like(light)[None]
         record(Transitions.of([light], [at_target]), prepared.camera, keys=keys, signals=capture)

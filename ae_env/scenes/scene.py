@@ -132,9 +132,7 @@ class Scene:
             denoised_lights=denoised,
             aperture_blur=aperture_blur,
             layout=self.layout,
-            blurred_light=BlurredLight(
-                self.light, denoised, self.nlf, aperture_blur, self._statistics
-            ),
+            blurred_light=BlurredLight(self.light, self.nlf, aperture_blur, self._statistics),
         )
 
     @cached_property

@@ -82,7 +82,7 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from ae_env.utils.user_files import find_config
-    from simulator.training.train import SimulatorConfig, first_modules, train_and_save
+    from simulator.training.trainer import SimulatorConfig, first_modules, train_and_save
     from simulator.utils.config_file import load_yaml
 
     training = load_yaml(find_config(config), SimulatorConfig)
@@ -101,14 +101,9 @@ def train_simulator(
                 tasks[name] = stack.enter_context(progress(name))
             tasks[name](share, 1.0, values)
 
-        weights = train_and_save(
-            training,
-            folder / training.preset,
-            command=console.command_line(),
-            device=device,
-            tensorboard=tensorboard,
-            progress=report,
-        )
+        how: dict[str, Any] = {"device": device, "tensorboard": tensorboard, "progress": report}
+        how["command"] = console.command_line()
+        weights = train_and_save(training, folder / training.preset, **how)
     print_files({"weights": weights, "model card": weights.with_suffix(".json")})
     if training.preset in ("compact", "paper"):
         command = shlex.join(["ae-env", "simulate", "RAW", "--weights", str(weights)])
@@ -129,7 +124,7 @@ def export(
     """
     import gymnasium as gym
 
-    from agents.learning.weights import load_agent, trained_grid
+    from agents.learning.policy_file import load_agent, trained_grid
     from agents.onboard.controller import Controller
     from agents.onboard.export import export_agent
     from agents.policy import PolicyContext

@@ -22,7 +22,7 @@ from ae_env.options import EnvOptions
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
-from agents.evaluation.plan import (
+from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
     SEED_STRIDE,
@@ -155,12 +155,11 @@ def _plan_of(
     delay = dict(options.delay) if isinstance(options.delay, Mapping) else options.delay
     environment = {k: v for k, v in given.items() if k not in CONDITION_ARGUMENTS}
     scenes = options.scenes if isinstance(options.scenes, str) else "given scenes"
+    condition = Condition(lighting=options.lighting, delay=delay)
     return EvaluationPlan(
         name=f"{scenes}, {options.split} split",
         environment={**environment, "split": options.split},
-        conditions={
-            light_name(options.lighting): Condition(lighting=options.lighting, delay=delay)
-        },
+        conditions={light_name(options.lighting): condition},
         starts=("random",),
         frames=frames,
         seeds=tuple(seeds),
@@ -254,9 +253,8 @@ class EvaluationRun:
     def score_light(self, condition: Condition, report: Report) -> Arrays:
         """q of every state in every frame of the light of `condition`, whatever the start.
 
-        Returns:
-            ``scores`` and ``allowed`` (J, T + 1, S), the reset frame first; ``speed`` and
-            ``defocus`` (J,) and ``movement`` (J, 4) that the episodes drew.
+        ``scores`` and ``allowed`` (J, T + 1, S) have the reset frame first; ``speed`` and
+        ``defocus`` (J,) and ``movement`` (J, 4) are those that the episodes drew.
         """
         count, frames, own = self.num_tables, self.plan.frames, self.episodes
         episodes = RolloutPlan(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
@@ -435,11 +433,8 @@ def run_batch(
     """Run one policy over one batch of episodes, which `envs` are freshly reset to.
 
     A privileged policy's ``info`` gets `oracle`, (N, frames + 1), the best state of every frame,
-    the reset frame first.
-
-    Returns:
-        The arrays of a `Track` without their leading axis, of the valid episodes, and their
-        ``start_states`` (n,); ``seconds`` (frames,) that `act` took for the batch.
+    the reset frame first. Returned are the arrays of a `Track` without their leading axis, of the
+    valid episodes, their ``start_states`` (n,), and ``seconds`` (frames,) that `act` took.
     """
     base: Any = envs.unwrapped
     with errors_of(name, "reset"):

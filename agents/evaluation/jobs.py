@@ -29,7 +29,7 @@ from agents.evaluation.engine import (
     check_scorers,
     other_scores,
 )
-from agents.evaluation.plan import Condition, EvaluationPlan
+from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
 from agents.evaluation.result import EvaluationResult, Track
 from agents.learning.workers import core_count, run_in_parallel, send_progress
 from agents.policy_names import (
@@ -186,10 +186,8 @@ class Jobs(EvaluationRun):
         policy = self.fitted(job.trained, conditions[0])
         for condition in conditions:
             light = self.light(condition) if getattr(policy, "privileged", False) else {}
-            track = self.run_policy(
-                *(job.trained.name, policy, condition, light),
-                report=lambda frames: report(frames * _FRAME_MS),
-            )
+            given = (job.trained.name, policy, condition, light)
+            track = self.run_policy(*given, report=lambda frames: report(frames * _FRAME_MS))
             others = {key: value for key, value in vars(track).items() if key != "arrays"}
             self.store.put(self.policy_key(job.trained, condition), {**track.arrays, **others})
 

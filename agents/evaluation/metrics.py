@@ -164,11 +164,9 @@ def reversals(evs: Floats) -> Ints:
 
 
 def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
-    """Mean absolute change of the image mean between successive frames of the same light.
+    """Mean absolute change of the mean linear signal, in [0, 1], (..., T), in the same light.
 
-    Args:
-        image_means: Mean linear signal of each frame after an action, in [0, 1], ``(..., T)``.
-        static: Whether the light is that of the frame before, ``(..., T - 1)``; if never, 0.
+    `static` (..., T - 1) says whether the light is that of the frame before; if never, it is 0.
     """
     change = np.abs(np.diff(image_means, axis=-1))
     static = np.broadcast_to(static, change.shape)

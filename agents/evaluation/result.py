@@ -26,7 +26,7 @@ from simulator.utils.checks import check_word
 if TYPE_CHECKING:
     from ae_env.grid import ExposureGrid
     from ae_env.scenes import Scene
-    from agents.evaluation.plan import EvaluationPlan
+    from agents.evaluation.evaluation_plan import EvaluationPlan
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -109,22 +109,18 @@ class Track:
 class EvaluationResult:
     """Everything measured in one condition; `E` episodes, `T` frames, `S` states.
 
+    Scene, source group and kind of each episode are ``(E,)``; tracks are by policy.
+
     Args:
-        grid: The exposure states.
-        scene_ids: Scene of each episode, ``(E,)``.
-        groups: Source group of each episode.
-        kinds: Kind of scene of each episode.
-        hard: Whether the episode's scene is in the hard part.
+        hard: Whether the episode's scene is in the hard part, ``(E,)``.
         start_states: State of the reset frame; empty for brackets, as `scores` and `allowed`.
         scores: q of every state, ``(E, T, S)``.
         allowed: Action masks of every frame, ``(E, T, S)``.
-        tracks: By policy.
         seed: The plan's first seed.
         delays: Frames between a decision and the frame that has its ISO, its exposure time and
             its aperture.
         plan: The plan that the condition belongs to; None where a result was put together by hand,
             as everything below.
-        scenes: Scene of each episode.
         speed: Image speed of each episode [frame heights per second], ``(E,)``.
         defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
         movement: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.

@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation.plan import EvaluationPlan, digest, load_plan
+from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
 from agents.report.evaluation import fill
@@ -161,10 +161,7 @@ def append_rows(
     """Adds rows of `bench_rows` to a benchmark's table, and writes its page again: files by name.
 
     A row of the same task, policy, observation and author is replaced, which is logged; others
-    stay. The table is made where missing.
-
-    Raises:
-        ValueError: If the table has other columns, or rows of another hash.
+    stay. The table is made where missing; one with rows of another hash is refused.
     """
     known = _read_own(table, plan)
     found = rows.assign(
@@ -212,11 +209,7 @@ def _parse(text: str) -> pd.DataFrame:
 
 
 def read_table(table: Path) -> pd.DataFrame:
-    """Rows of a benchmark's table, all cells as texts; none where there is no file.
-
-    Raises:
-        ValueError: If it cannot be read, its columns are not `COLUMNS`, or a cell is no number.
-    """
+    """Rows of a benchmark's table, checked, all cells as texts; none where there is no file."""
     if not table.is_file():
         return pd.DataFrame(columns=COLUMNS, dtype=str)
     try:

@@ -16,8 +16,8 @@ import jinja2
 import numpy as np
 import pandas as pd
 
+from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES
-from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, digest
 from agents.evaluation.result import (
     MORE_COLUMNS,
     ROW_COLUMNS,
@@ -173,13 +173,10 @@ def _fence(text: str, least: int) -> str:
 
 
 def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
-    """The page of a report.
+    """The page of a report, CommonMark with tables; raw HTML in it is shown as text.
 
-    Args:
-        markdown: CommonMark with tables; raw HTML in it is shown as text.
-        pictures: The picture files that may be shown, by their names in `markdown`; they are put
-            into the page. Of any other only the caption is shown.
-        title: Of the page.
+    `pictures`, by their names in `markdown`, are put into the page; of any other only the caption
+    is shown.
     """
     from markdown_it import MarkdownIt
 

@@ -107,9 +107,6 @@ def find_scenes(what: str) -> Library:
         what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
             (of a recorded grid the light that its captures tell together), or the id of a bundled
             scene.
-
-    Raises:
-        ValueError: If it is none of these.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
@@ -294,10 +291,9 @@ class ViewedScene:
                 if settings is not None:
                     values = (settings.iso,), (settings.exposure_time,), (settings.f_number,)
                     grid = ExposureGrid(*values)
+                moves: dict[str, Any] = {"speed": view.speed, "defocus": view.defocus}
                 tables = ScoreTables(grid, self.scene.camera, self._scorer)
-                self._tables[key] = tables.table(
-                    self.scored, speed=view.speed, defocus=view.defocus
-                )
+                self._tables[key] = tables.table(self.scored, **moves)
             return self._tables[key]
 
     def write_dng(self, path: Path, view: View) -> Path:

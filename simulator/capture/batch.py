@@ -17,7 +17,7 @@ import numpy as np
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import Pool
-from simulator.capture.exposure import LIGHT_LIMIT, Exposure, decide
+from simulator.capture.decision import LIGHT_LIMIT, Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (
@@ -98,8 +98,7 @@ class FrameSource(Protocol):
         """Records scenes that are prepared, and fills the outputs.
 
         Args:
-            indices: (B,) of the scenes.
-            states: (B,) at which each is photographed.
+            indices, states: As they were prepared.
             seeds: (B,) integers >= 0, of the noise.
             frames: (B,) numbers that the noise of one seed differs by.
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None
@@ -207,7 +206,8 @@ class CaptureBatch:
         read_noise = None
         if self.noise == "sensor":
             pairs = zip(indices.tolist(), states.tolist(), strict=True)
-            read_noise = [self.prepared_scene(i).read_noise(self.states[s]) for i, s in pairs]
+            boxes = [(self.states[s].iso, self.prepared_scene(i).box_factor) for i, s in pairs]
+            read_noise = [self.camera.read_noise(iso, box) for iso, box in boxes]
         counts = record(
             transitions,
             self.camera,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from simulator.capture.exposure import LIGHT_LIMIT, Exposure
+from simulator.capture.decision import LIGHT_LIMIT, Exposure
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
@@ -48,6 +48,8 @@ class ApertureBlur(ABC):
 
     #: Whether it works on the noise-reduced light only.
     needs_denoised = False
+    #: Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown.
+    mean_square_diameter: float = 0.0
 
     def __init__(self, f_number: float, everywhere: bool = True) -> None:
         self.f_number, self.everywhere = f_number, everywhere
@@ -67,23 +69,13 @@ class ApertureBlur(ABC):
         return self._extents[f_number]
 
     def opened(self, f_number: float, denoised: DenoisedLight | None = None) -> Tensor:
-        """Light (4, H, W) at the wider aperture, at unchanged exposure.
-
-        Args:
-            f_number: Effective f-number wanted, smaller than the source's.
-            denoised: The noise-reduced light that is opened; None for the light as recorded.
-        """
+        """Light (4, H, W) at a wider aperture, of `denoised` or as recorded, equally exposed."""
         key = f_number, None if self.needs_denoised else denoised
         result = self._opened.get(key)
         if result is None:
             result = self._open(f_number, denoised)
             self._opened.put(key, result, result.nbytes)
         return result
-
-    @property
-    def mean_square_diameter(self) -> float:
-        """Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown."""
-        return 0.0
 
     @abstractmethod
     def remaining_variance(self, f_number: float) -> Tensor | None:
@@ -105,7 +97,6 @@ class MapApertureBlur(ApertureBlur):
         light: (4, H, W) as recorded.
         diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or a function that
             estimates it, called when an aperture first opens.
-        f_number, everywhere: See `ApertureBlur`.
     """
 
     def __init__(
@@ -137,7 +128,7 @@ class MapApertureBlur(ApertureBlur):
         return self._left[f_number]
 
     @functools.cached_property
-    def mean_square_diameter(self) -> float:
+    def mean_square_diameter(self) -> float:  # type: ignore[override]
         """See `ApertureBlur`."""
         return float(self.diameter.square().mean())
 
@@ -146,11 +137,6 @@ class MapApertureBlur(ApertureBlur):
 
     def _added(self, diameter: Tensor, f_number: float) -> Tensor:
         return discs.added_blur(diameter, self.f_number, f_number)
-
-    @functools.cached_property
-    def _tiles(self) -> list[Tile]:
-        """The parts of the frame that are out of focus."""
-        return make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
 
     def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:
         light = self._recorded if denoised is None else denoised.light
@@ -161,7 +147,7 @@ class MapApertureBlur(ApertureBlur):
             cache = self._banks if self.diameter.numel() <= TILE**2 else {}
             return _bank(cache, (tile, denoised), light[tile.outer]).blurred(added)[tile.core]
 
-        tiles = self._tiles
+        tiles = make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
         if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
             return blurred(tiles[0])
         result = light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT)
@@ -229,7 +215,6 @@ class BlurredLight:
 
     Args:
         light: (4, H, W) as recorded.
-        denoised_lights: The same with little noise, by each network.
         nlf: Noise of `light`.
         aperture_blur: Blur that wider apertures add, or None.
         statistics: Statistics of `light`, where they are at hand.
@@ -240,15 +225,13 @@ class BlurredLight:
     def __init__(
         self,
         light: Tensor,
-        denoised_lights: tuple[DenoisedLight, ...],
         nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
         cache_bytes: int = CACHE_BYTES,
         pool: Pool | None = None,
     ) -> None:
-        self.light, self.denoised_lights = light, denoised_lights
-        self.aperture_blur = aperture_blur
+        self.light, self.aperture_blur = light, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
         self._cache_bytes = cache_bytes
@@ -259,21 +242,13 @@ class BlurredLight:
         self._latest: tuple[tuple[object, ...], Tensor] | None = None  # by `Exposure.blur`
 
     @property
-    def known(self) -> tuple[Any, ...]:
-        """All that is known of the light: the arguments between it and the statistics."""
-        return self.denoised_lights, self.residuals.nlf, self.aperture_blur
+    def known(self) -> tuple[NoiseLevelFunction, ApertureBlur | None]:
+        """Its noise and its aperture blur."""
+        return self.residuals.nlf, self.aperture_blur
 
     def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
-        copied = BlurredLight(
-            self.light,
-            self.denoised_lights,
-            self.residuals.nlf,
-            self.aperture_blur,
-            statistics=self.statistics,
-            cache_bytes=cache_bytes,
-            pool=pool,
-        )
+        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes, pool)
         copied.residuals = self.residuals
         return copied
 
@@ -319,13 +294,10 @@ class BlurredLight:
     # -- batches ------------------------------------------------------------------------------
 
     def begin(self, exposure: Exposure) -> tuple[Tensor, Blur | Callable[[], None] | None]:
-        """The light (4, H, W) with every blur of `exposure`, valid until the next call.
+        """The light (4, H, W) with every blur of `exposure`, valid until the next call; and the
+        blur or the function that fills it, None where that was done before.
 
         The latest light is cached, because an agent that has settled repeats its state.
-
-        Returns:
-            The light, and the blur (`simulator.optics.discs.blur_many`) or the function that fills
-            it; None where that was done before.
         """
         if self._latest is not None and self._latest[0] == exposure.blur:
             return self._latest[1], None

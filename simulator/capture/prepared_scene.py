@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
-from simulator.capture.exposure import (
+from simulator.capture.decision import (
     DEFAULT_TOLERANCE,
     Exposure,
     check_tolerance,
@@ -222,21 +222,21 @@ class PreparedScene:
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
-        known = self.denoised_lights, self.nlf, self.aperture_blur
-        same_light = cached is not None and cached.light is self.light
-        if cached is None or not same_light or cached.known != known:
-            if not same_light:  # a copy's light was checked before
-                object.__setattr__(self, "light", check_packed("light", self.light))
-            for denoised in self.denoised_lights:
-                check_type("denoised_lights", denoised, DenoisedLight)
-                if denoised.shape not in (None, self.light.shape):
-                    raise ValueError(
-                        f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
-                        f"`light`, {tuple(self.light.shape)}"
-                    )
-            statistics = cached.statistics if cached is not None and same_light else None
-            lights = BlurredLight(self.light, *known, statistics)
+        if cached is not None and cached.light is not self.light:
+            cached = None
+        if cached is None:  # else the light was checked before
+            object.__setattr__(self, "light", check_packed("light", self.light))
+        if cached is None or cached.known != (self.nlf, self.aperture_blur):
+            statistics = None if cached is None else cached.statistics
+            lights = BlurredLight(self.light, self.nlf, self.aperture_blur, statistics)
             object.__setattr__(self, "blurred_light", lights)
+        for denoised in self.denoised_lights:
+            check_type("denoised_lights", denoised, DenoisedLight)
+            if denoised.shape not in (None, self.light.shape):
+                raise ValueError(
+                    f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
+                    f"`light`, {tuple(self.light.shape)}"
+                )
         unit = " frame heights per second"
         check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
         check_number("defocus", self.defocus, 0.0, math.inf)
@@ -250,9 +250,9 @@ class PreparedScene:
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
 
     def changed(self, **values: Any) -> PreparedScene:
-        """A copy of the same light and camera with other values, which are known to be right.
+        """A copy of the same light with other values that are known to be right: not checked.
 
-        Nothing is checked, as `dataclasses.replace` would: an environment makes one an episode.
+        An environment makes one an episode.
         """
         copied = copy.copy(self)
         vars(copied).update(values)
@@ -280,11 +280,8 @@ class PreparedScene:
     ) -> Exposure:
         """Exposure of a capture at `settings`, without the steps that `tolerance` leaves out.
 
-        Args:
-            settings: Settings to simulate.
-            noise: Whether the capture will be noisy; if not, noise of the source cannot count as
-                part of the target's.
-            gain: Light relative to this scene's.
+        Without `noise`, that of the source cannot count as part of the target's; the light is
+        `gain` times this scene's.
         """
         check_type("settings", settings, CameraSettings)
         return decide(self, settings, noise=noise, gain=gain)
@@ -292,10 +289,7 @@ class PreparedScene:
     def plan(
         self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
     ) -> SimulationPlan:
-        """Steps, reasons, predicted error and cost of a capture at `settings`.
-
-        Without `noise`, of `expected`; the arguments are those of `exposure`.
-        """
+        """Steps, reasons, error and cost of a capture, or of `expected`; see `exposure`."""
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
@@ -320,21 +314,10 @@ class PreparedScene:
         source = exposure.source_noise.scaled(float(self.box_factor**2))
         return self.camera.nlf(settings.iso).at_least(source)
 
-    def read_noise(self, settings: CameraSettings) -> ReadNoise:
-        """Rows and tails of the read noise of a capture.
-
-        Raises:
-            ValueError: If the camera has no calibration of them.
-        """
-        return self.camera.read_noise(settings.iso, self.box_factor)
-
     # -- captures -----------------------------------------------------------------------------
 
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
-        """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped.
-
-        The light is `gain` times this scene's.
-        """
+        """Noise-free light on the sensor, (4, H, W), blurred and not clipped; see `exposure`."""
         exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
 
@@ -404,7 +387,9 @@ class PreparedScene:
             raise ValueError(f"`states` (={states!r}) must be several CameraSettings")
         frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed raises before any work
-        read_noise = [self.read_noise(s) for s in states] if noise == "sensor" else None
+        read_noise: list[ReadNoise] | None = None
+        if noise == "sensor":
+            read_noise = [self.camera.read_noise(s.iso, self.box_factor) for s in states]
         gains = np.ones(len(states)) if gain is None else gain
         exposures = [self.exposure(s, gain=g) for s, g in zip(states, gains.tolist(), strict=True)]
         groups: dict[tuple[object, ...], list[int]] = {}
@@ -435,28 +420,20 @@ class PreparedScene:
             return new_frame(wanted)
         fits = isinstance(out, torch.Tensor) and out.shape == wanted.shape
         fits = fits and (out.dtype, out.device) == (torch.float32, wanted.device)
+        fits = fits and out.untyped_storage().data_ptr() != self.light.untyped_storage().data_ptr()
         if not fits or not out.is_contiguous() or out.requires_grad:
             raise ValueError(
                 f"`out` (={type(out).__name__}) must be a contiguous float32 tensor of shape "
-                f"{tuple(wanted.shape)} on {wanted.device}, without gradient"
+                f"{tuple(wanted.shape)} on {wanted.device}, without gradient, and not the light's"
             )
-        if out.untyped_storage().data_ptr() == self.light.untyped_storage().data_ptr():
-            raise ValueError("`out` must not be the memory of the light that is exposed")
         return out
 
     def stream(
         self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
     ) -> Iterator[torch.Tensor]:
-        """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once.
+        """`expose` one capture (4, H, W) at a time, for frames too large to hold all at once.
 
         Each state is taken when its frame is: the next one may depend on the last frame.
-
-        Args:
-            states: Settings to simulate.
-            seed, noise: See `capture`.
-
-        Yields:
-            One capture (4, H, W) per state.
         """
         for settings in states:
             yield self.expose([settings], seed=seed, noise=noise)[0]

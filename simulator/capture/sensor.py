@@ -19,10 +19,9 @@ A blur averages the source's noise: where it leaves only a share r of the varian
 takes about 70 microseconds, everything else that a capture needs about 30: hence a bank of normals,
 looked up in hashed pieces.
 
-`record` is the one way from light to frames: sweeps, the full run and the environment all take it.
-On the CPU it is one fused kernel, which works in blocks of 256 samples that stay in the first-level
-cache, vectorised by the compiler, on as many threads as `simulator.utils.compute` allows.
-Elsewhere, and where the read noise has rows and tails, the steps run one by one.
+`record` is the one way from light to frames. On the CPU it is one fused kernel, which works in
+blocks of 256 samples that stay in the first-level cache, vectorised by the compiler. Elsewhere, and
+where the read noise has rows and tails, the steps run one by one.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ import torch
 from scipy.special import ndtri
 
 from simulator.camera import CameraProfile
-from simulator.capture.exposure import PEDESTAL, SIGNAL_LIMIT, Exposure
+from simulator.capture.decision import PEDESTAL, SIGNAL_LIMIT, Exposure
 from simulator.noise.generator import BLOCK, draw_block, drawn_normals
 from simulator.noise.noise_level_function import ReadNoise, plane_tensor
 from simulator.settings import CameraSettings
@@ -98,15 +97,12 @@ def _fold(keys, bits):  # type: ignore[no-untyped-def]
 
 
 def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndarray:
-    """Keys of B frames.
+    """(B,) uint64 keys of B frames, each a function of its seed and numbers and of nothing else.
 
     Args:
         seeds: (B,) or a single integer, >= 0.
         numbers: Numbers that the noise of the frames differs by, each (B,) or a single one: the
             frame of an episode, the settings of a capture.
-
-    Returns:
-        (B,) uint64, each a function of its seed and its numbers and of nothing else.
 
     Raises:
         ValueError: If a seed is not an integer >= 0.
@@ -182,11 +178,6 @@ def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> n
     """Standard normals of a frame of `shape` (P, H, W), float32.
 
     They are what `record` adds, as an array: for other devices and for tests.
-
-    Args:
-        key: 64 bits, from `noise_keys`.
-        shape: Planes, height and width.
-        noise: How the key becomes normals.
     """
     planes, height, width = shape
     if noise != "bank":

@@ -1,11 +1,10 @@
 """Statistics of a light, from which the errors of a capture are predicted.
 
-Errors are those of `simulator.capture.plan.SimulationPlan`. `LightStatistics` predicts what steps
-that are left out make, `ResidualStatistics` what a denoising network makes: the noise that it
-leaves, and the detail that it takes for noise. Both are, in units of the noise, functions of how
-well noise and detail can be told apart: of the error that the best linear filter would make. They
-are measured once for each network, on pictures that it was not trained on, and are part of its
-weights' card.
+`LightStatistics` predicts the errors of steps that are left out, `ResidualStatistics` those of a
+denoising network: the noise that it leaves, and the detail that it takes for noise. Both are, in
+units of the noise, functions of how well noise and detail can be told apart: of the error that the
+best linear filter would make. They are measured once for each network, on pictures that it was not
+trained on, and are part of its weights' card.
 """
 
 from __future__ import annotations
@@ -122,10 +121,8 @@ def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ig
     """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
     total = 0.0
     for plane in range(share.shape[0]):
-        source_shot, source_read = (
-            source[0, plane] * ratio * ratio,
-            source[1, plane] * ratio * ratio,
-        )
+        source_shot = source[0, plane] * ratio * ratio
+        source_read = source[1, plane] * ratio * ratio
         shot, read = target[0, plane] * ratio, target[1, plane]
         for edge in range(2):
             light, shares = edges[edge, plane], share[plane]
@@ -210,12 +207,7 @@ class LightStatistics:
         return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
 
     def blur_change(
-        self,
-        ratio: float,
-        source: NoiseLevelFunction,
-        target: NoiseLevelFunction,
-        *,
-        noise: bool = True,
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction, *, noise: bool
     ) -> float:
         """What a disc of one pixel changes, in units of the target's noise; other than in
         `curvature` estimated, not bounded: the noise of the light itself is taken out.
@@ -228,19 +220,20 @@ class LightStatistics:
         detail = np.maximum(bins.disc - _LAPLACIAN * own, 0.0)
         if noise:
             detail = np.where(ratio * (bins.light - SURE * np.sqrt(own)) > 1.0, 0.0, detail)
-        return abs(ratio) / 32.0 * _root_mean(bins.share, detail / wanted)
+        return abs(ratio) / 32.0 * math.sqrt(np.vdot(bins.share, detail / wanted))
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
         signal, wanted = self._signal(ratio, target)
-        return _root_mean(self._bins.share, signal**2 / wanted)
+        return math.sqrt(np.vdot(self._bins.share, signal**2 / wanted))
 
     def relative_noise(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
         """Root mean square of the exposed source's noise in units of the target's."""
         signal, wanted = self._signal(ratio, target)
-        return _root_mean(self._bins.share, _variance(signal, source.exposed(ratio)) / wanted)
+        relative = _variance(signal, source.exposed(ratio)) / wanted
+        return math.sqrt(np.vdot(self._bins.share, relative))
 
     def relative_excess_variance(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
@@ -312,10 +305,6 @@ def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
 def noise_numbers(nlf: NoiseLevelFunction) -> np.ndarray:
     """(2, 4) shot and read noise of the planes."""
     return np.array([nlf.shot, nlf.read])
-
-
-def _root_mean(weight: np.ndarray, square: np.ndarray) -> float:
-    return math.sqrt(float(np.vdot(weight, square)))
 
 
 # -- errors of networks -----------------------------------------------------------------------
@@ -398,7 +387,7 @@ class Residual:
                 f"`residual` (={values!r}) must have {', '.join(_TABLES)}, of one length, finite "
                 "and >= 0, and a spread >= 1"
             )
-        return cls(*tables, spread)
+        return cls(tables[0], tables[1], tables[2], spread)
 
     def to_card(self) -> dict[str, Any]:
         """JSON values of a model card."""
@@ -436,11 +425,8 @@ class ResidualStatistics:
     """Predicts the errors of networks on one recorded light, for any target.
 
     Each value is computed when it is first needed; the first answer takes a pass over the pixels
-    (over some rows of blocks, where the frame is large), later ones a few microseconds.
-
-    Args:
-        light: (4, H, W) as recorded.
-        nlf: Its noise.
+    (over some rows of blocks, where the frame is large), later ones a few microseconds. `nlf` is
+    the noise of `light` (4, H, W) as recorded.
     """
 
     def __init__(self, light: torch.Tensor, nlf: NoiseLevelFunction) -> None:
@@ -513,8 +499,7 @@ def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
 class DenoisedLight:
     """Light with its noise removed by a noise module.
 
-    A network is the most expensive step there is, and many transitions need none: it runs when
-    `light` is first read, and only then.
+    The network, the most expensive step there is, runs when `light` is first read.
 
     Args:
         light: (4, H, W) float32, or a function that works it out.

@@ -264,16 +264,14 @@ class NoiseModule(nn.Module):
             result = self.network(exposed, shot, read)
         else:
             level = variance_map(exposed, shot, read).sqrt()
-            second = level if self.preset == "paper" else exposed + level * _sample(exposed)
+            second = level
+            if self.preset == "ncs":  # the same sample for every image of this size
+                key = int(noise_keys(_SAMPLE_SEED)[0])
+                sample = torch.from_numpy(frame_normals(key, tuple(exposed.shape[1:])))
+                second = exposed + level * sample[None].to(exposed.device)
             result = exposed + self.network(torch.cat([exposed, second], dim=1)).float()
         noisy = ((shot > 0) | (read > 0)).any(dim=1)
         return torch.where(noisy[:, None, None, None], result, exposed.float())
-
-
-def _sample(image: Tensor) -> Tensor:
-    """Standard normals (1, 4, H, W), the same for every image of this size: results are shared."""
-    normals = frame_normals(int(noise_keys(_SAMPLE_SEED)[0]), tuple(image.shape[1:]))
-    return torch.from_numpy(normals)[None].to(image.device)
 
 
 def variance_map(signal: Tensor, shot: Tensor, read: Tensor) -> Tensor:

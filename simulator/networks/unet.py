@@ -42,14 +42,9 @@ def _left(variant: Variant, widths: tuple[int, ...]) -> tuple[int, ...]:
     return widths[-2::-1] if variant == "paper" else (*widths[-3::-1], widths[0])
 
 
-def halve(x: Tensor) -> Tensor:
-    """Max-pool of 2 x 2 that keeps the last row and column of odd sizes: 5 -> 3, 1 -> 1."""
-    return F.max_pool2d(x, 2, ceil_mode=True)
-
-
-def resize_to(x: Tensor, skip: Tensor) -> Tensor:
-    """`x` bilinearly enlarged to the height and width of `skip`, whatever they are."""
-    return F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=False)
+#: Max-pool of 2 x 2 that keeps the last row and column of odd sizes: 5 -> 3, 1 -> 1.
+_halve = functools.partial(F.max_pool2d, kernel_size=2, ceil_mode=True)
+_resize = functools.partial(F.interpolate, mode="bilinear", align_corners=False)
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:
@@ -107,8 +102,7 @@ class UNet(nn.Module):
     bilinear upsampling and concatenated skips on the way up, a last 3 x 3 convolution without
     activation; 7.85 M parameters at the default widths. ``"ncs"``: batch normalisation after each
     convolution, zero borders, a last 1 x 1 convolution; 13.4 M. Use it in evaluation mode: in
-    training mode the normalisation takes its statistics from the batch. The weights are drawn from
-    torch's global generator.
+    training mode the normalisation takes its statistics from the batch.
 
     Args:
         variant: ``"paper"`` or ``"ncs"``.
@@ -153,13 +147,13 @@ class UNet(nn.Module):
         x = x if paper else padded(x, MULTIPLE)
         skips: list[Tensor] = []
         for level in self.encoder:
-            x = level(halve(x) if skips else x)
+            x = level(_halve(x) if skips else x)
             skips.append(x)
         skips.pop()
         for level in self.decoder:
             skip = skips.pop()
             if paper:
-                x = level(torch.cat([resize_to(x, skip), skip], dim=1))
+                x = level(torch.cat([_resize(x, skip.shape[-2:]), skip], dim=1))
             else:
                 x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=True)
                 x = level(torch.cat([skip, x], dim=1))
@@ -309,7 +303,7 @@ class AttentionUNet(nn.Module):
     beside the image; being constant, these cancel in the first normalisation as a bias would.
     A constant image has a constant residual, which depends on the apertures only. Run it in
     float32: so many normalisations in a row multiply differences, and bfloat16's rounding grows to
-    half the residual of a new network. The weights are drawn from torch's global generator.
+    half the residual of a new network.
 
     ``"paper"``: f-numbers, bilinear upsampling, replicated borders; 8.78 M parameters at the
     default widths. ``"ncs"``: `light_of_aperture`, nearest-neighbour upsampling, zero borders;
@@ -367,12 +361,15 @@ class AttentionUNet(nn.Module):
         x = torch.cat([x, aperture[:, :, None, None].expand(-1, -1, *x.shape[-2:])], dim=1)
         skips: list[Tensor] = []
         for level in self.encoder:
-            x = level(halve(x) if skips else x, aperture)
+            x = level(_halve(x) if skips else x, aperture)
             skips.append(x)
         skips.pop()
         for upward, attention, level in zip(self.upward, self.attention, self.decoder, strict=True):
             skip = skips.pop()
-            x = resize_to(x, skip) if paper else F.interpolate(x, scale_factor=2.0, mode="nearest")
+            if paper:
+                x = _resize(x, skip.shape[-2:])
+            else:
+                x = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = F.relu(upward(x, aperture))
             x = level(torch.cat([attention(skip, x, aperture), x], dim=1), aperture)
         residual: Tensor = self.tail(x)

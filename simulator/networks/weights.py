@@ -23,22 +23,19 @@ from simulator.utils.checks import check_type, check_word, did_you_mean
 from simulator.utils.files import sibling, write_atomically
 
 
-def _all_three(preset: Any) -> nn.ModuleDict:
+def _untrained(preset: Any) -> nn.ModuleDict:
+    if preset not in get_args(AperturePreset):
+        return nn.ModuleDict({"noise": NoiseModule(preset)})
     aperture = ApertureModule(preset)
     both = {"exposure": ExposureModule(), "noise": NoiseModule(preset)}
     return nn.ModuleDict({**both, "aperture": aperture})
-
-
-def _noise_alone(preset: Any) -> nn.ModuleDict:
-    return nn.ModuleDict({"noise": NoiseModule(preset)})
 
 
 #: What makes the untrained modules of a preset, by stage: the simulator's networks in three sizes,
 #: the paper's, and those of its authors' released code. `benchmarks.paper_baselines` adds the
 #: paper's two baselines.
 BUILDERS: dict[str, Callable[[], nn.ModuleDict]] = {
-    preset: partial(_all_three if preset in get_args(AperturePreset) else _noise_alone, preset)
-    for preset in get_args(Preset)
+    preset: partial(_untrained, preset) for preset in get_args(Preset)
 }
 #: Increased when the networks change such that older weights no longer fit.
 FORMAT_VERSION = 2
@@ -176,18 +173,12 @@ def _hint(name: str, known: list[str]) -> str:
 
 
 def _check_card(card: dict[str, Any], name: str | Path) -> None:
-    rule = None
-    if card.get("format") != FORMAT_VERSION:
-        found = f"{FORMAT_VERSION}, got {card.get('format')!r}"
-        rule = f"the .json must be a model card of format {found}"
-    elif "sha256" not in card:
-        rule = "the .json must hold the hash, `sha256`"
-    elif card.get("preset") not in list(BUILDERS):
-        rule = (
-            f"unknown preset {card.get('preset')!r} in the .json, the presets are {list(BUILDERS)}"
-        )
-    if rule is not None:
-        raise ValueError(f"`weights` (={str(name)!r}): {rule}")
+    known: dict[str, list[Any]] = {"format": [FORMAT_VERSION], "preset": list(BUILDERS)}
+    wrong = [entry for entry, values in known.items() if card.get(entry) not in values]
+    wrong += [] if "sha256" in card else ["sha256"]
+    if wrong:
+        rule = f"the .json must be a model card of {known}, with the hash `sha256`"
+        raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {card.get(wrong[0])!r}")
 
 
 # -- the weights that the paper's authors released ------------------------------------------------

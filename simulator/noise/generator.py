@@ -18,13 +18,10 @@ BLOCK = 256
 
 
 def noise_generator(seed: int, *key: int | float) -> torch.Generator:
-    """A torch generator that depends on `seed` and on every number of `key`, and on nothing else.
+    """A torch generator that depends on `seed` >= 0 and on every number of `key` alone.
 
-    For the reference camera and for training, which draw with torch.
-
-    Args:
-        seed: Integer >= 0.
-        key: Numbers that the noise differs by: the step of a training, the settings of a capture.
+    For the reference camera and for training, which draw with torch: `key` is the step of a
+    training, or the settings of a capture.
     """
     words = [check_integer("seed", seed, 0), *(int(np.float64(k).view(np.uint64)) for k in key)]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
@@ -73,10 +70,8 @@ _jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundsche
 def philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
     """Four random words of a counter of four words and a key of two, all uint32."""
     for _ in range(_ROUNDS):
-        first, second = (
-            _PHILOX_MULTIPLIERS[0] * np.uint64(c0),
-            _PHILOX_MULTIPLIERS[1] * np.uint64(c2),
-        )
+        first = _PHILOX_MULTIPLIERS[0] * np.uint64(c0)
+        second = _PHILOX_MULTIPLIERS[1] * np.uint64(c2)
         c0 = np.uint32(np.uint32(second >> _WORD) ^ c1 ^ k0)
         c2 = np.uint32(np.uint32(first >> _WORD) ^ c3 ^ k1)
         c1, c3 = np.uint32(second), np.uint32(first)
@@ -121,13 +116,9 @@ def _transform(length, angle, first, second):  # type: ignore[no-untyped-def]
 
 @_jit()
 def draw_block(key, block, words, out):  # type: ignore[no-untyped-def]
-    """Draws the `BLOCK` normals of a block.
+    """Draws the `BLOCK` normals of a frame's block, whose number is below 2**26, into `out`.
 
-    Args:
-        key: uint64, of the frame.
-        block: Number of the block in the frame, below 2**26.
-        words: (4, BLOCK / 4) uint32 to work in.
-        out: (BLOCK,) float32.
+    `key` is a uint64; `words` (4, BLOCK / 4) uint32 is to work in.
     """
     low, high, zero = np.uint32(key), np.uint32(key >> _WORD), np.uint32(0)
     for j in range(_COUNTERS):

@@ -49,7 +49,16 @@ class NoiseLevelFunction:
 
     def __post_init__(self) -> None:
         for name in ("shot", "read"):
-            object.__setattr__(self, name, _four_variances(name, getattr(self, name)))
+            given: Any = getattr(self, name)
+            try:
+                values = tuple(map(float, given))
+            except (TypeError, ValueError):  # a single number, a word
+                values = ()
+            if len(values) != 4 or not all(map(math.isfinite, values)) or min(values) < 0.0:
+                raise ValueError(
+                    f"`{name}` (={given!r}) must be 4 finite values >= 0, of R, G1, G2, B"
+                )
+            object.__setattr__(self, name, values)
 
     @staticmethod
     @functools.cache
@@ -61,11 +70,6 @@ class NoiseLevelFunction:
     def is_zero(self) -> bool:
         """Whether there is no noise at all."""
         return max(*self.shot, *self.read) == 0.0
-
-    @property
-    def extrapolated(self) -> bool:
-        """Whether the ISO lies outside the calibrated table."""
-        return self.extrapolation != 0.0
 
     def scaled(self, factor: float) -> NoiseLevelFunction:
         """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
@@ -87,18 +91,6 @@ class NoiseLevelFunction:
 
     def _with(self, shot: Any, read: Any) -> NoiseLevelFunction:
         return NoiseLevelFunction(shot, read, self.extrapolation, self.source)
-
-
-def _four_variances(name: str, given: Any) -> tuple[float, ...]:
-    try:
-        values = tuple(map(float, given))
-    except (TypeError, ValueError):  # a single number, a word
-        values = ()
-    if len(values) != 4 or not all(map(math.isfinite, values)) or min(values) < 0.0:
-        raise ValueError(
-            f"`{name}` (={given!r}) must be 4 finite values >= 0, one for each of R, G1, G2, B"
-        )
-    return values
 
 
 def plane_tensor(values: Sequence[float] | np.ndarray, device: torch.device | str) -> Tensor:
@@ -138,23 +130,17 @@ class ReadNoise:
             raise ValueError(f"`shape` (={self.shape!r}) must be in (-0.25, 1]")
 
     def row_part(self, variance: Tensor, normals: Tensor) -> Tensor:
-        """The part that rows share, (..., 4, H, 1).
+        """The part that rows share, (..., 4, H, 1), of `normals` (..., 2, H).
 
-        An average over k x k pixels has k rows: it keeps 1/k of their variance, where independent
-        noise keeps 1/k^2.
-
-        Args:
-            variance: (4, 1, 1) of all read noise of the averages, as independent noise has it.
-            normals: (..., 2, H) standard normals.
+        `variance` (4, 1, 1) is that of all read noise of the averages, as independent noise has it;
+        an average over k x k pixels keeps 1/k of that of its k rows, of independent noise 1/k^2.
         """
         return (variance * self.box_factor).sqrt() * self.row * normals[..., _ROW_OF_PLANE, :, None]
 
     def pixel_part(self, variance: Tensor, normals: Tensor) -> Tensor:
-        """The part of each pixel, (..., 4, H, W).
+        """The part of each pixel, (..., 4, H, W), of so many `normals`.
 
-        Args:
-            variance: Its variance: ``1 - row ** 2`` of that of all read noise.
-            normals: (..., 4, H, W) standard normals.
+        Its `variance` is ``1 - row ** 2`` of that of all read noise.
         """
         return variance.sqrt() * tukey_lambda(normals, averaged_shape(self.shape, self.box_factor))
 

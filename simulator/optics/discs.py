@@ -164,15 +164,7 @@ def kernel_energy(motion_px: float, defocus_px: float) -> float:
 
 
 def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
-    """Defocus by a uniform disc.
-
-    Args:
-        light: (..., H, W) linear light.
-        diameter_px: Diameter of the circle of confusion, in pixels, >= 0.
-
-    Returns:
-        (..., H, W), the same dtype.
-    """
+    """Defocus of linear `light` (..., H, W) by a uniform disc of `diameter_px` >= 0 pixels."""
     weights = disc_kernel(diameter_px)
     taps = weights.shape[0]
     if taps == 1:
@@ -180,9 +172,9 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
         quadrant, reach = _quadrant(disc_radius(diameter_px))
-        disc = (quadrant, reach, np.float32(math.inf))
+        shape = (quadrant, reach, np.float32(math.inf))
         cost = len(quadrant) ** 2
-        return by_rows(light, None, lambda a, b, i, o: _disc(a, b, height, i, *disc, o), cost)
+        return by_rows(light, None, lambda a, b, i, o: _disc(a, b, height, i, *shape, o), cost)
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
@@ -216,9 +208,7 @@ class Blur(NamedTuple):
 def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
     """Blurs images of one shape: as `disc_blur` and `motion_blur`, but each image on one thread.
 
-    Args:
-        blurs: The images and their blurs; (P, H, W) each where a disc is wide.
-        limit: See `simulator.optics.motion.motion_blur`.
+    Where a disc is wide, images are (P, H, W); `limit` is that of `motion_blur`.
     """
     wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
     if wide:
@@ -418,10 +408,7 @@ class DiscBank:
 
 
 def _frame_of(diameter: Tensor) -> Tensor | None:
-    """The diameters as one frame (H, W) that the kernels take; None if they are not.
-
-    Nothing is learnt through the kernels: a gradient takes the other way.
-    """
+    """The diameters as one frame (H, W) for the kernels, which pass no gradient; else None."""
     learns = diameter.requires_grad and torch.is_grad_enabled()
     frame = diameter.detach()
     if learns or not has_kernels(frame) or frame.ndim < 2 or frame.numel() == 0:
@@ -453,7 +440,11 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
         diameter: (..., H, W) blur diameter of each pixel [pixel].
         taps: Of a motion behind the discs; None for none.
     """
-    products = _kernel_products() if taps is None else _moved_products(taps, diameter)
+    products = _kernel_products()
+    if taps is not None:
+        count = min(int(np.searchsorted(DIAMETERS, float(diameter.max()))) + 1, len(DIAMETERS))
+        products, weights = np.zeros_like(products), taps.weights.astype(np.float64)
+        _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
     ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
     frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
     out = torch.empty(frame.shape)
@@ -469,12 +460,9 @@ def _kernel_products() -> np.ndarray:
     kernels = [disc_kernel(d) for d in DIAMETERS]
     products = np.zeros((len(kernels), len(kernels)))
     for i, disc in enumerate(kernels):
-        products[i, i] = (disc**2).sum()
-        if i + 1 < len(kernels):
-            larger = kernels[i + 1]
-            margin = (larger.shape[0] - disc.shape[0]) // 2
-            inner = larger[margin : margin + disc.shape[0], margin : margin + disc.shape[0]]
-            products[i, i + 1] = (disc * inner).sum()
+        for j, other in enumerate(kernels[i : i + 2]):
+            inner = slice((len(other) - len(disc)) // 2, (len(other) + len(disc)) // 2)
+            products[i, i + j] = (disc * other[inner, inner]).sum()
     return products
 
 
@@ -492,16 +480,6 @@ def _correlations() -> np.ndarray:
             inner = slice(margin, margin + len(both))
             found[i, j, inner, inner] = both
     return found
-
-
-def _moved_products(taps: Taps, diameter: Tensor) -> np.ndarray:
-    """`_kernel_products` of discs behind which there is a motion, up to the largest `diameter`."""
-    largest = float(diameter.max())
-    count = min(int(np.searchsorted(DIAMETERS, largest)) + 1, len(DIAMETERS))
-    products = np.zeros((len(DIAMETERS), len(DIAMETERS)))
-    weights = taps.weights.astype(np.float64)
-    _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
-    return products
 
 
 # Each pixel looks up the two images around its squared diameter and interpolates between them: no
@@ -616,17 +594,10 @@ def _sum_products(correlations, rows, columns, weights, products):  # type: igno
 
 
 def box_mean(x: Tensor, window: int) -> Tensor:
-    """Mean over `window` x `window` pixels, borders repeated.
+    """Mean of `x` (B, C, H, W) over `window` x `window` pixels, an odd number, borders repeated.
 
     Sums over 1, 2, 4, 8 ... pixels are doubled from one another: a few additions of whole images
     where pooling would read every pixel `window` times.
-
-    Args:
-        x: (B, C, H, W).
-        window: Odd side of the window [pixel].
-
-    Returns:
-        (B, C, H, W).
     """
     height, width = x.shape[-2:]
     padded = F.pad(x, (window // 2,) * 4, mode="replicate")

@@ -1,4 +1,4 @@
-"""Flickering light integrated over an exposure: mains, modulated pulses, strobes.
+"""Flickering light integrated over an exposure: mains, modulated pulses, strobes, lightning.
 
 Each lamp gives its mean light over an exposure in closed form, relative to its long-term mean, so
 that the cost does not depend on how many periods the exposure lasts and no pulse, however short, is
@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike
 
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_integer, check_number
 
 #: Shortest and longest exposure [s], and how far from 0 a moment may lie [s]: periods are counted
 #: in whole numbers, and no product of the following leaves the range of float64.
@@ -25,6 +25,9 @@ _RANGES = {
     "depth": (0.0, 1.0),
     "phase": (-1e9, 1e9),
     "duty": (1e-12, 1.0),
+    "at": (-_LONGEST, _LONGEST),
+    "decay": (1e-12, _LONGEST),
+    "energy": (0.0, 1e9),
 }
 
 
@@ -37,14 +40,11 @@ class Lamp:
             check_number(field.name, getattr(self, field.name), *_RANGES[field.name])
 
     def mean_light(self, start: ArrayLike, exposure_time: float) -> np.ndarray:
-        """Mean light of exposures.
+        """Mean light (...) float64 of exposures, relative to the lamp's long-term mean.
 
         Args:
             start: (...) when each exposure begins [s], in [-1e9, 1e9].
             exposure_time: How long each lasts [s], in [1e-12, 1e9].
-
-        Returns:
-            (...) float64, relative to the lamp's long-term mean.
         """
         start = np.asarray(start, np.float64)
         time = check_number("exposure_time", exposure_time, _SHORTEST, _LONGEST, more=" s")
@@ -58,18 +58,21 @@ class Lamp:
     def row_light(
         self, start: float, exposure_time: float, rows: int, row_time: float, sensor_rows: int = 2
     ) -> np.ndarray:
-        """Mean light of each row of a packed raw behind a rolling shutter.
+        """Mean light (rows,) float64 of each row of a packed raw behind a rolling shutter.
 
         Args:
             start: When the first sensor row begins its exposure [s].
             exposure_time: How long each row is exposed [s].
-            rows: Rows of the packed raw.
+            rows: Their number.
             row_time: From one sensor row's begin to the next one's [s].
             sensor_rows: Sensor rows that one packed row is the mean of.
 
-        Returns:
-            (rows,) float64.
+        Raises:
+            ValueError: If there are no rows, or too many, or time goes backwards.
         """
+        check_integer("rows", rows, 1, 2**20)
+        check_integer("sensor_rows", sensor_rows, 1, 2**12)
+        check_number("row_time", row_time, 0.0, _LONGEST, more=" s")
         begins = start + row_time * np.arange(rows * sensor_rows)
         return self.mean_light(begins, exposure_time).reshape(rows, sensor_rows).mean(axis=1)
 
@@ -119,13 +122,33 @@ class PulsedLamp(Lamp):
         return (whole + (now + later) / self.duty) / (whole + rest)
 
 
+@dataclass(frozen=True)
+class Flash(Lamp):
+    """Steady light and one flash that decays exponentially: lightning, a photographer's strobe.
+
+    Args:
+        at: When it fires [s].
+        decay: Time in which it falls to 1/e [s]: microseconds to milliseconds.
+        energy: Its light in all, in seconds of the steady light.
+    """
+
+    at: float = 0.0
+    decay: float = 50e-6
+    energy: float = 1.0
+
+    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
+        since = start - self.at
+        seen = np.clip(since + time, 0.0, time) / self.decay
+        left = np.exp(-np.maximum(since, 0.0) / self.decay)
+        return 1.0 - self.energy / time * left * np.expm1(-seen)
+
+
 def _periods(
     start: np.ndarray, time: float, frequency: float, phase: float
 ) -> tuple[np.ndarray, int, float]:
-    """Where in a period exposures begin, in [0, 1), and how long they last.
+    """Where in a period exposures begin, whole periods that they last, and what is left of one.
 
-    Returns:
-        Begin; whole periods of the exposure; what is left of one, in [0, 1).
+    Begin and rest are in [0, 1).
     """
     turns, missing = _product(start, frequency)
     # Each exact: what is left of a day of periods must still tell where in one it is.

@@ -485,13 +485,9 @@ def _blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no
 def path_blur(
     light: Tensor, taps: Taps, out: Tensor | None = None, *, limit: float = math.inf
 ) -> Tensor:
-    """Motion along a path; the borders are replicated.
+    """Motion of `light` (P, H, W) float32 along a path; the borders are replicated.
 
-    Args:
-        light: (P, H, W) float32; on another device than the CPU, it is blurred here all the same.
-        taps: Of the path on frames of H x W.
-        out: Contiguous tensor on the CPU to write to, instead of a new one.
-        limit: Light beyond it, on either side of 0, is clipped before it is blurred.
+    It is blurred on the CPU wherever it lies; `out` and `limit` are those of `motion_blur`.
     """
     most = np.float32(limit)
     return _by_planes(light, out, lambda planes, to: _blur_rows(planes, *taps, most, to))
@@ -516,9 +512,8 @@ def path_blur_apart(
         light: (P, H, W) float32, L.
         mask: (1, H, W) float32, M.
         behind: (H, W) int64, which pixel (counted row by row) B shows in place of each.
-        taps: Of the background's path, K_b.
-        own: Of the subject's, K_s.
-        out, limit: See `path_blur`.
+        taps, own: Of the background's path, K_b, and of the subject's, K_s.
+        out, limit: See `motion_blur`.
     """
     fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
     return _by_planes(light, out, lambda planes, to: _blur_apart(planes, *fixed, to))

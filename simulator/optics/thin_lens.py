@@ -11,6 +11,7 @@ aperture, it sees past an edge, and the surface behind it is continued under the
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -19,6 +20,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from simulator.optics.discs import disc_blur, disc_kernel
+from simulator.utils.checks import check_number
 
 _Length = TypeVar("_Length", float, np.ndarray, torch.Tensor)
 
@@ -47,8 +49,7 @@ class Lens:
     focus_distance: float = math.inf
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.focal_length < math.inf:
-            raise ValueError(f"`focal_length` (={self.focal_length!r}) must be finite and > 0")
+        check_number("focal_length", self.focal_length, sys.float_info.min, sys.float_info.max)
         if not self.focus_distance > self.focal_length:
             raise ValueError(
                 f"`focus_distance` (={self.focus_distance!r}) must be above `focal_length` "
@@ -123,7 +124,11 @@ def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
     in_focus = int(np.searchsorted(layers.diameters, 0.0))
     for layer, blur in enumerate(layers.diameters.tolist()):
         if layer == in_focus:
-            canvas.pass_focus()
+            # Between surfaces on one side of the focus, shares of the aperture lie beside each
+            # other: what one takes, its neighbour did not have. On its other side their images in
+            # the aperture are upside down: the light of the far side passes through what the near
+            # side leaves of the aperture, and both shares count as independent.
+            canvas.beyond = (1.0 - canvas.covered).clamp(min=0.0)
         mask = layers.number == layer
         box = _grown_box(mask, layers.radius(layer))
         canvas.paint(box, mask[box], light[:, *box], blur)
@@ -138,16 +143,6 @@ class _Canvas:
         self.light = torch.zeros_like(light)  # (C, H, W)
         self.covered = torch.zeros_like(light[0])  # (H, W)
         self.beyond = torch.ones_like(light[0])  # share left by what is in front of the focus
-
-    def pass_focus(self) -> None:
-        """Says that every further layer lies in the plane in focus or behind it.
-
-        Between surfaces on one side of it, shares of the aperture lie beside each other: what one
-        takes, its neighbour did not have. On its other side their images in the aperture are upside
-        down, so a share may lie anywhere, and both count as independent: the light of the far side
-        passes through what the near side leaves of the aperture.
-        """
-        self.beyond = (1.0 - self.covered).clamp(min=0.0)
 
     def paint(
         self, box: tuple[slice, slice], mask: np.ndarray, light: torch.Tensor, diameter: float

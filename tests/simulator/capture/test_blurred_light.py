@@ -16,7 +16,7 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_cam
 from simulator.capture import batch as batch_module
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import Noise, Transitions, noise_keys, record
@@ -133,7 +133,7 @@ CLEAN = DenoisedLight(LIGHT * 0.5)
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
     source = CLEAN.light if denoised else LIGHT
-    blurred_light = BlurredLight(LIGHT, (DenoisedLight(LIGHT), CLEAN), ZERO, None)
+    blurred_light = BlurredLight(LIGHT, ZERO, None)
     exposure = replace(STILL, denoised=CLEAN if denoised else None)
     assert blurred_light.blurred(exposure) is source  # what needs no blur is not copied
     exposure = replace(exposure, defocus_px=2.0, motion_px=3.0)
@@ -149,7 +149,7 @@ def test_blur_that_opening_adds_and_noise_that_it_leaves() -> None:
     assert opens.extent(4.0) == pytest.approx(12**0.5)
     alone = opens.remaining_variance(4.0)
     noisy = Exposure(1.0, Z6.nlf(800), Z6.nlf(800), opened_to=4.0)
-    lights = BlurredLight(LIGHT, (), Z6.nlf(800), opens)
+    lights = BlurredLight(LIGHT, Z6.nlf(800), opens)
     assert torch.equal(lights.with_remaining_noise(noisy).remaining_variance, alone)
     moving = lights.with_remaining_noise(replace(noisy, motion_px=3.0))
     left = (alone / moving.energy).clamp(max=1.0)

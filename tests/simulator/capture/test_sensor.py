@@ -15,7 +15,7 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (
@@ -46,7 +46,7 @@ ROWS, COLUMNS = 32, 128  # pixels of one flat patch
 
 
 def sensor_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
-    lights = BlurredLight(light, (), ZERO, None)
+    lights = BlurredLight(light, ZERO, None)
     return exposed_light(lights.blurred(exposure), exposure)
 
 

@@ -72,9 +72,9 @@ def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
         ("{", "is damaged"),
         ("[" * 10**6, "net-0.5.json is damaged"),
         ("[]", "must hold a JSON object"),
-        ('{"format": [1]}', r"model card of format 2, got \[1\]"),
+        ('{"format": [1]}', r"model card of .*2.*got \[1\]"),
         ({"residual": {"wiener_error": []}}, "`residual`"),
-        *(({"preset": p}, re.escape(f"unknown preset {p!r}")) for p in ("huge", None, ["compact"])),
+        *(({"preset": p}, re.escape(f"got {p!r}")) for p in ("huge", None, ["compact"])),
     ],
 )
 def test_damaged_cards(saved: Path, card: str | dict[str, Any], message: str) -> None:

@@ -22,10 +22,9 @@ from scipy.stats import norm
 
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.sensor import (
-    Noise,
     Transitions,
     exposure_table,
     frame_normals,
@@ -45,7 +44,7 @@ from simulator.noise.noise_level_function import (
     tukey_lambda,
 )
 from simulator.optics.discs import disc_kernel
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))
@@ -272,12 +271,7 @@ def test_what_is_not_calibrated_is_refused() -> None:
 
 
 # -- keys, the bank and exact draws ----------------------------------------------------------------
-
-SHAPE = (4, 128, 128)
-PIXELS = math.prod(SHAPE)
 STEP, MASK = 0x9E3779B97F4A7C15, 2**64 - 1
-
-both = pytest.mark.parametrize("kind", ["exact", "bank"])
 
 
 def mixed(word: int) -> int:
@@ -299,32 +293,6 @@ def key_of(seed: int, *numbers: float) -> int:
 
 
 of_sweep = functools.partial(sweep_keys, states=[])
-
-
-def frames(kind: Noise, count: int) -> np.ndarray:
-    """(count, 4, 128, 128) noise of one rollout."""
-    keys = noise_keys(1, np.arange(count))
-    return np.stack([frame_normals(int(k), SHAPE, kind) for k in keys]).astype(np.float64)
-
-
-@both
-def test_frames_have_the_moments_of_a_normal(kind: Noise) -> None:
-    noise = frames(kind, 50)
-    n = noise.size
-    assert abs(noise.mean()) < 5.0 / math.sqrt(n)
-    # Standard errors of the k-th moment: sqrt(E x^2k - (E x^k)^2), 15 = E x^6 and so on.
-    assert abs((noise**2).mean() - 1.0) < 5.0 * math.sqrt(2.0 / n)
-    assert abs((noise**3).mean()) < 5.0 * math.sqrt(15.0 / n)
-    assert abs((noise**4).mean() - 3.0) < 5.0 * math.sqrt(96.0 / n)
-
-
-def test_the_bank_makes_frames_white_in_space_in_time_and_over_planes() -> None:
-    noise = frames("bank", 50)
-    pairs = [(noise[lag:], noise[:-lag]) for lag in (1, 2, 7)] + [(noise[:, 1:], noise[:, :-1])]
-    for rows, columns in [(0, 1), (0, 2), (0, 16), (1, 0), (1, 1), (2, 0), (2, 3), (4, 0), (64, 0)]:
-        pairs.append((noise[..., rows:, columns:], noise[..., : 128 - rows, : 128 - columns]))
-    for first, second in pairs:
-        assert abs((first * second).mean()) < 5.0 / math.sqrt(first.size)
 
 
 # -- keys ------------------------------------------------------------------------------------------
