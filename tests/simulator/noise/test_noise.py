@@ -75,6 +75,11 @@ def test_arithmetic() -> None:
     assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
     assert nlf.scaled(1 / 16).read == pytest.approx((2.5e-9, 1.875e-9, 1.875e-9, 1.25e-9))
     assert ZERO.is_zero
+    assert not nlf.extrapolated
+    for stops in (2.0, -1.0):  # whatever is done with it
+        beyond = replace(nlf, extrapolation=stops)
+        made = beyond, beyond.exposed(8), beyond.scaled(0.5), beyond.at_least(ZERO)
+        assert [(n.extrapolation, n.extrapolated) for n in made] == [(stops, True)] * 4
     assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
     most = NoiseLevelFunction((1.0,) * 4, (1.0,) * 4).exposed(1e30)
     assert (most.shot, most.read) == ((1e24,) * 4, (1e24,) * 4)
@@ -146,13 +151,15 @@ def kurtosis(shape: float) -> float:
     return moment(shape, 4) / moment(shape, 2) ** 2 - 3
 
 
-@pytest.mark.parametrize("shape", [-0.2, -0.1, 0.0, 0.05, 0.135, 0.3])
+@pytest.mark.parametrize("shape", [-0.2, -0.1, 0.0, 0.05, 0.135, 0.3, 1.0])
 def test_draws_are_quantiles_of_variance_one(shape: float) -> None:
     z = np.array([-4.0, -1.5, 0.0, 0.3, 2.0])
     deviation = math.sqrt(moment(shape, 2))
     expected = [quantile(norm.cdf(x), shape) / deviation for x in z]
     drawn = tukey_lambda(torch.from_numpy(z), shape).numpy()
     np.testing.assert_allclose(drawn, expected, rtol=1e-6, atol=1e-12)
+    pixels = ReadNoise(0.0, shape).pixel_part(torch.tensor(4.0), torch.from_numpy(z))
+    np.testing.assert_allclose(pixels, 2.0 * drawn)  # one pixel, no rows
 
 
 @pytest.mark.parametrize(("shape", "k"), [(-0.1, 1), (-0.1, 3), (0.05, 2), (0.3, 2), (0.13, 4)])
@@ -255,7 +262,10 @@ def test_what_is_not_calibrated_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match="nikon_z6"):
             call()
-    for wrong, message in (((1.0, 0.0), "`row`"), ((0.1, -0.25), "`shape`")):
+    for wrong, message in (
+        *(((row, 0.0), "`row`") for row in (1.0, -0.01)),
+        *(((0.1, shape), "`shape`") for shape in (-0.25, 1.01)),
+    ):
         with pytest.raises(ValueError, match=message):
             ReadNoise(*wrong)
 
