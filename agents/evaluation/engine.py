@@ -22,7 +22,7 @@ from ae_env.options import EnvOptions
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
-from agents.evaluation.plan import (
+from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
     SEED_STRIDE,

@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 from ae_env.grid import ExposureGrid
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 from simulator.raw.develop import develop
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from tests.simulator.training.scenes import scene
 
 #: Eight states over seven stops; at the middle ones a white card is at about half of white.

@@ -25,7 +25,7 @@ from ae_env.scenes.recorded import (
 )
 from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from tests.ae_env.environments import ID, check_parity, make_env
 from tests.ae_env.recorded_files import (
     GRID,

@@ -9,7 +9,7 @@ import pytest
 
 from agents.learning.training import AgentConfig
 from simulator.radiance.maps import read_radiance
-from simulator.training.train import SimulatorConfig
+from simulator.training.trainer import SimulatorConfig
 from simulator.utils.config_file import load_yaml
 
 INPUTS = 120

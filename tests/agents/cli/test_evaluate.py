@@ -9,7 +9,7 @@ import pytest
 
 from agents.cli import quickstart
 from agents.cli.evaluate import make_plan
-from agents.learning.weights import load_agent
+from agents.learning.policy_file import load_agent
 from simulator import RawImage, write_dng
 
 BASE = """\

@@ -16,7 +16,7 @@ from ae_env.scorers import list_scorers
 from agents.cli import console
 from agents.cli import main as cli
 from simulator import RawImage, write_dng
-from simulator.capture.exposure import DEFAULT_TOLERANCE
+from simulator.capture.decision import DEFAULT_TOLERANCE
 
 COMMANDS = (
     *("bench", "cache", "evaluate", "export", "film", "hdr"),
@@ -200,7 +200,7 @@ import sys
 from pathlib import Path
 from agents.cli import main
 main.CHECKOUT = Path("../checkout").resolve()
-sys.argv = ["ae-env", "bench", "convergence", "--quick", "--seed", "3", "--out", "here"]
+sys.argv = ["ae-env", "bench", "ptc", "--quick", "--seed", "3", "--out", "here"]
 main.main()
 """
     command = [sys.executable, "-c", code]
@@ -208,7 +208,7 @@ main.main()
     for folder, code in (("checkout", ours), ("mine", "raise RuntimeError('not ours')")):
         (tmp_path / folder / "benchmarks").mkdir(parents=True)
         (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")
-        (tmp_path / folder / "benchmarks" / "convergence.py").write_text(code)
+        (tmp_path / folder / "benchmarks" / "ptc.py").write_text(code)
     env = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
     printed = subprocess.check_output(command, cwd=tmp_path / "mine", env=env, text=True)
     assert printed == "ours here 3 True\n"

@@ -10,8 +10,8 @@ import pytest
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
 from simulator.training import scenes as pictures
-from simulator.training import train
-from simulator.training.data import ReferencePairs
+from simulator.training import trainer
+from simulator.training.crops import ReferencePairs
 from simulator.utils.files import sibling
 
 TINY = """\
@@ -30,8 +30,8 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     (tmp_path / "data").mkdir()
     monkeypatch.setenv("AE_ENV_DATA", str(tmp_path / "data"))
     monkeypatch.setattr(pictures, "_DRAWN", {"train": 2, "validation": 1})
-    monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
-    monkeypatch.setattr(train, "_CROPS", 8)
+    monkeypatch.setattr(trainer, "_VALIDATION_SCENES", 2)
+    monkeypatch.setattr(trainer, "_CROPS", 8)
     (tmp_path / "tiny.yaml").write_text(TINY)
     real, stops = ReferencePairs.batch, iter([True])
 

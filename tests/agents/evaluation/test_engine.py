@@ -11,7 +11,7 @@ from ae_env import UserCodeError
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from agents import Policy, evaluate, fit_policies, make_policy, run_plan
-from agents.evaluation.plan import EvaluationPlan, plan_scenes
+from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
 from agents.policy import PolicyContext
 from agents.rollouts import make_envs
 

@@ -15,6 +15,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.learning.networks import Session
+from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.ppo import PPOTraining, train_ppo
 from agents.learning.regression import (
     RegressionPolicy,
@@ -23,7 +24,6 @@ from agents.learning.regression import (
     ScoreRegressor,
     train_regression,
 )
-from agents.learning.weights import load_agent, save_agent
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from simulator.utils.files import sibling

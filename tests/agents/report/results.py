@@ -4,7 +4,7 @@ import numpy as np
 
 from ae_env.grid import ExposureGrid
 from agents import EvaluationResult
-from agents.evaluation.plan import EvaluationPlan
+from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.evaluation.result import BRACKET_METRICS, Track
 
 

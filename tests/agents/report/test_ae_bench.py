@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from agents.evaluation.evaluation_plan import EvaluationPlan, load_plan, plan_scenes
 from agents.evaluation.jobs import run_plan
-from agents.evaluation.plan import EvaluationPlan, load_plan, plan_scenes
 from agents.evaluation.result import overall_ranking
 from agents.report import ae_bench
 from simulator.capture.prepared_scene import Layout

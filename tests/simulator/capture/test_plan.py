@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
-from simulator.capture.exposure import Exposure, Step
+from simulator.capture.decision import Exposure, Step
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
 from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (

@@ -22,7 +22,7 @@ from scipy.stats import norm
 
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.sensor import (
     Transitions,
@@ -44,7 +44,7 @@ from simulator.noise.noise_level_function import (
     tukey_lambda,
 )
 from simulator.optics.discs import disc_kernel
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))

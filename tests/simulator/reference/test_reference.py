@@ -14,7 +14,7 @@ from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
-from simulator.reference.camera import (
+from simulator.reference.reference_camera import (
     BodyError,
     ReferenceCamera,
     ReferenceScene,

@@ -23,7 +23,7 @@ from simulator.training.paper_dataset import (
     train_on_captures,
     write_packed_sequence,
 )
-from simulator.training.train import SimulatorConfig, StageConfig, first_modules
+from simulator.training.trainer import SimulatorConfig, StageConfig, first_modules
 from tests.simulator.training.scenes import SETTINGS, write_dataset
 
 #: NoiseProfile of a Nikon Z6 raw at ISO 800, as exiftool prints it: (shot, read) of R, G, B.

@@ -12,9 +12,9 @@ from PIL import Image
 
 from simulator import CameraSettings, get_camera
 from simulator.radiance.procedural import KINDS
-from simulator.reference.camera import DRAPED, ReferenceScene
+from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from simulator.training import scenes as pictures
-from simulator.training.data import DetailPicture
+from simulator.training.crops import DetailPicture
 from simulator.training.scenes import (
     depth_photographs,
     detail_pictures,

@@ -7,8 +7,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from agents.evaluation import engine
-from agents.evaluation.jobs import policy_content, run_plan
-from agents.evaluation.plan import (
+from agents.evaluation.evaluation_plan import (
     Condition,
     EvaluationPlan,
     digest,
@@ -17,6 +16,7 @@ from agents.evaluation.plan import (
     plan_scenes,
     start_state,
 )
+from agents.evaluation.jobs import policy_content, run_plan
 
 PLAN = EvaluationPlan(
     environment={"scenes": "bundled:small", "split": "test", "resolution": 36}, max_scenes=5

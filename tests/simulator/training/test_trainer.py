@@ -23,16 +23,16 @@ from simulator import get_camera
 from simulator.capture.statistics import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
-from simulator.reference.camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
-from simulator.training import train
-from simulator.training.data import (
+from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
+from simulator.training import trainer
+from simulator.training.crops import (
     DetailCrops,
     DetailPicture,
     ReferencePairs,
     draw_sequences,
     no_progress,
 )
-from simulator.training.train import (
+from simulator.training.trainer import (
     Clock,
     SimulatorConfig,
     StageConfig,
@@ -69,8 +69,8 @@ def pictures(config: SimulatorConfig, split: str) -> list[DetailPicture]:
 @pytest.fixture(autouse=True, scope="module")
 def quick_calibration():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("simulator.training.train._CROPS", 8)
-        patch.setattr("simulator.training.train._SIDE", 16)
+        patch.setattr("simulator.training.trainer._CROPS", 8)
+        patch.setattr("simulator.training.trainer._SIDE", 16)
         yield
 
 
@@ -194,7 +194,7 @@ def test_what_a_scene_teaches():
         one = replace(scene(depth=kind == DRAPED), kind=kind, in_focus=in_focus)
         stages = ("exposure", "aperture", "baseline")
         # Private, as a whole training would take minutes to show it.
-        assert [stage for stage in stages if train._is_useful_for(one, stage)] == teaches
+        assert [stage for stage in stages if trainer._is_useful_for(one, stage)] == teaches
 
 
 class Watch:
@@ -205,7 +205,7 @@ class Watch:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.cpu, self.wall, self.steps, self.stop, self.broken = 1000.0, 50.0, [], -1, -1
         monkeypatch.setattr("time.process_time", lambda: self.cpu)
-        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
+        monkeypatch.setattr(trainer.time, "monotonic", lambda: self.wall)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> torch.Tensor:
         assert (size, crop, process) == (3, 16, 0)
@@ -289,7 +289,7 @@ def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
 
 
 def test_scenes_of_a_training() -> None:
-    found = train.scenes_of(config(scenes={"procedural": 4, "size": 32}), "train")
+    found = trainer.scenes_of(config(scenes={"procedural": 4, "size": 32}), "train")
     # Three of four procedural scenes have depth; the fourth is draped over two depths.
     assert Counter(s.kind for s in found if s.depth is not None) == {"depth": 3, "draped": 2}
     assert all(s.size == (32, 32) and s.sampled and s.illuminance for s in found)
@@ -354,8 +354,8 @@ class Known(NoiseModule):
 def calibrated(left: float, shift: Callable[[int], float]) -> Residual:
     picture = DetailPicture("a", "a", "mosaic", torch.full((4, 64, 64), 0.5))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("simulator.training.train._SIDE", 32)
-        patch.setattr("simulator.training.train._CROPS", 64)
+        patch.setattr("simulator.training.trainer._SIDE", 32)
+        patch.setattr("simulator.training.trainer._CROPS", 64)
         return calibrate(Known(left, shift), DetailCrops([picture], [get_camera("nikon_z6")]))
 
 
