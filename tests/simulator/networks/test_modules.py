@@ -13,18 +13,7 @@ from torch import Tensor, nn
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import get_camera
-from simulator.networks.aperture_module import (
-    BLUR_FACTOR,
-    DEAD_ZONE,
-    LARGEST,
-    ApertureModule,
-    AperturePreset,
-    DefocusMap,
-    added_blur,
-    band_features,
-    is_defocused,
-    to_diameter,
-)
+from simulator.networks import aperture_module
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
 from simulator.networks.noise_module import (
     SIZES,
@@ -91,15 +80,15 @@ def picture(*size: int) -> Tensor:
     return torch.from_numpy(values) * 5.0
 
 
-def module(preset: AperturePreset = "compact") -> ApertureModule:
+def module(preset: aperture_module.AperturePreset = "compact") -> aperture_module.ApertureModule:
     torch.manual_seed(1)
-    made = ApertureModule(preset).eval().requires_grad_(False)
+    made = aperture_module.ApertureModule(preset).eval().requires_grad_(False)
     if preset == "paper":
         made.network.tail.weight.mul_(10)
     return made
 
 
-def with_map(diameter: float) -> ApertureModule:
+def with_map(diameter: float) -> aperture_module.ApertureModule:
     """A module that finds the same circle of confusion everywhere, before the dead zone."""
     made = module()
     made.network.tail.weight.zero_()
@@ -111,7 +100,7 @@ F4, F8, F11 = (torch.full((2,), f) for f in (4.0, 8.0, 8 * 2**0.5))
 
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
-def test_only_the_images_that_open_change(preset: AperturePreset) -> None:
+def test_only_the_images_that_open_change(preset: aperture_module.AperturePreset) -> None:
     image = picture(16, 19)
     made = with_map(4.0) if preset == "compact" else module("paper")
     for target in (F8, 2 * F8):
@@ -128,7 +117,7 @@ def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
     image = torch.zeros(2, 4, 41, 41)
     image[..., 20, 20] = 1.0
     output = with_map(3.0)(image, torch.zeros_like(image), F8, F4).double().numpy()
-    squared = BLUR_FACTOR**2 * (9 - DEAD_ZONE**2) * 3
+    squared = aperture_module.BLUR_FACTOR**2 * (9 - aperture_module.DEAD_ZONE**2) * 3
     offsets = np.arange(41) - 20
     moments = (output.sum(-1) * offsets**2).sum(-1)
     np.testing.assert_allclose(output.sum((-2, -1)), 1.0, atol=1e-5)
@@ -153,10 +142,10 @@ def test_added_blur_is_the_thin_lens(source: float, target: float) -> None:
     at_source, at_target = (
         np.abs(lens.circle_of_confusion(depth, f)) / 11.8e-6 for f in (source, target)
     )
-    added = added_blur(torch.from_numpy(at_source), source, target).numpy()
+    added = aperture_module.added_blur(torch.from_numpy(at_source), source, target).numpy()
     np.testing.assert_allclose(np.hypot(at_source, added), at_target, rtol=1e-6, atol=1e-12)
-    for same_or_closed in (source, 2 * source):
-        assert not added_blur(torch.from_numpy(at_source), source, same_or_closed).any()
+    for closed in (source, 2 * source):
+        assert not aperture_module.added_blur(torch.from_numpy(at_source), source, closed).any()
 
 
 @pytest.mark.parametrize("spread", [0.2, 1.0, 3.0])
@@ -177,13 +166,13 @@ def test_defocus_is_judged_at_the_weighted_quantile(spread: float) -> None:
         share = np.cumsum(weight[order]) / weight.sum()
         level = values.ravel()[order][np.searchsorted(share, 0.95)]
         expected.append(float(np.clip((level - 1.7) / (2.2 - 1.7), 0, 1)))
-    found = is_defocused(torch.from_numpy(diameter), image)
+    found = aperture_module.is_defocused(torch.from_numpy(diameter), image)
     np.testing.assert_allclose(found.numpy(), expected, atol=0.01)
 
 
 def test_exposure_does_not_matter() -> None:
     torch.manual_seed(3)
-    network = DefocusMap(width=8).eval().requires_grad_(False)
+    network = aperture_module.DefocusMap(width=8).eval().requires_grad_(False)
     network.tail.weight.mul_(20.0)  # random, yet far from constant
     image = 0.1 + torch.rand(2, 4, 24, 30)
     deviation = torch.full_like(image, 0.01)
@@ -192,14 +181,15 @@ def test_exposure_does_not_matter() -> None:
     for factor in (2.0**-6, 8.0, 1024.0):  # only the tiny constant floor rounds differently
         result = network(factor * image, factor * deviation)
         torch.testing.assert_close(result, expected, atol=1e-4, rtol=0)
-    assert to_diameter(torch.tensor([-1e4, 1e4, 88.0])).tolist() == [0.0, LARGEST, LARGEST]
+    extremes = aperture_module.to_diameter(torch.tensor([-1e4, 1e4, 88.0]))
+    assert extremes.tolist() == [0.0] + 2 * [aperture_module.LARGEST]
 
 
 def test_the_noise_of_four_planes_averages() -> None:
     """The floor is the variance of their mean: a quarter of one plane's, measured."""
     field = torch.from_numpy(np.random.default_rng(2).normal(0, 0.01, (1, 4, 200, 200))).float()
     deviation = torch.full_like(field, 0.01)
-    noise_plane = band_features(field, deviation)[:, 8]
+    noise_plane = aperture_module.band_features(field, deviation)[:, 8]
     # Bands 0 - 1.5 - 3 - 5.5 - 10 px of white noise: their energies, from the kernels' own pixels.
     kernel = torch.zeros(41, 41)
     kernel[20, 20] = 1.0
@@ -257,13 +247,8 @@ class Seen(nn.Module):
         return torch.full_like(given[0][:, :4], self.value)
 
 
-def noisy(height: int = 16, width: int = 18) -> Tensor:
-    values = np.random.default_rng(0).normal(0.05, 0.06, (1, 4, height, width))
-    return torch.from_numpy(values.astype(np.float32))
-
-
 def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> None:
-    module, image = NoiseModule("paper"), noisy()
+    module, image = NoiseModule("paper"), 0.06 * normal(1, 4, 16, 18, dtype=torch.float32)
     module.network = Seen(0.125)
     assert torch.equal(module(image, SHOT, READ), image + 0.125)
     seen, deviation = module.network.given[0].split(4, dim=1)
@@ -291,7 +276,7 @@ def test_operations_by_hand() -> None:
 def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> None:
     module = NoiseModule(preset).eval().requires_grad_(False)
     torch.nn.init.normal_(module.network.tail.weight)
-    image = noisy().expand(3, -1, -1, -1)
+    image = (0.06 * normal(1, 4, 16, 18, dtype=torch.float32)).expand(3, -1, -1, -1)
     factor = torch.tensor([[1.0], [0.0], [2.0]])
     together = module(image, factor * SHOT, factor * READ)
     assert torch.equal(together[1], image[1])
@@ -484,21 +469,16 @@ def test_channel_attention_needs_only_the_f_numbers() -> None:
     module = SkipAttention(8, 4).double()
     skip, gate = normal(2, 8, 5, 6) * 3 + 1, normal(2, 8, 5, 6, seed=1) - 2
     aperture = torch.tensor([[1.4, 0.5], [2.0, 0.7]], dtype=torch.float64)
-    torch.manual_seed(1)
-    convolutions = [nn.Conv2d(8, 8, 1).double() for _ in range(2)]
-    scales = [nn.Linear(2, 8).double() for _ in range(2)]
-    shifts = [nn.Linear(2, 8).double() for _ in range(2)]
-    with torch.no_grad():  # what the network learns is the sum of the two branches' w_m and b_m
-        module.average.weight.copy_(shifts[0].weight + shifts[1].weight)
-        module.average.bias.copy_(shifts[0].bias + shifts[1].bias)
-    joint = sum(
-        scale(aperture)[:, :, None, None] * F.instance_norm(convolution(x))
-        + shift(aperture)[:, :, None, None]
-        for x, convolution, scale, shift in zip(
-            (skip, gate), convolutions, scales, shifts, strict=True
-        )
-    )
-    assert isinstance(joint, torch.Tensor)
+    module.average.requires_grad_(False).weight.zero_()
+    joint = torch.zeros(())
+    for x in (skip, gate):
+        layers = nn.Conv2d(8, 8, 1), nn.Linear(2, 8), nn.Linear(2, 8)
+        convolution, scale, shift = (layer.double().requires_grad_(False) for layer in layers)
+        normalised = F.instance_norm(convolution(x))
+        joint = joint + scale(aperture)[:, :, None, None] * normalised
+        joint = joint + shift(aperture)[:, :, None, None]
+        module.average.weight += shift.weight  # it learns the sum of the branches' w_m and b_m
+        module.average.bias += shift.bias
     literal = module.excite(F.adaptive_avg_pool2d(joint, 1).flatten(1))
     short = module.channel_attention(aperture)
     torch.testing.assert_close(short, literal, rtol=0, atol=1e-13)
