@@ -318,7 +318,7 @@ class EvaluationRun:
         envs = self._make_envs(condition, batch_size(len(episodes), self.batch), frames)
         parts = []
         for batch in episodes.batches(envs):
-            best = None if oracle is None else oracle[batch.index % self.num_tables]
+            best = None if oracle is None else oracle[batch.episodes % self.num_tables]
             parts.append(run_batch(name, policy, envs, batch, frames, oracle=best))
             report(float(batch.valid.sum()) * frames)
         alone = None

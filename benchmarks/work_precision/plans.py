@@ -185,13 +185,13 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
             for tolerance in (DEFAULT,) if position % _EVERY else TOLERANCES:
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
-                drawn = [torch.stack(own) for own in zip(*pairs, strict=True)]
+                light, added = (torch.stack(own) for own in zip(*pairs, strict=True))
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
                 row |= {"settings": str(settings), "tolerance": tolerance}
                 row |= {"network": plan.network, "errors": dict(plan.errors)}
                 row |= {"predicted": plan.predicted_error, "bound": plan.error_bound}
-                rows.append(row | {"measured": distance(*drawn, truth, wanted, shows)})
+                rows.append(row | {"measured": distance(light, added, truth, wanted, shows)})
     return rows
 
 

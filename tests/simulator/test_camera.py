@@ -133,8 +133,27 @@ def test_bad_values_are_named(name: str, value: object) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("iso", 1e-3, 1e8), ("exposure_time", 1e-9, 1e5), ("f_number", 0.5, 1024.0)],
+)
+def test_ranges_include_their_ends(name: str, low: float, high: float) -> None:
+    arguments = {"iso": 100.0, "exposure_time": 0.5, "f_number": 4.0}
+    assert repr(CameraSettings(**arguments)) == (
+        "CameraSettings(iso=100.0, exposure_time=0.5, f_number=4.0)"
+    )
+    for value in (low, high):
+        assert getattr(CameraSettings(**arguments | {name: value}), name) == value
+    for value in (0.999 * low, 1.001 * high):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            CameraSettings(**arguments | {name: value})
+
+
+@pytest.mark.parametrize(
     ("exposure_time", "text"),
-    [(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.5, "1/2 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+    [
+        *[(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.3, "1/3.333 s"), (0.4, "0.4 s")],
+        *[(0.5, "1/2 s"), (0.6, "0.6 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+    ],
 )
 def test_format(exposure_time: float, text: str) -> None:
     assert format_exposure_time(exposure_time) == text

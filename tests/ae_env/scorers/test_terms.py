@@ -99,8 +99,12 @@ def test_black_and_white_frames_score_below_a_twentieth(value: float) -> None:
 def test_noise_is_that_of_the_cameras_own_pixels() -> None:
     """Box-averaging does not make ISO free: only a frame's values are less noisy."""
     tables = ScoreTables(GRID, CAMERA, make_scorer("noise"))
-    wanted, found = (tables.table(random_scene(box_factor=k)).mean for k in (1, 31))
-    np.testing.assert_allclose(found, wanted, atol=0.01)
+    for source in (NoiseLevelFunction.zero(), CAMERA.nlf(6400)):
+        wanted, found = (
+            tables.table(random_scene(box_factor=k, nlf=source.scaled(1 / k**2))).mean
+            for k in (1, 31)
+        )
+        np.testing.assert_allclose(found, wanted, atol=0.01)
 
 
 def test_values_by_hand() -> None:
