@@ -30,9 +30,7 @@ def context() -> PolicyContext:
 def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
     """Frames of scenes (light relative to a grey card at its own EV) taken at grid states."""
 
-    def take(
-        light: np.ndarray, scene_ev: float, states: Any, speed: float = 0.0, defocus: float = 0.1
-    ) -> dict[str, np.ndarray]:
+    def take(light: np.ndarray, scene_ev: float, states: Any, speed=0.0, defocus=0.1) -> dict:
         states = np.atleast_1d(states)
         # Independent of the code under test: x = 0.12 * light * 2^(scene EV - state EV).
         gain = 2.0 ** (scene_ev - context.grid.ev100[states])

@@ -210,7 +210,11 @@ def test_saturated_and_black_parts_need_no_network(compact, monkeypatch):
     source = RawImage(data, SOURCE, Z6)
     everywhere, tolerant = (compact.prepare(source, tolerance=t) for t in (0.0, 0.1))
     network, real, seen = compact.noise.network, compact.noise.network.uncorrected, []
-    counted = lambda x, *rest: seen.append(x[0, 0].numel()) or real(x, *rest)  # noqa: E731
+
+    def counted(image: torch.Tensor, *rest: torch.Tensor) -> torch.Tensor:
+        seen.append(image[0, 0].numel())
+        return real(image, *rest)
+
     monkeypatch.setattr(network, "uncorrected", counted)
     expected, result = compact.denoise(everywhere), compact.denoise(tolerant)
     assert seen[0] == 640 * 800

@@ -277,5 +277,5 @@ def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, tmp_path: Path) -> N
         command = [sys.executable, "-c", code]
         done = subprocess.run(command, env=env, cwd=dng.parent, capture_output=True, text=True)
         assert (done.returncode, done.stdout[-5:]) == (0, shown), done.stderr
-        drawn.append({path: path.stat().st_mtime_ns for path in tmp_path.glob("cache/scenes/*")})
+        drawn.append({path: path.stat().st_ino for path in tmp_path.glob("cache/scenes/*")})
     assert drawn[0] == drawn[1] != {}

@@ -120,41 +120,33 @@ def test_networks_run_once_for_a_raw(ae_env, dng, tmp_path, monkeypatch):
         assert first.read_bytes() == second.read_bytes()
 
 
-def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path, tmp_path: Path) -> None:
+def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path) -> None:
     depth = np.full(raw.data.shape[-2:], 9.0, np.float32)
     depth[:, :60] = 2.0
-    np.save(tmp_path / "depth.npy", depth)
-    given = ("--depth", tmp_path / "depth.npy", "--focal-length", 50, "--focus", "2.0")
-    given = (*given, "--weights", "none")
-    out, png = tmp_path / "new" / "out.dng", tmp_path / "out.png"
-    code, text, _ = ae_env("refocus", dng, "--aperture", 1.4, *given, "-o", out, "--png", png)
-    assert code == 0
-    assert "depth given" in text
-    back = read_raw(out)
+
+    def refocused(source: str | Path, depth: np.ndarray, focus: object, *more: str) -> RawImage:
+        np.save("depth.npy", depth)
+        given = ("--depth", "depth.npy", "--focal-length", 50, "--focus", focus, *more)
+        given = ("--aperture", 1.4, *given, "--weights", "none", "-o", "new/out.dng")
+        code, text, error = ae_env("refocus", source, *given)
+        assert (code, "depth given" in text) == (0, True), error
+        return read_raw("new/out.dng")
+
+    back = refocused(dng, depth, 2.0, "--png", "out.png")
     assert back.settings.f_number == 1.4
-    assert not np.array_equal(back.to_mosaic()[:, 120:], read_raw(dng).to_mosaic()[:, 120:])
-    with Image.open(png) as picture:
+    assert not back.data[..., 60:].equal(read_raw(dng).data[..., 60:])
+    with Image.open("out.png") as picture:
         assert picture.size == (240, 200)
-    before = out.read_bytes()
-    ae_env("refocus", dng, "--aperture", 1.4, *given[:-4], "--focus", "5,5", *given[-2:], "-o", out)
-    assert out.read_bytes() == before  # the pixel lies at 2 m
+    assert refocused(dng, depth, "5,5").data.equal(back.data)  # the pixel lies at 2 m
     # The map is upright as the picture.
     depth[40:, :60] = 9.0
+    turned = replace(raw, metadata={"flip": 6}), np.rot90(depth, -1)  # a quarter, clockwise
     backs = []
-    for name, held, shown in (
-        ("level", raw, depth),
-        ("held", replace(raw, metadata={"flip": 6}), np.rot90(depth, -1)),  # a quarter, clockwise
-    ):
-        write_dng(tmp_path / f"{name}.dng", held)
-        np.save(tmp_path / f"{name}.npy", shown)
+    for held, shown in ((raw, depth), turned):
+        write_dng("held.dng", held)
         row, column = np.argwhere(shown == 2.0)[-1]
-        given = ("--depth", tmp_path / f"{name}.npy", "--focus", f"{column},{row}")
-        given = (*given, "--focal-length", 50, "--aperture", 1.4, "--weights", "none")
-        out = tmp_path / f"{name}-out.dng"
-        code, _, error = ae_env("refocus", tmp_path / f"{name}.dng", *given, "-o", out)
-        assert code == 0, error
-        backs.append(read_raw(out).to_mosaic())
-    assert np.array_equal(*backs)
+        backs.append(refocused("held.dng", shown, f"{column},{row}").data)
+    assert backs[0].equal(backs[1])
 
 
 def test_hdr(ae_env, dng: Path, tmp_path: Path) -> None:

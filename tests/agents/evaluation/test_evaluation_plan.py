@@ -151,9 +151,7 @@ def _arrays(folder: Path) -> dict[str, bytes]:
     return {f"{f} {name}": a.tobytes() for f, own in files.items() for name, a in own.items()}
 
 
-def test_a_stopped_run_continues_with_what_is_missing_or_damaged(
-    results, folder, tmp_path, monkeypatch, caplog
-):
+def test_a_stopped_run_continues_with_what_it_lacks(results, folder, tmp_path, monkeypatch, caplog):
     real, ran = engine.run_batch, []
 
     def counted(name, *args, **kwargs):
