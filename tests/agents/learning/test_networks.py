@@ -144,9 +144,7 @@ def _light(kind: str, count: int, seed: int = 9) -> np.ndarray:
     return np.stack([10.0 + MOVES[kind](rng)[:70] for _ in range(count)])
 
 
-def _forecasts(
-    networks: list[LightForecaster], reading: Reading, exposed_at: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _forecasts(networks: list[LightForecaster], reading: Reading, exposed_at: np.ndarray):
     """EV100 expected three frames ahead, and how sure that is, both (B, 60)."""
     tracker, found = LearntTracker(len(exposed_at), networks), []
     for t in range(60):

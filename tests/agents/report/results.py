@@ -29,17 +29,12 @@ def made_result(groups: int = 20) -> EvaluationResult:
     }
     pairs = np.arange(episodes) // 2
     hard = pairs % 2 == 0
+    ids, groups = (np.array([f"{kind}-{i:02d}" for i in pairs]) for kind in ("scene", "group"))
+    kinds, starts = np.where(hard, "snow", "photograph"), np.zeros(episodes, np.int64)
+    named = {"scene_ids": ids, "groups": groups, "kinds": kinds, "hard": hard, "tracks": tracks}
+    allowed = np.ones(scores.shape, bool)
     return EvaluationResult(
-        grid,
-        scene_ids=np.array([f"scene-{i:02d}" for i in pairs]),
-        groups=np.array([f"group-{i:02d}" for i in pairs]),
-        kinds=np.where(hard, "snow", "photograph"),
-        hard=hard,
-        start_states=np.zeros(episodes, np.int64),
-        scores=scores,
-        allowed=np.ones(scores.shape, bool),
-        tracks=tracks,
-        seed=11,
+        grid, **named, start_states=starts, scores=scores, allowed=allowed, seed=11
     )
 
 

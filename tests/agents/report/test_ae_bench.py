@@ -13,15 +13,9 @@ from agents.report import ae_bench
 from simulator.capture.prepared_scene import Layout
 from tests.agents.report.results import made_brackets
 
-PLAN = EvaluationPlan(
-    name="Bench",
-    task="still",
-    environment={"scenes": "bundled:small", "split": "test", "resolution": 36},
-    max_scenes=4,
-    frames=3,
-    starts=("middle",),
-    policies=("random", "matrix:P"),
-)
+ENVIRONMENT = {"scenes": "bundled:small", "split": "test", "resolution": 36}
+PLAN = EvaluationPlan(name="Bench", task="still", environment=ENVIRONMENT, max_scenes=4)
+PLAN = PLAN.changed(frames=3, starts=("middle",), policies=("random", "matrix:P"))
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +34,10 @@ def test_hash_notices_the_plan_and_the_light(plan, scenes):
     ae_bench.check_hash(plan.changed(policies=("spot:P",)), scenes)  # who runs is no matter
     corner = scenes[0].light.clone()
     corner[:, :9, :9] *= 2.0
-    changed = [
-        [replace(scenes[0], light=light), *scenes[1:]]
-        for light in (scenes[0].light * 1.15, corner)  # 0.2 EV
-    ]
-    assert scenes[0].layout is not None
-    changed.append([replace(scenes[0], layout=Layout(1.0 - scenes[0].layout.defocus)), *scenes[1:]])
-    for other, own in ((plan.changed(frames=4), scenes), *((plan, own) for own in changed)):
+    changed = [{"light": light} for light in (scenes[0].light * 1.15, corner)]  # 0.2 EV
+    changed.append({"layout": Layout(1.0 - scenes[0].layout.defocus)})
+    others = [(plan, [replace(scenes[0], **own), *scenes[1:]]) for own in changed]
+    for other, own in ((plan.changed(frames=4), scenes), *others):
         with pytest.raises(ValueError, match="`hash`"):
             ae_bench.check_hash(other, own)
     light = torch.full((4, 36, 36), 0.25)
@@ -97,10 +88,8 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     with table.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     shown = sorted(f"{row['policy']} {row['observation']} {row['author']}" for row in rows)
-    assert shown == [
-        *("matrix:P uint8 first", "random statistics first"),
-        *("random uint8 first", "random uint8 second"),
-    ]
+    named = ("random statistics first", "random uint8 first", "random uint8 second")
+    assert shown == ["matrix:P uint8 first", *named]
     assert tuple(rows[0]) == ae_bench.COLUMNS
     assert float(rows[0]["score"]) == pytest.approx(ranking.normalised_score[0], abs=5e-5)
     assert rows[0]["real"] == rows[0]["unseen"] == ""  # no real places, no brackets
@@ -117,10 +106,8 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
 def test_rows_of_brackets_by_hand(tmp_path):
     """Two groups, one of a real place; two budgets; one seed."""
     groups = [ae_bench.list_assets()[0].place, "zz"]
-    results = {
-        "0.1 s": made_brackets(groups, p=np.array([[0.9, 0.7]])),
-        "0.2 s": made_brackets(groups, p=np.array([[1.0, 0.8]])),
-    }
+    quality = {"0.1 s": [[0.9, 0.7]], "0.2 s": [[1.0, 0.8]]}
+    results = {name: made_brackets(groups, p=np.array(own)) for name, own in quality.items()}
     rows = ae_bench.bench_rows(results, overall_ranking(results))
     row = rows.iloc[0]
     assert row.score == pytest.approx(0.85)
