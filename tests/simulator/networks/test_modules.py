@@ -24,12 +24,7 @@ from simulator.networks.noise_module import (
     smoothed,
     variance_map,
 )
-from simulator.networks.unet import (
-    AttentionUNet,
-    SkipAttention,
-    UNet,
-    instance_norm,
-)
+from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
 from simulator.optics.thin_lens import Lens
