@@ -442,3 +442,14 @@ def test_a_term_with_a_scale_of_its_own_has_it() -> None:
         for part in (plain, other)
     )
     np.testing.assert_allclose(second, np.sqrt(first), atol=0.01)
+
+
+def test_a_composite_of_ones_own_is_called() -> None:
+    class Mine(CompositeScorer):
+        def __call__(self, images: torch.Tensor | None, captures: Any) -> torch.Tensor:
+            return torch.full((len(captures),), 0.25)
+
+    scorer = CompositeScorer({"mine": Mine({"noise": Noise()}), "noise": Noise()})
+    table = ScoreTables(SMALL, CAMERA, scorer).table(_scene())
+    np.testing.assert_array_equal(table.parts["mine"], 0.25)
+    assert np.ptp(table.parts["noise"]) > 0.1
