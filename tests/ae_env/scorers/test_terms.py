@@ -143,6 +143,8 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
     captures = replace(captures, noisy=False)
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx([1.0] * 4)
+    black = images * torch.tensor([0.0, -2e-4, -9e-4, 0.0])[:, None, None, None]
+    assert make_scorer("noise")(black, captures).tolist() == [0.0] * 4  # no signal, and no noise
 
 
 def test_bands_by_hand() -> None:
