@@ -96,7 +96,8 @@ def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
     assert read_raw(files[63]).settings == CameraSettings(6400, 1 / 2, 11)
 
 
-def test_networks_run_once_for_a_raw(ae_env, dng, tmp_path, monkeypatch):
+def test_networks_run_once_for_a_raw(ae_env, raw, tmp_path, monkeypatch):
+    write_dng(dng := tmp_path / "IMG_1.dng", replace(raw, data=raw.data[:, :40, :44]))
     modules = build_modules("compact").requires_grad_(False)
     torch.nn.init.normal_(modules["noise"].network.tail.weight, std=0.02)
     modules["aperture"].network.tail.bias.fill_(1.5)
