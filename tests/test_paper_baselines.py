@@ -29,9 +29,7 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("make", [ParameterConcatenation, DecoupledNet])
-def test_batch_of_different_parameters_equals_single_runs(
-    make: type[ParameterConcatenation | DecoupledNet],
-) -> None:
+def test_batch_of_different_parameters_equals_single_runs(make):
     net = make(width=6).eval().double()
     for module in net.modules():  # running statistics that differ from a single image's
         if isinstance(module, AdaptiveNorm):
@@ -61,9 +59,6 @@ def test_trained_baselines_come_back(tmp_path: Path) -> None:
         assert (list(loaded), card["preset"]) == (["baseline"], preset)
 
 
-# Parameter concatenation
-
-
 def test_adaptive_normalisation() -> None:
     """lambda * x + mu * BN(x): over the batch in training, with running statistics after it."""
     norm = AdaptiveNorm(3).double()
@@ -90,9 +85,6 @@ def test_receptive_field_of_the_published_table() -> None:
     assert image.grad is not None
     reached = image.grad[0, 0, 0].nonzero().flatten()
     assert (int(reached[0]), int(reached[-1])) == (350 - 256, 350 + 256)
-
-
-# Decoupled learning
 
 
 @pytest.mark.parametrize("options", [{}, {"stride": 2}, {"dilation": 4}, {"upsample": True}])

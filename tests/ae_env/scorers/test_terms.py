@@ -143,6 +143,8 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
     captures = replace(captures, noisy=False)
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx([1.0] * 4)
+    black = images * torch.tensor([0.0, -2e-4, -9e-4, 0.0])[:, None, None, None]
+    assert make_scorer("noise")(black, captures).tolist() == [0.0] * 4  # no signal, and no noise
 
 
 def test_bands_by_hand() -> None:
@@ -442,3 +444,14 @@ def test_a_term_with_a_scale_of_its_own_has_it() -> None:
         for part in (plain, other)
     )
     np.testing.assert_allclose(second, np.sqrt(first), atol=0.01)
+
+
+def test_a_composite_of_ones_own_is_called() -> None:
+    class Mine(CompositeScorer):
+        def __call__(self, images: torch.Tensor | None, captures: Any) -> torch.Tensor:
+            return torch.full((len(captures),), 0.25)
+
+    scorer = CompositeScorer({"mine": Mine({"noise": Noise()}), "noise": Noise()})
+    table = ScoreTables(SMALL, CAMERA, scorer).table(_scene())
+    np.testing.assert_array_equal(table.parts["mine"], 0.25)
+    assert np.ptp(table.parts["noise"]) > 0.1

@@ -20,6 +20,7 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture.decision import Exposure
@@ -75,11 +76,9 @@ def test_arithmetic() -> None:
     assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
     assert nlf.scaled(1 / 16).read == pytest.approx((2.5e-9, 1.875e-9, 1.875e-9, 1.25e-9))
     assert ZERO.is_zero
-    assert not nlf.extrapolated
-    for stops in (2.0, -1.0):  # whatever is done with it
-        beyond = replace(nlf, extrapolation=stops)
-        made = beyond, beyond.exposed(8), beyond.scaled(0.5), beyond.at_least(ZERO)
-        assert [(n.extrapolation, n.extrapolated) for n in made] == [(stops, True)] * 4
+    for beyond in (nlf, replace(nlf, extrapolation=2.0)):  # whatever is done with it
+        made = beyond.exposed(8), beyond.scaled(0.5), beyond.at_least(ZERO)
+        assert [n.extrapolation for n in made] == [0.0 if beyond is nlf else 2.0] * 3
     assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
     most = NoiseLevelFunction((1.0,) * 4, (1.0,) * 4).exposed(1e30)
     assert (most.shot, most.read) == ((1e24,) * 4, (1e24,) * 4)
@@ -252,6 +251,11 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     )
     np.testing.assert_array_equal(numbers, np.rint(signals.numpy() * SPAN + 3000))
     assert (low, high) == ((signals <= 2**-10).sum(), (signals >= 1 - 1e-6).sum())
+    assert record(transitions, known, count=True, **given).tolist() == [[low, high]]
+    codes = np.empty((1, 4, 9, 70), np.uint8)
+    assert record(transitions, known, codes=codes, **given).tolist() == [[0, 0]]
+    np.testing.assert_array_equal(codes, encode_observation(signals))
+    assert record(transitions, known, signals=signals, **given).tolist() == [[0, 0]]
 
 
 def test_what_is_not_calibrated_is_refused() -> None:
@@ -317,7 +321,7 @@ def test_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: 
 def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
     given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
     states = [CameraSettings(*values) for values in given]
-    for seed in (7, np.int64(8), MASK):
+    for seed in (7, np.int64(8), MASK):  # the last is the largest
         keys = sweep_keys(seed, states)
         assert keys.tolist() == [key_of(int(seed), *values) for values in given]
     assert len(sweep_keys(7, [])) == 0
