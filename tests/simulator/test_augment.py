@@ -18,9 +18,6 @@ def pictures(count: int = 4, size: int = 24, planes: int = 3) -> torch.Tensor:
     return torch.rand(count, planes, size, size, generator=torch.Generator().manual_seed(0))
 
 
-# -- determinism ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("planes", [3, 4])
 def test_a_seed_gives_the_same_picture_alone_in_a_batch_and_in_another_order(planes: int) -> None:
     augment, given = ExposureAugmentation(), pictures(planes=planes)
@@ -93,9 +90,6 @@ def test_samples_keep_what_they_hold_besides() -> None:
     assert torch.equal(alone[-4], alone[0])
     with pytest.raises(IndexError, match="`index`"):
         alone[-5]
-
-
-# -- what it does ---------------------------------------------------------------------------------
 
 
 def test_nothing_asked_changes_nothing() -> None:
@@ -190,9 +184,6 @@ def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
     here, there = (ExposureAugmentation()(x, range(4)) for x in (given, given.cuda()))
     assert there.is_cuda
     assert (here - there.cpu()).abs().max() <= 12.92 * 1.618 / min(CAMERA.span) + 1e-4
-
-
-# -- bad input ------------------------------------------------------------------------------------
 
 
 def test_bad_settings_and_images():

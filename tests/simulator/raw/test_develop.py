@@ -169,8 +169,6 @@ def test_the_inverse_takes_codes_and_floating_point() -> None:
     assert develop(same).sub(codes / 255.0).abs().max() < 1e-5
 
 
-# -- demosaicking ---------------------------------------------------------------------------------
-
 PATTERNS = [p.value for p in BayerPattern]
 
 
@@ -203,8 +201,6 @@ def test_malvar_on_the_gpu_is_not_rounded():
     on_gpu = demosaic_malvar(packed.cuda(), "GBRG").cpu()
     torch.testing.assert_close(on_gpu, demosaic_malvar(packed, "GBRG"), atol=3e-7, rtol=0)
 
-
-# -- clipped highlights ---------------------------------------------------------------------------
 
 BASE = CameraSettings(100, 1 / 64, 4)
 #: Levels of white: dark, only green clips, blue too, all planes; and a red lamp.

@@ -112,8 +112,6 @@ def test_saturated_pixels_of_frames_in_shares(rows):
     np.testing.assert_array_equal(raw.saturated, expected)
 
 
-# -- DNG files -------------------------------------------------------------------------------------
-
 NLF = NoiseLevelFunction((1.5e-4, 2e-4, 2e-4, 2.5e-4), (1e-6, 2e-6, 2e-6, 3e-6))
 
 
@@ -272,8 +270,6 @@ def test_bad_arguments_leave_what_is_there(tmp_path, path):
             write_dng(target, raw)
     assert path.read_bytes() == before
 
-
-# -- blind estimates of noise ----------------------------------------------------------------------
 
 LEVELS = (0.02, 0.1, 0.18, 0.5)
 

@@ -379,9 +379,6 @@ def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path, caplog):
         read_raw(dark, **given)
 
 
-# -- tags and other containers ---------------------------------------------------------------------
-
-
 def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
     """A directory at 8 of (tag, type, count, value) entries."""
     head = struct.pack("<2sHIH", b"II", 42, 8, len(entries))

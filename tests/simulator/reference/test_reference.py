@@ -308,8 +308,6 @@ def test_planes_are_sampled_by_their_colour_and_place(cfa: BayerPattern) -> None
         assert torch.equal(plane, light["RGB".index(cfa.name[at]), at // 2 : 6 : 2, at % 2 : 8 : 2])
 
 
-# -- sequences -------------------------------------------------------------------------------------
-
 #: What the marked f-numbers stand for: powers of sqrt(2).
 EXACT_F = {4.0: 4.0, 5.6: 2**2.5, 8.0: 8.0, 11.0: 2**3.5, 16.0: 16.0, 22.0: 2**4.5}
 

@@ -226,8 +226,6 @@ def test_a_recorded_mosaic_serves_only_where_it_is_quiet() -> None:
         crops.batch(0, 1, 49)
 
 
-# -- losses ----------------------------------------------------------------------------------------
-
 SHOT, READ = 4e-4, 1e-6
 
 

@@ -183,9 +183,6 @@ def test_what_is_no_dataset_is_refused(tmp_path, read, name):
             read(tmp_path)
 
 
-# -- training -------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_dataset(tmp_path_factory.mktemp("Nikon"), sequences=4)

@@ -117,9 +117,6 @@ def test_child_processes_make_threads_of_their_own():
     child.join(timeout=60)
 
 
-# -- tiles -----------------------------------------------------------------------------------------
-
-
 def frame(*size: int, seed: int = 0) -> Tensor:
     return torch.rand(1, 4, *size, generator=torch.Generator().manual_seed(seed))
 

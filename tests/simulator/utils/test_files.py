@@ -113,9 +113,6 @@ def test_files_read_back_and_bad_values_leave_them(tmp_path, bad):
     assert len(list(path.parent.iterdir())) == 1
 
 
-# -- configurations --------------------------------------------------------------------------------
-
-
 class Part(Configuration):
     steps: int = Field(ge=1)
 
@@ -181,8 +178,6 @@ def test_errors_name_file_and_entry_in_one_line(tmp_path, text, parts):
     assert "\n" not in message
     assert [part for part in parts if part not in message] == []
 
-
-# -- results in a cache ---------------------------------------------------------------------------
 
 KEYS = [cache_key("denoised", i) for i in range(64)]
 VALUES = {
@@ -375,9 +370,6 @@ def test_writers_share_a_folder(tmp_path, caplog):
     assert not caplog.records
     assert not list(tmp_path.rglob("*.tmp"))
     assert sum(size for _, size in Store(tmp_path).usage().values()) <= 60_000
-
-
-# -- states of a training -------------------------------------------------------------------------
 
 
 def made(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
