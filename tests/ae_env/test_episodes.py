@@ -259,26 +259,23 @@ RICH = {"with_oracle": True, "observation": "linear", "lighting": "sine", "delay
 RICH["costs"] = {"flicker": 0.1, "switch": 0.1}
 
 
+BANDED = {"with_oracle": True, "scorer": {"balanced": 0.7, "banding": 0.3}, "delay": 2}
+LIGHTINGS = (
+    {"kind": "flicker", "frequency": 500, "duty": 0.2},
+    {"kind": "schedule", "ev": [0, 1, -1]},
+)
+
+
 @pytest.mark.parametrize(
     ("mode", "extra"),
-    [(mode.name, RICH) for mode in AutoresetMode] + [("SAME_STEP", {"noise": "exact"})],
+    [
+        *((mode.name, RICH) for mode in AutoresetMode),
+        ("SAME_STEP", {"noise": "exact"}),
+        *(("SAME_STEP", {"lighting": lighting, **BANDED}) for lighting in LIGHTINGS),
+    ],
 )
 def test_parity_with_sync_vector_env(mode: str, extra: dict[str, Any]) -> None:
     check_parity(11, 9, mode, max_episode_steps=3, **extra)
-
-
-LIGHTINGS: list[Any] = [
-    "static",
-    "sine",
-    {"kind": "flicker", "frequency": 500, "duty": 0.2},
-    {"kind": "schedule", "ev": [0, 1, -1]},
-]
-
-
-@pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
-def test_parity_in_every_light(lighting: Any) -> None:
-    extra = {"lighting": lighting, "with_oracle": True, "scorer": {"balanced": 0.7, "banding": 0.3}}
-    check_parity(5, 4, max_episode_steps=3, delay=2, **extra)
 
 
 def test_delayed_settings_meet_the_light_of_their_frame() -> None:
@@ -370,12 +367,9 @@ def test_workers_that_are_forked_from_a_process_with_environments(tmp_path: Path
     # Gymnasium's default: torch's threads do not survive the fork, a worker must not need them,
     # not even to draw the scenes, as nothing is cached yet.
     code = (
-        "import gymnasium as gym\n"
-        "envs = gym.make_vec('ae_env:ae_env/AutoExposure-v0', num_envs=2,"
-        " vectorization_mode='async', scenes='bundled:snow', split='test', resolution=36)\n"
-        "envs.reset(seed=0)\n"
-        "print(envs.step([3, 40])[1].shape)\n"
-        "envs.close()\n"
+        "import gymnasium as gym; envs = gym.make_vec('ae_env:ae_env/AutoExposure-v0', num_envs=2,"
+        " vectorization_mode='async', scenes='bundled:snow', split='test', resolution=36);"
+        "envs.reset(seed=0); print(envs.step([3, 40])[1].shape); envs.close()"
     )
     variables = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
     variables["AE_ENV_CACHE"] = str(tmp_path)

@@ -8,21 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from PIL import Image
-from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
-from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.recorded import (
-    RecordedOptions,
-    index_recorded,
-    recorded_grid,
-    settings_in_name,
-    state_of,
-)
+from ae_env.scenes import Scene, load_scenes, recorded
 from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
 from simulator.reference.camera import ReferenceCamera
@@ -54,7 +45,7 @@ def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
     expected = scene.recorded.reshape(8, 4, 20, 2, 20, 2).mean(dim=(3, 5))
     torch.testing.assert_close(small.recorded, expected, rtol=0.0, atol=1e-6)
     assert small.box_factor == 2
-    body = RecordedOptions(tmp_path).camera(get_camera("canon_70d"))  # that of the raws
+    body = recorded.RecordedOptions(tmp_path).camera(get_camera("canon_70d"))  # that of the raws
     assert body.black_level == CAMERA.black_level
     for iso in (100.0, 1600.0):  # a DNG states one pair of numbers for both greens
         np.testing.assert_allclose(body.nlf_by_iso[iso].shot, CAMERA.nlf(iso).shot, rtol=0.02)
@@ -101,14 +92,14 @@ def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
     # They complete each other.
     rows = [f"{number}.jpg,f{settings.f_number:g}" for number, settings in enumerate(GRID)]
     (tmp_path / "a" / "settings.csv").write_text("\n".join(["file,aperture", *rows]))
-    files = index_recorded(tmp_path / "a", {})
+    files = recorded.index_recorded(tmp_path / "a", {})
     assert [f.scene for f in files] == ["a"] * 8
-    assert recorded_grid(files) == GRID
+    assert recorded.recorded_grid(files) == GRID
     # Nominal and exact values are one state.
     grid = ExposureGrid((100,), (1 / 128, 1 / 64), (2.8, 5.6))
-    assert state_of(CameraSettings(100, 1 / 125, 5.6569), grid) == 1
-    assert state_of(CameraSettings(100, 1 / 60, 5.6), grid) is None  # 6.7 % off
-    assert state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
+    assert recorded.state_of(CameraSettings(100, 1 / 125, 5.6569), grid) == 1
+    assert recorded.state_of(CameraSettings(100, 1 / 60, 5.6), grid) is None  # 6.7 % off
+    assert recorded.state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
 
 
 def test_states_without_a_capture_are_forbidden_and_said(tmp_path, caplog):
@@ -191,7 +182,7 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(text, errors="surrogateescape")
     with pytest.raises(ValueError, match=message):
-        index_recorded(tmp_path, {})
+        recorded.index_recorded(tmp_path, {})
 
 
 @pytest.mark.parametrize(
@@ -205,11 +196,13 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
 def test_options(tmp_path: Path, spec: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load(spec)
-    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
-    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
+    found = recorded.RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == recorded.RecordedOptions(
+        Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6
+    )
     names = [f"iso{i}_1-{i}s_f{i / 100}.png" for i in range(100, 1800, 100)]
     with pytest.raises(ValueError, match="4913 combinations; at most 4096"):
-        recorded_grid(index_recorded(touch(tmp_path, *names), {}))
+        recorded.recorded_grid(recorded.index_recorded(touch(tmp_path, *names), {}))
 
 
 @pytest.mark.parametrize(
@@ -232,7 +225,7 @@ def test_options(tmp_path: Path, spec: object, message: str) -> None:
 def test_settings_in_names(name: str, settings: tuple[float | None, ...], rest: str) -> None:
     names = ("iso", "exposure_time", "f_number")
     expected = {k: v for k, v in zip(names, settings, strict=True) if v is not None}
-    found, left = settings_in_name(name)
+    found, left = recorded.settings_in_name(name)
     assert found == pytest.approx(expected)
     assert left == rest
 
@@ -241,11 +234,11 @@ def test_imagenet_es(tmp_path: Path) -> None:
     grid = ExposureGrid((200, 12800), (1 / 1250, 0.4), (5, 13))
     write_states(tmp_path, seeds=(3,), grid=grid)
     shutil.copytree(tmp_path / "l1", tmp_path / "l5")
-    files = index_recorded(tmp_path, {})
+    files = recorded.index_recorded(tmp_path, {})
     assert [f.scene for f in files] == [f"l{i}/n00000003/val_3" for i in (1, 5) for _ in range(8)]
     # Both lights of a picture stay on one side of a split.
     assert {f.group for f in files} == {"n00000003/val_3"}
-    assert recorded_grid(files) == grid
+    assert recorded.recorded_grid(files) == grid
     by_folder = {f.path.parts[-3]: f.settings for f in files}
     assert by_folder == {f"param_{i + 1}": s for i, s in enumerate(grid)}
 
@@ -257,7 +250,7 @@ def test_video_stacks(tmp_path: Path) -> None:
     assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
     # Frames in the files' names are the same.
     flat = touch(tmp_path / "flat", *(f"v/frame_{i}_1-{t}s.png" for i in (9, 10) for t in (8, 15)))
-    files = index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
+    files = recorded.index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
     assert [(f.sequence, f.frame) for f in files] == [("v", 9), ("v", 9), ("v", 10), ("v", 10)]
 
 
@@ -372,13 +365,6 @@ def test_native_vector_environments_show_the_same(raws: Path, video: dict[str, A
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
         check_parity(0, 4, max_episode_steps=3, **given)
-
-
-def test_the_checkers_find_nothing(raws: Path, video: dict[str, Any]) -> None:
-    for scenes in (raws, video):
-        env = make_env(**arguments(scenes)).unwrapped
-        check_env(env)
-        check_for_sb3(env)
 
 
 def test_a_changed_folder_is_read_again(tmp_path: Path) -> None:
