@@ -18,7 +18,7 @@ from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
 from simulator.reference.camera import ReferenceCamera
 from tests.ae_env.environments import ID, check_parity, make_env
-from tests.ae_env.recorded_files import (
+from tests.ae_env.scene_files import (
     GRID,
     capture,
     write_picture,
@@ -365,6 +365,16 @@ def test_native_vector_environments_show_the_same(raws: Path, video: dict[str, A
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
         check_parity(0, 4, max_episode_steps=3, **given)
+
+
+def first_frame(env: Any) -> np.ndarray:
+    return env.reset(seed=4)[0]["raw"]
+
+
+def test_a_copy_in_another_process_shows_the_same(raws: Path, forkserver: Any) -> None:
+    env = make_env(**arguments(raws)).unwrapped
+    with forkserver.Pool(1) as pool:
+        np.testing.assert_array_equal(pool.apply(first_frame, (env,)), first_frame(env))
 
 
 def test_a_changed_folder_is_read_again(tmp_path: Path) -> None:

@@ -17,29 +17,10 @@ import pytest
 import torch
 
 from ae_env.lighting.moving import read_pans
-from ae_env.scenes import Scene, polyhaven
-from ae_env.scenes.bundled import (
-    DrawnScenes,
-    SceneGroup,
-    add_layout,
-    bundled_scenes,
-    procedural_groups,
-)
+from ae_env.scenes import Scene, bundled, polyhaven
 from ae_env.scenes.load import _LOADED, load_scenes
 from ae_env.scenes.measured_depth import depth_scenes
-from ae_env.scenes.polyhaven import (
-    ILLUMINANCE,
-    Asset,
-    asset_views,
-    cut_values,
-    download,
-    incident_light,
-    light_around,
-    list_assets,
-    mixed_scenes,
-    polyhaven_scenes,
-    split_assets,
-)
+from ae_env.scenes.polyhaven import Asset, incident_light, list_assets
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
 from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
@@ -49,6 +30,7 @@ from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
 from simulator.utils.cache import disk_cache
 from tests.ae_env.environments import assert_equal, make_envs
+from tests.ae_env.scene_files import write_hdr
 from tests.ae_env.scorer_images import make_scene
 
 CAMERA = get_camera("nikon_z6")
@@ -94,7 +76,7 @@ def test_splits_share_no_group_and_half_of_their_groups_are_hard(unseen: list[Sc
         assert scene.light.min() >= 0
         assert scene.median_speed == (1.0 if scene.kind == "motion" else 0.125)
     assert len({scene.scene_id for scene in unseen}) == len(unseen)
-    train = {f"{kind}-{index:03d}" for kind, index in procedural_groups("train", "large")}
+    train = {f"{kind}-{index:03d}" for kind, index in bundled.procedural_groups("train", "large")}
     train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
     assert len(train) >= 195
     assert not train & groups.keys()
@@ -196,7 +178,7 @@ def test_layouts_depend_on_the_name_alone() -> None:
     light = np.random.default_rng(0).random((4, 128, 128))
     named = ("a", light), ("a", light / 2), ("b", light), ("a", light[:, :64, :64])
     fine, again, other, small = (
-        add_layout(make_scene(picture, 100.0, scene_id=name)) for name, picture in named
+        bundled.add_layout(make_scene(picture, 100.0, scene_id=name)) for name, picture in named
     )
     assert fine.layout.subject.any()
     assert torch.equal(fine.layout.defocus, again.layout.defocus)
@@ -222,9 +204,9 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
 def test_drawn_one_by_one_they_are_those_drawn_together(part: str, monkeypatch) -> None:
     together = load_scenes(f"bundled:{part}", "test", camera=CAMERA, resolution=36)
     request = SceneRequest("test", CAMERA, 36)
-    loaded = bundled_scenes(request, part=part)
+    loaded = bundled.bundled_scenes(request, part=part)
     monkeypatch.setenv("AE_ENV_CACHE", "/dev/null/none")  # nothing is stored, nothing is found
-    drawn = bundled_scenes(request, part=part)
+    drawn = bundled.bundled_scenes(request, part=part)
     assert loaded.loaded == list(range(len(together)))
     assert drawn.loaded != loaded.loaded
     assert list(drawn.scene_ids) == [scene.scene_id for scene in together]
@@ -243,8 +225,8 @@ def test_no_more_are_drawn_than_are_asked_for_and_the_last_one_stores_them() -> 
         made.append(names)
         return [make_scene(np.full((4, 36, 36), 0.1 * len(made)), scene_id=n) for n in names]
 
-    groups = [SceneGroup(g, functools.partial(make, g)) for g in (["a"], ["b", "c"], ["d"])]
-    scenes = DrawnScenes("some", groups, "0" * 64)
+    groups = [bundled.SceneGroup(g, functools.partial(make, g)) for g in (["a"], ["b", "c"], ["d"])]
+    scenes = bundled.DrawnScenes("some", groups, "0" * 64)
     assert made == [["a"]]  # what cannot be drawn must fail at once
     assert (len(scenes), scenes.scene_ids) == (4, ("a", "b", "c", "d"))
     assert scenes[-2].scene_id == "c"
@@ -333,11 +315,8 @@ def an_asset(tmp_path, monkeypatch):
     """Makes an asset of a panorama, as the file that a folder of real files holds."""
 
     def make(light: np.ndarray, kind: str = "overcast") -> Asset:
-        import cv2
-
         path = tmp_path / "hdri_pool" / "made.hdr"
-        path.parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(path), light.transpose(1, 2, 0)[:, :, ::-1])
+        write_hdr(path, image=light.transpose(1, 2, 0))
         monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
         content = path.read_bytes()
         digest = hashlib.sha256(content).hexdigest()
@@ -349,11 +328,11 @@ def an_asset(tmp_path, monkeypatch):
 def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
     """A view of it is as bright as a white surface that it lights; each view has its own level."""
     even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
-    views = list(asset_views(an_asset(even), CAMERA, size=16, views=50))
+    views = list(polyhaven.asset_views(an_asset(even), CAMERA, size=16, views=50))
     for scene in views:
         assert scene.light[1:3].mean().item() == pytest.approx(WHITE_SIGNAL, rel=0.01)
         assert (scene.sampled, scene.box_factor) == (True, 1)
-    low, high = np.log(ILLUMINANCE["overcast"])
+    low, high = np.log(polyhaven.ILLUMINANCE["overcast"])
     levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
     assert 0 <= levels.min() < levels.max() <= 1
     assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
@@ -362,10 +341,10 @@ def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
 
 def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch):
     """A bright half of the world: the view into it is lit from behind."""
-    monkeypatch.setitem(ILLUMINANCE, "overcast", (1e4, 1e4))
+    monkeypatch.setitem(polyhaven.ILLUMINANCE, "overcast", (1e4, 1e4))
     half = panorama(lambda lon, lat: np.where(np.abs(lon) < np.pi / 2, 1.0, 0.05) + 0.0 * lat)
     lux, seen = [], []
-    for scene in asset_views(an_asset(half), CAMERA, size=16, views=16):
+    for scene in polyhaven.asset_views(an_asset(half), CAMERA, size=16, views=16):
         lux.append(scene.illuminance)
         seen.append(scene.light[1].median().item())
     order = np.argsort(lux)
@@ -375,22 +354,24 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
 
 def test_maps_that_are_cut_say_so(an_asset):
     gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
-    assert cut_values(gradient) == []
-    assert cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
-    assert cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
+    assert polyhaven.cut_values(gradient) == []
+    assert polyhaven.cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
+    assert polyhaven.cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
     asset = an_asset(np.minimum(gradient, 2.9))
-    assert "highlights are cut" in next(asset_views(asset, CAMERA, size=16)).source
+    assert "highlights are cut" in next(polyhaven.asset_views(asset, CAMERA, size=16)).source
 
 
 def test_real_scenes_alone_and_mixed(data_dir):
     request = SceneRequest("test", CAMERA, 36)
-    real, again = (polyhaven_scenes(request, views=1) for _ in range(2))  # then from the cache
+    # The second time from the cache.
+    real, again = (polyhaven.polyhaven_scenes(request, views=1) for _ in range(2))
     assert len({s.group for s in real}) >= 15
     assert all(a.content == b.content for a, b in zip(real, again, strict=True))
     for scene in real:
         assert (scene.light.shape, scene.box_factor) == ((4, 36, 36), 7)
-        assert 1e-3 < scene.illuminance <= ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
-    mixed = mixed_scenes(request, list(bundled_scenes(request, part="snow")), len(real))
+        assert 1e-3 < scene.illuminance <= polyhaven.ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
+    drawn = list(bundled.bundled_scenes(request, part="snow"))
+    mixed = polyhaven.mixed_scenes(request, drawn, len(real))
     kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
     assert kinds[True] == kinds[False] == 10
     assert {s.group for s in mixed if s.source.startswith("Poly")} < {s.group for s in real}
@@ -398,8 +379,8 @@ def test_real_scenes_alone_and_mixed(data_dir):
     places = read_pans()
     assert set(places) == {asset.name for asset in list_assets() if asset.split == "test"}
     assert {len(turn) for turn in places.values()} == {72}
-    asset = next(a for a in split_assets("polyhaven", "test") if a.name == "spree_bank")
-    found = light_around(read_radiance(asset.path))
+    asset = next(a for a in polyhaven.split_assets("polyhaven", "test") if a.name == "spree_bank")
+    found = polyhaven.light_around(read_radiance(asset.path))
     np.testing.assert_allclose(places["spree_bank"], found, atol=6e-4)
 
 
@@ -442,19 +423,19 @@ def server(tmp_path, monkeypatch):
 def test_a_download_fetches_what_is_missing_and_nothing_broken(server, tmp_path, monkeypatch):
     (url, folder), total = server, sum(map(len, CONTENT.values()))
     seen: list[tuple[int, int, str]] = []
-    assert len(download(url=url, progress=lambda *values: seen.append(values))) == 3
+    assert len(polyhaven.download(url=url, progress=lambda *values: seen.append(values))) == 3
     maps = {name: tmp_path / "cache" / "polyhaven" / f"{name}_1k.hdr" for name in CONTENT}
     assert {name: path.read_bytes() for name, path in maps.items()} == CONTENT
     assert (seen[0], seen[-1][:2]) == ((0, total, "map_0"), (total, total))
-    assert download(url=url, progress=None) == []
+    assert polyhaven.download(url=url, progress=None) == []
     maps["map_1"].write_bytes(bytes(len(CONTENT["map_1"])))  # of the right length
-    assert download(url=url, progress=None) == [maps["map_1"]]
+    assert polyhaven.download(url=url, progress=None) == [maps["map_1"]]
     assert maps["map_1"].read_bytes() == CONTENT["map_1"]
     maps["map_1"].unlink()
     (folder / "map_1_1k.hdr").write_bytes(b"another file")
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     with pytest.raises(ConnectionError, match=r"map_1_1k.hdr cannot be fetched"):
-        download(url=url, progress=None)
+        polyhaven.download(url=url, progress=None)
     assert not maps["map_1"].exists()  # no part of a file either
     with pytest.raises(ValueError, match="`url`"):
-        download(url="ftp://a", progress=None)
+        polyhaven.download(url="ftp://a", progress=None)

@@ -1,6 +1,7 @@
 """A user's files: raws and maps with bad ones among them, groups and splits, recorded sequences."""
 
 import logging
+import struct
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from ae_env.scenes.folder import Shot, group_shots, radiance_scenes, sequence_bo
 from ae_env.scenes.scene import SceneRequest
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 from simulator.radiance.maps import assumed_ev100, perspective, read_radiance
-from tests.ae_env.environments import make_env
+from tests.ae_env.environments import check_parity, make_env
 from tests.ae_env.scene_files import load, write_exr, write_hdr
 
 CAMERA = get_camera("nikon_z6")
@@ -177,6 +178,11 @@ def test_scores_are_those_of_the_frame(recorded: Path) -> None:
     assert env.core.scenes[2].scene_id == after[4]["scene_id"] == "IMG_10"
     assert after[1] == pytest.approx(scores[0], abs=1e-9)
     assert before[0] > scores[0]
+
+
+def test_many_at_once_are_as_single_ones(recorded: Path) -> None:
+    arguments = {"scenes": {"sequence": str(recorded)}, "with_oracle": True, "delay": 1}
+    check_parity(8, 4, max_episode_steps=4, lighting="flicker", **arguments, **ARGUMENTS, **STILL)
 
 
 def test_large_folder_is_split_by_group(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -363,10 +369,17 @@ def test_maps_are_sampled_where_they_have_the_photosites(tmp_path, caplog):
             )
         ),
         ("a.exr", b"not an EXR file", ""),
+        ("a.exr", (60_000, 60_000), "claims 60000 x 60000"),
+        ("a.exr", (20_000, 13_000), "claims .*8192 a byte"),
     ],
 )
-def test_errors_name_the_file(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+def test_errors_name_the_file(tmp_path: Path, name: str, content: Any, words: str) -> None:
     pytest.importorskip("cv2")
+    if isinstance(content, tuple):  # the size that the header of a small file claims
+        write_exr(tmp_path / name, np.ones((32, 64)))
+        sides, content = content, bytearray((tmp_path / name).read_bytes())
+        corner = content.index(b"dataWindow\0box2i\0") + 29
+        struct.pack_into("<2i", content, corner, *(side - 1 for side in sides))
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{name}.*{words}"):
         read_radiance(tmp_path / name)

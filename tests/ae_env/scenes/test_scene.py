@@ -16,14 +16,8 @@ from skimage.color import rgb2xyz
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    exposure_ratio,
-    get_camera,
-)
-from simulator.camera import CameraProfile
+from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, exposure_ratio
+from simulator.camera import CameraProfile, get_camera
 from simulator.capture.prepared_scene import Layout
 from simulator.networks.aperture_module import BLUR_FACTOR, DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
@@ -247,18 +241,22 @@ DIAMETER = BLUR_FACTOR * math.sqrt(FOUND**2 - DEAD_ZONE**2)
 NOISY = CameraSettings(6400, 1 / 1024, 8)
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """An untrained denoiser, and a defocus map that is the same everywhere."""
-    torch.manual_seed(0)
+def save_networks(folder: Path, *, even: bool) -> tuple[str, Any]:
+    """Untrained networks whose defocus map is around `FOUND`, or the same everywhere."""
+    torch.manual_seed(3)
     modules = build_modules("compact")
     tail: Any = modules["aperture"].network.tail
     with torch.no_grad():
-        tail.weight.zero_()
         tail.bias.fill_(math.log(FOUND + 0.3))
-    path = tmp_path_factory.mktemp("weights") / "tiny"
-    save_modules(path, modules, "compact", {})
-    return str(path.with_suffix(".safetensors"))
+        if even:
+            tail.weight.zero_()
+    save_modules(folder / "tiny", modules, "compact", {})
+    return str(folder / "tiny.safetensors"), modules.eval()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return save_networks(tmp_path_factory.mktemp("weights"), even=True)[0]
 
 
 def noisy_scene() -> Scene:
@@ -336,20 +334,23 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
 
 def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:
     """Only the middle of a large frame is looked at, with what the networks see around it."""
-    torch.manual_seed(3)
-    modules = build_modules("compact")
-    tail: Any = modules["aperture"].network.tail
-    with torch.no_grad():
-        tail.bias.fill_(math.log(FOUND + 0.3))  # beyond the dead zone
-    save_modules(tmp_path / "random", modules, "compact", {})
-    networks = SceneNetworks(str(tmp_path / "random.safetensors"))
+    file, modules = save_networks(tmp_path, even=False)
     light = 0.3 * torch.rand((4, 252, 244), generator=torch.Generator().manual_seed(1))
     scene = Scene.from_array(light, CameraSettings(100, 0.01, 8), CAMERA, scene_id="large")
     with torch.no_grad():
-        whole = modules.eval()["aperture"].defocus(light[None], torch.zeros_like(light)[None])[0]
-    native = networks.resized(scene, 16, "native")
+        whole = modules["aperture"].defocus(light[None], torch.zeros_like(light)[None])[0]
+    native = SceneNetworks(file).resized(scene, 16, "native")
     torch.testing.assert_close(native.defocus_map, whole[118:134, 114:130], rtol=1e-3, atol=1e-4)
     assert float(whole.std()) > 1e-3
+
+
+def test_maps_are_kept_and_made_again_where_damaged(weights, tmp_path, monkeypatch, caplog) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    first = SceneNetworks(weights).resized(noisy_scene(), 40).defocus_map
+    (file,) = (tmp_path / "defocus_maps").iterdir()
+    file.write_bytes(b"damaged")
+    assert torch.equal(SceneNetworks(weights).resized(noisy_scene(), 40).defocus_map, first)
+    assert f"{file} is damaged" in caplog.text
 
 
 def test_it_is_metered_by_its_mean_and_drawn_by_name_and_seed():

@@ -17,17 +17,9 @@ from skimage.measure import shannon_entropy
 
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import defects as defect_signs
-from ae_env.scorers import make_scorer
+from ae_env.scorers import make_scorer, measures
 from ae_env.scorers.defects import DEFECTS, KNOTS, mapped, severity
 from ae_env.scorers.fidelity import likeness, reference_pictures
-from ae_env.scorers.measures import (
-    histogram_entropy,
-    immerkaer_sigma,
-    shim_gradient,
-    shin_metric,
-    srgb_decode,
-    zhang_gradient,
-)
 from benchmarks import defects as benchmark
 from simulator import CameraSettings, NoiseLevelFunction, incident_ev100
 from simulator.raw.develop import srgb_encode
@@ -65,7 +57,7 @@ def test_shim_is_the_mean_of_the_logarithmic_response() -> None:
     levels = _levels()
     expected = [_shim_pixels(picture).mean() for picture in levels]
     assert min(expected) > 0.05
-    got = shim_gradient(torch.from_numpy(levels / 255.0))
+    got = measures.shim_gradient(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
 
 
@@ -84,7 +76,7 @@ def test_zhang_is_the_weighted_mean_of_sorted_squared_gradients() -> None:
                 angle = math.pi / 2 - math.pi / 2 * (i - n + 1) / (size - n)
             weights.append(math.sin(angle) ** 5)
         expected.append(np.dot(weights, ordered) / sum(weights))
-    got = zhang_gradient(torch.from_numpy(levels / 255.0))
+    got = measures.zhang_gradient(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
     pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
     scores = make_scorer("zhang").parts["zhang"](pictures, None)
@@ -115,7 +107,7 @@ def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
     # Not whole levels, of which many gradients would tie at the percentile.
     levels = 255.0 * random_pictures(3, 40, 60)[:, 0].double().numpy()
     expected = np.array([_shin(picture) for picture in levels])
-    got = shin_metric(torch.from_numpy(levels / 255.0))
+    got = measures.shin_metric(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
     pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
     scores = make_scorer("shin").parts["shin"](pictures, None)
@@ -144,14 +136,14 @@ def test_blind_sigma_is_immerkaers() -> None:
     for picture in 255.0 * luma.numpy():
         response = np.abs(scipy.signal.convolve2d(picture, KERNEL, mode="valid"))
         expected.append(math.sqrt(math.pi / 2) / (6 * 29 * 18) * response.sum())
-    np.testing.assert_allclose(immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
+    np.testing.assert_allclose(measures.immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
 
 
 def test_blind_sigma_of_known_noise() -> None:
     rows, columns = np.mgrid[0:200, 0:220]
     slope = 60.0 + 0.3 * rows + 0.2 * columns  # straight slopes leave nothing
     noisy = slope + 5.0 * np.random.default_rng(2).normal(size=slope.shape)
-    found = immerkaer_sigma(torch.from_numpy(np.stack([noisy, slope]) / 255.0)).tolist()
+    found = measures.immerkaer_sigma(torch.from_numpy(np.stack([noisy, slope]) / 255.0)).tolist()
     assert found == pytest.approx([5.0, 0.0], rel=0.02, abs=1e-9)
     pictures = torch.from_numpy(noisy / 255.0).float().expand(1, 3, -1, -1)
     score = make_scorer("blind_noise").parts["blind_noise"](pictures, None).item()
@@ -221,10 +213,10 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
     codes = np.stack([rng.integers(0, top, (31, 29)) for top in (2, 17, 200, 256)])
     luma = torch.from_numpy(codes / 255.0)
     expected = [shannon_entropy(picture, base=2) for picture in codes]
-    np.testing.assert_allclose(histogram_entropy(luma).numpy(), expected, rtol=1e-9)
+    np.testing.assert_allclose(measures.histogram_entropy(luma).numpy(), expected, rtol=1e-9)
     for bad in (torch.zeros(2, 3), torch.zeros(1, 2, 3, dtype=torch.uint8)):
         with pytest.raises(ValueError, match="`luma`"):
-            histogram_entropy(bad)
+            measures.histogram_entropy(bad)
     every = torch.arange(256.0).reshape(1, 16, 16) / 255.0
     assert _score("entropy", every[:, None].expand(-1, 3, -1, -1)) == pytest.approx([1.0])
 
@@ -233,7 +225,9 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
 def rendered() -> dict[str, torch.Tensor]:
     """Pictures (L, 3, H, W) of a photograph with each defect at its severities."""
     picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
-    scene = Scene.from_radiance(srgb_decode(picture), CAMERA, scene_id="astronaut").resized(128)
+    scene = Scene.from_radiance(
+        measures.srgb_decode(picture), CAMERA, scene_id="astronaut"
+    ).resized(128)
     generator = torch.Generator().manual_seed(3)
     return {name: benchmark.render(scene, name, generator) for name in DEFECTS}
 

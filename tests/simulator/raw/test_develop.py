@@ -11,16 +11,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ae_env.scenes import Scene
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    RawImage,
-    develop,
-    get_camera,
-    read_raw,
-    render_srgb,
-)
-from simulator.camera import BayerPattern, CameraProfile
+from simulator import CameraSettings, CameraSimulator, RawImage, develop, read_raw, render_srgb
+from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.raw.develop import (
     apply_tone,
     demosaic_malvar,

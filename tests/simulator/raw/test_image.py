@@ -15,19 +15,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from simulator import (
-    CameraProfile,
-    CameraSettings,
-    NoiseLevelFunction,
-    RawImage,
-    estimate_nlf,
-    get_camera,
-    list_cameras,
-    read_raw,
-    write_dng,
-)
-from simulator.camera import BayerPattern
-from simulator.raw.dng import DEFAULT_COLOUR_MATRIX
+from simulator import CameraSettings, NoiseLevelFunction, RawImage, estimate_nlf, read_raw
+from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
+from simulator.raw.dng import DEFAULT_COLOUR_MATRIX, write_dng
 from simulator.raw.image import pack_mosaic, unpack_mosaic
 from tests.strategies import cameras, log_uniform, mosaics, settings_within
 

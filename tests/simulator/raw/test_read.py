@@ -14,18 +14,10 @@ import tifffile
 import torch
 from skimage.io import imsave
 
-from simulator import (
-    CameraProfile,
-    CameraSettings,
-    NoiseLevelFunction,
-    RawFileError,
-    RawImage,
-    get_camera,
-    read_raw,
-    write_dng,
-)
-from simulator.camera import BayerPattern
+from simulator import CameraSettings, NoiseLevelFunction, RawFileError, RawImage, read_raw
+from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.raw import read as read_module
+from simulator.raw.dng import write_dng
 from simulator.raw.metadata import camera_identity, is_raw_container, read_directories
 
 SETTINGS = CameraSettings(iso=100, exposure_time=1 / 60, f_number=4.0)

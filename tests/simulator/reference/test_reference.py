@@ -14,6 +14,7 @@ from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
+from simulator.reference import sequences
 from simulator.reference.camera import (
     BodyError,
     ReferenceCamera,
@@ -22,15 +23,7 @@ from simulator.reference.camera import (
     lens_blur,
     sample_mosaic,
 )
-from simulator.reference.sequences import (
-    EXPOSURE_TIMES,
-    ISO_SPEEDS,
-    Sequence,
-    draw_settings,
-    exposure_error,
-    grey_signal,
-    select_pairs,
-)
+from simulator.reference.sequences import Sequence, select_pairs
 from simulator.settings import CameraSettings
 
 BASE = CameraSettings(100, 1 / 64, 4)
@@ -334,7 +327,7 @@ def targets(camera: CameraProfile, ev: int, *settings: CameraSettings) -> set[in
 
 def drawn(illuminance: float, count: int, camera: CameraProfile = Z6) -> list[CameraSettings]:
     rng = np.random.default_rng(7)
-    return [s for _ in range(count) for s in draw_settings(illuminance, rng, camera)]
+    return [s for _ in range(count) for s in sequences.draw_settings(illuminance, rng, camera)]
 
 
 def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
@@ -352,11 +345,13 @@ def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
 @pytest.mark.parametrize("illuminance", [10.0, 20_000.0])
 def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
     rng = np.random.default_rng(1)
-    sequences = [draw_settings(illuminance, rng, Z6) for _ in range(40)]
-    assert {20, 25} <= {len(settings) for settings in sequences} <= set(range(20, 26))
-    assert all(settings == sorted(set(settings)) for settings in sequences)
-    every = list(itertools.chain(*sequences))
-    assert all(s.iso in ISO_SPEEDS and s.exposure_time in EXPOSURE_TIMES for s in every)
+    drawn_settings = [sequences.draw_settings(illuminance, rng, Z6) for _ in range(40)]
+    assert {20, 25} <= {len(settings) for settings in drawn_settings} <= set(range(20, 26))
+    assert all(settings == sorted(set(settings)) for settings in drawn_settings)
+    every = list(itertools.chain(*drawn_settings))
+    assert all(
+        s.iso in sequences.ISO_SPEEDS and s.exposure_time in sequences.EXPOSURE_TIMES for s in every
+    )
     # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
     states = [(s.iso, s.exposure_time, EXACT_F[s.f_number]) for s in every]
     iso, time, f_number = np.array(states).T
@@ -369,7 +364,7 @@ def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance
 def test_bad_arguments_are_refused():
     for light in (0.0, 1e-3):  # no exposure of the levels suits it
         with pytest.raises(ValueError, match="`illuminance`"):
-            draw_settings(light, np.random.default_rng(0), Z6)
+            sequences.draw_settings(light, np.random.default_rng(0), Z6)
     with pytest.raises(ValueError, match="`settings`"):
         Sequence(lit_scene(), (CameraSettings(100, 1, 4),))
     with pytest.raises(ValueError, match="`stage`"):
@@ -379,14 +374,14 @@ def test_bad_arguments_are_refused():
 def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
     # 320 lux is EV 7: ISO 100, 1/8 s, f/4 is right; the error is positive where it is too bright.
     for values, ev in (((100, 1 / 8, 4), 0), ((200, 1 / 4, 4), 2), ((100, 1 / 8, 5.6), -1)):
-        assert exposure_error(320.0, CameraSettings(*values)) == pytest.approx(ev)
+        assert sequences.exposure_error(320.0, CameraSettings(*values)) == pytest.approx(ev)
     # x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
     card, settings = 0.18 * 250 / (120 * math.pi), CameraSettings(100, 1 / 8, 4)
     assert card == pytest.approx(0.119, abs=5e-4)
-    assert grey_signal(lit_scene(320.0), settings) == pytest.approx(card)
-    assert grey_signal(lit_scene(640.0), settings) == pytest.approx(2 * card)
+    assert sequences.grey_signal(lit_scene(320.0), settings) == pytest.approx(card)
+    assert sequences.grey_signal(lit_scene(640.0), settings) == pytest.approx(2 * card)
     dark = lit_scene(None, CameraSettings(100, 1 / 4, 4), light=0.3)
-    assert grey_signal(dark, settings) == pytest.approx(0.15)
+    assert sequences.grey_signal(dark, settings) == pytest.approx(0.15)
 
 
 def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():

@@ -20,6 +20,7 @@ from simulator.optics.discs import DiscBank
 from simulator.reference.camera import ReferenceCamera
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
+from simulator.training import losses
 from simulator.training.data import (
     Batch,
     DetailCrops,
@@ -27,14 +28,6 @@ from simulator.training.data import (
     NoiseBatch,
     ReferencePairs,
     draw_sequences,
-)
-from simulator.training.losses import (
-    ApertureLoss,
-    BaselineLoss,
-    ExposureLoss,
-    NoiseLoss,
-    away_from_clipping,
-    expose,
 )
 from tests.simulator.training.scenes import REFERENCE, scene
 
@@ -271,18 +264,18 @@ def noise_batch(level: float = 0.2, noise: bool = True) -> NoiseBatch:
 
 
 def test_exposure_is_the_mean_error_of_what_is_not_over_exposed():
-    data, loss = batch(noise=False), ExposureLoss(ExposureModule())
+    data, loss = batch(noise=False), losses.ExposureLoss(ExposureModule())
     data.source[:, :, :16] = 0.995  # half the pixels; their error would be large
     assert loss(data)["loss"].item() == pytest.approx(0.01, rel=1e-4)
     data.source[:] = 1.0
     assert loss(data)["loss"].item() == 0.0  # not NaN
-    baseline = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
+    baseline = losses.BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
     values = baseline(batch(noise=False))  # source 0.2, compared with the sample, 0.41
     assert values["loss"].item() == pytest.approx(0.21, rel=1e-5)
     # The noise goes with the exposure.
     module, data = ExposureModule(), batch()
     module.load_state_dict({"w": torch.tensor(1.5), "b": torch.full((4,), 0.1)})
-    exposed, shot, read = expose(module, data)
+    exposed, shot, read = losses.expose(module, data)
     torch.testing.assert_close(exposed, (data.source + 0.1) * 3.0)
     torch.testing.assert_close(shot, torch.full((2, 4), 3 * SHOT))
     torch.testing.assert_close(read, torch.full((2, 4), 9 * READ))
@@ -297,11 +290,11 @@ def test_the_noise_loss_is_the_logarithm_of_what_is_left(level):
     data = noise_batch(level)
     for left, loss in ((1.0, 0.2), (0.5, math.log(0.25)), (0.0, math.log(3e-4))):
         halfway = partial(torch.lerp, data.clean, weight=left)
-        values = NoiseLoss(denoiser(lambda image, *_, to=halfway: to(image)))(data)
+        values = losses.NoiseLoss(denoiser(lambda image, *_, to=halfway: to(image)))(data)
         assert values["loss"].item() == pytest.approx(loss, abs=0.05)
         gain = 60.0 if left == 0.0 else -20 * math.log10(left)  # at most a million times
         assert float(values["gain_db"]) == pytest.approx(gain, abs=1e-4)
-    paper = NoiseLoss(denoiser(lambda both: torch.zeros_like(both[:, :4]), "paper"))
+    paper = losses.NoiseLoss(denoiser(lambda both: torch.zeros_like(both[:, :4]), "paper"))
     assert paper(data)["loss"].item() == pytest.approx(
         math.sqrt(2 / math.pi * (SHOT * level + READ)), rel=0.03
     )
@@ -312,7 +305,7 @@ def test_the_noise_loss_counts_each_pixels_noise_and_that_of_the_whole_crop():
     data = noise_batch(0.0)
     data.shot.fill_(0.0)
     data.read[:, :2], data.read[:, 2:] = 4e-4, 25e-6
-    loss = NoiseLoss(denoiser(lambda *_: data.clean + 0.01))(data)["loss"].item()
+    loss = losses.NoiseLoss(denoiser(lambda *_: data.clean + 0.01))(data)["loss"].item()
     each, pooled = (0.25 + 4) / 2, 1e-4 / ((4e-4 + 25e-6) / 2)
     expected = sum(math.log(p + 3e-4) + 2 * max(p - 0.9, 0) for p in (each, pooled)) / 2
     assert loss == pytest.approx(expected, rel=1e-5)
@@ -328,7 +321,7 @@ def test_black_and_blown_out_batches_teach_finite_gradients(level, preset):
         data.shot.fill_(noise)
         data.read.fill_(noise / 100)
         module.zero_grad()
-        assert_finite(NoiseLoss(module)(data), module)
+        assert_finite(losses.NoiseLoss(module)(data), module)
 
 
 def assert_finite(values: dict[str, Tensor], module: nn.Module) -> None:
@@ -345,10 +338,10 @@ def opened(data: Batch) -> Batch:
     return data._replace(source=texture, target=target, ratio=torch.ones(2))
 
 
-def aperture_loss(log_blur: Callable[..., Tensor]) -> ApertureLoss:
+def aperture_loss(log_blur: Callable[..., Tensor]) -> losses.ApertureLoss:
     module = ApertureModule("compact")
     module.network.forward = Fixed(log_blur).forward
-    return ApertureLoss(ExposureModule(), denoiser(lambda image, *_: image), module)
+    return losses.ApertureLoss(ExposureModule(), denoiser(lambda image, *_: image), module)
 
 
 def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change():
@@ -366,7 +359,7 @@ def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change():
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
 def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble(preset):
-    loss = ApertureLoss(ExposureModule(), NoiseModule("nano"), ApertureModule(preset))
+    loss = losses.ApertureLoss(ExposureModule(), NoiseModule("nano"), ApertureModule(preset))
     same = opened(batch())._replace(f_target=torch.full((2,), 8.0))
     white = opened(batch())._replace(source=torch.ones(2, 4, 32, 32))
     for data in (same, white):
@@ -378,7 +371,7 @@ def test_seven_pixels_around_clipping_are_left_out():
     source, target = torch.zeros(1, 4, 40, 40), torch.zeros(1, 4, 40, 40)
     source[0, 2, 10, 10] = 0.995
     target[0, 0, 30, 39] = 1.0
-    used = away_from_clipping(source, target)
+    used = losses.away_from_clipping(source, target)
     left_out = torch.zeros(40, 40, dtype=torch.bool)
     left_out[3:18, 3:18] = left_out[23:38, 32:] = True
     assert torch.equal(used[0, 0], ~left_out)

@@ -4,6 +4,7 @@ import csv
 import math
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,8 @@ import torch
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import CameraSettings, RawImage, get_camera
 from simulator.networks.weights import load_modules
-from simulator.training.paper_dataset import (
-    CapturedPairs,
-    captured_pairs,
-    packed_camera,
-    read_dataset,
-    split_dataset,
-    train_on_captures,
-    write_packed_sequence,
-)
+from simulator.training import paper_dataset
+from simulator.training.paper_dataset import packed_camera, read_dataset, split_dataset
 from simulator.training.train import SimulatorConfig, StageConfig, first_modules
 from tests.simulator.training.scenes import SETTINGS, write_dataset
 
@@ -42,7 +36,7 @@ def captures(name: str) -> list[RawImage]:
 @pytest.mark.parametrize("camera", ["nikon_z6", "canon_70d"])
 def test_captures_come_back(tmp_path, camera):
     raws, folder = captures(camera), tmp_path / "scene_007"
-    write_packed_sequence(folder, raws)
+    paper_dataset.write_packed_sequence(folder, raws)
     (sequence,) = read_dataset(folder)
     assert sequence.name == "scene_007"
     for capture, raw in zip(sequence.captures, raws, strict=True):
@@ -164,10 +158,10 @@ def test_what_cannot_be_written(tmp_path):
     (tmp_path / "a.txt").write_text("words")
     other_levels = [RawImage(canon[0].data, SETTINGS[0], get_camera("canon_70d"))]
     with pytest.raises(ValueError, match="`folder`"):
-        write_packed_sequence(tmp_path, nikon)
+        paper_dataset.write_packed_sequence(tmp_path, nikon)
     for raws in ([], [*nikon, canon[0]], other_levels):  # would come back as another camera's
         with pytest.raises(ValueError, match="`raws`"):
-            write_packed_sequence(tmp_path / "b", raws)
+            paper_dataset.write_packed_sequence(tmp_path / "b", raws)
     assert not (tmp_path / "b").exists()
 
 
@@ -206,8 +200,9 @@ def test_sequences_are_split_whole(folder: Path, tmp_path: Path) -> None:
 def test_pairs_of_each_stage(folder: Path) -> None:
     sequences = split_dataset(folder)[0][:1]
     settings = sequences[0].settings
+    pairs = paper_dataset.captured_pairs
     found = {
-        stage: [(settings[p.source], settings[p.target]) for p in captured_pairs(sequences, stage)]
+        stage: [(settings[p.source], settings[p.target]) for p in pairs(sequences, stage)]
         for stage in ("exposure", "noise", "aperture")
     }
     assert len(found["exposure"]) == 4 * 3
@@ -219,7 +214,7 @@ def test_pairs_of_each_stage(folder: Path) -> None:
 
 def test_batches_hold_what_the_files_and_the_table_say(folder: Path) -> None:
     sequences = split_dataset(folder)[0]
-    pairs, other = (CapturedPairs(sequences, "noise", seed=5) for _ in range(2))
+    pairs, other = (paper_dataset.CapturedPairs(sequences, "noise", seed=5) for _ in range(2))
     batch = pairs.batch(3, 4, 16)
     assert all(map(torch.equal, batch, other.batch(3, 4, 16)))
     assert batch.source.shape == (4, 4, 16, 16)
@@ -237,13 +232,14 @@ def test_a_training_changes_the_weights_and_a_second_run_resumes(tmp_path, folde
     train, _ = split_dataset(folder)
     path, once = tmp_path / "out" / "pc", StageConfig(steps=1, batch=1, crop=16)
     training = SimulatorConfig(preset="pc", baseline=once)
-    modules, card = load_modules(train_on_captures(training, train, path, command="test"))
+    run = partial(paper_dataset.train_on_captures, sequences=train, command="test")
+    modules, card = load_modules(run(training, path=path))
     assert card["stages"]["baseline"]["steps"] == 1
     assert (card["sequences"], card["training"]["preset"]) == (3, "pc")
     state, fresh = modules.state_dict(), first_modules(training)[0].state_dict()
     assert not all(torch.equal(fresh[name], value) for name, value in state.items())
-    again = load_modules(train_on_captures(training, train, path, command="test"))[0].state_dict()
+    again = load_modules(run(training, path=path))[0].state_dict()
     assert all(torch.equal(again[name], value) for name, value in state.items())
     compact = SimulatorConfig(preset="compact", exposure=once, noise=once, aperture=once)
     with pytest.raises(ValueError, match="`preset`"):
-        train_on_captures(compact, train, tmp_path / "a", command="test")
+        run(compact, path=tmp_path / "a")

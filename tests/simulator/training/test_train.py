@@ -25,24 +25,8 @@ from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
 from simulator.reference.camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
 from simulator.training import train
-from simulator.training.data import (
-    DetailCrops,
-    DetailPicture,
-    ReferencePairs,
-    draw_sequences,
-    no_progress,
-)
-from simulator.training.train import (
-    Clock,
-    SimulatorConfig,
-    StageConfig,
-    calibrate,
-    first_modules,
-    make_accelerator,
-    train_and_save,
-    train_stage,
-    validate,
-)
+from simulator.training.data import DetailCrops, DetailPicture, ReferencePairs, draw_sequences
+from simulator.training.train import SimulatorConfig, StageConfig, make_accelerator, validate
 from simulator.utils.config_file import load_yaml
 from tests.simulator.training.scenes import scene
 
@@ -74,10 +58,10 @@ def quick_calibration():
         yield
 
 
-def save(folder, *given, progress=no_progress, scenes=scenes, **changes):
+def save(folder, *given, progress=lambda *_: None, scenes=scenes, **changes):
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
-    return train_and_save(
+    return train.train_and_save(
         made, file, make_scenes=scenes, make_pictures=pictures, tensorboard=True, **options
     )
 
@@ -130,7 +114,7 @@ def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):
     assert again.read_bytes() == before
     assert card_of(again)["stages"] == card["stages"]
     assert not any("training" in task for task in calls)
-    first, other = (first_modules(config(seed=seed))[0].state_dict() for seed in (0, 1))
+    first, other = (train.first_modules(config(seed=seed))[0].state_dict() for seed in (0, 1))
     assert not torch.equal(first["noise.network.head.weight"], other["noise.network.head.weight"])
     monkeypatch.setitem(sys.modules, "accelerate", None)
     with pytest.raises(ImportError, match=r"pip install 'ae-env\[train\]'"):
@@ -232,7 +216,9 @@ def run(file: Path, watch: Watch, **budget: float) -> tuple[Loss, dict[str, Any]
     loss, stage = Loss(), StageConfig(batch=3, crop=16, learning_rate=0.05, **budget)
     accelerator = make_accelerator(config("pc"), "cpu", None)
     options = {"checkpoint": file, "identity": "one"}
-    return loss, train_stage("noise", loss, loss.trained, watch, stage, accelerator, **options)
+    return loss, train.train_stage(
+        "noise", loss, loss.trained, watch, stage, accelerator, **options
+    )
 
 
 @pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}, {"steps": 9, "average": 0.7}])
@@ -281,7 +267,7 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_pa
 def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch = Watch(monkeypatch)
     for on_cpu, seconds in ((True, 30.0), (False, 90.0)):
-        clock = Clock(StageConfig(minutes=2), on_cpu=on_cpu)
+        clock = train.Clock(StageConfig(minutes=2), on_cpu=on_cpu)
         clock.start()
         watch.cpu, watch.wall = watch.cpu + 30.0, watch.wall + 90.0
         clock.tick()
@@ -356,7 +342,7 @@ def calibrated(left: float, shift: Callable[[int], float]) -> Residual:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("simulator.training.train._SIDE", 32)
         patch.setattr("simulator.training.train._CROPS", 64)
-        return calibrate(Known(left, shift), DetailCrops([picture], [get_camera("nikon_z6")]))
+        return train.calibrate(Known(left, shift), DetailCrops([picture], [get_camera("nikon_z6")]))
 
 
 @pytest.mark.parametrize(("left", "shift"), [(0.0, 0.3), (0.8, -0.2)])
