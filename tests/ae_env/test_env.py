@@ -175,7 +175,6 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("scenes", ["bundled", "polyhaven"])
 def test_oracle_is_spread_over_every_control(scenes: str) -> None:
-    """No single value of a control may be the oracle's in more than half of the episodes."""
     if scenes == "polyhaven" and any(asset.path is None for asset in list_assets()):
         pytest.skip("needs the maps of Poly Haven (AE_ENV_DATA)")
     env = make_env(scenes=scenes, split="test", resolution=64).unwrapped

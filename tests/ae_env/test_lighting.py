@@ -91,7 +91,6 @@ def test_a_subclass_is_known_by_its_name() -> None:
 
 @st.composite
 def lightings(draw: st.DrawFn) -> dict[str, Any]:
-    """Any lighting in its range."""
     stops, frames = st.floats(-MAX_STOPS, MAX_STOPS), st.integers(-(2**31), 2**31)
     values = {"period": log_uniform(1e-3, 2**31), "stops": stops}
     values |= {"stops_per_frame": st.floats(0, MAX_STOPS), "edge": st.integers(0, 2**31)}
@@ -124,7 +123,6 @@ def test_light_is_positive_and_finite_in_every_frame(spec, frame, exposure_time,
 
 
 def test_each_frame_has_its_stops_and_the_last_holds(tmp_path: Path) -> None:
-    """However they are given: as numbers of any kind, or as a file."""
     wanted = [1.0, 0.5, 4.0, 4.0, 4.0]
     same = make_lighting({"kind": "schedule", "ev": [0, -1, 2]})
     for ev in ((0, -1, 2.0), np.array([0, -1, 2]), np.array([0, -1, 2], np.float32)):

@@ -346,7 +346,6 @@ def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str,
 
 
 def test_the_table_is_what_stepping_gives(raws: Path) -> None:
-    """The oracle of a recorded grid is the best of the rewards that its captures earn."""
     for scorer in ("balanced", {"entropy": 0.5, "noise": 0.5}):
         env = make_env(**arguments(raws, scorer=scorer, with_oracle=True))
         base: Any = env.unwrapped

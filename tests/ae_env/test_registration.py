@@ -135,7 +135,6 @@ def test_a_config_of_the_package_is_found_from_anywhere(tmp_path, monkeypatch) -
 
 
 def test_a_foreign_package_of_a_common_name_is_named(tmp_path: Path) -> None:
-    """Else the first import from it fails with a puzzle."""
     (tmp_path / "simulator").mkdir()
     (tmp_path / "simulator" / "__init__.py").touch()
     code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; import ae_env"
@@ -167,7 +166,6 @@ def test_a_file_is_run_once_until_it_changes(tmp_path, monkeypatch):
 
 
 def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> None:
-    """From any folder, a package too; two folders may have helpers of the same names."""
     before, path = set(sys.modules), list(sys.path)
     for number in (1, 2):
         folder = tmp_path / str(number)

@@ -245,8 +245,6 @@ def test_no_more_are_drawn_than_are_asked_for_and_the_last_one_stores_them() -> 
 
 @pytest.mark.usefixtures("empty_cache")
 def test_episodes_do_not_depend_on_when_scenes_are_drawn() -> None:
-    """Which scene an episode shows, too: the draw must not wait for what is drawn."""
-
     def episodes() -> list[tuple[object, ...]]:
         _LOADED.clear()
         envs = make_envs(3, scenes="bundled:spot_light", split="test")
@@ -326,7 +324,6 @@ def an_asset(tmp_path, monkeypatch):
 
 
 def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
-    """A view of it is as bright as a white surface that it lights; each view has its own level."""
     even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
     views = list(polyhaven.asset_views(an_asset(even), CAMERA, size=16, views=50))
     for scene in views:

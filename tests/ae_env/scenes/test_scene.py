@@ -260,7 +260,6 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def noisy_scene() -> Scene:
-    """A photograph at ISO 6400, of 80 x 80 pixels."""
     rng = np.random.default_rng(0)
     nlf = CAMERA.nlf(NOISY.iso)
     light = 0.1 + 0.3 * rng.random((4, 80, 80))
@@ -287,7 +286,6 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
 
 
 def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
-    """All at ISO 100 and 1/15 s, of one picture: rewards rise as frames have less noise."""
     generator = torch.Generator().manual_seed(0)
     light = 0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
     picture = Scene.from_array(light, NOISY, CAMERA, scene_id="flat", illuminance=640.0)
@@ -385,7 +383,6 @@ def test_its_noise_is_the_cameras_averaged(box_factor: int) -> None:
 
 
 def test_in_the_environment_everything_comes_from_the_raw():
-    """The neural simulator takes part: cleaner states are denoised, and the plan says its error."""
     given = {"scenes": "bundled:small", "motion": "none", "depth": "far"}
     sources = ({"source": "raw"}, {}, {"source": "raw", "simulator": None})
     env, *others = (make_env(**given, **source) for source in sources)

@@ -338,7 +338,6 @@ def test_structure_is_the_similarity_of_even_lightness():
 
 
 def test_what_a_camera_does_costs():
-    """Of the ideal picture: noise, blur, a stop too much, another white balance."""
     scorer, scene = make_scorer("fidelity"), random_scene(illuminance=1000.0)
     state = CameraSettings(100, 2.0 ** -(math.log2(1000 / 2.5) - 4), 4)
     captures = make_captures(scene, [state] * 5)

@@ -297,8 +297,6 @@ def test_rubbish_is_refused(returned: Any) -> None:
 
 @pytest.mark.parametrize("observation", ["uint8", "linear", "dn"])
 def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) -> None:
-    """Neither the observation nor the other scorers see it."""
-
     def blacken(images: torch.Tensor, captures: Captures) -> torch.Tensor:
         images.numpy()[:] = 0.0  # past torch's own counting
         return images.new_zeros(len(images))
@@ -321,8 +319,6 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
 @pytest.mark.parametrize("name", TENSORS)
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
 def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
-    """The scene, which other environments show too, stays as it is."""
-
     def write(images: Any, captures: Captures) -> torch.Tensor:
         getattr(captures, name)[0] *= 0.5
         return torch.zeros(len(captures))

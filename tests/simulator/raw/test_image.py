@@ -275,13 +275,11 @@ def patches() -> np.ndarray:
 
 
 def photograph(name: str) -> np.ndarray:
-    """A photograph in linear light as planes of one raw."""
     linear = (getattr(skimage.data, name)() / 255.0) ** 2.2
     return np.moveaxis(linear * [0.5, 1.0, 0.65], -1, 0)[[0, 1, 1, 2]]
 
 
 def soft(name: str) -> np.ndarray:
-    """The same a little softer than the pixel grid."""
     return gaussian_filter(photograph(name), (0, 1, 1))
 
 

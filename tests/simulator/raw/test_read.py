@@ -172,12 +172,7 @@ def test_camera_argument(path):
     raw = read_raw(path, settings=SETTINGS, camera=own)
     assert raw.camera == own
     assert raw.data[0, 0, 0] == pytest.approx((int(MOSAIC[0, 0]) - 50) / 3950)
-    for camera in (
-        replace(own, cfa=BayerPattern.GBRG),
-        get_camera("nikon_z6"),
-        "nikon_z",
-        3,
-    ):
+    for camera in (replace(own, cfa=BayerPattern.GBRG), get_camera("nikon_z6"), "nikon_z", 3):
         with pytest.raises(ValueError, match="`camera`"):
             read_raw(path, settings=SETTINGS, camera=camera)
 
@@ -413,7 +408,6 @@ def test_identities_of_other_containers(tmp_path):
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
 @pytest.mark.parametrize("kind", [1, 3, 4, 12])
 def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
-    """Every tag there is claims `count` values, in a file that is long enough for them."""
     codes = sorted({*range(254, 345), *tifffile.TIFF.TAG_READERS, *range(50706, 50830), 34665})
     path = tmp_path / "a.dng"
     path.write_bytes(tiff([(code, kind, count, 4096) for code in codes]))
@@ -442,12 +436,6 @@ def test_structures_that_never_end_are_left():
 def test_one_damaged_tag_costs_no_other():
     no_such_type, beyond_the_end = (CODE["Make"], 99, 1, 0), (CODE["StripOffsets"], 4, 7, 2**31)
     content = tiff([no_such_type, beyond_the_end, (CODE["WhiteLevel"], 4, 1, 4095)])
-    for magic, found in (
-        (42, 1),
-        (0x4F52, 1),
-        (0x5352, 1),
-        (0x55, 1),
-        (0, 0),
-    ):  # Olympus, Panasonic
+    for magic, found in ((42, 1), (0x4F52, 1), (0x5352, 1), (0x55, 1), (0, 0)):
         file = io.BytesIO(content[:2] + struct.pack("<H", magic) + content[4:])
         assert read_directories(file) == found * [{"WhiteLevel": (4095,)}]

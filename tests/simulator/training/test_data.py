@@ -68,7 +68,6 @@ def test_sequences_are_drawn_by_seed_and_index():
 
 
 def test_source_and_sample_have_the_noise_that_is_stated():
-    """Standardised by the noise level function, both have mean 0 and variance 1."""
     source, target = CameraSettings(1600, 1 / 512, 4), CameraSettings(400, 1 / 256, 4)
     made = pairs(source, target, size=64, depth=False)
     made.pairs = [p for p in made.pairs if p.source == 0]
@@ -234,7 +233,6 @@ class Fixed(nn.Module):
 
 
 def batch(level: float = 0.2, ratio: float = 2.0, noise: bool = True) -> Batch:
-    """A flat field whose noise is drawn by NumPy, and its noise-free target."""
     deviation = math.sqrt(READ + SHOT * level) if noise else 0.0
     drawn = np.random.default_rng(0).normal(level, deviation, (2, 4, 32, 32))
     target = torch.full((2, 4, 32, 32), level * ratio)
@@ -295,9 +293,8 @@ def test_the_noise_loss_is_the_logarithm_of_what_is_left(level):
         gain = 60.0 if left == 0.0 else -20 * math.log10(left)  # at most a million times
         assert float(values["gain_db"]) == pytest.approx(gain, abs=1e-4)
     paper = losses.NoiseLoss(denoiser(lambda both: torch.zeros_like(both[:, :4]), "paper"))
-    assert paper(data)["loss"].item() == pytest.approx(
-        math.sqrt(2 / math.pi * (SHOT * level + READ)), rel=0.03
-    )
+    wanted = math.sqrt(2 / math.pi * (SHOT * level + READ))
+    assert paper(data)["loss"].item() == pytest.approx(wanted, rel=0.03)
 
 
 def test_the_noise_loss_counts_each_pixels_noise_and_that_of_the_whole_crop():

@@ -96,7 +96,6 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
 
 @pytest.mark.real_data
 def test_real_pictures_become_scenes(data_dir: Path) -> None:
-    """Of the smallest split; that no two share a group, small files show below."""
     made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
     assert {s.kind for s in made} == {"photograph", "radiance"}
     mosaics = list(pictured.mosaic_scenes("test", CAMERA, data_dir, size=128))
@@ -164,7 +163,6 @@ def the_only(folder: Path, name: str) -> DetailPicture:
 
 
 def test_groups_of_files_stay_together(tmp_path: Path) -> None:
-    """Three photographs of each of 20 series, which a table names; and two known maps."""
     (tmp_path / "photo_pool").mkdir()
     rows = ["file,licence,group"]
     for i in range(60):
