@@ -398,7 +398,7 @@ def test_refused_resets_and_steps_change_nothing(for_many: bool) -> None:
         assert_equal(env.reset(seed=first), twin.reset(seed=second))
 
 
-def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
+def test_scenes_are_loaded_once_for_each_camera_and_splits_are_disjoint() -> None:
     train = EnvOptions(**SMALL).load_scenes()
     EnvOptions(**SMALL).load_scenes().clear()  # a list of one's own
     again = EnvOptions(**SMALL).load_scenes()
@@ -406,9 +406,6 @@ def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
     test, both = (EnvOptions(split=split, **SMALL).load_scenes() for split in ("test", "all"))
     assert {s.group for s in train}.isdisjoint({s.group for s in test})
     assert [s.scene_id for s in both] == [s.scene_id for s in train + test]
-
-
-def test_cameras_of_one_name_have_scenes_of_their_own() -> None:
     other = replace(CAMERA, colour_matrix=CAMERA.colour_matrix[::-1])
     for one in (CAMERA, other):
         assert EnvOptions(camera=one, **SMALL).load_scenes()[0].camera == one

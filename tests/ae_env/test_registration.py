@@ -114,15 +114,12 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
             ae_env.load_preset(str(own))
 
 
-def test_every_package_and_the_presets_are_installed() -> None:
+def test_packages_and_configs_are_installed_and_found_from_anywhere(tmp_path, monkeypatch) -> None:
     """`configs` is no folder of `ae_env`: it must not be forgotten."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["packages"] == ["simulator", "ae_env", "agents"]
     assert wheel["force-include"] == {"configs": "ae_env/configs"}
-
-
-def test_a_config_of_the_package_is_found_from_anywhere(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shipped = find_config(Path("configs/simulator/nano.yaml"))
     assert shipped.is_file()

@@ -87,7 +87,7 @@ def test_samples_keep_what_they_hold_besides() -> None:
         alone[-5]
 
 
-def test_nothing_asked_changes_nothing() -> None:
+def test_nothing_asked_changes_nothing_and_highlights_above_white_stay_white() -> None:
     given = pictures()
     assert torch.equal(ExposureAugmentation(modules=())(given, range(4)), given)
     # Only the sensor's digital numbers are left, 1 / 15520 of white: at black, where the curves
@@ -95,6 +95,13 @@ def test_nothing_asked_changes_nothing() -> None:
     still = ExposureAugmentation(**NOTHING, highlights=(0.0, 0.0), modules=("exposure", "blur"))
     step = 0.5 / min(CAMERA.span)
     assert (still(given, range(4)) - given).abs().max() <= 12.92 * 1.618 * step + 1e-5
+    white, darker = torch.ones(1, 3, 4, 4), {"stops": (-2.0, -2.0), "modules": ("exposure",)}
+    raised = ExposureAugmentation(**darker, highlights=(2.0, 2.0))
+    assert raised(white, [0]).min().item() == pytest.approx(1.0, abs=1e-6)
+    grey = ExposureAugmentation(**darker, highlights=(0.0, 0.0))
+    assert grey(white, [0]).max() < 0.8
+    codes = torch.full((1, 3, 4, 4), 255, dtype=torch.uint8)
+    assert torch.allclose(raised(codes, [0]), raised(white, [0]))
 
 
 def test_raws_are_exposed_by_the_ratio_and_clipped_and_cards_two_stops_under() -> None:
@@ -113,16 +120,6 @@ def test_raws_are_exposed_by_the_ratio_and_clipped_and_cards_two_stops_under() -
     card = torch.full((1, 3, 4, 4), shown(GREY_CARD_SIGNAL))
     wanted = shown(GREY_CARD_SIGNAL / 4)
     assert augment(card, [0]).mean().item() == pytest.approx(wanted, abs=4e-4)
-
-
-def test_clipped_highlights_stay_white_where_their_light_is_above() -> None:
-    white, darker = torch.ones(1, 3, 4, 4), {"stops": (-2.0, -2.0), "modules": ("exposure",)}
-    raised = ExposureAugmentation(**darker, highlights=(2.0, 2.0))
-    assert raised(white, [0]).min().item() == pytest.approx(1.0, abs=1e-6)
-    grey = ExposureAugmentation(**darker, highlights=(0.0, 0.0))
-    assert grey(white, [0]).max() < 0.8
-    codes = torch.full((1, 3, 4, 4), 255, dtype=torch.uint8)
-    assert torch.allclose(raised(codes, [0]), raised(white, [0]))
 
 
 @pytest.mark.parametrize("source", [None, NoiseLevelFunction((2e-5,) * 4, (1e-7,) * 4)])

@@ -119,6 +119,18 @@ def test_frame_t_shows_raw_t_and_the_last_one_stays(recorded: Path) -> None:
     assert signals == pytest.approx([0.1, 0.1, 0.2, 0.2, 0.2, 0.4], rel=5e-3)
     for frame, name in ((1, "IMG_9"), (2, "IMG_10"), (77, "IMG_10")):
         assert env.reset(seed=0, options={"frame": frame})[1]["scene_id"] == name
+    # Scores are of the frame: with twice the light ISO 100 scores what ISO 200 did before.
+    env = _env(recorded / "street", scorer="brightness", with_oracle=True)
+    env.reset(seed=0, options={"state": 0})
+    before = env.expected_scores()
+    after = [env.step(0) for _ in range(2)][-1]
+    scores = env.expected_scores()
+    # Unknown light: the right exposure has the mean of green at 0.12.
+    stops = np.log2([0.2 / 0.12, 0.4 / 0.12])
+    np.testing.assert_allclose(scores, np.exp(1 - np.sqrt(1 + stops**2)), rtol=5e-3)
+    assert env.core.scenes[2].scene_id == after[4]["scene_id"] == "IMG_10"
+    assert after[1] == pytest.approx(scores[0], abs=1e-9)
+    assert before[0] > scores[0]
 
 
 def test_folders_are_sequences_and_source_groups(tmp_path: Path, recorded: Path) -> None:
@@ -165,27 +177,12 @@ def test_recordings_of_one_name_are_apart(tmp_path, folders, groups) -> None:
         assert shown == [f"{place}{name}" for name in NAMES]
 
 
-def test_scores_are_those_of_the_frame(recorded: Path) -> None:
-    """The third raw has twice the light: ISO 100 there scores what ISO 200 does before."""
-    env = _env(recorded / "street", scorer="brightness", with_oracle=True)
-    env.reset(seed=0, options={"state": 0})
-    before = env.expected_scores()
-    after = [env.step(0) for _ in range(2)][-1]
-    scores = env.expected_scores()
-    # Unknown light: the right exposure has the mean of green at 0.12.
-    stops = np.log2([0.2 / 0.12, 0.4 / 0.12])
-    np.testing.assert_allclose(scores, np.exp(1 - np.sqrt(1 + stops**2)), rtol=5e-3)
-    assert env.core.scenes[2].scene_id == after[4]["scene_id"] == "IMG_10"
-    assert after[1] == pytest.approx(scores[0], abs=1e-9)
-    assert before[0] > scores[0]
-
-
 def test_many_at_once_are_as_single_ones(recorded: Path) -> None:
     arguments = {"scenes": {"sequence": str(recorded)}, "with_oracle": True, "delay": 1}
     check_parity(8, 4, max_episode_steps=4, lighting="flicker", **arguments, **ARGUMENTS, **STILL)
 
 
-def test_large_folder_is_split_by_group(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_large_folder_is_split_by_group_and_stays_so(tmp_path, caplog) -> None:
     names = [f"subject{i}/{name}" for i in range(15) for name in "ab"]
     for name in names[:28]:
         write_hdr(tmp_path / f"{name}.hdr")
@@ -201,6 +198,13 @@ def test_large_folder_is_split_by_group(tmp_path: Path, caplog: pytest.LogCaptur
         count = 15 - len({s.group for s in part})
         assert 0 < count < 15
         assert f"split '{split}' leaves out {count} of 15 source groups" in caplog.text
+    names = [f"g{i}" for i in range(200)]
+    split = split_groups(names)
+    assert 0.6 < np.mean([split[n] == "train" for n in names]) < 0.8
+    assert split_groups([*names, "new"]).items() > split.items()
+    assert set(split_groups(names[:14]).values()) == {"test"}
+    for start in range(180):
+        assert set(split_groups(names[start : start + 15]).values()) == {"train", "test"}
 
 
 def test_groups_file_names_the_groups(tmp_path: Path) -> None:
@@ -218,16 +222,6 @@ def test_groups_file_names_the_groups(tmp_path: Path) -> None:
         (tmp_path / "groups.csv").write_bytes(content)
         with pytest.raises(ValueError, match=words):
             load(tmp_path)
-
-
-def test_split_of_groups_is_stable_and_needs_fifteen() -> None:
-    names = [f"g{i}" for i in range(200)]
-    split = split_groups(names)
-    assert 0.6 < np.mean([split[n] == "train" for n in names]) < 0.8
-    assert split_groups([*names, "new"]).items() > split.items()
-    assert set(split_groups(names[:14]).values()) == {"test"}
-    for start in range(180):
-        assert set(split_groups(names[start : start + 15]).values()) == {"train", "test"}
 
 
 def shot(seconds: float | None, look: int, camera: str = "A") -> Shot:

@@ -110,9 +110,7 @@ def test_resized_averages_what_the_networks_found() -> None:
     np.testing.assert_allclose(small.defocus_map, np.sqrt(square) / 3, rtol=1e-5)
     native = scene.resized(2, "native")
     np.testing.assert_array_equal(native.defocus_map, diameter[2:4, 3:5])
-
-
-def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
+    # A scene's own blur grows with the aperture and never shrinks.
     diameter = torch.tensor([[1.0, 7.0], [5.0, 5.0]])  # mean square 25
     scene = array_scene(torch.ones(4, 2, 2), defocus_map=diameter)  # at f/4
     assert scene.own_blur(2.0) == pytest.approx(10.0)

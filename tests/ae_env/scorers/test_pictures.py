@@ -137,9 +137,6 @@ def test_blind_sigma_is_immerkaers() -> None:
         response = np.abs(scipy.signal.convolve2d(picture, KERNEL, mode="valid"))
         expected.append(math.sqrt(math.pi / 2) / (6 * 29 * 18) * response.sum())
     np.testing.assert_allclose(measures.immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
-
-
-def test_blind_sigma_of_known_noise() -> None:
     rows, columns = np.mgrid[0:200, 0:220]
     slope = 60.0 + 0.3 * rows + 0.2 * columns  # straight slopes leave nothing
     noisy = slope + 5.0 * np.random.default_rng(2).normal(size=slope.shape)
@@ -242,12 +239,18 @@ def test_severity_rises_with_the_defect(defect: str, rendered: dict[str, torch.T
     assert low <= float(found.min()) <= float(found.max()) <= high
 
 
-def test_white_share_and_missing_highlights_by_hand() -> None:
+def test_white_share_missing_highlights_and_veil_by_hand() -> None:
     pictures = torch.full((2, 3, 10, 10), 0.3)
     pictures[0, :, :3] = 1.0
     pictures[1, :, 0, :2] = 0.75  # 2 of 100 pixels: the 99th percentile
     assert defect_signs.white_share(pictures).tolist() == pytest.approx([0.3, 0.0])
     assert defect_signs.missing_highlights(pictures).tolist() == pytest.approx([0.0, 0.25])
+    # A veil is the airlight over the mean.
+    linear = torch.zeros(1, 3, 10, 10)
+    linear[:, :, 5:] = 0.5
+    hazy = 0.6 * linear + 0.4 * 0.5
+    found = defect_signs.veil(srgb_encode(torch.cat([linear, hazy]))).tolist()
+    assert found == pytest.approx([0.0, 0.2 / 0.35], abs=1e-5)
 
 
 def test_colour_cast_is_the_length_of_the_gains_in_stops() -> None:
@@ -267,14 +270,6 @@ def test_colourfulness_is_hasler_and_suesstrunks() -> None:
         spread, mean = np.hypot(rg.std(), yb.std()), np.hypot(rg.mean(), yb.mean())
         expected.append(spread + 0.3 * mean)
     np.testing.assert_allclose(defect_signs.colourfulness(pictures), expected, rtol=1e-5)
-
-
-def test_veil_is_the_airlight_over_the_mean() -> None:
-    linear = torch.zeros(1, 3, 10, 10)
-    linear[:, :, 5:] = 0.5
-    hazy = 0.6 * linear + 0.4 * 0.5
-    found = defect_signs.veil(srgb_encode(torch.cat([linear, hazy]))).tolist()
-    assert found == pytest.approx([0.0, 0.2 / 0.35], abs=1e-5)
 
 
 def test_blur_effect_is_cretes() -> None:
@@ -318,7 +313,7 @@ def lab(lightness: float, a: float = 0.0, b: float = 0.0, size: int = 16) -> np.
     return np.broadcast_to(np.array([lightness, a, b]), (size, size, 3)).copy()
 
 
-def test_colour_is_the_published_difference():
+def test_colour_is_the_published_difference_and_structure_that_of_even_lightness():
     """Pairs of Sharma, Wu and Dalal 2005, table 1, of equal lightness: even areas, structure 1."""
     for first, second, difference in (
         ((2.6772, -79.7751), (0.0, -82.7485), 2.0425),
@@ -327,10 +322,7 @@ def test_colour_is_the_published_difference():
     ):
         found = likeness(lab(50.0, *first), lab(50.0, *second))
         assert found == pytest.approx(math.sqrt(math.exp(-difference / 10)), abs=1e-5)
-
-
-def test_structure_is_the_similarity_of_even_lightness():
-    """Without variance SSIM is (2 m n + c) / (m^2 + n^2 + c), c = (0.01 * 100)^2."""
+    # Without variance SSIM is (2 m n + c) / (m^2 + n^2 + c), c = (0.01 * 100)^2.
     found, m, n = likeness(lab(40.0), lab(60.0)), 40.0, 60.0
     structure = (2 * m * n + 1.0) / (m * m + n * n + 1.0)
     # CIEDE2000 of greys is |dL| / S_L, S_L = 1 + 0.015 (L - 50)^2 / sqrt(20 + (L - 50)^2), L = 50.

@@ -248,7 +248,7 @@ TENSORS = [f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.typ
 TENSORS += [name for name, value in vars(Captures).items() if isinstance(value, cached_property)]
 
 
-def test_a_mapping_is_the_weighted_mean() -> None:
+def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for() -> None:
     captures = make_captures(random_scene(), [GRID[i] for i in (3, 20, 50)], 0.1, 1.0)
     mixed = make_scorer({"brightness": 3.0, "sharpness": 1.0})
     expected = 0.75 * make_scorer("brightness")(None, captures)
@@ -257,9 +257,6 @@ def test_a_mapping_is_the_weighted_mean() -> None:
     assert mixed.closed_form
     assert mixed.depends_on == "blur"
     assert make_scorer("balanced").depends_on == "image"
-
-
-def test_callables_see_the_view_they_ask_for() -> None:
     captures = make_captures(random_scene(), [GRID[20]] * 3)
     images = torch.rand(3, 4, 40, 40)
     scorer = make_scorer(Own())

@@ -64,9 +64,6 @@ def test_unpack_clips_to_the_sensor_and_rounds():
     for shape in ((4,), (1, 8), (2, 2, 2)):
         with pytest.raises(ValueError, match="`mosaic`"):
             pack_mosaic(np.zeros(shape, np.uint16), camera())
-
-
-def test_bad_arguments():
     usual = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()}
     bad = {"camera": ["nikon_z6"], "settings": [(100, 0.01)], "nlf": [(1e-4, 1e-6)]}
     bad |= {"box_factor": [0, 1.5], "white_balance": [(1.0, 1.0), (1.0, 0.0, 1.0)]}
@@ -167,7 +164,7 @@ def test_writing_and_reading_invert(tmp_path, mosaic, settings, white_balance, b
         assert getattr(back.noise, name) == pytest.approx((red, green, green, blue), rel=1e-12)
 
 
-def test_noise_beyond_the_whole_range_and_none(path):
+def test_noise_beyond_the_range_colour_matrix_and_camera_survive(path):
     nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))
     write_dng(path, make_raw(nlf=nlf, settings=CameraSettings(409_600, 4.0, 1.0)))
     back = read_raw(path)
@@ -175,6 +172,13 @@ def test_noise_beyond_the_whole_range_and_none(path):
     write_dng(path, make_raw(nlf=None))
     with tifffile.TiffFile(path) as tiff:  # nothing is known of its noise
         assert "NoiseProfile" not in tiff.pages.first.tags
+    matrix = ((1.0, -0.25, 0.0), (-0.5, 1.5, 0.125), (0.0, -0.25, 0.75))
+    z6 = replace(get_camera("nikon_z6"), colour_matrix=matrix, colour_matrix_source="measured")
+    write_dng(path, make_raw(z6, nlf=None))
+    back = read_raw(path)
+    assert (back.camera.name, back.camera.colour_matrix_source) == ("nikon_z6", "measured")
+    assert back.camera.colour_matrix == matrix  # not LibRaw's own for this camera
+    assert back.camera.nlf(100) == z6.nlf(100)
 
 
 @pytest.mark.parametrize(
@@ -195,16 +199,6 @@ def test_libraw_reads_the_settings(path, values):
         content = path.read_bytes().replace(*(np.array([1, n], "<u4").tobytes() for n in (60, 30)))
         path.write_bytes(content)
         assert read_raw(path).settings.exposure_time == pytest.approx(1 / 30)
-
-
-def test_colour_matrix_and_camera_survive(path):
-    matrix = ((1.0, -0.25, 0.0), (-0.5, 1.5, 0.125), (0.0, -0.25, 0.75))
-    z6 = replace(get_camera("nikon_z6"), colour_matrix=matrix, colour_matrix_source="measured")
-    write_dng(path, make_raw(z6, nlf=None))
-    back = read_raw(path)
-    assert (back.camera.name, back.camera.colour_matrix_source) == ("nikon_z6", "measured")
-    assert back.camera.colour_matrix == matrix  # not LibRaw's own for this camera
-    assert back.camera.nlf(100) == z6.nlf(100)
 
 
 def test_tags_as_tifffile_reads_them(path):
@@ -318,16 +312,13 @@ def test_noise_that_was_put_in_is_found(light, camera, iso, least, most):
     assert least < low <= high < most
 
 
-def test_clipped_half_does_not_count():
+def test_clipped_halves_dark_frames_and_grey_cards():
     nlf = get_camera("canon_70d").nlf(1600)
     sides = np.full((4, 256, 200), 1.2), np.zeros((4, 256, 90))
     noisy = with_noise(np.concatenate([ramp(), *sides], axis=2), nlf)
     for clipped in (noisy, np.maximum(noisy, 0.0)):  # with a pedestal, and without one
         low, high = worst_ratio(estimate_nlf(clipped), nlf)
         assert 0.85 < low <= high < 1.15
-
-
-def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level():
     rng = np.random.default_rng(6)
     noise = rng.standard_normal((4, 128, 128))
     dark = estimate_nlf(1e-3 * noise)

@@ -120,9 +120,7 @@ def test_levels_colour_and_metadata(tmp_path):
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
     assert "ColorMatrix of the file" in camera.colour_matrix_source
     np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)  # the rotation is not applied
-
-
-def test_second_colour_matrix_is_daylight(tmp_path):
+    # Of two colour matrices that of daylight is taken.
     tags = {
         "CalibrationIlluminant1": ("H", (17,)),
         "ColorMatrix2": ("2i", fractions(2 * np.eye(3))),
@@ -419,7 +417,7 @@ def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
     tracemalloc.stop()
 
 
-def test_structures_that_never_end_are_left():
+def test_structures_that_never_end_are_left_and_a_damaged_tag_costs_no_other():
     # A directory that is its own sub-directory, EXIF directory and successor.
     loop = [(CODE[name], 4, 1, 8) for name in ("SubIFDs", "ExifTag")]
     assert read_directories(io.BytesIO(tiff(loop, following=8))) == []
@@ -431,9 +429,6 @@ def test_structures_that_never_end_are_left():
     heap = struct.pack("<H", 64) + 64 * struct.pack("<HII", 0x2800, 2 + 64 * 10 + 4, 0)
     content = struct.pack("<2sI8s", b"II", 14, b"HEAPCCDR") + heap + struct.pack("<I", 0)
     assert camera_identity(io.BytesIO(content), []) == ("", "")
-
-
-def test_one_damaged_tag_costs_no_other():
     no_such_type, beyond_the_end = (CODE["Make"], 99, 1, 0), (CODE["StripOffsets"], 4, 7, 2**31)
     content = tiff([no_such_type, beyond_the_end, (CODE["WhiteLevel"], 4, 1, 4095)])
     for magic, found in ((42, 1), (0x4F52, 1), (0x5352, 1), (0x55, 1), (0, 0)):

@@ -133,7 +133,7 @@ def test_counts_are_poisson_and_read_noise_is_gaussian():
         assert inside == pytest.approx(math.erf(numbers / 16 / math.sqrt(2)), abs=0.008)
 
 
-def test_rounding_and_box_average_in_the_variance():
+def test_rounding_and_box_average_in_the_variance_and_without_noise():
     # sigma = 0.6 numbers: with 1/12 counted twice the variance would be 23 % too large.
     read = (0.6 / 16000) ** 2
     sample = record(ReferenceCamera(sensor(1e-5, read)), 0.0, 100.0)
@@ -155,9 +155,6 @@ def test_rounding_and_box_average_in_the_variance():
     assert average_planes(planes, 1) is planes
     expected = planes[:, :12, :15].reshape(4, 4, 3, 5, 3).mean(dim=(2, 4))
     torch.testing.assert_close(average_planes(planes, 3), expected)
-
-
-def test_no_noise_at_all_is_exact():
     camera = ReferenceCamera(sensor(0.0, 0.0, span=1000.0))
     signal = torch.tensor([-1.0, -0.2, -0.0012, 0.1234, 0.9996, 7.0]).expand(4, 1, 6)
     found = camera.record(signal, 100.0, torch.Generator()) * 1000

@@ -41,7 +41,7 @@ def pairs(*settings: CameraSettings, seed: int = 0, **scene_changes: object) -> 
     return ReferencePairs([sequence], ReferenceCamera(Z6), "exposure", seed=seed)
 
 
-def test_a_batch_is_that_of_its_step_process_and_seed_alone():
+def test_batches_and_sequences_are_those_of_their_seed_and_index():
     made = pairs()
     batches = [made.batch(0, 4, 16), made.batch(1, 4, 16), made.batch(0, 4, 16, process=1)]
     batches.append(pairs(seed=1).batch(0, 4, 16))
@@ -50,6 +50,11 @@ def test_a_batch_is_that_of_its_step_process_and_seed_alone():
         assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
     torch.manual_seed(77)
     assert all(map(torch.equal, batches[1], pairs().batch(1, 4, 16)))  # the first that it draws
+    first, again, other = (draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1))
+    assert [s.settings for s in first] == [s.settings for s in again]
+    assert first[1].settings != first[0].settings != other[0].settings
+    with pytest.raises(ValueError, match="`sequences`"):
+        ReferencePairs([], ReferenceCamera(Z6), "aperture")
 
 
 def test_the_target_is_clipped_as_the_camera_clips():
@@ -57,14 +62,6 @@ def test_the_target_is_clipped_as_the_camera_clips():
     batch = pairs(LIGHT, bright, depth=False).batch(0, 8, 32)
     assert float(batch.target.max()) == float(batch.sample.max()) == 1.0
     assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
-
-
-def test_sequences_are_drawn_by_seed_and_index():
-    first, again, other = (draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1))
-    assert [s.settings for s in first] == [s.settings for s in again]
-    assert first[1].settings != first[0].settings != other[0].settings
-    with pytest.raises(ValueError, match="`sequences`"):
-        ReferencePairs([], ReferenceCamera(Z6), "aperture")
 
 
 def test_source_and_sample_have_the_noise_that_is_stated():

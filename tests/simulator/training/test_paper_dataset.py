@@ -132,15 +132,12 @@ def test_a_partial_copy_is_read_with_a_warning(nikon, caplog):
         read_dataset(root)
 
 
-def test_a_cell_that_is_no_value_is_named(tmp_path):
+def test_cells_that_are_no_value_and_files_that_are_no_raw_are_named(tmp_path):
     bad = {"iso": "auto", "time": "", "aperture": "0", "noiseprofile": "1e-5 1e-8 1e-5"}
     for name, value in bad.items():
         author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("s/a.jpg", **{name: value}))
         with pytest.raises(ValueError, match=f"row 2: `{name.replace('aperture', 'f_number')}`"):
             read_dataset(tmp_path)
-
-
-def test_files_that_are_no_packed_raw_are_refused(tmp_path):
     file, pickled = tmp_path / "a.npy", np.array([{}], dtype=object)  # nothing pickled is run
     author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("a.jpg"))
     for array in (np.zeros((4, 6)), np.full((4, 2, 2), math.nan), np.zeros((5, 2, 2)), pickled):
