@@ -177,7 +177,7 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
 def test_oracle_is_spread_over_every_control(scenes: str) -> None:
     if scenes == "polyhaven" and any(asset.path is None for asset in list_assets()):
         pytest.skip("needs the maps of Poly Haven (AE_ENV_DATA)")
-    env = make_env(scenes=scenes, split="test", resolution=64).unwrapped
+    env = make_env(scenes=scenes, split="test", resolution=36).unwrapped
     states = []
     for i in range(len(env.scenes)):
         env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])

@@ -187,7 +187,7 @@ def test_kinds_stay_within_their_bounds_and_move(kind: str) -> None:
         assert np.median(np.ptp(traces[:, :96], axis=1)) > 0.5
 
 
-def test_the_phase_decides_and_every_kind_is_drawn():
+def test_the_phase_decides_every_kind_is_drawn_and_lamps_are_those_of_the_mains():
     lighting = make_lighting({"kind": "moving", "kinds": "all"})
     kinds = [lighting.kind(phase) for phase in PHASES]
     assert set(kinds) == set(MOVES) == {*KIND_SETS["train"], *KIND_SETS["test"]}
@@ -199,10 +199,7 @@ def test_the_phase_decides_and_every_kind_is_drawn():
             stops = lighting.stops(phase)[0:200:7]
             np.testing.assert_allclose(np.log2(found), stops, atol=1e-12)
     assert lighting.gain(10**6, 0.01, PHASES[0]) == lighting.gain(1023, 0.01, PHASES[0])
-
-
-def test_lamps_are_those_of_the_mains():
-    """Whole periods of 100 or of 120 Hz have no ripple; 1/500 s has that of the depth drawn."""
+    # Whole periods of 100 or of 120 Hz have no ripple; 1/500 s has that of the depth drawn.
     lighting = make_lighting({"kind": "moving", "kinds": ["lamps"]})
     most = 0.0
     for hertz in (100.0, 120.0):

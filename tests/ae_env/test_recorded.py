@@ -360,20 +360,19 @@ def test_the_table_is_what_stepping_gives(raws: Path) -> None:
         assert info["oracle_state"] == rewards.argmax()
 
 
-def test_native_vector_environments_show_the_same(raws: Path, video: dict[str, Any]) -> None:
+def test_vector_environments_and_copies_in_another_process_show_the_same(
+    raws: Path, video: dict[str, Any], forkserver: Any
+) -> None:
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
         check_parity(0, 4, max_episode_steps=3, **given)
+    env = make_env(**arguments(raws)).unwrapped
+    with forkserver.Pool(1) as pool:
+        np.testing.assert_array_equal(pool.apply(first_frame, (env,)), first_frame(env))
 
 
 def first_frame(env: Any) -> np.ndarray:
     return env.reset(seed=4)[0]["raw"]
-
-
-def test_a_copy_in_another_process_shows_the_same(raws: Path, forkserver: Any) -> None:
-    env = make_env(**arguments(raws)).unwrapped
-    with forkserver.Pool(1) as pool:
-        np.testing.assert_array_equal(pool.apply(first_frame, (env,)), first_frame(env))
 
 
 def test_a_changed_folder_is_read_again(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from tests.ae_env.environments import ID, SMALL, assert_equal, make_env
 from tests.ae_env.scorer_images import Own
 
 
-def test_spec_round_trips_through_json_and_pickle() -> None:
+def test_spec_round_trips_and_in_process_arguments_say_so() -> None:
     given = {"observation": "linear", "costs": {"switch": 0.1}, "lighting": {"kind": "ramp"}}
     env = make_env(scorer="ae_env.scorers.terms:Noise", **given)
     env.reset(seed=3)
@@ -32,9 +32,6 @@ def test_spec_round_trips_through_json_and_pickle() -> None:
         again = gym.make(spec)
         again.reset(seed=3)
         assert_equal(again.step(11), expected)
-
-
-def test_in_process_arguments_say_so_when_json_is_asked_for() -> None:
     env = make_env(scorer=Own())
     env.reset(seed=0)
     assert 0.0 <= env.step(0)[1] <= 1.0

@@ -121,22 +121,6 @@ def test_rewards_add_up_to_the_quality_of_the_picture() -> None:
     assert after["frames"] == 2
 
 
-def test_noise_lowers_the_quality() -> None:
-    """The mean of |log2(1 + s z)| for a normal z is sqrt(2 / pi) s / ln 2 for a small s."""
-    scene = two_lights(0.5, 0.5)
-    state = GRID.index(2, 1, 0)  # ISO 1600, 1/1000 s
-    env = bracket(scenes=[scene], split="all", motion="none", noise="exact")
-    env.reset(seed=1)
-    *_, info = env.step(state)
-    signal = 0.5 * WHITE_SIGNAL * 2.0 ** float(10.0 - GRID.ev100[state])
-    nlf = get_camera("nikon_z6").nlf(1600)
-    noise = np.sqrt(np.array(nlf.shot) * signal + np.array(nlf.read)) / signal
-    expected = float((math.sqrt(2.0 / math.pi) * noise / math.log(2.0)).mean())
-    # 5,184 samples; the standard deviation of |z| is 0.76 of its mean.
-    assert info["log_error"] == pytest.approx(expected, rel=5 * 0.76 / math.sqrt(5184) + 0.01)
-    assert info["quality"] == pytest.approx(1.0 - info["log_error"] / 2.0)
-
-
 def test_an_episode_ends_with_its_frames_or_its_time() -> None:
     env = bracket()
     env.reset(seed=0)
@@ -157,11 +141,24 @@ def test_an_episode_ends_with_its_frames_or_its_time() -> None:
     assert one.step(0)[2]
 
 
-def test_the_viewfinder_is_metered() -> None:
+def test_the_viewfinder_is_metered_and_noise_lowers_the_quality() -> None:
     env = bracket(scenes=[two_lights(0.14, 0.14)], split="all")
     # The mean is 0.14 of white, 0.12 of the sensor's, at EV100 10: ISO 100, 1/60 s.
     assert env.reset(seed=0)[1]["state"] == GRID.index(0, 3, 0)
     assert env.reset(seed=0, options={"state": 5})[1]["state"] == 5
+    # The mean of |log2(1 + s z)| for a normal z is sqrt(2 / pi) s / ln 2 for a small s.
+    scene = two_lights(0.5, 0.5)
+    state = GRID.index(2, 1, 0)  # ISO 1600, 1/1000 s
+    env = bracket(scenes=[scene], split="all", motion="none", noise="exact")
+    env.reset(seed=1)
+    *_, info = env.step(state)
+    signal = 0.5 * WHITE_SIGNAL * 2.0 ** float(10.0 - GRID.ev100[state])
+    nlf = get_camera("nikon_z6").nlf(1600)
+    noise = np.sqrt(np.array(nlf.shot) * signal + np.array(nlf.read)) / signal
+    expected = float((math.sqrt(2.0 / math.pi) * noise / math.log(2.0)).mean())
+    # 5,184 samples; the standard deviation of |z| is 0.76 of its mean.
+    assert info["log_error"] == pytest.approx(expected, rel=5 * 0.76 / math.sqrt(5184) + 0.01)
+    assert info["quality"] == pytest.approx(1.0 - info["log_error"] / 2.0)
 
 
 def test_a_subject_moves_between_frames_and_leaves_ghosts() -> None:

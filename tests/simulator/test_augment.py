@@ -1,5 +1,6 @@
 import math
 from collections import namedtuple
+from functools import partial
 
 import numpy as np
 import pytest
@@ -194,7 +195,7 @@ def test_bad_arguments():
         *((augment, (each, [0]), "images") for each in images),
         *((augment, (right, seeds), "seeds") for seeds in ([0, 1], [-1], [0.5], 3)),
         *((AugmentedDataset([sample], augment).__getitem__, (0,), "dataset") for sample in samples),
-        (AugmentedDataset, ([], augment, -1), "seed"),
+        (partial(AugmentedDataset, seed=-1), ([], augment), "seed"),
         (AugmentedDataset, ([], "x"), "augmentation"),
         *((sample_seeds, (0, -1, [0]), "epoch"), (sample_seeds, (0, 0, 5), "indices")),
     ):

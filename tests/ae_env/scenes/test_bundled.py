@@ -65,7 +65,7 @@ def test_dead_leaves_have_the_spectrum_of_nature() -> None:
     np.testing.assert_allclose(picture.mean(axis=(1, 2), dtype=float), mean, rtol=1e-5)
 
 
-def test_splits_share_no_group_and_half_of_their_groups_are_hard(unseen: list[Scene]) -> None:
+def test_splits_share_no_group_and_half_are_hard_which_fools_a_meter(unseen: list[Scene]) -> None:
     groups = {scene.group: scene.hard for scene in unseen}
     assert len(groups) >= 90
     assert 0.4 <= np.mean(list(groups.values())) <= 0.6
@@ -80,10 +80,7 @@ def test_splits_share_no_group_and_half_of_their_groups_are_hard(unseen: list[Sc
     train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
     assert len(train) >= 195
     assert not train & groups.keys()
-
-
-def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> None:
-    """By how many EV one on the mean of the clipped frame would expose too little."""
+    # By how many EV a meter on the mean of the clipped frame would expose too little.
     errors = {
         kind: np.log2([s.light[1].clamp(max=1.0).mean() / 0.12 for s in unseen if s.kind == kind])
         for kind in (*KINDS, "photograph")
@@ -310,6 +307,12 @@ def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
     assert 0 <= levels.min() < levels.max() <= 1
     assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
     assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
+    gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
+    assert polyhaven.cut_values(gradient) == []
+    assert polyhaven.cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
+    assert polyhaven.cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
+    asset = an_asset(np.minimum(gradient, 2.9))
+    assert "highlights are cut" in next(polyhaven.asset_views(asset, CAMERA, size=16)).source
 
 
 def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch):
@@ -323,15 +326,6 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
     order = np.argsort(lux)
     assert lux[order[-1]] / lux[order[0]] == pytest.approx(20, rel=0.3)
     assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
-
-
-def test_maps_that_are_cut_say_so(an_asset):
-    gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
-    assert polyhaven.cut_values(gradient) == []
-    assert polyhaven.cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
-    assert polyhaven.cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
-    asset = an_asset(np.minimum(gradient, 2.9))
-    assert "highlights are cut" in next(polyhaven.asset_views(asset, CAMERA, size=16)).source
 
 
 def test_real_scenes_alone_and_mixed(data_dir):

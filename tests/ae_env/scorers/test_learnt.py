@@ -68,12 +68,8 @@ def keras_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pictures = rng.random((3, 224, 224, 3)) * np.array([1.0, 0.2, 1.0])[:, None, None, None]
     pictures[2] = np.linspace(0.0, 1.0, 224)[None, :, None] ** np.array([0.5, 1.0, 2.0])
     np.save(folder / "pictures.npy", pictures.astype(np.float32))
-    script = folder / "write.py"
-    script.write_text(textwrap.dedent(KERAS))
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(script), str(folder)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    code = textwrap.dedent(KERAS)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(folder)], check=True)
     return folder
 
 

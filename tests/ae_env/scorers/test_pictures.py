@@ -253,15 +253,12 @@ def test_white_share_missing_highlights_and_veil_by_hand() -> None:
     assert found == pytest.approx([0.0, 0.2 / 0.35], abs=1e-5)
 
 
-def test_colour_cast_is_the_length_of_the_gains_in_stops() -> None:
+def test_colour_cast_in_stops_and_colourfulness_of_hasler_and_suesstrunk() -> None:
     grey = torch.rand(1, 1, 21, 19, generator=torch.Generator().manual_seed(1)) * 0.3 + 0.05
     gains = torch.tensor([2.0**0.6, 1.0, 2.0**-0.8])[None, :, None, None]
     picture = srgb_encode(grey * gains)
     picture[:, :, :4] = torch.tensor([1.0, 0.0, 0.0])[:, None, None]  # a red object
     assert defect_signs.colour_cast(picture).item() == pytest.approx(1.0, abs=1e-4)
-
-
-def test_colourfulness_is_hasler_and_suesstrunks() -> None:
     pictures = random_pictures(3)[:, :3]
     expected = []
     for picture in 255.0 * pictures.double().numpy():

@@ -247,7 +247,7 @@ def test_bad_input_is_refused():
     blind = ReferenceCamera(replace(plain, pixel_pitch_um=None))
     assert torch.equal(blind.blurred_light(scene(flat(0.1)), 4.0), flat(0.1))  # no depth, no need
     late = ReferenceCamera(plain, body=BodyError(shutter_delay=-0.001))
-    brief = replace(BASE, exposure_time=1 / 2000)
+    brief, drawing = replace(BASE, exposure_time=1 / 2000), np.random.default_rng(0)
     bad = [torch.where(torch.eye(8) > 0, z, depth) for z in (0.0, -1.0, 0.04, math.nan)]
     for call, arguments, message in (
         *((scene, (light,), "`light`") for light in (flat(-0.1), torch.zeros(3, 7, 8))),
@@ -256,6 +256,10 @@ def test_bad_input_is_refused():
         (ReferenceCamera, (replace(plain, nlf_by_iso={}),), "noise calibration"),
         (blind.blurred_light, (scene(flat(0.1), depth + 1), 4.0), "pixel pitch"),
         (late.capture, (scene(flat(0.1)), brief, 0), "`exposure_time`"),
+        # No exposure of the levels suits these.
+        *((sequences.draw_settings, (lux, drawing, Z6), "`illuminance`") for lux in (0.0, 1e-3)),
+        (Sequence, (lit_scene(), (CameraSettings(100, 1, 4),)), "`settings`"),
+        (select_pairs, ([], "noises", Z6), "`stage`"),
     ):
         with pytest.raises(ValueError, match=message):
             call(*arguments)
@@ -356,16 +360,6 @@ def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance
     assert np.abs(errors).max() <= 3 + 1e-9
     assert abs(np.median(errors)) < 0.5
     assert np.percentile(errors, 5) < -2 < 2 < np.percentile(errors, 95)
-
-
-def test_bad_arguments_are_refused():
-    for light in (0.0, 1e-3):  # no exposure of the levels suits it
-        with pytest.raises(ValueError, match="`illuminance`"):
-            sequences.draw_settings(light, np.random.default_rng(0), Z6)
-    with pytest.raises(ValueError, match="`settings`"):
-        Sequence(lit_scene(), (CameraSettings(100, 1, 4),))
-    with pytest.raises(ValueError, match="`stage`"):
-        select_pairs([], "noises", Z6)
 
 
 def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():

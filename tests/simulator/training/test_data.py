@@ -57,13 +57,6 @@ def test_batches_and_sequences_are_those_of_their_seed_and_index():
         ReferencePairs([], ReferenceCamera(Z6), "aperture")
 
 
-def test_the_target_is_clipped_as_the_camera_clips():
-    bright = CameraSettings(100, 1, 4)  # 16 x the light: most of it beyond white
-    batch = pairs(LIGHT, bright, depth=False).batch(0, 8, 32)
-    assert float(batch.target.max()) == float(batch.sample.max()) == 1.0
-    assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
-
-
 def test_source_and_sample_have_the_noise_that_is_stated():
     source, target = CameraSettings(1600, 1 / 512, 4), CameraSettings(400, 1 / 256, 4)
     made = pairs(source, target, size=64, depth=False)
@@ -123,6 +116,11 @@ def test_settings_of_a_pair_and_defocus_at_the_sources_aperture():
     np.testing.assert_allclose(batch.defocus.amax((1, 2)), expected, rtol=1e-4)
     assert not batch.defocus.amin((1, 2)).any()
     assert ((batch.defocus > 0).float().mean((1, 2)) == 0.5).all()
+    # The target is clipped as the camera clips.
+    bright = CameraSettings(100, 1, 4)  # 16 x the light: most of it beyond white
+    batch = pairs(LIGHT, bright, depth=False).batch(0, 8, 32)
+    assert float(batch.target.max()) == float(batch.sample.max()) == 1.0
+    assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
 
 
 def picture(*size: int, seed: int = 0, **named: object) -> DetailPicture:

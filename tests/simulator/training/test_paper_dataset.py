@@ -84,7 +84,7 @@ def nikon(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
     return root, mosaics
 
 
-def test_the_authors_nikon_files(nikon):
+def test_the_authors_nikon_files_and_a_partial_copy_of_them(nikon, caplog):
     root, mosaics = nikon
     sequences = read_dataset(root)
     assert [(s.name, len(s.captures)) for s in sequences] == [("scene_001", 2), ("scene_002", 1)]
@@ -101,6 +101,12 @@ def test_the_authors_nikon_files(nikon):
     assert (raw.box_factor, raw.metadata["nlf_source"]) == (1, "camera_params.csv")
     mine = get_camera("canon_70d")
     assert read_dataset(root, camera=mine)[0].captures[0].read().camera is mine
+    (root / "scene_002" / "DSC_0001.npy").unlink()
+    assert [s.name for s in read_dataset(root)] == ["scene_001"]
+    assert "1 of 3 files are not there" in caplog.text
+    shutil.rmtree(root / "scene_001")
+    with pytest.raises(ValueError, match=r"camera_params\.csv"):
+        read_dataset(root)
 
 
 def test_the_authors_canon_files(tmp_path):
@@ -120,16 +126,6 @@ def test_the_authors_canon_files(tmp_path):
     assert raw.settings == CameraSettings(3200, 4, 22)
     assert (raw.noise.shot, raw.noise.read) == ((2e-4,) * 4, (3e-7,) * 4)
     assert raw.white_balance == pytest.approx((2.0, 1.0, 1.6))
-
-
-def test_a_partial_copy_is_read_with_a_warning(nikon, caplog):
-    root = nikon[0]
-    (root / "scene_002" / "DSC_0001.npy").unlink()
-    assert [s.name for s in read_dataset(root)] == ["scene_001"]
-    assert "1 of 3 files are not there" in caplog.text
-    shutil.rmtree(root / "scene_001")
-    with pytest.raises(ValueError, match=r"camera_params\.csv"):
-        read_dataset(root)
 
 
 def test_cells_that_are_no_value_and_files_that_are_no_raw_are_named(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from skimage.data import stereo_motorcycle
 
 from simulator import CameraSettings, get_camera
 from simulator.radiance.procedural import KINDS
@@ -54,9 +55,6 @@ def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
     other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
     assert other.group != fewer[0].group
     assert not torch.equal(other.light, fewer[0].light)
-
-
-def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
     train = scenes["train"]
     kinds = [s.kind for s in train]
     assert kinds.count("depth") == 21
@@ -94,19 +92,8 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
         reference_scenes("train", CAMERA, number=0, data=tmp_path / "none")
 
 
-@pytest.mark.real_data
-def test_real_pictures_become_scenes(data_dir: Path) -> None:
-    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
-    assert {s.kind for s in made} == {"photograph", "radiance"}
-    mosaics = list(pictured.mosaic_scenes("test", CAMERA, data_dir, size=128))
-    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
-    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
-
-
 def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     """z = baseline * focal length / (disparity + offset), as scikit-image's documentation says."""
-    from skimage.data import stereo_motorcycle
-
     _, _, disparity = stereo_motorcycle()
     front, middle = pictured.depth_photographs(CAMERA)
     assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
@@ -119,10 +106,15 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
 
 
 @pytest.mark.real_data
-def test_real_cones(data_dir: Path) -> None:
+def test_real_pictures_become_scenes(data_dir: Path) -> None:
     for scene in pictured.depth_photographs(CAMERA, data=data_dir)[2:]:
         assert (scene.group, scene.size) == ("cones", (187, 225))
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
+    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
+    assert {s.kind for s in made} == {"photograph", "radiance"}
+    mosaics = list(pictured.mosaic_scenes("test", CAMERA, data_dir, size=128))
+    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
+    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
 
 
 def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:

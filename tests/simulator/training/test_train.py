@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
@@ -122,8 +123,6 @@ def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):
 
 
 def test_baselines_in_any_precision_and_their_logs(tmp_path):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     # One precision after another in one process.
     for preset, precision in (("dl", "bfloat16"), ("pc", "float32")):
         modules, card = load_modules(save(tmp_path / preset, preset, precision=precision))
