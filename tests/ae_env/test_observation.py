@@ -207,9 +207,8 @@ def test_masks_are_the_union_per_control() -> None:
     assert nearest == inner.grid.index(0, 0, 1)
     envs = make_envs(2, grid=grid, scenes=scenes)
     envs.reset(seed=0, options={"state": [inner.grid.index(1, 1, 0), 0]})
-    np.testing.assert_array_equal(
-        wrappers.VectorControlActions(envs).action_masks(), [controls] * 2
-    )
+    masks = wrappers.VectorControlActions(envs).action_masks()
+    np.testing.assert_array_equal(masks, [controls] * 2)
     np.testing.assert_array_equal(wrappers.VectorRelativeActions(envs).action_masks()[0], steps)
 
 

@@ -3,10 +3,10 @@
 import dataclasses
 import math
 import sys
-import types
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -99,13 +99,6 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
     mixed = make_scorer({f"{folder}/my_scorer.py:Level": 3.0, "noise": 1.0})
     assert mixed.weights == {"Level": 0.75, "noise": 0.25}
     assert type(mixed.parts["Level"]) is type(relative.parts["Level"])
-    for spec, message in (
-        ("my_scorer.py:Levle", r"`scorer` \(='my_scorer.py:Levle'\).*did you mean 'Lev"),
-        ({"no.py:Level": 1.0}, r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"),
-        ("my_scorer.py:torch", "must be callable"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make_scorer(spec)
 
 
 def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,17 +106,11 @@ def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPa
     facts |= {"niqe": ("NR", True, "-50.0, 150"), "lpips": ("FR", True, "0, 1")}
     facts |= {"open": ("NR", True, "0, inf"), "old": ("NR", None, None)}
 
-    def create_metric(name: str, device: torch.device) -> Any:
-        def metric(images: torch.Tensor) -> torch.Tensor:
-            return 100.0 * images.mean(dim=(1, 2, 3))[:, None]
+    def create_metric(name: str, device: torch.device) -> Mock:
+        known = dict(zip(("metric_mode", "lower_better", "score_range"), facts[name], strict=True))
+        return Mock(side_effect=lambda images: 100 * images.mean(dim=(1, 2, 3))[:, None], **known)
 
-        names = ("metric_mode", "lower_better", "score_range")
-        vars(metric).update(zip(names, facts[name], strict=True))
-        return metric
-
-    module: Any = types.ModuleType("pyiqa")
-    module.create_metric = create_metric
-    monkeypatch.setitem(sys.modules, "pyiqa", module)
+    monkeypatch.setitem(sys.modules, "pyiqa", Mock(create_metric=create_metric))
     images = torch.tensor([0.0, 0.25, 1.0])[:, None, None, None].expand(3, 3, 4, 4)
     higher = make_scorer("pyiqa:musiq")
     assert list(higher.parts) == ["musiq"]
@@ -161,6 +148,7 @@ def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> Non
         ("no_such_module:Thing", "cannot be loaded: "),
         ("ae_env.scorers.terms:Nothing", "cannot be loaded: "),
         ("math:pi", "must be callable"),
+        ({"no.py:Level": 1.0}, r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"),
         ({}, "must map one name or more"),
         (lambda images, captures: None, "must be 'raw' or 'srgb'"),
         *((Own(depends_on="imgae"), "imgae"), (Own(domain="RGB"), "RGB")),
