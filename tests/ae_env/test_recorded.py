@@ -224,7 +224,7 @@ def test_settings_in_names(name: str, settings: tuple[float | None, ...], rest: 
     assert left == rest
 
 
-def test_imagenet_es(tmp_path: Path) -> None:
+def test_imagenet_es_and_video_stacks(tmp_path: Path) -> None:
     grid = ExposureGrid((200, 12800), (1 / 1250, 0.4), (5, 13))
     write_states(tmp_path, seeds=(3,), grid=grid)
     shutil.copytree(tmp_path / "l1", tmp_path / "l5")
@@ -235,9 +235,6 @@ def test_imagenet_es(tmp_path: Path) -> None:
     assert recorded.recorded_grid(files) == grid
     by_folder = {f.path.parts[-3]: f.settings for f in files}
     assert by_folder == {f"param_{i + 1}": s for i, s in enumerate(grid)}
-
-
-def test_video_stacks(tmp_path: Path) -> None:
     write_video(tmp_path, frames=11, times=("1-1000s", "1-60s"))
     scenes = load({"recorded": tmp_path, "iso": 400, "f_number": 4})
     assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]

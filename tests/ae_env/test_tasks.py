@@ -56,10 +56,7 @@ def test_merging_weighs_by_the_inverse_of_the_noise() -> None:
     assert float(precision[0].min()) > 0.0
     assert not precision[1].any()
     assert not light[1].any()
-
-
-def test_the_precision_is_that_of_many_draws() -> None:
-    """Variance of the merged light over 40,000 draws, and no frame alone is better."""
+    # Variance of the merged light over 40,000 draws, and no frame alone is better.
     generator = torch.Generator().manual_seed(3)
     light, gains = 0.02, torch.tensor([[1.0, 6.0, 20.0]])
     shot, read = four([2e-3, 8e-3, 8e-3]), four([4e-5, 1e-4, 1e-4])

@@ -7,10 +7,8 @@ import math
 import pickle
 import threading
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -189,7 +187,7 @@ def test_layouts_depend_on_the_name_alone() -> None:
 
 
 @pytest.fixture
-def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def empty_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
     _LOADED.clear()
     yield
@@ -239,7 +237,7 @@ def test_episodes_do_not_depend_on_when_scenes_are_drawn() -> None:
     assert loaded[0] < loaded[1] == 10
 
 
-def test_the_list_splits_places_and_each_kind_is_tested():
+def test_the_list_splits_places_and_each_kind_is_tested(tmp_path, monkeypatch):
     splits = {}
     for asset in list_assets():
         assert splits.setdefault(asset.place, asset.split) == asset.split
@@ -247,6 +245,12 @@ def test_the_list_splits_places_and_each_kind_is_tested():
     tested = {a.kind for a in list_assets() if a.split == "test"}
     assert tested >= {"night", "indoor", "backlit", "forest", "sun", "overcast", "studio", "tunnel"}
     assert list(splits.values()).count("test") >= 15  # enough for intervals
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
+    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
+        load_scenes("polyhaven", "test", camera=CAMERA)
+    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
+        load_scenes("mixed", "train", camera=CAMERA)
 
 
 def panorama(light) -> np.ndarray:
@@ -349,15 +353,6 @@ def test_real_scenes_alone_and_mixed(data_dir):
     asset = next(a for a in polyhaven.split_assets("polyhaven", "test") if a.name == "spree_bank")
     found = polyhaven.light_around(read_radiance(asset.path))
     np.testing.assert_allclose(places["spree_bank"], found, atol=6e-4)
-
-
-def test_missing_maps_name_the_command(tmp_path, monkeypatch):
-    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
-    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
-        load_scenes("polyhaven", "test", camera=CAMERA)
-    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
-        load_scenes("mixed", "train", camera=CAMERA)
 
 
 CONTENT = {f"map_{i}": bytes([i]) * (5000 + i) for i in range(3)}

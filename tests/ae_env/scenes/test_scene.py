@@ -1,7 +1,6 @@
 """Scene: normalisation, colours, resizing."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from simulator.capture.prepared_scene import Layout
 from simulator.networks.aperture_module import BLUR_FACTOR, DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 from simulator.radiance.light import camera_from_srgb, temperature_tint
-from simulator.raw.image import RawImage
 from tests.ae_env.environments import assert_equal, make_env, rollout
 from tests.ae_env.scene_files import load, write_hdr
 from tests.ae_env.scorer_images import random_scene
@@ -84,18 +82,6 @@ def test_unknown_light_is_anchored_to_the_mean() -> None:
     assert scene.light[1, 5, 5].item() == pytest.approx((0.12 * 100 - 1) / 99, rel=1e-5)
 
 
-def test_clipped_pixels_of_a_raw_are_marked() -> None:
-    data = torch.full((4, 8, 8), 0.5)
-    data[3, 2, 5] = 1.0
-    noise = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    raw = RawImage(data, CameraSettings(200, 0.01, 2.8), PLAIN, nlf=noise)
-    scene = Scene.from_raw(raw, scene_id="r")
-    assert scene.saturated.nonzero().tolist() == [[2, 5]]
-    assert (scene.illuminance, scene.reference) == (None, raw.settings)
-    clean = RawImage(data.clamp(max=0.5), raw.settings, PLAIN, nlf=noise)
-    assert Scene.from_raw(clean, scene_id="r").saturated is None
-
-
 def test_resized_averages_what_the_networks_found() -> None:
     """Denoised light like light; blur by its second moment, in pixels of the new light."""
     rng = np.random.default_rng(0)
@@ -143,7 +129,7 @@ def test_resized_averages_what_the_networks_found() -> None:
         (lambda: simulate_source_raw(random_scene(nlf=CAMERA.nlf(400))), "`scene`"),
     ],
 )
-def test_what_is_wrong_with_a_scene_is_named(make: Callable[[], Scene], words: str) -> None:
+def test_what_is_wrong_with_a_scene_is_named(make: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -192,15 +178,12 @@ def my_scenes(split: str, camera: object) -> list[Scene]:
 MINE = my_scenes("all", None)
 
 
-def test_scenes_from_lists_and_attributes() -> None:
+def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
     for split in ("train", "test", "all"):
         assert [s.scene_id for s in load(MINE, split)] == ["all"]
         assert [s.scene_id for s in load(f"{__name__}:MINE", split)] == ["all"]
         assert [s.scene_id for s in load(f"{__name__}:my_scenes", split)] == [split]
     assert load(MINE, resolution=8)[0].box_factor == 2
-
-
-def test_small_folder_is_zero_shot(tmp_path: Path) -> None:
     for i in (10, 2, 1):
         write_hdr(tmp_path / f"map{i}.hdr", i)
     for spec, split, names in (

@@ -38,7 +38,7 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
+def test_tone_curve_shows_the_grey_card_as_grey_and_is_inverted():
     linear = torch.linspace(0, 1, 10_001, dtype=torch.float64)
     curve = apply_tone(linear, "photographic")
     assert (curve.diff() > 0).all()
@@ -48,6 +48,14 @@ def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
     encoded = srgb_encode(linear.float()).numpy()
     np.testing.assert_allclose(encoded, srgb(linear.numpy()), atol=5e-7)
     assert (np.diff(encoded) >= 0).all()
+    # The inverse, above the sRGB curve's toe by hand: Schlick's curve solved for light.
+    codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16).expand(1, 3, 16, 16)
+    light, same = develop_inverse(codes), develop_inverse(codes.float() / 255.0)
+    assert torch.allclose(light, same, rtol=1e-5, atol=1e-8)
+    shown, p = ((200 / 255 + 0.055) / 1.055) ** 2.4, 1.618
+    by_hand = shown / (p - (p - 1) * shown)
+    assert light[0, 3].flatten()[200].item() == pytest.approx(by_hand, rel=1e-3)
+    assert develop(same).sub(codes / 255.0).abs().max() < 1e-5
 
 
 def test_develop_follows_the_formula():
@@ -146,17 +154,6 @@ def test_a_real_raw_looks_as_libraw_shows_it(data_dir):
     assert np.quantile(np.abs(difference), 0.999) < 1.5
 
 
-def test_the_inverse_takes_codes_and_floating_point() -> None:
-    """Above the sRGB curve's toe by hand: its inverse, then Schlick's curve solved for light."""
-    codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16).expand(1, 3, 16, 16)
-    light, same = develop_inverse(codes), develop_inverse(codes.float() / 255.0)
-    assert torch.allclose(light, same, rtol=1e-5, atol=1e-8)
-    shown, p = ((200 / 255 + 0.055) / 1.055) ** 2.4, 1.618
-    by_hand = shown / (p - (p - 1) * shown)
-    assert light[0, 3].flatten()[200].item() == pytest.approx(by_hand, rel=1e-3)
-    assert develop(same).sub(codes / 255.0).abs().max() < 1e-5
-
-
 PATTERNS = [p.value for p in BayerPattern]
 
 
@@ -234,6 +231,7 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     level = torch.tensor([0.5, 1.1, 1.6, 4.0]) * ratio
     expected = level / torch.tensor([2, 1, 1, 1.25])[:, None]
     scene = Scene.from_raw(raw, scene_id="raw")
+    assert (scene.illuminance, scene.reference) == (None, raw.settings)
     for found in (prepared, scene.prepared):
         light = found.expected(settings)[:, 0]
         torch.testing.assert_close(light, expected)
@@ -246,4 +244,5 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     small = Scene.from_raw(black, scene_id="raw").resized(1).light.flatten()
     torch.testing.assert_close(small, expected.mean(1) / ratio / 4)  # averaged after, not before
     dark = clipped(pixels[0])
+    assert Scene.from_raw(dark, scene_id="raw").saturated is None
     assert CameraSimulator(device="cpu").prepare(dark).light is dark.data

@@ -338,16 +338,7 @@ def test_damaged_files_are_read_or_refused(path, own_dng, name):
     assert 15 < refused < 150
 
 
-def test_white_beyond_the_bits_of_a_sample():
-    """Private, as there is no such file to test on: Sony's ARW compress 14 bits to 12."""
-    tags = {"PhotometricInterpretation": (32803,), "BitsPerSample": (12,)}
-    stated = tags | {"WhiteLevel": (15360,)}
-    for own, brightest, wanted in ((tags, 900, 15360), (stated, 14000, 15360), (stated, 900, 4095)):
-        mosaic, path = np.full((2, 2), brightest, np.uint16), Path("a.arw")
-        assert read_module._white_level(path, 15360.0, [512.0] * 4, [own], mosaic) == wanted
-
-
-def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path, caplog):
+def test_white_levels_that_are_wrong_or_beyond_the_bits_of_a_sample(tmp_path, caplog):
     """Its brightest sample is four times that level; darker files do not show that it is wrong."""
     camera = CameraProfile("sensor", BayerPattern.RGGB, (64.0,) * 4, 4095, 12)
     given = {"settings": SETTINGS, "nlf": NLF, "camera": camera}
@@ -362,6 +353,12 @@ def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path, caplog):
     dark = write_sample_dng(tmp_path / "b.dng", MOSAIC // 5, WhiteLevel=("I", (1000,)))
     with pytest.raises(ValueError, match="`camera`"):
         read_raw(dark, **given)
+    # Private, as there is no such file to test on: Sony's ARW compress 14 bits to 12.
+    tags = {"PhotometricInterpretation": (32803,), "BitsPerSample": (12,)}
+    stated = tags | {"WhiteLevel": (15360,)}
+    for own, brightest, wanted in ((tags, 900, 15360), (stated, 14000, 15360), (stated, 900, 4095)):
+        mosaic, path = np.full((2, 2), brightest, np.uint16), Path("a.arw")
+        assert read_module._white_level(path, 15360.0, [512.0] * 4, [own], mosaic) == wanted
 
 
 def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:

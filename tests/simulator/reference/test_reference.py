@@ -85,9 +85,6 @@ def test_photosites_averages_and_marked_stops_in_the_blur():
     torch.testing.assert_close(native.blur_diameter(fine, 4.0), expected)
     # f/5.6 stands for 4 sqrt(2), f/11 for 8 sqrt(2)
     torch.testing.assert_close(native.blur_diameter(shot, 11.0), expected / (2 * math.sqrt(2)))
-
-
-def test_scene_without_depth_or_in_focus_is_left_as_it_is():
     light, camera = torch.rand(4, 7, 5), ReferenceCamera(sensor(1e-4, 1e-8))
     assert not scene(light).sampled
     assert float(camera.blur_diameter(scene(light), 4.0).max()) == 0.0
@@ -175,7 +172,7 @@ def test_clipped_flat_fields_are_white_or_a_full_well_under_the_base_iso():
         np.testing.assert_allclose(recorded, 0.5, rtol=0.005)
 
 
-def test_ratio_of_two_captures_is_the_bodys():
+def test_ratio_of_two_captures_and_black_offset_are_the_bodys():
     body = BodyError(shutter_delay=-20e-6, shutter_scale=0.01, transmission={12: 0.03, 21: -0.05})
     camera = ReferenceCamera(sensor(1e-6, 1e-9), body=body)
     first, second = CameraSettings(100, 1 / 4000, 4), CameraSettings(400, 1 / 125, 11)
@@ -189,9 +186,6 @@ def test_ratio_of_two_captures_is_the_bodys():
     # A stop without an entry has no error.
     plain = camera.capture(shot, replace(first, f_number=8), 3).mean.mean()
     assert float(captures[0].mean.mean() / plain) == pytest.approx(4 * 1.03, rel=1e-5)
-
-
-def test_black_offset_moves_the_numbers_but_not_the_noise_of_light():
     offset = (2 / 16000, -1.5 / 16000, 0.0, 1 / 16000)
     dark = ReferenceCamera(sensor(1e-4, 1e-6), body=BodyError(black_offset=offset))
     capture = dark.capture(scene(flat(0.0, 200)), BASE, 0)
@@ -375,7 +369,7 @@ def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
     assert sequences.grey_signal(dark, settings) == pytest.approx(0.15)
 
 
-def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
+def test_noise_targets_collect_four_times_the_light_and_are_neither_black_nor_white():
     # With photon noise alone, variance at a common exposure goes as 1 / (light collected): at one
     # f-number the target's must be at most a quarter, so its exposure time at least fourfold.
     source = CameraSettings(6400, 1 / 128, 8)
@@ -388,9 +382,6 @@ def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
     )
     # Each target is within the range of exposures asked of it.
     assert targets(SHOT_ONLY, 9, source, *candidates) == {1, 3}
-
-
-def test_noise_targets_are_neither_black_nor_white_and_read_noise_counts():
     source = CameraSettings(6400, 1 / 8192, 8)  # an eighth of the light of any target
     # EV 12 is ISO 100, 1/64 s, f/8; 3 EV below and 2 EV above are the limits.
     times = (2.0**-9 * 0.98, 2.0**-9 * 1.02, 2.0**-4 * 0.98, 2.0**-4 * 1.02)

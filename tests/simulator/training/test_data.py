@@ -145,6 +145,10 @@ def test_a_step_gives_the_same_batch_and_another_one_another() -> None:
     captures = crops.captures(2, 4, 24)
     assert all(torch.equal(part, part[:1].expand_as(part)) for part in captures[1:])
     assert not torch.equal(captures.noisy[0], captures.noisy[1])
+    # A tenth of the crops has coinciding planes; there alone the greens are equal.
+    clean = DetailCrops([picture(3, 128, 128)], [Z6]).batch(0, 200, 16).clean
+    equal = [torch.equal(each[1], each[2]) for each in clean]
+    assert np.mean(equal) == pytest.approx(0.1, abs=0.085)  # four standard errors
 
 
 def test_recorded_noise_has_the_variance_that_is_stated() -> None:
@@ -160,10 +164,7 @@ def test_recorded_noise_has_the_variance_that_is_stated() -> None:
             assert bool((error.mean(dim=1).abs() < 5 * (variance / error.shape[1]).sqrt()).all())
             seen += 1
     assert seen > 2
-
-
-def test_what_is_recorded_is_clipped_and_whole_numbers() -> None:
-    """A picture too small to be averaged: each sample is one of the camera's digital numbers."""
+    # A picture too small to be averaged: each sample is one of the camera's digital numbers.
     bright = DetailCrops([picture(3, 70, 70)], [CANON]).batch(0, 40, 32)
     numbers = bright.noisy.double() * torch.tensor(CANON.span)[:, None, None]
     assert float((numbers - numbers.round()).abs().max()) < 1e-2
@@ -172,13 +173,6 @@ def test_what_is_recorded_is_clipped_and_whole_numbers() -> None:
     levels = bright.clean.mean(dim=(1, 2, 3)).log2()
     assert -11.1 < float(levels.min()) < -7
     assert -3 < float(levels.max()) < -0.5
-
-
-def test_planes_are_sampled_at_their_own_places_but_for_some_crops() -> None:
-    """A tenth of the crops has coinciding planes; there alone the greens are equal."""
-    clean = DetailCrops([picture(3, 128, 128)], [Z6]).batch(0, 200, 16).clean
-    equal = [torch.equal(each[1], each[2]) for each in clean]
-    assert np.mean(equal) == pytest.approx(0.1, abs=0.085)  # four standard errors
 
 
 def test_a_mosaic_is_transposed_with_its_greens() -> None:

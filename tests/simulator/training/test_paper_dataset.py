@@ -175,7 +175,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_dataset(tmp_path_factory.mktemp("Nikon"), sequences=4)
 
 
-def test_sequences_are_split_whole(folder: Path, tmp_path: Path) -> None:
+def test_sequences_are_split_whole_and_paired_for_each_stage(folder: Path, tmp_path: Path) -> None:
     train, test = split_dataset(folder, seed=0)
     assert (len(train), len(test)) == (3, 1)
     assert {s.name for s in (*train, *test)} == {f"scene_00{n}" for n in range(4)}
@@ -188,9 +188,6 @@ def test_sequences_are_split_whole(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path / "AutoModeNikon_Train")
     train, test = split_dataset(tmp_path)  # folders named test are held out
     assert (len(train), len(test)) == (4, 1)
-
-
-def test_pairs_of_each_stage(folder: Path) -> None:
     sequences = split_dataset(folder)[0][:1]
     settings = sequences[0].settings
     pairs = paper_dataset.captured_pairs

@@ -177,17 +177,7 @@ def test_groups_of_files_stay_together(tmp_path: Path) -> None:
         assert drawn.count(split) / 2000 == pytest.approx(share, abs=error)
 
 
-def test_a_map_has_a_median_of_one_and_no_lamp_outshines_it(tmp_path: Path) -> None:
-    image = np.full((8, 16, 3), 4.0)
-    image[0, 0] = 4000.0
-    write_hdr(tmp_path / "hdri_pool" / "room.hdr", image=image)
-    light = the_only(tmp_path, "room").light
-    assert light.shape == (3, 8, 16)
-    assert light[:, 0, 0].tolist() == [64.0] * 3
-    torch.testing.assert_close(light[:, 1:], torch.ones(3, 7, 16), rtol=0.01, atol=0)
-
-
-def test_mosaics_and_linear_frames_by_hand(tmp_path: Path) -> None:
+def test_mosaics_linear_frames_and_maps_by_hand(tmp_path: Path) -> None:
     """Black 10 and white 110; the planes lie at (0, 0), (0, 1), (1, 0), (1, 1)."""
     cv2 = pytest.importorskip("cv2")
     for folder in ("gopro_raw", "intel_tau_small"):
@@ -205,6 +195,14 @@ def test_mosaics_and_linear_frames_by_hand(tmp_path: Path) -> None:
     assert (mosaic.nlf.shot, mosaic.nlf.read) == ((0.002,) * 4, (0.00003,) * 4)
     assert linear.light[:, 3, 0].tolist() == [1.0, 0.0, 0.0]
     assert linear.nlf.is_zero
+    # A map has a median of one, and no lamp outshines it.
+    image = np.full((8, 16, 3), 4.0)
+    image[0, 0] = 4000.0
+    write_hdr(tmp_path / "hdri_pool" / "room.hdr", image=image)
+    light = the_only(tmp_path, "room").light
+    assert light.shape == (3, 8, 16)
+    assert light[:, 0, 0].tolist() == [64.0] * 3
+    torch.testing.assert_close(light[:, 1:], torch.ones(3, 7, 16), rtol=0.01, atol=0)
 
 
 def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

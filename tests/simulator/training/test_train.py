@@ -6,8 +6,6 @@ import math
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable
-from collections.abc import Sequence as SequenceOf
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +39,7 @@ def config(preset: str = "compact", **changes: Any) -> SimulatorConfig:
     return SimulatorConfig.model_validate(values)
 
 
-def scenes(config: SimulatorConfig, split: str) -> SequenceOf[ReferenceScene]:
+def scenes(config: SimulatorConfig, split: str) -> list[ReferenceScene]:
     first = {"train": 0, "validation": 10}[split]
     return [scene(f"{split}-deep", seed=first), scene(f"{split}-flat", seed=first + 1, depth=False)]
 
@@ -178,6 +176,10 @@ def test_what_a_scene_teaches():
         stages = ("exposure", "aperture", "baseline")
         # Private, as a whole training would take minutes to show it.
         assert [stage for stage in stages if train._is_useful_for(one, stage)] == teaches
+    found = train.scenes_of(config(scenes={"procedural": 4, "size": 32}), "train")
+    # Three of four procedural scenes have depth; the fourth is draped over two depths.
+    assert Counter(s.kind for s in found if s.depth is not None) == {"depth": 3, "draped": 2}
+    assert all(s.size == (32, 32) and s.sampled and s.illuminance for s in found)
 
 
 class Watch:
@@ -273,13 +275,6 @@ def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
         assert (clock.seconds, clock.share) == (seconds, seconds / 120)
 
 
-def test_scenes_of_a_training() -> None:
-    found = train.scenes_of(config(scenes={"procedural": 4, "size": 32}), "train")
-    # Three of four procedural scenes have depth; the fourth is draped over two depths.
-    assert Counter(s.kind for s in found if s.depth is not None) == {"depth": 3, "draped": 2}
-    assert all(s.size == (32, 32) and s.sampled and s.illuminance for s in found)
-
-
 STAGES = "exposure: {steps: 2}\nnoise: {steps: 3}\naperture: {minutes: 0.5, crop: 128}\n"
 COMPACT = f"preset: compact\n{STAGES}"
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "simulator"
@@ -324,7 +319,7 @@ def test_a_later_stage_does_not_change_what_an_earlier_one_is():
 class Known(NoiseModule):
     """Leaves a share of the noise's deviation on a flat field, and shifts it by another."""
 
-    def __init__(self, left: float, shift: Callable[[int], float]) -> None:
+    def __init__(self, left: float, shift: Any) -> None:
         super().__init__("nano")
         self.left, self.shift, self.calls = left, shift, 0
 
@@ -335,7 +330,7 @@ class Known(NoiseModule):
         return mean + self.left * (noisy - mean) + self.shift(self.calls) * sigma
 
 
-def calibrated(left: float, shift: Callable[[int], float]) -> Residual:
+def calibrated(left: float, shift: Any) -> Residual:
     picture = DetailPicture("a", "a", "mosaic", torch.full((4, 64, 64), 0.5))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("simulator.training.train._SIDE", 32)

@@ -66,7 +66,7 @@ def test_targets_that_cannot_be_written_and_permissions(tmp_path):
     assert written.stat().st_mode == ordinary.stat().st_mode
 
 
-def test_the_folder_of_real_files(tmp_path, monkeypatch):
+def test_the_folders_of_real_files_and_of_the_cache(tmp_path, monkeypatch):
     beside = Path(__file__).resolve().parents[4] / "shared" / "data"
     unset = beside if beside.is_dir() else None
     for value, expected in ((tmp_path, tmp_path), ("", unset)):
@@ -77,6 +77,14 @@ def test_the_folder_of_real_files(tmp_path, monkeypatch):
         data_folder()
     monkeypatch.delenv("AE_ENV_DATA")
     assert data_folder() == unset
+    usual, here = Path(platformdirs.user_cache_dir("ae-env")), tmp_path / "here"
+    for value, expected in ((here, here), ("~/there", Path.home() / "there"), ("", usual)):
+        monkeypatch.setenv("AE_ENV_CACHE", str(value))
+        assert cache_dir() == expected
+    assert not here.exists()
+    for cache in (LruCache, lambda size: Store(tmp_path, max_bytes=size)):
+        with pytest.raises(ValueError, match="`max_bytes`"):
+            cache(-1)
 
 
 def test_meta_says_where_a_number_comes_from():
@@ -181,17 +189,6 @@ VALUES = {
     "mask": np.array(True),
     "rows": [{"scene": "ä", "score": None, "regret": 0.1}],
 }
-
-
-def test_the_variable_names_the_folder(monkeypatch, tmp_path):
-    usual, here = Path(platformdirs.user_cache_dir("ae-env")), tmp_path / "here"
-    for value, expected in ((here, here), ("~/there", Path.home() / "there"), ("", usual)):
-        monkeypatch.setenv("AE_ENV_CACHE", str(value))
-        assert cache_dir() == expected
-    assert not here.exists()
-    for cache in (LruCache, lambda size: Store(tmp_path, max_bytes=size)):
-        with pytest.raises(ValueError, match="`max_bytes`"):
-            cache(-1)
 
 
 def test_what_keys_and_digests_depend_on(monkeypatch):
@@ -310,14 +307,8 @@ def test_the_bound_holds_and_what_was_used_longest_ago_goes_first(tmp_path):
     assert store.get(keys[0]) is not None  # used just now: 1 is the oldest
     store.put(keys[5], values)
     assert [i for i, key in enumerate(keys) if store.path(key).is_file()] == [0, 2, 3, 4, 5]
-    store = Store(tmp_path, max_bytes=20_000)
-    for i, key in enumerate(KEYS[:32]):
-        store.put(key, {"light": torch.zeros(100 * (1 + i % 9))})
-        assert store.usage()["denoised"][1] <= 20_000
-        assert store.get(key) is not None
-    assert store.usage()["denoised"][0] > 4
-    store.put(KEYS[0], {"light": torch.zeros(5001)})  # 20,004 bytes
-    assert store.usage()["denoised"][1] <= 20_000
+    store.put(KEYS[0], {"light": torch.zeros(5001)})  # more than all may have
+    assert sum(size for _, size in store.usage().values()) <= 16_500
 
 
 def test_nothing_else_is_ever_removed(tmp_path):
