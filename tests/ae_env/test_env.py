@@ -51,7 +51,7 @@ def test_same_seed_same_rollout(kind: str) -> None:
     np.testing.assert_array_equal(unseen.reset(seed=7)[0]["raw"], first[0][0]["raw"])
 
 
-def test_spaces_are_as_documented() -> None:
+def test_spaces_and_infos_are_as_documented() -> None:
     env = make_env(resolution=40)
     box, space = gym.spaces.Box, env.observation_space
     assert space["raw"] == box(0, 255, (4, 40, 40), np.uint8)
@@ -61,9 +61,6 @@ def test_spaces_are_as_documented() -> None:
     assert dn.high.max() == env.unwrapped.camera.white_level
     assert env.action_space == gym.spaces.Discrete(64)
     assert env.get_wrapper_attr("action_masks")().tolist() == [True] * 64
-
-
-def test_info_has_the_same_keys_and_plain_numbers() -> None:
     env = make_env(with_oracle=True)
     _, first = env.reset(seed=0)
     _, reward, terminated, truncated, second = env.step(5)

@@ -300,7 +300,7 @@ def test_modes_have_the_names_and_values_of_gymnasiums_enum(mode: AutoresetMode)
         assert envs.step(torch.tensor([5, 6, 7]))[4]["rewards"]["score"].shape == (3,)
 
 
-def test_resets_that_are_needed() -> None:
+def test_resets_that_are_needed_and_options_of_each_environment() -> None:
     envs = make_envs(autoreset_mode="DISABLED", max_episode_steps=1, render_mode="rgb_array")
     first = {"options": {"reset_mask": np.array([True, False, True])}}
     for early in (envs.render, lambda: envs.step([0] * 3), lambda: envs.reset(**first)):
@@ -310,9 +310,6 @@ def test_resets_that_are_needed() -> None:
     envs.step([0] * 3)
     with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
         envs.step([0] * 3)
-
-
-def test_reset_options_per_environment() -> None:
     envs = make_envs()
     ids = [envs.unwrapped.scenes[i].scene_id for i in (0, 2, 4)]
     _, info = envs.reset(seed=0, options={"scene": ids, "state": [1, 2, 3]})

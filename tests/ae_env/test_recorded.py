@@ -33,7 +33,7 @@ CAMERA = get_camera("nikon_z6")
 load = functools.partial(load_scenes, split="all", camera=CAMERA, resolution=None)
 
 
-def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
+def test_raws_are_shown_as_they_are_and_pictures_developed_back(tmp_path: Path) -> None:
     write_raws(tmp_path / "desk")
     (scene,) = load(f"recorded:{tmp_path}?iso=50")  # what the files state comes first
     assert scene.allowed.all()
@@ -50,6 +50,16 @@ def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
     assert body.black_level == CAMERA.black_level
     for iso in (100.0, 1600.0):  # a DNG states one pair of numbers for both greens
         np.testing.assert_allclose(body.nlf_by_iso[iso].shot, CAMERA.nlf(iso).shot, rtol=0.02)
+    for settings in GRID:
+        name = f"iso{settings.iso:.0f}_1-{1 / settings.exposure_time:.0f}s_f{settings.f_number:g}"
+        write_picture(tmp_path / "shown" / f"{name}.png", settings)
+    (scene,) = load(f"recorded:{tmp_path / 'shown'}")
+    pictures = [Image.open(path) for path in sorted((tmp_path / "shown").iterdir())]
+    sums = {np.asarray(picture).astype(int).sum() for picture in pictures}
+    developed = develop(scene.recorded, scene.white_balance, scene.camera.colour_matrix)
+    shown = (developed * 255.0).round().int()
+    assert {int(rgb.sum()) for rgb in shown} == sums  # the same codes as in the files
+    assert scene.camera.nlf(100) == CAMERA.nlf(100)
 
 
 def test_the_light_is_that_of_all_captures(tmp_path: Path) -> None:
@@ -66,19 +76,6 @@ def test_the_light_is_that_of_all_captures(tmp_path: Path) -> None:
         errors.append(float((scene.recorded[number] - truth).std()) * alpha)
     merged = float((scene.light - truth * alpha).std())
     assert merged < 0.9 * min(errors)
-
-
-def test_pictures_are_developed_back(tmp_path: Path) -> None:
-    for settings in GRID:
-        name = f"iso{settings.iso:.0f}_1-{1 / settings.exposure_time:.0f}s_f{settings.f_number:g}"
-        write_picture(tmp_path / "desk" / f"{name}.png", settings)
-    (scene,) = load(f"recorded:{tmp_path}")
-    pictures = [Image.open(path) for path in sorted((tmp_path / "desk").iterdir())]
-    sums = {np.asarray(picture).astype(int).sum() for picture in pictures}
-    developed = develop(scene.recorded, scene.white_balance, scene.camera.colour_matrix)
-    shown = (developed * 255.0).round().int()
-    assert {int(rgb.sum()) for rgb in shown} == sums  # the same codes as in the files
-    assert scene.camera.nlf(100) == CAMERA.nlf(100)
 
 
 def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:

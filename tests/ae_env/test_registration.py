@@ -145,7 +145,7 @@ def _write(file: Path, text: str) -> Path:
     return file
 
 
-def test_a_file_is_run_once_until_it_changes(tmp_path, monkeypatch):
+def test_files_are_run_once_until_they_change_and_imports_once(tmp_path, monkeypatch):
     file = _write(tmp_path / "my file-1.py", "class Mine:\n    number = 1\n")
     first = load_from_file(str(file), "Mine", ARGUMENT)
     monkeypatch.chdir(tmp_path)
@@ -154,6 +154,13 @@ def test_a_file_is_run_once_until_it_changes(tmp_path, monkeypatch):
     assert load_from_file("~/my file-1.py", "Mine", ARGUMENT) is first
     _write(file, "class Mine:\n    number = 2\n")  # in the same second, of the same length
     assert load_from_file(str(file), "Mine", ARGUMENT).number == 2
+    monkeypatch.syspath_prepend(tmp_path)
+    _write(tmp_path / "on_the_path.py", "class Base: ...")
+    for name in ("one", "two"):
+        _write(tmp_path / f"{name}.py", "from on_the_path import Base as Mine")
+    one, two = (load_from_file(str(tmp_path / f"{n}.py"), "Mine", ARGUMENT) for n in ("one", "two"))
+    assert one is two
+    monkeypatch.delitem(sys.modules, "on_the_path")
 
 
 def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> None:
@@ -175,16 +182,6 @@ def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> Non
     assert sys.path == path
     for name in set(sys.modules) - before:
         del sys.modules[name]
-
-
-def test_what_is_importable_anyway_is_not_imported_twice(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    _write(tmp_path / "on_the_path.py", "class Base: ...")
-    for name in ("one", "two"):
-        _write(tmp_path / f"{name}.py", "from on_the_path import Base as Mine")
-    one, two = (load_from_file(str(tmp_path / f"{n}.py"), "Mine", ARGUMENT) for n in ("one", "two"))
-    assert one is two
-    monkeypatch.delitem(sys.modules, "on_the_path")
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
     np.testing.assert_allclose(scores, mapped, atol=1e-2)  # a level may round the other way
 
 
-def test_snr_is_the_mean_of_decibels() -> None:
+def test_snr_and_dynamic_range_by_hand() -> None:
     light = 0.1 * np.exp(np.random.default_rng(0).normal(0.0, 2.0, (4, 6, 5)))
     states = [CameraSettings(*s) for s in ((100, 1 / 64, 4), (6400, 1 / 64, 4), (400, 1 / 4000, 4))]
     expected = []
@@ -128,6 +128,23 @@ def test_snr_is_the_mean_of_decibels() -> None:
     scores = make_scorer("snr")(None, captures_of(light, states))
     np.testing.assert_allclose(scores.numpy(), expected, rtol=1e-5)
     assert make_scorer("snr").closed_form
+    # The 11th and 991st of 1001 greens, each the mean of G1 and G2, from the noise floor on.
+    read, shot = (9.0, 2e-6, 6e-6, 9.0), (9.0, 1e-3, 3e-3, 9.0)
+    floor = 0.5 * (2e-3 + math.sqrt(4e-6 + 4 * 4e-6))  # of the greens' means, 2e-3 and 4e-6
+    none, noisy = NoiseLevelFunction.zero(), NoiseLevelFunction(shot, read)
+    stops = math.log2(9e3) * 0.98
+    for darkest, time, nlf, wanted in (
+        (1e-4, 1 / 64, none, stops / 14),
+        (1e-4, 1 / 64, noisy, math.log2(0.9 * 9e3**-0.01 / floor) / 14),
+        # Four stops more: white at 1.
+        (1e-4, 1 / 4, none, (stops - math.log2(0.9 * 9e3**-0.01 * 16)) / 14),
+        (1e-9, 1 / 64, none, 1.0),  # 29 stops are more than 14
+    ):
+        green = np.random.default_rng(0).permutation(np.geomspace(darkest, 0.9, 1001))
+        light = np.stack([green * 0 + 50.0, 1.5 * green, 0.5 * green, green * 0])[:, None]
+        captures = replace(captures_of(light, [CameraSettings(100, time, 4)]), nlf=[nlf])
+        found = make_scorer("dynamic_range")(None, captures).item()
+        assert found == pytest.approx(wanted, rel=1e-5)
 
 
 def test_blind_sigma_is_immerkaers() -> None:
@@ -160,7 +177,7 @@ def test_mid_grey_takes_the_mean_of_linear_luminance() -> None:
     np.testing.assert_allclose(_score("mid_grey", pictures), expected, rtol=2e-3)
 
 
-def test_clipping_counts_samples_of_all_planes() -> None:
+def test_clipping_counts_samples_of_all_planes_and_well_exposedness_is_mertens_product() -> None:
     raw = torch.full((2, 4, 2, 5), 0.5)  # 40 samples each
     raw[0, 0, 0, :3] = 1.0
     raw[0, 3, 1, :2] = 0.0
@@ -168,29 +185,6 @@ def test_clipping_counts_samples_of_all_planes() -> None:
     raw[1, 2, 0, 0] = 2.0**-8
     raw[1, 2, 1, 0] = 16382 / 16383  # the code below white
     assert _score("clipping", raw) == pytest.approx([1 - 5 / 40, 1 - 1 / 40])
-
-
-def test_dynamic_range_by_hand() -> None:
-    """The 11th and 991st of 1001 greens, each the mean of G1 and G2, from the noise floor on."""
-    read, shot = (9.0, 2e-6, 6e-6, 9.0), (9.0, 1e-3, 3e-3, 9.0)
-    floor = 0.5 * (2e-3 + math.sqrt(4e-6 + 4 * 4e-6))  # of the greens' means, 2e-3 and 4e-6
-    none, noisy = NoiseLevelFunction.zero(), NoiseLevelFunction(shot, read)
-    stops = math.log2(9e3) * 0.98
-    for darkest, time, nlf, wanted in (
-        (1e-4, 1 / 64, none, stops / 14),
-        (1e-4, 1 / 64, noisy, math.log2(0.9 * 9e3**-0.01 / floor) / 14),
-        # Four stops more: white at 1.
-        (1e-4, 1 / 4, none, (stops - math.log2(0.9 * 9e3**-0.01 * 16)) / 14),
-        (1e-9, 1 / 64, none, 1.0),  # 29 stops are more than 14
-    ):
-        green = np.random.default_rng(0).permutation(np.geomspace(darkest, 0.9, 1001))
-        light = np.stack([green * 0 + 50.0, 1.5 * green, 0.5 * green, green * 0])[:, None]
-        captures = replace(captures_of(light, [CameraSettings(100, time, 4)]), nlf=[nlf])
-        found = make_scorer("dynamic_range")(None, captures).item()
-        assert found == pytest.approx(wanted, rel=1e-5)
-
-
-def test_well_exposedness_is_mertens_product() -> None:
     pictures = random_pictures(2, 7, 5)[:, :3]
     weights = np.exp(-((pictures.double().numpy() - 0.5) ** 2) / (2 * 0.2**2))
     expected = weights.prod(axis=1).mean(axis=(1, 2))

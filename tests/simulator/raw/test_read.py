@@ -162,7 +162,7 @@ def test_noise_profile_wins_if_it_can_be_one(tmp_path, caplog, profile, shot, re
     assert (camera.name, camera.black_level[0], camera.white_level) == ("canon_70d", 64, 4095)
 
 
-def test_camera_argument(path):
+def test_cameras_that_are_given_or_estimated(path, tmp_path):
     named = read_raw(path, settings=SETTINGS, camera="nikon_z6")
     assert_on_12_bits(named, get_camera("nikon_z6"))
     assert named.camera.white_level == 4095
@@ -173,9 +173,6 @@ def test_camera_argument(path):
     for camera in (replace(own, cfa=BayerPattern.GBRG), get_camera("nikon_z6"), "nikon_z", 3):
         with pytest.raises(ValueError, match="`camera`"):
             read_raw(path, settings=SETTINGS, camera=camera)
-
-
-def test_unknown_camera_is_estimated_and_declared(tmp_path):
     rng = np.random.default_rng(1)
     light = np.broadcast_to(np.linspace(0.02, 0.8, 384), (256, 384))
     noisy = rng.normal(light, np.sqrt(4e-4 * light + 4e-6))

@@ -207,17 +207,6 @@ def test_drawn_bodies():
     assert CameraSettings(100, 1, 22).aperture_stop in bodies[5].transmission
 
 
-def test_moving_image_is_smeared_over_the_true_exposure_time():
-    light = torch.zeros(4, 20, 80)
-    light[:, :, 40] = 1.0
-    camera = ReferenceCamera(sensor(1e-4, 1e-8), body=BodyError(shutter_scale=0.5))
-    settings = replace(BASE, exposure_time=1 / 16)
-    signal = camera.expose(light, settings, settings, image_speed=4.0)[0, 0].double().numpy()
-    extent = 4.0 * 1.5 / 16 * 20  # frame heights per second, seconds, pixels per frame height
-    assert signal.sum() == pytest.approx(1.5, rel=1e-5)
-    assert signal @ (np.arange(80) - 40) ** 2 / 1.5 == pytest.approx(extent**2 / 12, rel=1e-3)
-
-
 def test_same_seed_same_capture():
     camera, shot = ReferenceCamera(Z6), scene(flat(0.2, 16))
     first = camera.capture(shot, BASE, 4)
@@ -259,7 +248,7 @@ def test_bad_input_is_refused():
             call(*arguments)
 
 
-def test_a_rolling_shutter_shows_bands_of_a_lamp():
+def test_lamps_show_bands_and_moving_images_are_smeared_over_the_true_exposure_time():
     camera = ReferenceCamera(sensor(1e-5, 1e-8, row_time=1e-3), box_factor=2)
     # On for 5 ms of every 10; exposed for 1 us, four sensor rows of 1 ms to a packed row.
     lit = PulsedLamp(frequency=100.0, duty=0.5)
@@ -276,6 +265,14 @@ def test_a_rolling_shutter_shows_bands_of_a_lamp():
     shot, whole = scene(flat(0.1, 10)), CameraSettings(100, 0.01, 4)
     even = camera.capture(shot, whole, seed=0, lamp=lit, start=0.0031).mean
     np.testing.assert_allclose(even, camera.capture(shot, whole, seed=0).mean)
+    light = torch.zeros(4, 20, 80)
+    light[:, :, 40] = 1.0
+    camera = ReferenceCamera(sensor(1e-4, 1e-8), body=BodyError(shutter_scale=0.5))
+    settings = replace(BASE, exposure_time=1 / 16)
+    signal = camera.expose(light, settings, settings, image_speed=4.0)[0, 0].double().numpy()
+    extent = 4.0 * 1.5 / 16 * 20  # frame heights per second, seconds, pixels per frame height
+    assert signal.sum() == pytest.approx(1.5, rel=1e-5)
+    assert signal @ (np.arange(80) - 40) ** 2 / 1.5 == pytest.approx(extent**2 / 12, rel=1e-3)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 0.5, 1.2])
