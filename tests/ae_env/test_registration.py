@@ -140,24 +140,20 @@ def test_a_foreign_package_of_a_common_name_is_named(tmp_path: Path) -> None:
 ARGUMENT = "`thing` (='mine.py:Mine')"
 
 
-def _write(file: Path, text: str) -> Path:
-    file.write_text(text)
-    return file
-
-
 def test_files_are_run_once_until_they_change_and_imports_once(tmp_path, monkeypatch):
-    file = _write(tmp_path / "my file-1.py", "class Mine:\n    number = 1\n")
+    file = tmp_path / "my file-1.py"
+    file.write_text("class Mine:\n    number = 1\n")
     first = load_from_file(str(file), "Mine", ARGUMENT)
     monkeypatch.chdir(tmp_path)
     assert load_from_file("my file-1.py", "Mine", ARGUMENT) is first
     monkeypatch.setenv("HOME", str(tmp_path))
     assert load_from_file("~/my file-1.py", "Mine", ARGUMENT) is first
-    _write(file, "class Mine:\n    number = 2\n")  # in the same second, of the same length
+    file.write_text("class Mine:\n    number = 2\n")  # in the same second, of the same length
     assert load_from_file(str(file), "Mine", ARGUMENT).number == 2
     monkeypatch.syspath_prepend(tmp_path)
-    _write(tmp_path / "on_the_path.py", "class Base: ...")
+    (tmp_path / "on_the_path.py").write_text("class Base: ...")
     for name in ("one", "two"):
-        _write(tmp_path / f"{name}.py", "from on_the_path import Base as Mine")
+        (tmp_path / f"{name}.py").write_text("from on_the_path import Base as Mine")
     one, two = (load_from_file(str(tmp_path / f"{n}.py"), "Mine", ARGUMENT) for n in ("one", "two"))
     assert one is two
     monkeypatch.delitem(sys.modules, "on_the_path")
@@ -168,14 +164,16 @@ def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> Non
     for number in (1, 2):
         folder = tmp_path / str(number)
         (folder / "own_package").mkdir(parents=True)
-        _write(folder / "own_helper.py", f"number = {number}")
-        _write(folder / "own_package" / "__init__.py", "")
-        _write(folder / "own_package" / "part.py", f"from own_helper import number as n{number}")
+        (folder / "own_helper.py").write_text(f"number = {number}")
+        (folder / "own_package" / "__init__.py").write_text("")
+        (folder / "own_package" / "part.py").write_text(
+            f"from own_helper import number as n{number}"
+        )
         text = f"from own_package.part import n{number} as n\nclass Mine:\n    number = n\n"
-        _write(folder / "mine.py", text)
+        (folder / "mine.py").write_text(text)
     files = [str(tmp_path / str(number) / "mine.py") for number in (1, 2)]
     assert [load_from_file(f, "Mine", ARGUMENT).number for f in (*files, files[0])] == [1, 2, 1]
-    _write(tmp_path / "1" / "own_helper.py", "number = 333")
+    (tmp_path / "1" / "own_helper.py").write_text("number = 333")
     with open(files[0], "a") as file:
         file.write("# changed")
     assert load_from_file(files[0], "Mine", ARGUMENT).number == 333
@@ -196,7 +194,8 @@ def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> Non
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: str) -> None:
-    file = _write(tmp_path / "mine.py", text)
+    file = tmp_path / "mine.py"
+    file.write_text(text)
     before = set(sys.modules)
     with pytest.raises(ValueError, match=message) as caught:
         load_from_file(str(file), "Mine", ARGUMENT)

@@ -288,8 +288,6 @@ def test_shipped_configurations_are_valid(file):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (f"preset: compact\nnoize: {{steps: 1}}\n{STAGES}", "noize"),
-        (COMPACT.replace("{steps: 3}", "{stesp: 3}"), "noise.stesp"),
         (COMPACT.replace("steps: 3", "steps: 3, minutes: 1"), "exactly one"),
         (COMPACT.replace("128", "257"), "`aperture.crop` (=257)"),
         (COMPACT.replace("compact", "nano"), "`exposure` must be left out"),
