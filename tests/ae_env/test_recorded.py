@@ -100,18 +100,16 @@ def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
     assert recorded.state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
 
 
-def test_states_without_a_capture_are_forbidden_and_said(tmp_path, caplog):
-    write_raws(tmp_path / "a")
-    write_raws(tmp_path / "b", [s for i, s in enumerate(GRID) if i not in (2, 5)], seed=1)
-    a, b = load(f"recorded:{tmp_path}")
+def test_states_without_a_capture_are_forbidden_and_said(raws, caplog) -> None:
+    a, b = load(f"recorded:{raws}")
     assert a.allowed.all()
-    assert np.flatnonzero(~b.allowed).tolist() == [2, 5]
-    assert not b.recorded[[2, 5]].any()
+    assert np.flatnonzero(~b.allowed).tolist() == [*HOLES]
+    assert not b.recorded[[*HOLES]].any()
     (message,) = caplog.messages
     assert "1 of 2 recorded scenes lack states" in message
-    assert "'b' lacks 2 of 8, the first is ISO 100, 1/125 s, f/4" in message
+    assert "'b' lacks 2 of 8, the first is ISO 1600, 1/1000 s, f/8" in message
     # A grid of one's own leaves out what it does not have.
-    (a, b) = load(f"recorded:{tmp_path}", grid=ExposureGrid((1600,), (1 / 1000, 1 / 125), (4,)))
+    (a, b) = load(f"recorded:{raws}", grid=ExposureGrid((1600,), (1 / 1000, 1 / 125), (4,)))
     assert a.recorded.shape[0] == b.recorded.shape[0] == 2
     torch.testing.assert_close(a.recorded[1], capture(GRID[6]).data)
 

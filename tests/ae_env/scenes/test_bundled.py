@@ -285,17 +285,20 @@ def test_light_on_a_surface_from_an_even_sky_a_dome_and_a_small_lamp():
         assert incident_light(light, azimuth, pitch) == pytest.approx(expected, abs=straight / 200)
 
 
+def asset_of(name: str, content: bytes, kind: str = "sun") -> Asset:
+    known = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    return Asset(name=name, kind=kind, split="test", **known)
+
+
 @pytest.fixture
 def an_asset(tmp_path, monkeypatch):
     """Makes an asset of a panorama, as the file that a folder of real files holds."""
 
-    def make(light: np.ndarray, kind: str = "overcast") -> Asset:
+    def make(light: np.ndarray) -> Asset:
         path = tmp_path / "hdri_pool" / "made.hdr"
         write_hdr(path, image=light.transpose(1, 2, 0))
         monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
-        content = path.read_bytes()
-        digest = hashlib.sha256(content).hexdigest()
-        return Asset(name="made", kind=kind, split="test", bytes=len(content), sha256=digest)
+        return asset_of("made", path.read_bytes(), "overcast")
 
     return make
 
@@ -368,11 +371,7 @@ def server(tmp_path, monkeypatch):
     handler = functools.partial(SimpleHTTPRequestHandler, directory=folder)
     running = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=running.serve_forever, daemon=True).start()
-    known = {"kind": "sun", "split": "test"}
-    assets = tuple(
-        Asset(name=name, bytes=len(c), sha256=hashlib.sha256(c).hexdigest(), **known)
-        for name, c in CONTENT.items()
-    )
+    assets = tuple(asset_of(name, content) for name, content in CONTENT.items())
     monkeypatch.setattr(polyhaven, "list_assets", lambda: assets)
     monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
