@@ -254,10 +254,8 @@ RICH["costs"] = {"flicker": 0.1, "switch": 0.1}
 
 
 BANDED = {"with_oracle": True, "scorer": {"balanced": 0.7, "banding": 0.3}, "delay": 2}
-LIGHTINGS = (
-    {"kind": "flicker", "frequency": 500, "duty": 0.2},
-    {"kind": "schedule", "ev": [0, 1, -1]},
-)
+LIGHTINGS = [{"kind": "flicker", "frequency": 500, "duty": 0.2}]
+LIGHTINGS += [{"kind": "schedule", "ev": [0, 1, -1]}]
 
 
 @pytest.mark.parametrize(

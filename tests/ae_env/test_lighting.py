@@ -145,10 +145,8 @@ SHUTTER = RollingShutter(rows=40, row_time=2e-5, sensor_rows=8)
 )
 @pytest.mark.parametrize("time", [1 / 1000, 1 / 320, 1 / 30])
 def test_rows_are_integrated_over_their_own_exposures(spec, lamp, time: float) -> None:
-    lighting, share = (
-        make_lighting({"kind": "flicker", "frame_rate": 24, **spec}),
-        spec.get("depth", 1),
-    )
+    lighting = make_lighting({"kind": "flicker", "frame_rate": 24, **spec})
+    share = spec.get("depth", 1)
     gain, rows = lighting.rows(7, time, 0.3, SHUTTER)
     starts = (7 / 24 + 2e-5 * np.arange(320)).reshape(40, 8)
     wanted = 1 - share + share * np.vectorize(lamp.mean_light)(starts, time)

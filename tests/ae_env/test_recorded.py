@@ -185,10 +185,9 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
 def test_options(tmp_path: Path, spec: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load(spec)
-    found = recorded.RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
-    assert found == recorded.RecordedOptions(
-        Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6
-    )
+    options = recorded.RecordedOptions
+    found = options.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == options(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
     names = [f"iso{i}_1-{i}s_f{i / 100}.png" for i in range(100, 1800, 100)]
     with pytest.raises(ValueError, match="4913 combinations; at most 4096"):
         recorded.recorded_grid(recorded.index_recorded(touch(tmp_path, *names), {}))

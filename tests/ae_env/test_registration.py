@@ -166,9 +166,8 @@ def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> Non
         (folder / "own_package").mkdir(parents=True)
         (folder / "own_helper.py").write_text(f"number = {number}")
         (folder / "own_package" / "__init__.py").write_text("")
-        (folder / "own_package" / "part.py").write_text(
-            f"from own_helper import number as n{number}"
-        )
+        part = folder / "own_package" / "part.py"
+        part.write_text(f"from own_helper import number as n{number}")
         text = f"from own_package.part import n{number} as n\nclass Mine:\n    number = n\n"
         (folder / "mine.py").write_text(text)
     files = [str(tmp_path / str(number) / "mine.py") for number in (1, 2)]

@@ -156,9 +156,8 @@ def test_averaging_a_scene_down_keeps_its_mean(light, data, seed):
     top, left = ((n - k * resolution) // 2 for n in light.shape[1:])
     window = slice(top, top + k * resolution), slice(left, left + k * resolution)
     part = light[:, window[0], window[1]].double()
-    torch.testing.assert_close(
-        small.light.double().mean(dim=(1, 2)), part.mean(dim=(1, 2)), rtol=2e-7, atol=1e-5
-    )
+    found, wanted = (planes.double().mean(dim=(1, 2)) for planes in (small.light, part))
+    torch.testing.assert_close(found, wanted, rtol=2e-7, atol=1e-5)
     assert small.nlf.shot[0] == pytest.approx(1e-3 / k**2)
     found = torch.zeros(1) if small.saturated is None else small.saturated
     wanted = marks[window].reshape(resolution, k, resolution, k).amax(dim=(1, 3))
@@ -339,9 +338,8 @@ def test_it_is_metered_by_its_mean_and_drawn_by_name_and_seed():
     again, other = (simulate_source_raw(random_scene(scene_id="scene-3"), seed=s) for s in (0, 1))
     assert torch.equal(again.light, drawn[3].light)
     assert other.reference != drawn[3].reference
-    darker, metered, brighter = (
-        simulate_source_raw(random_scene(), iso=100.0, ev=e) for e in (-1, 0, 1)
-    )
+    exposed = (simulate_source_raw(random_scene(), iso=100.0, ev=e) for e in (-1, 0, 1))
+    darker, metered, brighter = exposed
     assert metered.light[1:3].mean().item() == pytest.approx(0.12, rel=0.01)
     for taken, ev in ((darker, -1), (brighter, 1)):
         assert exposure_ratio(metered.reference, taken.reference) == pytest.approx(2.0**ev)

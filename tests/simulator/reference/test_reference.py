@@ -218,9 +218,8 @@ def test_same_seed_same_capture():
     # Captures of a sequence do not repeat each other's noise, whatever seed or setting differs.
     changes = [{}, {"iso": 200}, {"exposure_time": 1 / 128}, {"f_number": 8}, {}]
     dark, settings = scene(flat(0.0, 40)), [replace(BASE, **change) for change in changes]
-    drawn = [
-        camera.capture(dark, s, seed) for s, seed in zip(settings, (4, 4, 4, 4, 5), strict=True)
-    ]
+    seeds = zip(settings, (4, 4, 4, 4, 5), strict=True)
+    drawn = [camera.capture(dark, each, seed) for each, seed in seeds]
     correlation = torch.corrcoef(torch.stack([capture.sample.flatten() for capture in drawn]))
     assert float((correlation - torch.eye(5)).abs().max()) < 5 / math.sqrt(4 * 40 * 40)
 
@@ -341,9 +340,8 @@ def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance
     assert {20, 25} <= {len(settings) for settings in drawn_settings} <= set(range(20, 26))
     assert all(settings == sorted(set(settings)) for settings in drawn_settings)
     every = list(itertools.chain(*drawn_settings))
-    assert all(
-        s.iso in sequences.ISO_SPEEDS and s.exposure_time in sequences.EXPOSURE_TIMES for s in every
-    )
+    assert {s.iso for s in every} <= {*sequences.ISO_SPEEDS}
+    assert {s.exposure_time for s in every} <= {*sequences.EXPOSURE_TIMES}
     # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
     states = [(s.iso, s.exposure_time, EXACT_F[s.f_number]) for s in every]
     iso, time, f_number = np.array(states).T

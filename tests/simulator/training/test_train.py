@@ -217,9 +217,8 @@ def run(file: Path, watch: Watch, **budget: float) -> tuple[Loss, dict[str, Any]
     loss, stage = Loss(), StageConfig(batch=3, crop=16, learning_rate=0.05, **budget)
     accelerator = make_accelerator(config("pc"), "cpu", None)
     options = {"checkpoint": file, "identity": "one"}
-    return loss, train.train_stage(
-        "noise", loss, loss.trained, watch, stage, accelerator, **options
-    )
+    args = "noise", loss, loss.trained, watch, stage, accelerator
+    return loss, train.train_stage(*args, **options)
 
 
 @pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}, {"steps": 9, "average": 0.7}])
