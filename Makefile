@@ -49,10 +49,9 @@ check-dist: dist
 bench: $(STAMP)
 	$(BIN)/ae-env bench scorers
 	$(BIN)/ae-env bench defects
-	$(BIN)/ae-env bench convergence
+	$(BIN)/ae-env evaluate --preset convergence --out docs/results/convergence
 	$(BIN)/ae-env bench ptc
 	$(BIN)/ae-env bench throughput
-	$(BIN)/ae-env bench stability
 	@echo "error against time (half an hour, and three hours once for the networks to compare with): $(BIN)/ae-env bench work-precision"
 	@echo "the simulator against the reference camera (20 minutes, and three hours once for the networks to compare with): $(BIN)/ae-env bench simulator"
 	@echo "agents trained on the simulator, judged in the truth (about an hour): $(BIN)/ae-env bench transfer"

@@ -21,8 +21,8 @@ from ae_env.scenes.scene import SceneSet
 from ae_env.scenes.scene import Split as Split
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture.exposure import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
-from simulator.capture.exposure import MAX_DISC_PX, check_tolerance
+from simulator.capture.decision import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
+from simulator.capture.decision import MAX_DISC_PX, check_tolerance
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED
 from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 

@@ -25,9 +25,9 @@ __all__ = sorted(_EXPORTS)
 if TYPE_CHECKING:
     from agents.evaluation.engine import evaluate as evaluate
     from agents.evaluation.engine import fit_policies as fit_policies
+    from agents.evaluation.evaluation_plan import EvaluationPlan as EvaluationPlan
+    from agents.evaluation.evaluation_plan import load_plan as load_plan
     from agents.evaluation.jobs import run_plan as run_plan
-    from agents.evaluation.plan import EvaluationPlan as EvaluationPlan
-    from agents.evaluation.plan import load_plan as load_plan
     from agents.evaluation.result import EvaluationResult as EvaluationResult
     from agents.evaluation.result import result_rows as result_rows
     from agents.metering.metering_policy import MeteringPolicy as MeteringPolicy

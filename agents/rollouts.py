@@ -83,7 +83,7 @@ def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Bools:
 class EpisodeBatch(NamedTuple):
     """One batch of freshly reset episodes."""
 
-    index: Ints  # (N,) numbers of the episodes
+    episodes: Ints  # (N,) their numbers
     observations: Observations
     info: Mapping[str, Any]
     action_masks: Bools  # (N, S) allowed states

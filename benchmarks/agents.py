@@ -1,11 +1,9 @@
 """The long training: both agents over several seeds, and every light meter, on unseen scenes.
 
-    ae-env bench agents
-
 Trained agents lie under ``runs/bench_agents``, so that a second run continues where the first was
 stopped. It writes the report of an evaluation on each set of scenes to ``agents/`` under the output
 folder. Real places are looked for in the folder of real files and in the cache. Trainings run side
-by side and show their own progress, so this one is no `benchmarks.harness.Benchmark`.
+by side and show their own progress, so this one is no `benchmarks.harness.benchmark`.
 """
 
 from __future__ import annotations
@@ -17,12 +15,11 @@ from typing import Any
 
 from agents.cli.console import print_files, progress_bars
 from agents.evaluation.engine import evaluate, fit_policies
-from agents.learning.training import TrainingJob, load_config, train_in_parallel
+from agents.learning.training import AgentConfig, TrainingJob, load_config, train_in_parallel
 from agents.policy import PolicyContext
 from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
 from agents.report.evaluation import write_report
 from agents.rollouts import make_envs
-from benchmarks.ablation import changed_config
 from benchmarks.isolated import ROOT
 
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}
@@ -33,6 +30,14 @@ SETS = ("bundled", "polyhaven")
 #: Scorers that no agent was trained on.
 OTHER_SCORERS = ("fidelity", "shin", "defects")
 QUICK = {"regression": {"frames": 2_000}, "ppo": {"total_timesteps": 2_048}}
+
+
+def changed_config(
+    config: AgentConfig, environment: dict[str, Any], training: dict[str, Any]
+) -> AgentConfig:
+    changed = {"environment": environment, "training": training}
+    parts = {name: {**getattr(config, name), **own} for name, own in changed.items()}
+    return AgentConfig.model_validate({**config.model_dump(), **parts})
 
 
 def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:

@@ -65,14 +65,8 @@ def known_light(context: Any, envs: Any) -> Any:
 
 
 def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None) -> Row:
-    make: Any = partial(
-        gym.make_vec,
-        "ae_env:ae_env/ExposureBracket-v0",
-        num_envs=32,
-        scenes=scenes,
-        budget=budget,
-        autoreset_mode="DISABLED",
-    )
+    given: Any = {"scenes": scenes, "budget": budget, "autoreset_mode": "DISABLED"}
+    make: Any = partial(gym.make_vec, "ae_env:ae_env/ExposureBracket-v0", num_envs=32, **given)
     row: Row = {"scenes": scenes, "budget": budget, "policy": policy}
     with closing(make(split="test")) as envs:
         context = PolicyContext.from_envs(envs)
@@ -87,11 +81,10 @@ def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    sets, found = SETS if data_root() is not None else SETS[:1], []
-    given = {"seed": seed, "most": QUICK_SCENES if quick else None}
-    for scenes, budget, policy in product(sets, BUDGETS, POLICIES):
-        arguments = {"scenes": scenes, "budget": budget, "policy": policy, **given}
-        found.append(Part(f"{scenes}, {budget} s, {policy}", measure, arguments, threads=1))
+    names, found = ("scenes", "budget", "policy"), []
+    for case in product(SETS if data_root() is not None else SETS[:1], BUDGETS, POLICIES):
+        arguments = dict(zip(names, case, strict=True)) | {"most": QUICK_SCENES if quick else None}
+        found.append(Part("{}, {} s, {}".format(*case), measure, arguments, threads=1))
     return found
 
 
@@ -137,8 +130,10 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     for scenes, budget in product(SETS, BUDGETS):
         own = [row for row in rows if (row["scenes"], row["budget"]) == (scenes, budget)]
         tables[f"{scenes}-{1e3 * budget:.0f}ms"] = table(own, _COLUMNS)
-    short = [{name: value for name, value in row.items() if name != "each"} for row in rows]
-    return Report(short, tables, figures={"bracketing.png": distributions(rows)})
+    figure = distributions(rows)
+    for row in rows:
+        del row["each"]
+    return Report(rows, tables, figures={"bracketing.png": figure})
 
 
 run = benchmark("bracketing", parts, report)

@@ -41,10 +41,8 @@ def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    return [
-        Part(f"{on}-{n}", measure, {"on": on, "workers": n, "seed": seed, "quick": quick})
-        for on, n in (("local", 1), ("ray", 1), ("ray", 2))
-    ]
+    cases = (("local", 1), ("ray", 1), ("ray", 2))
+    return [Part(f"{on}-{n}", measure, {"on": on, "workers": n}) for on, n in cases]
 
 
 _COLUMNS = """on = {on}, workers: {workers} | raws = {files} | time [s] = {seconds:.1f} |

@@ -1,7 +1,5 @@
 """Colour accuracy of `simulator.develop` on real raws of a ColorChecker.
 
-    ae-env bench colour_checker
-
 Every patch is averaged on the packed raw, brought to the chart's exposure by one scale, developed
 (linear tone) and compared with the chart's published colour: CIE dE2000, D50, 2 degree observer.
 """
@@ -16,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from scipy.stats import linregress
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
 from ae_env.scorers.measures import srgb_decode
@@ -141,21 +138,6 @@ def paper_range(raw: RawImage) -> Row:
     return {"darkest": round(float(edge.min()), 3), "brightest": round(float(edge.max()), 3)}
 
 
-def linearity(raw: RawImage, chart: Chart) -> list[Row]:
-    means, rows = patch_means(raw, chart), []
-    order = [i for i in sorted(means) if i >= 18]
-    published = lab_to_luminance(PUBLISHED[order])
-    for name, planes in (("R", [0]), ("G", [1, 2]), ("B", [3])):
-        values = np.array([means[i][planes].mean() for i in order])
-        fit = linregress(published, values)
-        residual = np.abs(values - (fit.slope * published + fit.intercept)).max()
-        row: Row = {"file": raw.metadata["path"], "channel": name, "patches": len(order)}
-        row |= {"slope": fit.slope, "offset_percent_of_white": 100 * fit.intercept / fit.slope}
-        row |= {"r_squared": fit.rvalue**2}
-        rows.append(rounded(row | {"residual_percent_of_white": 100 * residual / fit.slope}))
-    return rows
-
-
 def summary(rows: list[Row]) -> Row:
     frame = pd.DataFrame(rows).set_index("patch").filter(like="delta_e")
     errors, means = frame["delta_e_2000"], frame.mean()
@@ -174,7 +156,7 @@ def measure_file(file: str) -> dict[str, Any]:
         summaries.append({"file": file, "white_balance": white_balance} | summary(own))
     whole = chart.rows == (0, 3) and chart.columns == (0, 5)  # the close-ups show little paper
     paper = [{"file": file, **paper_range(raw)}] if whole else []
-    return {"rows": rows, "summary": summaries, "linearity": linearity(raw, chart), "paper": paper}
+    return {"rows": rows, "summary": summaries, "paper": paper}
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
@@ -185,16 +167,14 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    keys = ("rows", "summary", "linearity", "paper")
+    keys = ("rows", "summary", "paper")
     found: dict[str, list[Row]] = {k: [r for own in results.values() for r in own[k]] for k in keys}
-    shown = [
-        row | {name: " ".join(map(str, row[f"lab_{name}"])) for name in ("published", "measured")}
-        for row in found["rows"]
-        if row["file"] == next(iter(FILES))
-    ]
+    shown = [row for row in found["rows"] if row["file"] == next(iter(FILES))]
+    for row, name in product(shown, ("published", "measured")):
+        row[name] = " ".join(map(str, row[f"lab_{name}"]))
     contents = "published = {published} | measured = {measured} | dE2000 = {delta_e_2000:.2f}"
     tables = {"patches": pivot(shown, "patch = {patch}", "{white_balance}", contents)}
-    for name, key in (("charts", "summary"), ("linearity", "linearity"), ("paper", "paper")):
+    for name, key in (("charts", "summary"), ("paper", "paper")):
         columns = {title.replace("_", " "): f"{{{title}}}" for title in found[key][0]}
         tables[name] = table(found[key], columns)
     return Report(found.pop("rows"), tables, meta=found)

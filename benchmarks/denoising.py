@@ -1,7 +1,5 @@
 """Denoising of real detail that no training saw, sampled as a sensor samples it.
 
-    ae-env bench denoising
-
 One crop of every source of the test split of `simulator.training.scenes`: views into radiance maps,
 photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
 every method; the gain is that of the PSNR over the noisy input. One thread.
@@ -28,8 +26,8 @@ from benchmarks.harness import Part, Report, Row, benchmark, data_root, interval
 from simulator import CameraProfile, get_camera
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import ReferenceCamera, lens_blur, sample_mosaic
-from simulator.training.data import DetailPicture
+from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
+from simulator.training.crops import DetailPicture
 from simulator.training.scenes import detail_pictures
 
 #: Sources are photographed by both cameras in turn.
@@ -37,8 +35,6 @@ CAMERAS = ("nikon_z6", "canon_70d")
 ISOS, LEVELS = (400, 1600, 6400, 16000), (0, -3, -6)
 #: Side of a crop [packed pixel], and sources measured by one part.
 SIZE, _AT_ONCE = 128, 4
-#: Flat fields: ISOs of the table, light, and side [packed pixel].
-FLAT_LEVELS, FLAT_SIZE = (-10, -8, -6, -4, -2), 256
 #: A recorded mosaic is a case where the noise that is added has this many times its own variance.
 _CLEAN_RATIO = 16.0
 #: Non-local means' strength in units of the noise and patch size: the best of a few on
@@ -120,11 +116,8 @@ def measure(methods: str, first: int, seed: int, quick: bool) -> list[Row]:
         for name, denoise in known.items():
             begun = perf_counter()
             clean = denoise(case.noisy, case.camera.nlf(case.iso))
-            row: Row = {
-                "part": "cases",
-                "method": name,
-                "milliseconds": 1e3 * (perf_counter() - begun),
-            }
+            ms = 1e3 * (perf_counter() - begun)
+            row: Row = {"part": "cases", "method": name, "milliseconds": ms}
             row |= {"source": case.source, "kind": case.kind, "camera": case.camera.name}
             gain = 10.0 * np.log10(before / max(_error(clean, case.light), 1e-30))
             kept = float(((clean[1] - clean[2]) * green).sum() / green.square().sum())
@@ -135,19 +128,6 @@ def measure(methods: str, first: int, seed: int, quick: bool) -> list[Row]:
 
 def _error(image: Tensor, truth: Tensor) -> float:
     return float((image.clamp(max=1.0).double() - truth.double()).square().mean())
-
-
-def measure_flat(camera: str, seed: int, quick: bool) -> list[Row]:
-    profile, rows, denoisers = get_camera(camera), [], networks()
-    reference = ReferenceCamera(profile)
-    for iso, ev in product(list(profile.nlf_by_iso)[:: 4 if quick else 1], FLAT_LEVELS):
-        light = torch.full((4, FLAT_SIZE, FLAT_SIZE), 2.0**ev)
-        noisy = reference.record(light, iso, noise_generator(seed, iso, float(ev)))
-        for name, denoise in denoisers.items():
-            shift = (denoise(noisy, profile.nlf(iso)) - noisy).double().mean(dim=(1, 2))
-            row: Row = {"part": "flat", "method": name, "camera": camera, "iso": iso, "ev": ev}
-            rows.append(row | {"mean_shift": float(shift.abs().max()) / 2.0**ev})
-    return rows
 
 
 # -- classical methods ----------------------------------------------------------------------------
@@ -213,34 +193,28 @@ _HADAMARD = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 
 def parts(seed: int, quick: bool) -> list[Part]:
     step = 1 if quick else _AT_ONCE
     starts = list(range(0, len(sources()), step))[: 2 if quick else None]
-    given, found = {"seed": seed, "quick": quick}, []
-    for methods, first in product(("networks", "classical"), starts):
-        arguments = {"methods": methods, "first": first, **given}
-        found.append(Part(f"{methods} {first}", measure, arguments, threads=1))
-    for camera in CAMERAS:
-        found.append(Part(f"flat {camera}", measure_flat, {"camera": camera, **given}, threads=1))
-    return found
+    return [
+        Part(f"{methods} {first}", measure, {"methods": methods, "first": first}, threads=1)
+        for methods, first in product(("networks", "classical"), starts)
+    ]
 
 
 _COLUMNS = """method = {method} | gain [dB] = {gain_db:.2f} |
 10th percentile = {gain_db_10_percent:.2f} | worst = {gain_db_worst:.2f} |
 to BM3D [dB] = {to_bm3d_db:+.2f} ({ci95:+.2f}) | green difference kept = {green_kept:.2f} |
-mean shift = {flat:.2%} | ms = {milliseconds:.1f}"""
+ms = {milliseconds:.1f}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     rows = [row for own in results.values() for row in own]
-    frame = pd.DataFrame(rows)
-    cases, flat = frame[frame["part"] == "cases"], frame[frame["part"] == "flat"]
+    cases, summary = pd.DataFrame(rows), []
     by_source = cases.pivot_table("gain_db", "source", "method")
-    shifts, summary = flat.groupby("method")["mean_shift"].max(), []
     for name, own in cases.groupby("method", sort=False):
         differences, gains = (by_source[name] - by_source[REFERENCE]).to_numpy(), own["gain_db"]
         row: Row = {"part": "summary", "method": name, "cases": len(own), "gain_db": gains.mean()}
         row |= {"gain_db_10_percent": gains.quantile(0.1), "gain_db_worst": gains.min()}
         row |= {"to_bm3d_db": differences.mean(), "ci95": interval(differences)}
-        row |= {key: own[key].median() for key in ("green_kept", "milliseconds")}
-        summary.append(row | {"flat": shifts.get(name)})
+        summary.append(row | own[["green_kept", "milliseconds"]].median().to_dict())
     means = cases.groupby(["iso", "ev", "method"], sort=False)["gain_db"].mean().reset_index()
     means = means.sort_values(["iso", "ev"], ascending=[True, False], kind="stable")
     line, group = "method = {method}", "ISO {iso:.0f}, EV {ev:.0f}"

@@ -9,10 +9,15 @@ kept on disk until the whole run is, so that a run that was stopped continues. I
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import math
+import os
 import re
+import subprocess
+import sys
+import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from scipy.stats import bootstrap
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -29,11 +35,11 @@ from agents.cli.console import print_files, progress_bars
 from agents.report.evaluation import Cell, to_markdown
 from agents.report.evaluation import cell as markdown_cell
 from agents.report.plots import write_palette_png
-from benchmarks.isolated import CORES, ROOT, isolated
+from benchmarks.isolated import CORES, ROOT
 from simulator import CameraProfile
-from simulator.reference.camera import ReferenceScene
+from simulator.reference.reference_camera import ReferenceScene
 from simulator.utils import files as result_files
-from simulator.utils.cache import Store, cache_key
+from simulator.utils.cache import CACHE_VARIABLE, Store, cache_key
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
@@ -49,7 +55,7 @@ RUNS = ROOT / "runs" / "bench"
 _CODE = ("simulator", "ae_env", "agents", "benchmarks", "runs/simulator")
 
 
-# -- parts ----------------------------------------------------------------------------------------
+# -- a benchmark ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ class Part:
     Args:
         name: Key of its result.
         task: Function of a module; takes and returns what JSON can hold.
-        arguments: Of `task`.
+        arguments: Of `task`; ``seed`` and ``quick``, if it has them, come from the run.
         threads: Threads that torch and the kernels may use.
         fresh_cache: Whether it finds nothing on disk that earlier runs computed.
         timeout: Seconds after which it is stopped.
@@ -73,35 +79,27 @@ class Part:
     timeout: float = 4 * 3600.0
 
     def run(self) -> Any:
-        """The result of `task`, of a process of its own."""
-        options: dict[str, Any] = {"fresh_cache": self.fresh_cache, "timeout": self.timeout}
-        return isolated(self.task, num_threads=self.threads, **options, **self.arguments)
+        """The result of `task`, run by a fresh Python.
 
-
-class FinishedParts:
-    """Results of parts in a folder, which count for the very same code, networks and `words`."""
-
-    def __init__(self, folder: Path, *words: Any) -> None:
-        files, checksum = (path for name in _CODE for path in (ROOT / name).rglob("*")), 0
-        for path in sorted(p for p in files if p.suffix in (".py", ".safetensors")):
-            checksum = zlib.crc32(path.read_bytes(), checksum)
-        self._store, self._words = Store(folder), [checksum, *words]
-
-    def get(self, name: str, measure: Callable[[], Any]) -> Any:
-        """The result under `name`: of an earlier run, or what `measure` returns."""
-        key = cache_key("parts", [*self._words, name])
-        found = self._store.get(key)
-        if found is None:
-            found = {"result": json.dumps(measure())}
-            self._store.put(key, found)
-        return json.loads(found["result"])
-
-    def forget(self) -> None:
-        """Removes all results, those of earlier code too: the next run measures everything."""
-        self._store.clear()
-
-
-# -- a benchmark ----------------------------------------------------------------------------------
+        Raises:
+            ValueError: If it refuses its arguments; in its own words.
+            RuntimeError: If it fails otherwise; with its last words.
+        """
+        task = f"{self.task.__module__}:{self.task.__qualname__}"
+        command = [sys.executable, "-m", "benchmarks.isolated", task, json.dumps(self.arguments)]
+        variables = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(self.threads))
+        with tempfile.TemporaryDirectory() as folder:
+            if self.fresh_cache:
+                variables[CACHE_VARIABLE] = folder
+            options: Any = {"cwd": ROOT, "env": os.environ | variables, "timeout": self.timeout}
+            done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+        if done.returncode:
+            words = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+            kind, _, message = words[-1].partition(": ")
+            if kind == "ValueError":
+                raise ValueError(message)
+            raise RuntimeError(f"{task}({self.arguments}): {words[-1]}")
+        return json.loads(done.stdout.splitlines()[-1])
 
 
 @dataclass(frozen=True)
@@ -140,32 +138,39 @@ def benchmark(
     """
 
     def run(out: Path, *, seed: int = 0, quick: bool = False, **options: Any) -> None:
-        shown = "".join(
-            f" {value}" if key == "folder" else f" --{key} {value}"
-            for key, value in options.items()
-        )
-        command = f"ae-env bench {name}{shown}{' --quick' * quick}"
+        words = (f" {f'--{k} ' * (k != 'folder')}{v}" for k, v in options.items())
+        command = f"ae-env bench {name}{''.join(words)}{' --quick' * quick}"
+        given = {"seed": seed, "quick": quick}
         meta = result_meta(command, seed) | {"quick": quick}
-        data = [value for key, value in options.items() if key != "against"]
-        finished = FinishedParts(RUNS / name, command, seed, _state(data))
+        data = [v for k, v in options.items() if k != "against" and isinstance(v, Path)]
+        store, state = Store(RUNS / name), [command, seed, *_state(data)]
         chosen, results = parts(seed, quick, **options), {}
         with progress_bars() as progress, progress(name) as task:
             for number, part in enumerate(chosen):
                 task(number, len(chosen), part.name)
-                results[part.name] = finished.get(f"{part.name} {part.arguments}", part.run)
+                taken = inspect.signature(part.task).parameters
+                own = {name: value for name, value in given.items() if name in taken}
+                part = replace(part, arguments=own | dict(part.arguments))
+                key = cache_key("parts", [*state, f"{part.name} {part.arguments}"])
+                if (found := store.get(key)) is None:
+                    found = {"result": json.dumps(part.run())}
+                    store.put(key, found)
+                results[part.name] = json.loads(found["result"])
             task(1, 1)
         files = write_report(report(results, meta), out, name.replace("-", "_"), meta)
-        finished.forget()
+        store.clear()  # the next run measures everything
         print_files(files)
 
     return run
 
 
-def _state(data: Iterable[Any]) -> list[Any]:
-    """Name, size and time of every file of `data`, and in its folders."""
-    given = [path for path in data if isinstance(path, Path)]
-    files = sorted(file for path in given for file in (path, *path.rglob("*")) if file.is_file())
-    return [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
+def _state(data: Iterable[Path]) -> list[Any]:
+    """Checksum of the very code and networks; name, size and time of every file of `data`."""
+    files, checksum = (path for name in _CODE for path in (ROOT / name).rglob("*")), 0
+    for path in sorted(p for p in files if p.suffix in (".py", ".safetensors")):
+        checksum = zlib.crc32(path.read_bytes(), checksum)
+    given = sorted(file for path in data for file in (path, *path.rglob("*")) if file.is_file())
+    return [checksum, *([str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in given)]
 
 
 def write_report(report: Report, out: Path, stem: str, meta: Mapping[str, Any]) -> dict[str, Path]:
@@ -219,11 +224,7 @@ def origin(meta: Mapping[str, Any]) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """`value` with numbers of `DIGITS` significant digits; None for numbers that are not finite.
-
-    >>> rounded({"a": [1 / 3, float("nan"), 10**9], "b": True})
-    {'a': [0.333333, None, 1000000000], 'b': True}
-    """
+    """`value` with numbers of `DIGITS` significant digits; None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: rounded(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -248,33 +249,30 @@ def write_picture(path: Path, figure: Figure) -> Path:
     return write_palette_png(path, Image.open(stream))
 
 
-def side_by_side(pictures: Mapping[str, torch.Tensor]) -> Figure:
-    """Pictures (3, H, W), uint8 or in [0, 1], of one size, each below its title."""
-    height, width = next(iter(pictures.values())).shape[-2:]
-    shape = (3.0 * len(pictures), 3.0 * height / width + 0.3)
+def side_by_side(*lines: Mapping[str, Tensor]) -> Figure:
+    """Lines of pictures (3, H, W), uint8 or in [0, 1], of one size, each below its title."""
+    height, width = next(iter(lines[0].values())).shape[-2:]
+    shape = (3.0 * len(lines[0]), (3.0 * height / width + 0.3) * len(lines))
     figure = Figure(figsize=shape, dpi=110, layout="constrained")
-    axes = figure.subplots(1, len(pictures), squeeze=False)[0]
-    for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
-        axis.imshow(picture.permute(1, 2, 0).numpy())
-        axis.set_title(title, fontsize=9)
-        axis.axis("off")
+    grid = figure.subplots(len(lines), len(lines[0]), squeeze=False)
+    for axes, line in zip(grid, lines, strict=True):
+        for axis, (title, picture) in zip(axes, line.items(), strict=True):
+            axis.imshow(picture.permute(1, 2, 0).numpy())
+            axis.set_title(title, fontsize=9)
+            axis.axis("off")
     return figure
 
 
-def panels(curves: Iterable[Row], columns: int = 3, width: float = 3.6, **axes: Any) -> Figure:
-    """Lines in panels; a legend wherever the labels are new.
+def panels(curves: Iterable[Row], width: float = 3.6, **axes: Any) -> Figure:
+    """Lines in panels of `width` inches, three in a row; a legend wherever the labels are new.
 
-    Args:
-        curves: Each has ``panel``, ``label``, ``x``, ``y`` and perhaps ``style``, of `Axes.plot`,
-            and ``axes``, like `axes` for its panel.
-        columns: Panels in a row.
-        width: Of a panel [inch].
-        axes: Arguments of `Axes.set`.
+    Each curve has ``panel``, ``label``, ``x``, ``y`` and perhaps ``style``, of `Axes.plot`. `axes`
+    are arguments of `Axes.set`.
     """
     groups: dict[str, list[Row]] = {}
     for curve in curves:
         groups.setdefault(curve["panel"], []).append(curve)
-    columns = min(columns, len(groups))
+    columns = min(3, len(groups))
     lines = -(-len(groups) // columns)
     figure = Figure(figsize=(width * columns, 3.0 * lines), dpi=90, layout="constrained")
     axes_of = figure.subplots(lines, columns, squeeze=False).flat
@@ -282,7 +280,7 @@ def panels(curves: Iterable[Row], columns: int = 3, width: float = 3.6, **axes: 
     for (title, own), axis in zip(groups.items(), axes_of, strict=False):
         for curve in own:
             axis.plot(curve["x"], curve["y"], label=curve["label"], **curve.get("style", {}))
-        axis.set(**{"title": title, **axes, **own[-1].get("axes", {})})
+        axis.set(**{"title": title, **axes})
         axis.grid(alpha=0.3)
         labels = [curve["label"] for curve in own]
         if labels not in explained:
@@ -301,10 +299,8 @@ def data_folder(name: str) -> Path:
     """
     root = data_root()
     if root is None or not (root / name).is_dir():
-        raise FileNotFoundError(
-            f"there is no folder {name!r} of real files in {root or 'AE_ENV_DATA'}: set "
-            "AE_ENV_DATA to the folder that holds it"
-        )
+        where = f"{root or 'AE_ENV_DATA'}: set AE_ENV_DATA to the folder that holds it"
+        raise FileNotFoundError(f"there is no folder {name!r} of real files in {where}")
     return root / name
 
 
@@ -312,11 +308,7 @@ def data_folder(name: str) -> Path:
 
 
 def cell(row: Row, content: Cell) -> str:
-    """Text of a cell; empty where a value of its format is missing or None.
-
-    >>> cell({"ms": 1.25, "error": None}, "{ms:.1f} ms"), cell({"error": None}, "{error:.2f}")
-    ('1.2 ms', '')
-    """
+    """Text of a cell; empty where a value of its format is missing or None."""
     return markdown_cell(row, content, missing="")
 
 
@@ -375,11 +367,10 @@ def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str])
     return "\n\n".join(f"### {name}\n\n{show(own)}" for name, own in groups.items())
 
 
-def interval(values: np.ndarray, seed: int = 0, resamples: int = 10_000) -> list[float]:
+def interval(values: np.ndarray, seed: int = 0) -> list[float]:
     """95 % bootstrap interval of the mean of `values`."""
-    drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
-    return [float(low), float(high)]
+    found = bootstrap((values,), np.mean, method="percentile", rng=seed).confidence_interval
+    return [float(found.low), float(found.high)]
 
 
 def quartiles(values: Sequence[float]) -> list[float]:

@@ -7,63 +7,15 @@ import importlib
 import json
 import os
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from simulator.utils.cache import CACHE_VARIABLE
-
 ROOT = Path(__file__).absolute().parents[1]
 #: Threads of everything that is not measured on one: targets are stated for two cores.
 CORES = min(2, os.cpu_count() or 1)
-
-
-def isolated(
-    task: Callable[..., Any],
-    *,
-    num_threads: int,
-    fresh_cache: bool = False,
-    timeout: float = 1800.0,
-    **arguments: Any,
-) -> Any:
-    """The result of `task`, run by a fresh Python.
-
-    Args:
-        task: Function of a module of this package; takes and returns what JSON can hold.
-        num_threads: Threads that torch and the kernels may use.
-        fresh_cache: Whether it finds nothing on disk that earlier runs computed.
-        timeout: Seconds after which it is stopped.
-        arguments: Of `task`.
-
-    Raises:
-        ValueError: If it refuses its arguments; in its own words.
-        RuntimeError: If it fails otherwise; with its last words.
-    """
-    command = [sys.executable, "-m", __name__, f"{task.__module__}:{task.__qualname__}"]
-    variables = {name: str(num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-    with tempfile.TemporaryDirectory() as folder:
-        if fresh_cache:
-            variables[CACHE_VARIABLE] = folder
-        done = subprocess.run(
-            [*command, json.dumps(arguments)],
-            cwd=ROOT,
-            env=os.environ | variables,
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-            check=False,
-        )
-    if done.returncode:
-        words = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        kind, _, message = words[-1].partition(": ")
-        if kind == "ValueError":
-            raise ValueError(message)
-        raise RuntimeError(f"{task.__qualname__}({arguments}): {words[-1]}")
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def peak_memory() -> float:

@@ -29,13 +29,9 @@ from benchmarks.harness import RUNS, Part, Report, Row, benchmark, clipped, pivo
 from simulator import CameraSimulator, RawImage
 from simulator.networks.weights import load_modules
 from simulator.reference.sequences import any_pairs
-from simulator.training.paper_dataset import (
-    PARAMETERS,
-    CapturedSequence,
-    split_dataset,
-    train_on_captures,
-)
-from simulator.training.train import SimulatorConfig
+from simulator.training import paper_dataset
+from simulator.training.paper_dataset import CapturedSequence, split_dataset, train_on_captures
+from simulator.training.trainer import SimulatorConfig
 from simulator.utils.config_file import load_yaml
 
 #: What is trained: the paper's networks, parameter concatenation and decoupled learning.
@@ -95,13 +91,14 @@ def parts(
             wrong = f"`weights` (={str(weights)!r}) must be of all three modules"
             raise ValueError(f"{wrong}, not {preset!r}")
         names = [str(weights.resolve())]
-    given: dict[str, Any] = {"folder": str(folder.resolve()), "seed": seed, "quick": quick}
-    names = list(dict.fromkeys((*names, "compact")))
-    return [Part(name, measure, {"name": name, **given}, timeout=LONGEST) for name in names]
+    given = [
+        {"name": n, "folder": str(folder.resolve())} for n in dict.fromkeys((*names, "compact"))
+    ]
+    return [Part(own["name"], measure, own, timeout=LONGEST) for own in given]
 
 
 def _digest(folder: Path) -> str:
-    tables = (path.read_bytes() for path in sorted(folder.rglob(PARAMETERS)))
+    tables = (path.read_bytes() for path in sorted(folder.rglob(paper_dataset.PARAMETERS)))
     return hashlib.sha256(b"".join(tables)).hexdigest()
 
 
@@ -126,9 +123,8 @@ def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
         pair["ms"] = 1e3 * (time.perf_counter() - begin)  # of all stages together
         truth = clipped(case.target.data, case.target.camera)
         for method, image in estimates.items():
-            rows.append(
-                {**head, "method": method, **pair, **scores(image, truth, case.target.camera)}
-            )
+            own = scores(image, truth, case.target.camera)
+            rows.append({**head, "method": method, **pair, **own})
     return rows
 
 
@@ -200,9 +196,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     means = groups[["psnr_db", "ssim"]].mean().assign(pairs=groups.size()).reset_index()
     ours = ~means["preset"].isin(TRAINED[1:])
     means["label"] = means["method"].where(~ours, means["method"] + " `" + means["preset"] + "`")
-    means = means.sort_values(
-        "group", key=lambda names: names.map(list(GROUPS).index), kind="stable"
-    )
+    means["group"] = pd.Categorical(means["group"], list(GROUPS))
+    means = means.sort_values("group", kind="stable")
     published = [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()]
     line, values = "PSNR [dB] / SSIM = {label:md}", "{psnr_db:.2f} / {ssim:.3f}"
     networks = "network = `{preset}` | weights = `{sha}` | ms a pair (median) = {ms:.0f}"

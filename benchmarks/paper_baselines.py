@@ -98,13 +98,7 @@ class GeneratedConvolution(nn.Module):
     """
 
     def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        *,
-        stride: int = 1,
-        dilation: int = 1,
-        upsample: bool = False,
+        self, inputs: int, outputs: int, stride: int = 1, dilation: int = 1, upsample: bool = False
     ) -> None:
         super().__init__()
         size = 4 if upsample else 3
@@ -128,10 +122,7 @@ class GeneratedConvolution(nn.Module):
         if self.upsample:
             x = F.conv_transpose2d(x, kernels, stride=2, padding=1, groups=batch)
         else:
-            stride, dilation = self.stride, self.dilation
-            x = F.conv2d(
-                x, kernels, None, stride, padding=dilation, dilation=dilation, groups=batch
-            )
+            x = F.conv2d(x, kernels, None, self.stride, self.dilation, self.dilation, batch)
         return x.reshape(batch, -1, *x.shape[-2:])
 
 
@@ -145,7 +136,6 @@ class _NormalisedGenerated(nn.Module):
         self.shift = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, x: Tensor, parameters: Tensor) -> Tensor:
-        """(B, inputs, H, W) and scaled parameters (B, 6), to (B, outputs, H', W')."""
         batch = len(x)
         x = self.convolution(x, parameters)
         return instance_norm(x, self.scale.expand(batch, -1), self.shift.expand(batch, -1))
@@ -160,7 +150,6 @@ class _ResidualBlock(nn.Module):
         self.second = _NormalisedGenerated(width, width, dilation=dilation)
 
     def forward(self, x: Tensor, parameters: Tensor) -> Tensor:
-        """(B, C, H, W) and scaled parameters (B, 6), to the same shape."""
         return F.relu(x + self.second(F.relu(self.first(x, parameters)), parameters))
 
 

@@ -25,12 +25,10 @@ from matplotlib.figure import Figure
 from scipy.stats import t as student
 
 from benchmarks.harness import Part, Report, Row, benchmark, panels, pivot, table
-from simulator.camera import CameraProfile, get_camera, list_cameras
-from simulator.camera_simulator import CameraSimulator
+from simulator import CameraProfile, CameraSettings, CameraSimulator, get_camera, list_cameras
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
-from simulator.settings import CameraSettings
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 ISOS = (100.0, 800.0, 6400.0)
 PATHS = ("reference camera", "transition engine")
@@ -52,23 +50,16 @@ def flat_fields(camera: CameraProfile, iso: float, path: str, rows: bool, seed: 
     if path == "reference camera":
         body = ReferenceCamera(camera, sensor_noise=rows)
         scenes = [ReferenceScene("flat", "flat", "flat", light, base) for light in (dark, lit)]
-        frames = torch.stack(
-            [
-                body.capture(scenes[level > 0], s, seed).sample
-                for level, s in zip(LADDER, states, strict=True)
-            ]
-        )
+        pairs = zip(LADDER, states, strict=True)
+        frames = torch.stack([body.capture(scenes[int(x > 0)], s, seed).sample for x, s in pairs])
     else:
         clean, simulator = NoiseLevelFunction.zero(), CameraSimulator(device="cpu", cache=None)
         kind: Any = "sensor" if rows else "exact"
-        frames = torch.cat(
-            [
-                simulator.prepare(PreparedScene(light, base, camera, clean)).expose(
-                    some, seed=seed, noise=kind
-                )
-                for light, some in ((dark, states[:1]), (lit, states[1:]))
-            ]
-        )
+        shown = [
+            simulator.prepare(PreparedScene(light, base, camera, clean)) for light in (dark, lit)
+        ]
+        steps = zip(shown, (states[:1], states[1:]), strict=True)
+        frames = torch.cat([one.expose(some, seed=seed, noise=kind) for one, some in steps])
     return (frames.double() * torch.tensor(camera.span).double()[:, None, None]).numpy()
 
 
@@ -122,11 +113,11 @@ def measure(camera: str, repetitions: int, seed: int) -> list[Row]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    given = {"repetitions": 3 if quick else 20}
-    return [
-        Part(name, measure, {"camera": name, **given, "seed": 1000 * (100 * seed + n)}, 1)
-        for n, name in enumerate(list_cameras())
-    ]
+    found = []
+    for n, name in enumerate(list_cameras()):
+        own = {"camera": name, "seed": 1000 * (100 * seed + n)}
+        found.append(Part(name, measure, {**own, "repetitions": 3 if quick else 20}, 1))
+    return found
 
 
 def curves(rows: list[Row]) -> Figure:
@@ -141,13 +132,8 @@ def curves(rows: list[Row]) -> Figure:
             line = {"y": given["dark"] ** 2 + given["gain"] * mean, "style": {"c": colour}}
             drawn.append(common | line | {"label": f"ISO {row['iso']:g}"})
     # Below a variance of 30 there are only saturated steps.
-    axes: Row = {
-        "yscale": "log",
-        "ylim": (30, None),
-        "xlabel": "mean [DN]",
-        "ylabel": "variance [DN²]",
-    }
-    return panels(drawn, **axes)
+    labels: Row = {"xlabel": "mean [DN]", "ylabel": "variance [DN²]"}
+    return panels(drawn, yscale="log", ylim=(30, None), **labels)
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:

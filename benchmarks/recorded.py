@@ -30,12 +30,13 @@ from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from benchmarks import brackets
-from benchmarks.brackets import texture, timed_result
+from benchmarks.brackets import texture
 from benchmarks.fidelity.models import radiance_views
 from benchmarks.harness import Part, Report, Row, benchmark, clipped, data_folder, psnr, table
+from benchmarks.isolated import median_seconds
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
 from simulator.radiance.light import MEAN_SIGNAL
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 
 CAMERA = "nikon_z6"
 #: Side of a frame [packed pixel].
@@ -92,7 +93,7 @@ def _of_folder(folder: str) -> list[Scene]:
 def _boreal(grid: ExposureGrid) -> list[Scene]:
     folder, scenes = data_folder(BOREAL), []
     for name in brackets.SCENES:
-        taken = {t: brackets.load(folder, name, t)[0] for t in brackets.TIMES_MS}
+        taken = {t: brackets.load(folder, name, t) for t in brackets.TIMES_MS}
         frames, _ = brackets.calibrated(taken)
         scenes.append(merged_scene(name, enumerate(frames.values()), grid, frames[1].camera))
     return [scene.resized(RESOLUTION) for scene in scenes]
@@ -133,10 +134,8 @@ def _compared(
     tables, clean = ScoreTables(grid, camera, make_scorer("balanced")), networks.denoised(light)
     true, known = tables.table(scene), real[source].amax(dim=0) < KNOWN_BELOW
     brightest = torch.maximum(real[source], real).amax(dim=1)  # (S, H, W)
-    masks, ratios = (
-        known & (brightest < linear_below),
-        [exposure_ratio(grid[source], s) for s in grid],
-    )
+    masks = known & (brightest < linear_below)
+    ratios = [exposure_ratio(grid[source], s) for s in grid]
 
     def simulate() -> torch.Tensor:
         prepared = networks.denoised(light).prepared
@@ -146,7 +145,7 @@ def _compared(
         return torch.stack([clipped(light.light * ratio, camera) for ratio in ratios])
 
     for method, call in (("simulated", simulate), ("scaled", scale)):
-        frames, milliseconds = timed_result(call, 3)
+        frames, milliseconds = call(), 1e3 * median_seconds(call, least=0.0)
         expected, q = frames, tables.table(replace(light, recorded=frames, allowed=allowed))
         if method == "simulated":
             expected = clipped(clean.prepared.expected_sweep(grid.states), camera)
@@ -193,12 +192,11 @@ def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -
 
 
 def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
-    shared: dict[str, Any] = {"seed": seed, "quick": quick}
     if folder is None:
-        return [Part(name, measure, {"source": name, **shared}) for name in (REFERENCE, BOREAL)]
+        return [Part(name, measure, {"source": name}) for name in (REFERENCE, BOREAL)]
     assert _options(str(folder)).grid  # raises before any work
     name = folder.resolve().name.partition("?")[0]
-    return [Part(name, measure, {"source": name, "folder": str(folder.resolve()), **shared})]
+    return [Part(name, measure, {"source": name, "folder": str(folder.resolve())})]
 
 
 _COLUMNS = """PSNR, all pixels [dB] = {psnr_all_db:.1f} | PSNR, known [dB] = {psnr_db:.1f} |
@@ -224,9 +222,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     regrets = frame.loc[frame["method"] == "simulated", "oracle_regret"]
     regret = {"mean": regrets.mean(), "upper": regrets.quantile(0.75), "most": regrets.max()}
     of_set, method = "scenes = {scenes} | ", "method = {title:md} | "
-    each = (
-        "scene = {scene} | from = {source_state} | states = {states} | known = {known_share:.1%} | "
-    )
+    each = "scene = {scene} | from = {source_state} | states = {states} | "
+    each += "known = {known_share:.1%} | "
     same, number = " | same oracle = {same_oracle:.0%}", "number = {number} | "
     every = [row | {"title": METHODS[row["method"]]} for row in rows]
     by_stops = " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS)

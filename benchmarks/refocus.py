@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import pandas as pd
@@ -16,21 +15,12 @@ from torch import Tensor
 
 from agents.applications.refocus import refocus
 from benchmarks.fidelity.models import equal_exposure, weights
-from benchmarks.harness import (
-    Part,
-    Report,
-    Row,
-    benchmark,
-    clipped,
-    data_root,
-    psnr,
-    side_by_side,
-    table,
-)
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, side_by_side, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.optics.discs import DiscBank, added_blur
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
+from simulator.utils.files import data_folder as data_root
 
 CAMERA, F_SOURCE = "nikon_z6", 11.0
 ISOS, F_NUMBERS = (100, 1600), (4.0, 2.8, 2.0, 1.4)
@@ -155,11 +145,8 @@ def picture(seed: int) -> Figure:
 
 def parts(seed: int, quick: bool) -> list[Part]:
     count = len(depth_photographs(get_camera(CAMERA), data=data_root()))
-    given = {"seed": seed, "quick": quick}
-    return [
-        Part(f"scene {number}", measure, {"number": number, **given}, threads=1)
-        for number in range(0, count, 2 if quick else 1)
-    ]
+    numbers = range(0, count, 2 if quick else 1)
+    return [Part(f"scene {n}", measure, {"number": n}, threads=1) for n in numbers]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -168,12 +155,13 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     frame = groups[["psnr", "edge_psnr"]].mean().reset_index()
     seconds = pd.DataFrame(rows).groupby(["method", "iso"])["seconds"].median()
     means: list[Row] = []
-    for method, iso in product(METHODS, sorted(set(frame["iso"]))):
-        own = frame[(frame["method"] == method) & (frame["iso"] == iso)]
-        mean: Row = {"method": METHODS[method], "iso": iso, "seconds": seconds.get((method, iso))}
+    for (method, iso), own in frame.groupby(["method", "iso"], sort=False):
+        mean: Row = {"method": METHODS[str(method)], "iso": iso}
+        mean["seconds"] = seconds.get((method, iso))
         for n, whole, edge in own[["f_number", "psnr", "edge_psnr"]].to_numpy():
             mean |= {f"psnr {n:g}": whole, f"edge_psnr {n:g}": edge}
-        means += [mean] if len(own) else []
+        means.append(mean)
+    means.sort(key=lambda row: (list(METHODS.values()).index(row["method"]), row["iso"]))
     columns = {"method": "{method:md}", "ISO": "{iso}"}
     for name in (f"{f_number:g}" for f_number in F_NUMBERS):
         columns[f"f/{name}"] = f"{{psnr {name}:.1f}} / {{edge_psnr {name}:.1f}}"

@@ -1,7 +1,5 @@
 """Cost and taste of the scorers, and whether they tell good captures from bad ones.
 
-    ae-env bench scorers
-
 *Gain* and *best exposure*: noisy captures without blur of the small bundled test scenes.
 *Correlation*: for every bundled test scene, with a motion and a defocus drawn as in an episode, the
 64 states are simulated and compared with the reference: the same scene noise-free, blur-free and
@@ -242,15 +240,11 @@ def _closeness(
     similar = [ssim(p, reference, channel_axis=2) for p in pictures]
     near = np.abs(env.grid.ev100 - scene.ev100) <= NEAR_EV
     found = {f"aspect:{name}": -error for name, error in errors.items()}
-    return found | {
-        "rmse": -rmse,
-        "ssim": np.array(similar),
-        "exposed": np.where(near, -rmse, np.nan),
-    }
+    exposures = np.where(near, -rmse, np.nan)
+    return found | {"rmse": -rmse, "ssim": np.array(similar), "exposed": exposures}
 
 
 # -- report ---------------------------------------------------------------------------------------
-
 
 _GAIN = """scorer = `{scorer}` | ISO 100 = {low_gain:.3f} | ISO 6400 = {high_gain:.3f} |
 change = {change:+.3f} ± {change_sd:.3f} | scenes in which it rises = {rises:.0%}"""
@@ -265,16 +259,17 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     named = {**results, "correlation": correlations["rows"]}
     rows = [{"measure": name, **row} for name, own in named.items() for row in own]
     best = [row for row in results["best_ev"] if row["median"] is not None]
-    best.sort(key=lambda row: row["median"])
-    each = [" ".join("=" if v is None else f"{v:+g}" for v in r["by_scene"].values()) for r in best]
-    shown = [row | {"each": text} for row, text in zip(best, each, strict=True)]
-    times = results["milliseconds"]
+    for row in best:
+        by_scene = row["by_scene"].values()
+        row["each"] = " ".join("=" if value is None else f"{value:+g}" for value in by_scene)
     why = [{"scorer": name, "why": text} for name, text in missing.items()]
     line = "scorer = `{scorer}`"
     tables = {
         "gain": table(sorted(results["gain"], key=lambda row: -row["change"]), _GAIN),
-        "best_exposure": table(shown, _BEST),
-        "cost": pivot(times, line, "{size} x {size} [ms]", "{ms:.1f} ± {ms_spread:.1f}"),
+        "best_exposure": table(sorted(best, key=lambda row: row["median"]), _BEST),
+        "cost": pivot(
+            results["milliseconds"], line, "{size} x {size} [ms]", "{ms:.1f} ± {ms_spread:.1f}"
+        ),
         "correlation": pivot(correlations["rows"], line, "{reference}", _CORRELATION),
         "missing": table(why, f"{line} | why = {{why}}"),
     }

@@ -24,6 +24,7 @@ import gymnasium as gym
 PACKAGES = ("simulator", "ae_env", "agents")
 #: Episodes that are traced.
 EPISODES = 12
+STEPS = ("step, new state", "step, same state")
 _ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -32,13 +33,11 @@ def entered(call: Callable[[], Any]) -> list[tuple[str, str]]:
     found: list[tuple[str, str]] = []
 
     def note(frame: FrameType, event: str, argument: object) -> None:
-        code = frame.f_code
-        path = Path(code.co_filename)
-        if event != "call" or not path.is_relative_to(_ROOT):
-            return
-        file = path.relative_to(_ROOT)
-        if file.parts[0] in PACKAGES:
-            found.append((file.as_posix(), code.co_qualname))
+        path = Path(frame.f_code.co_filename)
+        if event == "call" and path.is_relative_to(_ROOT):
+            file = path.relative_to(_ROOT)
+            if file.parts[0] in PACKAGES:
+                found.append((file.as_posix(), frame.f_code.co_qualname))
 
     sys.setprofile(note)
     try:
@@ -57,9 +56,7 @@ def trace(seed: int) -> dict[str, list[tuple[str, str]]]:
         for state in (0, 21, 42, 63):
             env.step(state)
     found = {"reset": entered(lambda: env.reset(seed=seed))}
-    for name in ("step, new state", "step, same state"):
-        found[name] = entered(lambda: env.step(37))
-    return found
+    return found | {name: entered(lambda: env.step(37)) for name in STEPS}
 
 
 def main() -> None:
@@ -69,16 +66,15 @@ def main() -> None:
     shows_files = parser.parse_args().files
     traced = [trace(seed) for seed in range(EPISODES)]
     print("| call | files | most | functions | moves between files |\n|---|--:|--:|--:|--:|")
-    for name in traced[0]:
+    for name in ("reset", *STEPS):
         paths = [[file for file, _ in calls[name]] for calls in traced]
         files = [len(set(path)) for path in paths]
         functions = median(len(set(calls[name])) for calls in traced)
         moves = median(sum(a != b for a, b in pairwise(path)) for path in paths)
         print(f"| {name} | {median(files):g} | {max(files)} | {functions:g} | {moves:g} |")
-    for name in traced[0] if shows_files else ():
-        count = Counter(file for calls in traced for file in {file for file, _ in calls[name]})
-        print(f"\n{name}, in how many of {EPISODES} episodes:")
-        print("\n".join(f"  {number:3} {file}" for file, number in count.most_common()))
+        if shows_files:
+            count = Counter(file for path in paths for file in set(path))
+            print("\n".join(f"  {number:3} {file}" for file, number in count.most_common()))
 
 
 if __name__ == "__main__":

@@ -97,12 +97,10 @@ def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder; parts of benchmarks run in this process, and keep their results there."""
     from benchmarks import harness
 
-    def isolated(task: Callable[..., Any], *, num_threads: int, **options: Any) -> Any:
-        for name in ("fresh_cache", "timeout"):
-            options.pop(name)
-        return json.loads(json.dumps(task(**options)))
+    def run(part: harness.Part) -> Any:
+        return json.loads(json.dumps(part.task(**part.arguments)))
 
-    monkeypatch.setattr(harness, "isolated", isolated)
+    monkeypatch.setattr(harness.Part, "run", run)
     monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
     return tmp_path
 

@@ -19,13 +19,9 @@ from benchmarks.paper_baselines import (
 )
 from simulator.networks.weights import build_modules, load_modules, save_modules
 
-PARAMETERS = torch.tensor(
-    [
-        [0.0, -7.0, 3.5, 6.0, -10.0, 2.0],
-        [7.3, -13.0, 2.0, 0.0, 2.0, 4.5],
-        [2.0, -5.0, 2.5, 3.0, -6.0, 2.5],
-    ]
-)
+_SOURCES = torch.tensor([[0.0, -7.0, 3.5], [7.3, -13.0, 2.0], [2.0, -5.0, 2.5]])
+_TARGETS = torch.tensor([[6.0, -10.0, 2.0], [0.0, 2.0, 4.5], [3.0, -6.0, 2.5]])
+PARAMETERS = torch.cat([_SOURCES, _TARGETS], dim=1)
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -33,9 +29,7 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("make", [ParameterConcatenation, DecoupledNet])
-def test_batch_of_different_parameters_equals_single_runs(
-    make: type[ParameterConcatenation | DecoupledNet],
-) -> None:
+def test_batch_of_different_parameters_equals_single_runs(make):
     net = make(width=6).eval().double()
     for module in net.modules():  # running statistics that differ from a single image's
         if isinstance(module, AdaptiveNorm):
@@ -63,9 +57,6 @@ def test_trained_baselines_come_back(tmp_path: Path) -> None:
         save_modules(tmp_path / preset, modules, preset, {})
         loaded, card = load_modules(tmp_path / preset)
         assert (list(loaded), card["preset"]) == (["baseline"], preset)
-
-
-# Parameter concatenation
 
 
 def test_adaptive_normalisation() -> None:
@@ -96,30 +87,21 @@ def test_receptive_field_of_the_published_table() -> None:
     assert (int(reached[0]), int(reached[-1])) == (350 - 256, 350 + 256)
 
 
-# Decoupled learning
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"stride": 2}, {"dilation": 4}, {"upsample": True}], ids=str
-)
+@pytest.mark.parametrize("options", [{}, {"stride": 2}, {"dilation": 4}, {"upsample": True}])
 def test_generated_convolution_is_each_sample_s_own(options: dict[str, int]) -> None:
     torch.manual_seed(0)
     layer = GeneratedConvolution(5, 5, **options).double()  # type: ignore[arg-type]
-    x, parameters = (
-        normal(3, 5, 7, 6).double(),
-        scaled_parameters(PARAMETERS, normal(3, 1).double()),
-    )
+    x = normal(3, 5, 7, 6).double()
+    parameters = scaled_parameters(PARAMETERS, x)
     result = layer(x, parameters)
     for i in range(3):
         flat = layer.generator.weight @ parameters[i] + layer.generator.bias
         one = x[i : i + 1]
         if layer.upsample:
-            weight = flat.reshape(5, 5, 4, 4)
-            expected = F.conv_transpose2d(one, weight, stride=2, padding=1)
+            expected = F.conv_transpose2d(one, flat.reshape(5, 5, 4, 4), stride=2, padding=1)
         else:
-            weight = flat.reshape(5, 5, 3, 3)
             padded = {"padding": options.get("dilation", 1), **options}
-            expected = F.conv2d(one, weight, **padded)
+            expected = F.conv2d(one, flat.reshape(5, 5, 3, 3), **padded)
         torch.testing.assert_close(result[i : i + 1], expected)
 
 

@@ -51,7 +51,7 @@ from simulator.networks.noise_module import SIZES
 from simulator.noise.generator import noise_generator
 from simulator.radiance.light import mean_anchor
 from simulator.raw.image import RawImage
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_type, check_word, did_you_mean

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import Layout
-from simulator.reference.camera import lens_blur, sample_mosaic
+from simulator.reference.reference_camera import lens_blur, sample_mosaic
 from simulator.training.scenes import depth_photographs
 from simulator.utils.files import data_folder
 

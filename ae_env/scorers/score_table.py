@@ -20,7 +20,7 @@ from ae_env.scorers.captures import prepare_scene
 from ae_env.scorers.term_scores import CHUNK, TermScores, slices
 from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
-from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.decision import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.optics.motion import ALONG_ROWS, Movement

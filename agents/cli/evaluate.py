@@ -15,7 +15,7 @@ from agents.cli import console
 if TYPE_CHECKING:
     import pandas as pd
 
-    from agents.evaluation.plan import EvaluationPlan
+    from agents.evaluation.evaluation_plan import EvaluationPlan
     from agents.evaluation.result import EvaluationResult
 
 logger = logging.getLogger(__name__)
@@ -30,8 +30,8 @@ _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 Preset = Annotated[
     str | None,
     Option(
-        help="quick, standard, video, bracket, ae_bench_v2_still (_video, _bracket), or a .yaml "
-        "file of one's own."
+        help="quick, standard, video, convergence, ablation, bracket, ae_bench_v2_still (_video, "
+        "_bracket), or a .yaml file of one's own."
     ),
 ]
 Environment = Annotated[
@@ -121,8 +121,8 @@ def evaluate(
 def _run(
     plan: EvaluationPlan, out: Path, append: Path | None, author: str, workers: Any, device: str
 ) -> None:
+    from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.jobs import Jobs
-    from agents.evaluation.plan import plan_scenes
     from agents.evaluation.result import overall_ranking
     from agents.report.ae_bench import append_rows, bench_rows, check_append, check_hash
     from agents.report.evaluation import write_report
@@ -154,7 +154,7 @@ def make_plan(
     """The plan that the options describe; `given` are those about episodes, by name."""
     from pydantic import ValidationError
 
-    from agents.evaluation.plan import EvaluationPlan, light_name, load_plan
+    from agents.evaluation.evaluation_plan import EvaluationPlan, light_name, load_plan
     from simulator.utils.config_file import one_line
 
     if preset is not None:

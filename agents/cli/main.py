@@ -31,10 +31,9 @@ from simulator import __version__
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
-    *("ablation", "agents", "bracketing", "brackets", "cluster", "colour_checker", "convergence"),
-    *("defects", "denoising", "features", "hdr", "libcamera", "onboard", "paper", "ptc"),
-    *("recorded", "refocus", "scorers", "simulator", "stability", "throughput", "transfer"),
-    *("viewer", "work_precision"),
+    *("agents", "bracketing", "brackets", "cluster", "colour_checker", "defects", "denoising"),
+    *("features", "hdr", "onboard", "paper", "ptc", "recorded", "refocus", "scorers"),
+    *("simulator", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -64,10 +63,7 @@ def bench(
     ] = None,
     weights: Annotated[
         Path | None,
-        Option(
-            help="Of paper: measure these weights, and train nothing; of features: ALIKED's "
-            "(aliked-n16.pth), judged beside."
-        ),
+        Option(help="Of paper: measure these weights, and train nothing."),
     ] = None,
     part: Annotated[
         str | None, Option(help="Of transfer: agents or tables; by default both.")
@@ -102,7 +98,7 @@ _TAKES = {
     "against": ("throughput",),
     "folder": ("paper", "recorded"),
     "part": ("transfer",),
-    "weights": ("paper", "features"),
+    "weights": ("paper",),
 }
 
 

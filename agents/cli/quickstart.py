@@ -45,7 +45,7 @@ def quickstart(
     Example: `ae-env quickstart --scenes ~/my_raws --out my_raws_result`
     """
     from agents.evaluation.engine import evaluate, fit_policies
-    from agents.evaluation.plan import MAX_SEED
+    from agents.evaluation.evaluation_plan import MAX_SEED
     from agents.report.evaluation import write_report
     from agents.rollouts import make_envs, scenes_of, training_arguments
     from simulator.utils.checks import check_integer

@@ -55,7 +55,7 @@ def view(
     from ae_env.scorers import make_scorer
     from agents.viewer.page import Options
     from agents.viewer.viewed_scene import find_scenes
-    from simulator.capture.exposure import check_tolerance
+    from simulator.capture.decision import check_tolerance
 
     check_tolerance(tolerance)
     make_scorer(scorer)

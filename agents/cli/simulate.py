@@ -49,7 +49,7 @@ def simulate(
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
     from simulator import CameraSettings
-    from simulator.capture.exposure import check_tolerance
+    from simulator.capture.decision import check_tolerance
     from simulator.capture.sensor import check_noise
 
     check_noise(noise)
@@ -115,7 +115,7 @@ def sweep(
     from ae_env.scenes import Scene
     from ae_env.scenes.load import SceneNetworks
     from simulator import write_dng
-    from simulator.capture.exposure import check_tolerance
+    from simulator.capture.decision import check_tolerance
 
     check_tolerance(tolerance)
     simulator = make_simulator(weights, device, cache, depth)

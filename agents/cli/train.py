@@ -82,7 +82,7 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from ae_env.utils.user_files import find_config
-    from simulator.training.train import SimulatorConfig, first_modules, train_and_save
+    from simulator.training.trainer import SimulatorConfig, first_modules, train_and_save
     from simulator.utils.config_file import load_yaml
 
     training = load_yaml(find_config(config), SimulatorConfig)
@@ -124,7 +124,7 @@ def export(
     """
     import gymnasium as gym
 
-    from agents.learning.weights import load_agent, trained_grid
+    from agents.learning.policy_file import load_agent, trained_grid
     from agents.onboard.controller import Controller
     from agents.onboard.export import export_agent
     from agents.policy import PolicyContext

@@ -22,7 +22,7 @@ from ae_env.options import EnvOptions
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
-from agents.evaluation.plan import (
+from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
     SEED_STRIDE,
@@ -318,7 +318,7 @@ class EvaluationRun:
         envs = self._make_envs(condition, batch_size(len(episodes), self.batch), frames)
         parts = []
         for batch in episodes.batches(envs):
-            best = None if oracle is None else oracle[batch.index % self.num_tables]
+            best = None if oracle is None else oracle[batch.episodes % self.num_tables]
             parts.append(run_batch(name, policy, envs, batch, frames, oracle=best))
             report(float(batch.valid.sum()) * frames)
         alone = None

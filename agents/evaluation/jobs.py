@@ -29,7 +29,7 @@ from agents.evaluation.engine import (
     check_scorers,
     other_scores,
 )
-from agents.evaluation.plan import Condition, EvaluationPlan
+from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
 from agents.evaluation.result import EvaluationResult, Track
 from agents.learning.workers import core_count, run_in_parallel, send_progress
 from agents.policy_names import (

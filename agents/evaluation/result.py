@@ -26,7 +26,7 @@ from simulator.utils.checks import check_word
 if TYPE_CHECKING:
     from ae_env.grid import ExposureGrid
     from ae_env.scenes import Scene
-    from agents.evaluation.plan import EvaluationPlan
+    from agents.evaluation.evaluation_plan import EvaluationPlan
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

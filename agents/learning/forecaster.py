@@ -18,7 +18,7 @@ from torch import nn
 
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
 from agents.learning.networks import UNWATCHED, Optimisation, Session
-from agents.learning.weights import MAX_WIDTH, load_agent, load_into
+from agents.learning.policy_file import MAX_WIDTH, load_agent, load_into
 from agents.metering.reading import (
     BLACK_SIGNAL,
     TARGET_SIGNAL,

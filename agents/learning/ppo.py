@@ -32,8 +32,8 @@ from agents.learning.networks import (
     StateHead,
     with_history,
 )
+from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
-from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.policy import Bools, Ints, Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration

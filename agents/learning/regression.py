@@ -31,7 +31,7 @@ from agents.learning.networks import (
     StateHead,
     random_shift,
 )
-from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
+from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.meters import make_meter
 from agents.metering.reading import Reading
 from agents.policy import Bools, Floats, Ints, Observations, PolicyContext, masked_argmax

@@ -14,8 +14,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.networks import Progress, Session
+from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.regression import RegressionTraining, train_regression
-from agents.learning.weights import load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
 from simulator.utils.checks import check_word

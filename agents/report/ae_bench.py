@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation.plan import EvaluationPlan, digest, load_plan
+from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
 from agents.report.evaluation import fill

@@ -16,8 +16,8 @@ import jinja2
 import numpy as np
 import pandas as pd
 
+from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES
-from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, digest
 from agents.evaluation.result import (
     MORE_COLUMNS,
     ROW_COLUMNS,

@@ -24,12 +24,7 @@ from simulator import develop
 from simulator.augment import ExposureAugmentation, sample_seeds
 from simulator.radiance.maps import read_radiance
 from simulator.raw.develop import GREY_CARD_SIGNAL, srgb_encode
-from simulator.training.scenes import (
-    Split,
-    photograph_pictures,
-    radiance_files,
-    recorded_mosaics,
-)
+from simulator.training.scenes import Split, photograph_pictures, radiance_files, recorded_mosaics
 
 # -- pictures, and pairs of views of them with a known homography ---------------------------------
 
@@ -154,14 +149,11 @@ def finer(homography: np.ndarray) -> np.ndarray:
     return up @ homography @ np.linalg.inv(up)
 
 
-def batches(count: int, size: int, seed: int) -> Iterator[np.ndarray]:
-    """Indices of endless batches, each picture as often as any other."""
-    rng, left = np.random.default_rng([seed, 1]), np.zeros(0, np.int64)
+def shuffled(count: int, seed: int) -> Iterator[int]:
+    """Indices without end, each as often as any other."""
+    rng = np.random.default_rng([seed, 1])
     while True:
-        while len(left) < size:
-            left = np.concatenate([left, rng.permutation(count)])
-        yield left[:size]
-        left = left[size:]
+        yield from rng.permutation(count).tolist()
 
 
 # -- a small detector and descriptor of local features --------------------------------------------
@@ -251,19 +243,7 @@ def sample(dense: Tensor, points: Tensor) -> Tensor:
     return F.normalize(values[..., 0].transpose(1, 2), dim=-1)
 
 
-def mutual_matches(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of descriptors (N, D) and (M, D) that are each other's nearest."""
-    if not len(first) or not len(second):
-        none = torch.zeros(0, dtype=torch.int64)
-        return none, none
-    similar = first @ second.T
-    forth, back = similar.argmax(dim=1), similar.argmax(dim=0)
-    index = torch.arange(len(first))
-    mutual = back[forth] == index
-    return index[mutual], forth[mutual]
-
-
-# -- training -------------------------------------------------------------------------------------
+# -- augmentations --------------------------------------------------------------------------------
 
 #: Exposures that plain scaling and ours draw from [EV]; the tests lie within.
 STOPS = (-6.0, 4.0)
@@ -274,20 +254,9 @@ SIZE, BATCH, POINTS = 80, 8, 48
 STEPS, QUICK_STEPS = 3200, 20
 #: Share of the crops that are augmented; the others stay as they are.
 AUGMENTED = 0.15
-#: Name of the weights that all augmentations start from.
-START = "start"
 _RATE, _TEMPERATURE, _SAME = 2e-3, 0.1, 6.0
-#: Weight of the loss of the descriptors against that of the scores.
-_DESCRIBED = 1.0
 
 Augmentation = Callable[[Tensor, list[int]], Tensor]
-
-
-# -- augmentations --------------------------------------------------------------------------------
-
-
-def unchanged(pictures: Tensor, seeds: list[int]) -> Tensor:
-    return pictures
 
 
 def jittered(pictures: Tensor, seeds: list[int]) -> Tensor:
@@ -310,7 +279,7 @@ def scaled(pictures: Tensor, seeds: list[int]) -> Tensor:
 
 #: By name: none, jitter, plain scaling, ours with its exposure alone, ours in full.
 AUGMENTATIONS: dict[str, Augmentation] = {
-    "none": unchanged,
+    "none": lambda pictures, seeds: pictures,
     "jitter": jittered,
     "scaling": scaled,
     "exposure": ExposureAugmentation(CAMERA, STOPS, modules=("exposure",)),
@@ -321,14 +290,6 @@ AUGMENTATIONS: dict[str, Augmentation] = {
 # -- training -------------------------------------------------------------------------------------
 
 
-def weights_file(arm: str, seed: int, steps: int) -> Path:
-    """Where the weights of a training lie: a file for each state of the code."""
-    checksum = 0
-    for path in (ROOT / "simulator" / "augment.py", Path(__file__)):
-        checksum = zlib.crc32(path.read_bytes(), checksum)
-    return RUNS.parent / "features" / f"{arm}-{seed}-{steps}-{checksum:08x}.safetensors"
-
-
 def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[Detector, float]:
     """The detector trained under an augmentation, or that of an earlier run; and its seconds.
 
@@ -336,7 +297,13 @@ def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[De
     augmentation for as many steps. All arms see the same crops in the same order, and what they
     make of the same few of them. `limit` is for photographs, and for maps; None for all.
     """
-    begin, end = weights_file(START, seed, steps), weights_file(arm, seed, steps)
+    files, checksum = (ROOT / "simulator" / "augment.py", Path(__file__)), 0
+    for path in files:  # weights are those of one state of the code
+        checksum = zlib.crc32(path.read_bytes(), checksum)
+    begin, end = (
+        RUNS.parent / "features" / f"{name}-{seed}-{steps}-{checksum:08x}.safetensors"
+        for name in ("start", arm)
+    )
     if not begin.is_file():
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -364,10 +331,10 @@ def _fit(
     model.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(len(steps), 2))
-    chosen = islice(enumerate(batches(len(views), BATCH, seed)), steps.start, steps.stop)
-    for step, indices in chosen:
+    indices = islice(shuffled(len(views), seed), BATCH * steps.start, None)
+    for step in steps:
         drawn = (np.random.default_rng([seed, step, j]) for j in range(BATCH))
-        batch = [_pair(views[i], rng) for i, rng in zip(indices, drawn, strict=True)]
+        batch = [_pair(views[next(indices)], rng) for rng in drawn]
         pictures = torch.from_numpy(np.stack([p for pair in batch for p in pair[0]]))
         pictures = pictures.permute(0, 3, 1, 2).float() / 255.0
         some = np.random.default_rng([seed, step]).random(len(pictures)) < AUGMENTED
@@ -438,4 +405,4 @@ def _loss(model: Detector, pictures: Tensor, batch: list[Pair]) -> Tensor:
     similar = similar.masked_fill(blocks, -torch.inf)
     target = torch.arange(len(similar))
     described = F.cross_entropy(similar, target) + F.cross_entropy(similar.T, target)
-    return scored + _DESCRIBED * 0.5 * described
+    return scored + 0.5 * described

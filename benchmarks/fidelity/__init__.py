@@ -1,7 +1,5 @@
 """The camera simulator against the reference camera: error and time of every module.
 
-    ae-env bench simulator
-
 Needs trained weights: ``compact`` comes with the package; ``paper`` and the baselines ``pc`` and
 ``dl`` are trained by their configurations, once, where ``runs/simulator`` does not hold them. The
 real files that ``AE_ENV_DATA`` names are used where they are. One thread: what the networks are
@@ -12,17 +10,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.fidelity import defocus, in_focus, pairs, pictures
+from benchmarks.fidelity import defocus, pairs, pictures
 from benchmarks.fidelity.models import load_models, train_missing
 from benchmarks.harness import Part, Report, benchmark, data_root, table
 
-#: By the part of their rows, in the order of the report.
-MODULES: dict[str, Any] = {
-    "pairs": pairs,
-    "defocus": defocus,
-    "in focus": in_focus,
-    "pictures": pictures,
-}
 _CARDS = """model = `{name}` | parameters = {parameters:,} | stage: steps in CPU time = {steps} |
 weights (SHA-256) = `{sha}`"""
 
@@ -30,13 +21,9 @@ weights (SHA-256) = `{sha}`"""
 def parts(seed: int, quick: bool) -> list[Part]:
     if not quick:
         train_missing()
-    given, found = {"seed": seed, "quick": quick}, []
-    for camera in pairs.CAMERAS:
-        for mix in pairs.PAIRS:
-            arguments = {"camera": camera, "mix": mix, **given}
-            found.append(Part(f"pairs {camera} {mix}", pairs.measure, arguments, threads=1))
-    for name in list(MODULES)[1:]:
-        found.append(Part(name, MODULES[name].measure, given, threads=1))
+    found = [Part(f"pairs {c}", pairs.measure, {"camera": c}, threads=1) for c in pairs.CAMERAS]
+    for task in (defocus.measure, defocus.measure_in_focus, pictures.measure):
+        found.append(Part(f"{task.__module__} {task.__name__}", task, threads=1))
     return found
 
 
@@ -48,8 +35,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         steps = (f"{s}: {own['steps']:,} in {own['seconds'] / 60:.1f} min" for s, own in stages)
         shown.append({"name": name, **card, "steps": "; ".join(steps), "sha": card["sha256"][:12]})
     tables = {"models": table(shown, _CARDS)}
-    for name, module in MODULES.items():
-        tables |= module.tables([row for row in rows if row["part"] == name])
+    tables |= pairs.tables([row for row in rows if row["part"] == "pairs"])
+    tables |= defocus.tables(rows)
+    tables |= pictures.tables([row for row in rows if row["part"] == "pictures"])
     return Report(rows, tables, meta={"models": cards, "real_files": data_root() is not None})
 
 

@@ -1,8 +1,13 @@
-"""Opening the aperture from f/11 to f/4: error by size of the circle of confusion.
+"""Opening the aperture: error by size of the circle of confusion; pictures in focus.
 
 The source is a noisy capture at f/11, the truth the noise-free mean at f/4 and the same exposure,
 with the reference camera's occlusion-aware defocus. Errors are pooled over the pixels of a class in
 held-out procedural scenes, and in each of the photographs with measured depth.
+
+Pictures that are in focus throughout may not change where their depth is not told: views into
+radiance maps, photographs and recorded mosaics of the test split, photographed at f/8 and opened to
+f/4. The change is that of the noise-free light against the same with ``depth="far"``, root mean
+square in units of the source's noise.
 """
 
 from __future__ import annotations
@@ -17,13 +22,14 @@ from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from benchmarks.fidelity.models import equal_exposure, load_models
-from benchmarks.harness import Row, clipped, data_root, pivot, sections
+from benchmarks.harness import Row, clipped, cropped, data_root, pivot, sections, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
+from simulator.noise.noise_level_function import noise_variance
 from simulator.optics.discs import DiscBank, added_blur
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
-from simulator.training.scenes import depth_photographs, reference_scenes
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import depth_photographs, mosaic_scenes, reference_scenes
 
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].
 FULL, QUICK = (32, 256), (8, 128)
@@ -136,7 +142,49 @@ def _denoised(simulator: CameraSimulator, source: RawImage) -> tuple[Tensor, Ten
     return simulator.noise(exposed, shot, read), deviation
 
 
+# -- pictures in focus ----------------------------------------------------------------------------
+
+#: Height and width of a picture in focus [packed pixel], at most.
+SIZE = 160
+#: Change that was asked for, and the share of the pictures that shall stay below it.
+ASKED, ASKED_SHARE = 0.1, 0.95
+#: Its letters are blurred over five pixels.
+_OUT_OF_FOCUS = "CRW_0118"
+_SHARE = f"""pictures = {{pictures}} | change by less than {ASKED:g} of the noise = {{small:.1%}} |
+asked = {{asked:.0%}}"""
+
+
+def measure_in_focus(seed: int, quick: bool) -> list[Row]:
+    simulator = CameraSimulator.from_pretrained(device="cpu", cache=None)
+    camera, data, rows = get_camera("nikon_z6"), data_root(), []
+    scenes = list(reference_scenes("test", camera, number=0, data=data))
+    if data is not None:
+        scenes += mosaic_scenes("test", camera, data)
+    sharp = (scene for scene in scenes if scene.depth is None and scene.in_focus)
+    chosen = [scene for scene in sharp if scene.scene_id != _OUT_OF_FOCUS]
+    for number, scene in enumerate(chosen[:: 8 if quick else 1]):
+        scene = cropped(scene, SIZE, SIZE)
+        source, target = (equal_exposure(scene.reference, ISOS[0], f) for f in (8.0, F_TARGET))
+        sample = ReferenceCamera(camera).capture(scene, source, seed + number).sample
+        raw = RawImage(sample, source, camera)
+        unknown = simulator.prepare(raw, depth="unknown").expected(target)
+        far = simulator.prepare(raw, depth="far").expected(target)
+        variance = noise_variance(far.clamp(min=0.0), raw.noise)
+        change = float(((unknown - far).square() / variance).double().mean().sqrt())
+        row: Row = {"part": "in focus", "picture": scene.scene_id, "kind": scene.kind}
+        rows.append(row | {"change": change})
+    return rows
+
+
 def tables(rows: list[Row]) -> dict[str, str]:
     line = "circle of confusion (area; asked) = {pixels} ({area:.1%}; {asked:g})"
-    by_set = sections(rows, "{set}", lambda own: pivot(own, line, "ISO {iso}", _CONTENTS))
-    return {"defocus": by_set}
+    opened, sharp = ([r for r in rows if r["part"] == part] for part in ("defocus", "in focus"))
+    small = np.mean([row["change"] < ASKED for row in sharp])
+    share = {"pictures": len(sharp), "small": small, "asked": ASKED_SHARE}
+    most = sorted(sharp, key=lambda row: -row["change"])[:8]
+    columns = "picture = {picture} | kind = {kind} | change [noise] = {change:.2f}"
+    return {
+        "defocus": sections(opened, "{set}", lambda own: pivot(own, line, "ISO {iso}", _CONTENTS)),
+        "in-focus": table([share], _SHARE),
+        "most-changed": table(most, columns),
+    }

@@ -18,8 +18,8 @@ from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraProfile, CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.noise_module import SIZES, NoiseModule
 from simulator.networks.weights import load_modules
-from simulator.reference.camera import ReferenceScene
-from simulator.training.data import settings_parameters
+from simulator.reference.reference_camera import ReferenceScene
+from simulator.training.crops import settings_parameters
 from simulator.training.scenes import reference_scenes
 
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.

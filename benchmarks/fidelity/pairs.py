@@ -9,10 +9,8 @@ mean. Everything is clipped to [-pedestal, 1] first.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,23 +18,20 @@ from torch import Tensor
 
 from benchmarks.fidelity.models import FULL, QUICK, baseline, held_out_scenes, load_models, scores
 from benchmarks.harness import Row, pivot, table
-from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
+from simulator import CameraSettings, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceCapture
-from simulator.reference.sequences import Pair, select_pairs
+from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceCapture
+from simulator.reference.sequences import Pair, any_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence
-from simulator.training.data import draw_sequences
+from simulator.training.crops import draw_sequences
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.
 CAMERAS = {"nikon_z6": 1, "canon_70d": 7}
 _NAMES = {"nikon_z6": "Nikon Z6, trained body", "canon_70d": "Canon 70D, unseen"}
-#: Pairs by mix: "all" is the paper's, any two captures of a sequence; the others are drawn from the
-#: scenes that have depth, because few pairs of the first open the aperture of something defocused.
-PAIRS = {"all": 300, "opening": 100, "f/11 to f/4": 60}
-QUICK_PAIRS = {"all": 6, "opening": 2, "f/11 to f/4": 2}
-#: Defocus that can be seen [packed pixel], and the share of white pixels from which a source counts
-#: as saturated.
-VISIBLE_BLUR, SATURATED = 1.5, 0.01
+#: Pairs of a camera, and those of a quick run: any two captures of a sequence, as the paper's.
+PAIRS, QUICK_PAIRS = 300, 6
+#: Defocus that can be seen [packed pixel].
+VISIBLE_BLUR = 1.5
 #: PSNR and SSIM that the paper publishes (table 1), on its own photographs.
 PUBLISHED = {
     "nikon_z6": "PC 18.78 / 0.542, DL 34.34 / 0.879, EXP 35.31 / 0.903, NS 35.36 / 0.911, "
@@ -61,14 +56,9 @@ class Case:
     blur: float
 
     @property
-    def stops(self) -> int:
-        """By how many steps the aperture opens."""
-        return self.source.settings.aperture_stop - self.target.settings.aperture_stop
-
-    @property
     def opens(self) -> bool:
         """Whether the aperture opens."""
-        return self.stops > 0
+        return self.source.settings.aperture_stop > self.target.settings.aperture_stop
 
     @property
     def cleaner(self) -> bool:
@@ -83,60 +73,29 @@ def needs_cleaning(source: RawImage, target: CameraSettings, mean: Tensor) -> bo
     return bool(noise_variance(mean, wanted).mean() < noise_variance(mean, exposed).mean())
 
 
-#: Groups of which every pair is in exactly one: where the average margin comes from.
-PARTITION: dict[str, Callable[[Case], bool]] = {
+#: All pairs, and groups of which every pair is in exactly one: where the average margin comes from.
+GROUPS: dict[str, Callable[[Case], bool]] = {
+    "all": lambda c: True,
     "opens, blur >= 1.5 px": lambda c: c.opens and c.blur >= VISIBLE_BLUR,
     "opens, blur < 1.5 px": lambda c: c.opens and c.blur < VISIBLE_BLUR and c.has_depth,
     "opens, no depth known": lambda c: c.opens and not c.has_depth,
     "does not open, cleaner target": lambda c: not c.opens and c.cleaner,
     "does not open, noisier target": lambda c: not c.opens and not c.cleaner,
 }
-#: Groups of pairs, in the order of the report.
-GROUPS: dict[str, Callable[[Case], bool]] = {
-    "all": lambda c: True,
-    "target noisier than the source": lambda c: not c.cleaner,
-    "target cleaner than the source": lambda c: c.cleaner,
-    "aperture closes": lambda c: c.stops < 0,
-    "same aperture": lambda c: c.stops == 0,
-    "aperture opens": lambda c: c.opens,
-    **PARTITION,
-    "source saturated in > 1 %": lambda c: float(c.source.saturated.float().mean()) > SATURATED,
-}
 
 
-def measure(camera: str, mix: str, seed: int, quick: bool) -> list[Row]:
-    number, index = list(CAMERAS).index(camera), list(PAIRS).index(mix)
-    count = (QUICK_PAIRS if quick else PAIRS)[mix]
+def measure(camera: str, seed: int, quick: bool) -> list[Row]:
+    number, count = list(CAMERAS).index(camera), QUICK_PAIRS if quick else PAIRS
     profile = get_camera(camera)
     reference = ReferenceCamera(profile, body=BodyError.draw(profile, CAMERAS[camera]))
     sequences = draw_sequences(held_out_scenes(camera, quick), profile, seed)
-    pairs = _pairs_of(mix, sequences, reference)
+    pairs = any_pairs(sequences)
     if count < len(pairs):
-        rng = np.random.default_rng([seed, number, index])
+        rng = np.random.default_rng([seed, number, 0])
         pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), count, replace=False))]
     crop = (QUICK if quick else FULL)[2]
     cases = _photographed(pairs, sequences, reference, crop, seed)
-    return list(_rows([(case, _scores(case)) for case in cases], camera, mix))
-
-
-def _pairs_of(
-    mix: str, sequences: Sequence[CaptureSequence], camera: ReferenceCamera
-) -> list[Pair]:
-    """The pairs of a mix: any two captures of a sequence; those of scenes with depth that open the
-    aperture, or in a tenth of them keep it; or those of them from f/11 to f/4."""
-    if mix == "all":
-        return select_pairs(sequences, "all", camera.camera)
-    opening = select_pairs(sequences, "aperture", camera.camera)
-    pairs = [p for p in opening if sequences[p.sequence].scene.depth is not None]
-    if mix == "opening":
-        return pairs
-    wanted = [CameraSettings(100, 1.0, n).aperture_stop for n in (11, 4)]
-
-    def stops(pair: Pair) -> list[int]:
-        settings = sequences[pair.sequence].settings
-        return [settings[i].aperture_stop for i in (pair.source, pair.target)]
-
-    return [pair for pair in pairs if stops(pair) == wanted]
+    return list(_rows([(case, _scores(case)) for case in cases], camera))
 
 
 def _photographed(
@@ -175,64 +134,44 @@ def _photographed(
 Method = tuple[str, str, bool]
 
 
-def _estimates(case: Case) -> Iterator[tuple[Method, Tensor, float | None]]:
-    """Every method's estimate of the target and its time [ms], and the ceiling."""
+def _estimates(case: Case) -> Iterator[tuple[Method, Tensor]]:
+    """Every method's estimate of the target, and the ceiling."""
     models, target = load_models(), case.target.settings
     for name, network in models.baselines.items():
-        begun = time.perf_counter()
-        image = baseline(network, case.source, target)
-        yield (name.upper(), "", False), image, 1e3 * (time.perf_counter() - begun)
+        yield (name.upper(), "", False), baseline(network, case.source, target)
     for preset, corrected in (("compact", True), ("compact", False), ("paper", True)):
         simulator = (models.corrected if corrected else models.simulators).get(preset)
-        if simulator is None:
-            continue
-        times: dict[str, float] = {}
-        handles = _stopwatch(simulator, times)
-        stages = simulator.stages(case.source, target)
-        for handle in handles:
-            handle.remove()
-        images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
-        for name, image in images.items():
-            yield (name, preset, corrected), image, 1e3 * (times[name] - times["start"])
-    yield ("ceiling", "", False), case.target.mean, None
-
-
-def _stopwatch(simulator: CameraSimulator, times: dict[str, float]) -> list[Any]:
-    """Hooks that note when a simulator's exposure module starts and each module ends."""
-    assert simulator.noise is not None
-    assert simulator.aperture is not None
-    modules = {"EXP": simulator.exposure, "NS": simulator.noise, "Full": simulator.aperture}
-
-    def note(name: str) -> Callable[..., None]:
-        return lambda *_: times.update({name: time.perf_counter()})
-
-    handles = [module.register_forward_hook(note(name)) for name, module in modules.items()]
-    return [*handles, simulator.exposure.register_forward_pre_hook(note("start"))]
+        if simulator is not None:
+            stages = simulator.stages(case.source, target)
+            images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
+            for name, image in images.items():
+                yield (name, preset, corrected), image
+    yield ("ceiling", "", False), case.target.mean
 
 
 def _scores(case: Case) -> dict[Method, Row]:
     found: dict[Method, Row] = {}
-    for method, estimate, ms in _estimates(case):
-        found[method] = {"ms": ms}
+    for method, estimate in _estimates(case):
+        found[method] = {}
         for name, target in (("noisy", case.target.sample), ("mean", case.target.mean)):
             own = scores(estimate, target, case.source.camera)
             found[method] |= {f"{name}_db": own["psnr_db"], f"{name}_ssim": own["ssim"]}
     return found
 
 
-def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str, mix: str) -> Iterator[Row]:
+def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str) -> Iterator[Row]:
     for group, belongs in GROUPS.items():
         chosen = [(case, found) for case, found in scored if belongs(case)]
-        if not chosen or (mix != "all" and not group.startswith(("aperture opens", "opens"))):
+        if not chosen:
             continue
         subjects = [case.group for case, _ in chosen]
         frames = {m: pd.DataFrame([found[m] for _, found in chosen]) for m in chosen[0][1]}
         for method, own in frames.items():
             name, preset, corrected = method
-            row: Row = {"part": "pairs", "camera": camera, "mix": mix, "group": group}
+            row: Row = {"part": "pairs", "camera": camera, "group": group}
             row |= {"method": name, "preset": preset, "body_correction": corrected}
             row |= {"pairs": len(chosen), "source_groups": len(set(subjects))}
-            row |= {str(k): mean for k, mean in own.drop(columns="ms").mean().items()}
+            row |= {str(k): mean for k, mean in own.mean().items()}
             # Gains are over the exposure alone, and over the stage before.
             others = {"over_exp": ("EXP", preset or "compact", corrected or not preset)}
             if before := {"NS": "EXP", "Full": "NS"}.get(name):
@@ -242,7 +181,7 @@ def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str, mix: str) -
                     gains = (own[field] - frames[other][field]).to_numpy()
                     row[f"{over}_{field}"] = float(gains.mean())
                     row[f"{over}_{field}_error"] = _standard_error(gains, subjects)
-            yield row | {"milliseconds": own["ms"].astype(float).median()}
+            yield row
 
 
 def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
@@ -256,9 +195,8 @@ def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
 
 # -- report ---------------------------------------------------------------------------------------
 
-_COUNTS = "camera = {camera} | mix = {mix} | pairs = {pairs} | source groups = {source_groups}"
-_PAPER = """noisy = {noisy_db:.2f} / {noisy_ssim:.3f} | mean = {mean_db:.2f} / {mean_ssim:.3f} |
-ms = {milliseconds:.1f}"""
+_COUNTS = "camera = {camera} | pairs = {pairs} | source groups = {source_groups}"
+_PAPER = "noisy = {noisy_db:.2f} / {noisy_ssim:.3f} | mean = {mean_db:.2f} / {mean_ssim:.3f}"
 _MARGINS = """share = {share:.0%} |
 over EXP [dB] = {over_exp_noisy_db:+.2f} ± {over_exp_noisy_db_error:.2f} |
 over NS [dB] = {over_before_noisy_db:+.2f} ± {over_before_noisy_db_error:.2f} |
@@ -271,28 +209,14 @@ def tables(rows: list[Row]) -> dict[str, str]:
         if row["preset"]:
             plain = ", w = 1, b = 0" * (not row["body_correction"])
             row["label"] += f" `{row['preset']}`" + plain
-    paper = [r for r in rows if (r["mix"], r["group"]) == ("all", "all")]
+    paper = [r for r in rows if r["group"] == "all"]
     whole = {r["camera"]: r["pairs"] for r in paper}
-    counts = [
-        row
-        for row in rows
-        if row["method"] == "ceiling"
-        and row["group"] == ("all" if row["mix"] == "all" else "aperture opens")
-    ]
     full = []
-    for row in (r for r in rows if r["mix"] == "all" and r["group"] in (*PARTITION, "all")):
-        if row["label"] == "Full `compact`":
-            share = row["pairs"] / whole[row["camera"]]
-            full.append(row | {"share": share, "contribution": share * row["over_exp_noisy_db"]})
-    found = {
-        "counts": table(counts, _COUNTS),
+    for row in (r for r in rows if r["label"] == "Full `compact`"):
+        share = row["pairs"] / whole[row["camera"]]
+        full.append(row | {"share": share, "contribution": share * row["over_exp_noisy_db"]})
+    return {
+        "counts": table((row for row in paper if row["method"] == "ceiling"), _COUNTS),
         "paper": pivot(paper, "PSNR [dB] / SSIM = {label:md}", "{name}", _PAPER),
         "margin": pivot(full, "pairs = {group}", "{name}", _MARGINS),
     }
-    for camera in CAMERAS:
-        own = [
-            r for r in rows if r["camera"] == camera and (r["body_correction"] or not r["preset"])
-        ]
-        line, values = "mix: pairs = {mix}: {group} ({pairs})", "{noisy_db:.2f} / {mean_db:.2f}"
-        found[f"groups-{camera}"] = pivot(own, line, "{label:md}", values)
-    return found

@@ -1,4 +1,4 @@
-"""How time and memory grow with pixels and states, and a 24-megapixel raw beside LibRaw.
+"""How time and memory grow with pixels, and a 24-megapixel raw beside LibRaw.
 
 Every point is measured in a process of its own, because its peak memory is wanted. Memory is the
 peak less what the process held before it, with all libraries loaded and warm. The large frame is a
@@ -8,33 +8,25 @@ camera's.
 
 from __future__ import annotations
 
-import itertools
 import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import rawpy
 import torch
 from scipy.stats import linregress
 
 import ae_env  # noqa: F401  registers the environment
 from benchmarks.harness import RUNS, Part, Row, data_root
-from benchmarks.isolated import forget_peak, median_seconds, peak_memory, timed
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    read_raw,
-    write_dng,
-)
-from simulator.camera import get_camera
+from benchmarks.isolated import forget_peak, peak_memory, timed
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.discs import disc_blur
 from simulator.radiance.procedural import LeafStyle, dead_leaves
 from simulator.raw.dng import SOFTWARE_NAME
@@ -43,7 +35,6 @@ from simulator.raw.dng import SOFTWARE_NAME
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.
 PIXELS = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2000, 3000))
-STATES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 #: Least seconds that a point is repeated for, quick and in full.
 _LEAST = (0.1, 0.6)
 #: Memory below this is that of the allocator's own steps [MiB].
@@ -54,34 +45,21 @@ _TILE, _DEFOCUS = 512, 4.0
 
 
 def growth_parts(quick: bool) -> Iterator[Part]:
-    pixels = [{"height": h, "width": w} for h, w in (PIXELS[1:4] if quick else PIXELS)]
-    states = [{"count": n} for n in (STATES[:7:3] if quick else STATES)]
-    curves: dict[str, tuple[Callable[..., Any], list[Any], dict[str, Any]]] = {
-        "pixels|exposure + noise": (measure_pixels, pixels, {"weights": None}),
-        "pixels|full model": (measure_pixels, pixels, {"weights": "compact"}),
-        "states|sweep, bank noise": (measure_states, states, {"noise": "bank"}),
-        "states|sweep, exact noise": (measure_states, states, {"noise": "exact"}),
-    }
-    for name, (task, points, fixed) in curves.items():
-        for point in points:
-            label = f"growth|{name}|{'x'.join(map(str, point.values()))}"
-            yield Part(label, task, {**point, **fixed, "quick": quick}, fresh_cache=True)
+    curves = {"exposure + noise": None, "full model": "compact"}
+    for (curve, weights), (h, w) in product(curves.items(), PIXELS[1:4] if quick else PIXELS):
+        arguments = {"curve": curve, "height": h, "width": w, "weights": weights}
+        yield Part(f"growth|{curve}|{h}x{w}", measure_pixels, arguments, fresh_cache=True)
 
 
-def curves(results: dict[str, Any]) -> list[Row]:
-    found: dict[tuple[str, str], list[Row]] = {}
-    for label, point in results.items():
-        if label.startswith("growth|"):
-            _, against, name, _ = label.split("|")
-            found.setdefault((against, name), []).append(point)
+def curves(points: list[Row]) -> list[Row]:
     rows = []
-    for (against, name), points in found.items():
-        row: Row = {"name": name, "against": against, "points": points}
-        row["exponents"] = {
-            key: fitted_exponent([(point["x"], point[key]) for point in points], floor)
+    for curve, own in pd.DataFrame(points).groupby("curve", sort=False):
+        exponents = {
+            key: fitted_exponent(list(zip(own["x"], own[key], strict=True)), floor)
             for key, floor in (("seconds", 0.0), ("mib", MEMORY_FLOOR))
         }
-        rows.append(row)
+        row: Row = {"curve": curve, "exponents": exponents}
+        rows.append(row | {"points": own[["x", "seconds", "mib"]].to_dict("records")})
     return rows
 
 
@@ -101,7 +79,7 @@ def fitted_exponent(points: list[tuple[float, float]], floor: float) -> list[flo
 # -- the points, each run in a process of its own --------------------------------------------------
 
 
-def measure_pixels(height: int, width: int, weights: str | None, quick: bool) -> Row:
+def measure_pixels(curve: str, height: int, width: int, weights: str | None, quick: bool) -> Row:
     """`simulate` of one raw at one state: time and memory, the raw itself included."""
     simulator, settings, depth = CameraSimulator(), CameraSettings(1600, 1 / 256, 8.0), "far"
     if weights is not None:  # to cleaner settings and a wider aperture, so that both are needed
@@ -117,21 +95,8 @@ def measure_pixels(height: int, width: int, weights: str | None, quick: bool) ->
     memory = peak_memory() - before
     while sum(seconds) < _LEAST[not quick]:
         seconds.append(timed(lambda: simulator.simulate(raw, settings, **options)))
-    return {"x": 4.0 * height * width, "seconds": float(np.median(seconds)), "mib": memory}
-
-
-def measure_states(count: int, noise: Any, quick: bool) -> Row:
-    """A sweep of a clean 128 x 128 scene over `count` states: time, and memory of the frames."""
-    raw, clean = noisy_raw(128, 128), NoiseLevelFunction.zero()
-    prepared = PreparedScene(raw.data.clamp(min=0.0), raw.settings, raw.camera, clean)
-    every = itertools.product(range(8), range(8), range(8))
-    states = [CameraSettings(100 * 2**i, 2.0 ** (-t - 2), 2 ** (1 + n / 2)) for i, t, n in every]
-    states = [states[i] for i in np.random.default_rng(0).permutation(len(states))[:count]]
-    prepared.expose(states[:1], noise=noise)
-    forget_peak()
-    before = peak_memory()
-    seconds = median_seconds(lambda: prepared.expose(states, noise=noise), least=_LEAST[not quick])
-    return {"x": float(count), "seconds": seconds, "mib": peak_memory() - before}
+    row: Row = {"curve": curve, "x": 4.0 * height * width, "mib": memory}
+    return row | {"seconds": float(np.median(seconds)), "ms": 1e3 * float(np.median(seconds))}
 
 
 def noisy_raw(height: int, width: int) -> RawImage:
@@ -188,16 +153,6 @@ def frame_parts(quick: bool) -> Iterator[Part]:
             yield Part(f"frame|{path.name}|{case}", simulate, arguments, fresh_cache=True)
 
 
-def frame_rows(results: dict[str, Any]) -> list[Row]:
-    found = []
-    for label, row in results.items():
-        if label.startswith("frame|"):
-            _, name, case = label.split("|")
-            file = "synthetic DNG" if name.startswith("frame") else name
-            found.append({"case": case, "file": file, **row, "libraw": results[f"libraw|{name}"]})
-    return found
-
-
 def _write_foreign_dng(path: Path, height: int, width: int) -> None:
     write_dng(path, noisy_raw(height, width))
     note = SOFTWARE_NAME.encode()
@@ -231,15 +186,20 @@ def simulate(path: str, case: str, passes: int) -> Row:
             clock.append(time.perf_counter())
             seconds.append(clock[-1] - clock[0])
             megapixels = 4e-6 * raw.data[0].numel()
-            modules, peak = list(prepared.plan(settings).modules), peak_memory()
+            modules, peak = ", ".join(prepared.plan(settings).modules), peak_memory()
             del raw, prepared, result
-    row: Row = {"megapixels": megapixels, "first": seconds[1], "peak_mib": peak, "modules": modules}
+    row: Row = {"case": case, "file": _shown(path), "modules": modules}
+    row |= {"megapixels": megapixels, "first": seconds[1], "peak_mib": peak}
     row |= {"seconds": statistics.median(seconds[2:] or seconds[1:])}
-    row |= {"stages": {name: clock[i + 1] - clock[i] for i, name in enumerate(STAGES)}}
-    return row | {"networks": weights is not None}
+    return row | {"stages": {name: clock[i + 1] - clock[i] for i, name in enumerate(STAGES)}}
 
 
-def libraw(path: str) -> dict[str, float]:
+def _shown(path: str) -> str:
+    name = Path(path).name
+    return "synthetic DNG" if name.startswith("frame") else name
+
+
+def libraw(path: str) -> Row:
     """Seconds of LibRaw for the file: unpacking, writing as many bytes, developing.
 
     ``first`` is the first unpacking and writing of the process; the others are medians of those
@@ -259,6 +219,6 @@ def libraw(path: str) -> dict[str, float]:
         unpacking = [timed(unpack) for _ in range(PASSES)]
         content = os.urandom(unpack())
         writing = [timed(lambda: file.write_bytes(content)) for _ in range(PASSES)]
-    found = {"first": unpacking[0] + writing[0], "develop": timed(develop)}
-    found["unpack"] = statistics.median(unpacking[1:])
-    return found | {"write": statistics.median(writing[1:])}
+    row: Row = {"file": _shown(path), "first": unpacking[0] + writing[0], "develop": timed(develop)}
+    unpacked, written = (statistics.median(times[1:]) for times in (unpacking, writing))
+    return row | {"unpack": unpacked, "write": written}

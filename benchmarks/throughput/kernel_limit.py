@@ -8,9 +8,7 @@ nothing else at hand draws them as fast (torch's generator takes three times as 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numba
 import numpy as np
@@ -81,19 +79,14 @@ class KernelLimit:
         self._states = [np.uint64(seed + i + 1) for i in range(threads)]
         # Variances of the order of those of a camera at ISO 400.
         self._shot, self._read = np.full(4, 1e-4, _F), np.full(4, 1e-6, _F)
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._pool = ThreadPoolExecutor(threads)
 
     def step(self) -> np.ndarray:
         """Makes all frames, (B, 4, H, W), in an array that the next step overwrites."""
         count = len(self._flat)
         self._chosen = self._rng.integers(len(self._lights), size=count)
         self._ratios = self._rng.uniform(0.1, 2.0, count).astype(_F)
-        threads = range(len(self._states))
-        list(
-            map(self._share, threads)
-            if self._pool is None
-            else self._pool.map(self._share, threads)
-        )
+        list(self._pool.map(self._share, range(len(self._states))))
         return self._out
 
     def _share(self, thread: int) -> None:
@@ -102,10 +95,3 @@ class KernelLimit:
             args = (self._lights[self._chosen[i]], self._ratios[i], self._shot, self._read)
             state = np.uint64(_loop(*args, self._bank, self._exact, state, self._flat[i]))
         self._states[thread] = state
-
-
-def lookup(frames: tuple[int, ...], num_frames: int, seed: int) -> Callable[[], Any]:
-    """Copies observations of shape `frames` that were worked out beforehand: no simulation."""
-    rng = np.random.default_rng(seed)
-    known = rng.integers(256, size=(512, *frames), dtype=np.uint8)
-    return lambda: known[rng.integers(len(known), size=num_frames)]

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from statistics import median
 from typing import Any
 
 import gymnasium as gym
@@ -25,7 +24,7 @@ import ae_env  # noqa: F401  registers the environment
 from ae_env.scorers import Captures
 from benchmarks.harness import Row, quartiles
 from benchmarks.isolated import CORES, timed
-from benchmarks.throughput.kernel_limit import KernelLimit, lookup
+from benchmarks.throughput.kernel_limit import KernelLimit
 from benchmarks.throughput.worker import CACHED, ID, warm_environments
 from simulator.utils.cache import CACHE_VARIABLE
 
@@ -34,7 +33,6 @@ SCENES = "bundled:small"
 QUICK, FULL = (3, 0.08), (9, 0.3)
 #: Names of the limits that others are compared with.
 KERNEL = {"bank": "fused kernel, noise bank", "exact": "fused kernel, exact noise"}
-LOOKUP = "lookup"
 
 
 class LiveScore:
@@ -44,24 +42,20 @@ class LiveScore:
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,) of `images` (B, 4, H, W)."""
-        away = images.sqrt() - 0.5
-        return away.square_().mul_(-1 / (2 * 0.2**2)).exp_().mean(dim=(1, 2, 3))
+        return ((images.sqrt() - 0.5) ** 2 / (-2 * 0.2**2)).exp().mean(dim=(1, 2, 3))
 
 
 @dataclass
 class Case:
     """One thing to time: `step` makes `num_envs` frames; `noise` names its kernel limit.
 
-    `error` is the largest difference of a code between an episode in a batch and the same alone;
-    `seconds` the time per frame, one for each round.
+    `seconds` are the times per frame, one for each round.
     """
 
     name: str
     num_envs: int
     step: Callable[[], Any]
     noise: str = "bank"
-    observation: str = "uint8"
-    error: float | None = None
     close: Callable[[], Any] = lambda: None
     seconds: list[float] = field(default_factory=list)
 
@@ -75,7 +69,7 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
     for noise, name in KERNEL.items():
         kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
         cases.append(Case(name, 64, kernel.step, noise))
-    cases += [Case(LOOKUP, 64, lookup((4, size, size), 64, seed)), *_cases(size, seed, threads > 1)]
+    cases += _cases(size, seed, threads > 1)
     try:
         _measure(cases, *(QUICK if quick else FULL))
     finally:
@@ -90,37 +84,29 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
 def _cases(size: int, seed: int, full: bool) -> Iterator[Case]:
     """Cases of the environment itself; without `full` only the chief ones."""
     live, exact = {"scorer": f"{__name__}:LiveScore"}, {"noise": "exact"}
-    # An episode of 8 steps takes 9 frames; the kernel takes one per step.
-    endless: dict[str, Any] = {"max_episode_steps": None}
+    many, rest, moved = "vector env", "cached scene", "motion and defocus"
     cases: list[tuple[str, int, dict[str, Any]]] = [
-        ("one environment, cached scene", 1, CACHED),
-        ("vector env, cached scene", 64, CACHED),
-        ("vector env, cached scene, endless episodes", 64, CACHED | endless),
-        ("vector env, cached scene, live scoring", 64, CACHED | live),
-        ("vector env, cached scene, exact noise", 64, CACHED | exact),
-        ("vector env, motion and defocus", 64, {}),
+        (f"one environment, {rest}", 1, CACHED),
+        (f"{many}, {rest}", 64, CACHED),
+        # An episode of 8 steps takes 9 frames; the kernel takes one per step.
+        (f"{many}, {rest}, endless episodes", 64, CACHED | {"max_episode_steps": None}),
+        (f"{many}, {rest}, live scoring", 64, CACHED | live),
+        (f"{many}, {rest}, exact noise", 64, CACHED | exact),
+        (f"{many}, {moved}", 64, {}),
     ]
     if full:
-        for shown in ("linear", "dn"):
-            cases.append(
-                (f"vector env, cached scene, {shown}", 64, CACHED | {"observation": shown})
-            )
-        for lighting in ("sine", "flicker"):
-            name = f"vector env, motion and defocus, {lighting} light"
-            cases.append((name, 64, {"lighting": lighting}))
-        cases.append(("one environment, motion and defocus", 1, {}))
+        shown = ("linear", "dn")
+        cases += [(f"{many}, {rest}, {kind}", 64, CACHED | {"observation": kind}) for kind in shown]
+        lights = ("sine", "flicker")
+        cases += [(f"{many}, {moved}, {kind} light", 64, {"lighting": kind}) for kind in lights]
+        cases.append((f"one environment, {moved}", 1, {}))
         for count in (8, 512):
-            cases.append(("vector env, cached scene", count, CACHED))
-            cases.append(("vector env, motion and defocus", count, {}))
+            cases += [(f"{many}, {rest}", count, CACHED), (f"{many}, {moved}", count, {})]
     for name, count, options in cases:
         make: dict[str, Any] = {"scenes": SCENES, "resolution": size} | options
-        noise, shown = make.get("noise", "bank"), make.get("observation", "uint8")
-        if count == 1:
-            yield Case(name, 1, _stepper(warm_environments(1, make, seed), seed), noise)
-            continue
-        envs = warm_environments(count, make | {"autoreset_mode": "SAME_STEP"}, seed)
-        error = _largest_difference(envs, make, seed)
-        yield Case(name, count, _stepper(envs, seed), noise, shown, error)
+        make |= {"autoreset_mode": "SAME_STEP"} if count > 1 else {}
+        envs = warm_environments(count, make, seed)
+        yield Case(name, count, _stepper(envs, seed), make.get("noise", "bank"))
 
 
 def _copies(count: int, size: int, seed: int) -> Case:
@@ -134,14 +120,13 @@ def _copies(count: int, size: int, seed: int) -> Case:
     context = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
     copies, mode = [partial(_copy, options)] * count, AutoresetMode.SAME_STEP
     envs = AsyncVectorEnv(copies, context=context, autoreset_mode=mode)
-    error, name = _largest_difference(envs, options, seed), "copies in subprocesses, cached scene"
-    return Case(name, count, _stepper(envs, seed), error=error, close=envs.close)
+    name = "copies in subprocesses, cached scene"
+    return Case(name, count, _stepper(envs, seed), close=envs.close)
 
 
-def _copy(options: dict[str, Any]) -> gym.Env:
+def _copy(options: dict[str, Any]) -> Any:
     torch.set_num_threads(1)
-    env: gym.Env = warm_environments(1, options)
-    return env
+    return warm_environments(1, options)
 
 
 def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
@@ -154,20 +139,6 @@ def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
             envs.reset()
 
     return step
-
-
-def _largest_difference(envs: gym.vector.VectorEnv, make: dict[str, Any], seed: int) -> float:
-    """Largest difference of a code between the last environment and the same episode alone."""
-    last = envs.num_envs - 1
-    alone = gym.make(ID, **make)
-    pairs = [(envs.reset(seed=seed)[0], alone.reset(seed=seed + last)[0])]
-    for action in (0, 21, 42, 63):
-        actions = np.full(envs.num_envs, action)
-        pairs.append((envs.step(actions)[0], alone.step(action)[0]))
-    return max(
-        float(np.abs(many["raw"][last].astype(float) - one["raw"].astype(float)).max())
-        for many, one in pairs
-    )
 
 
 # -- measuring ------------------------------------------------------------------------------------
@@ -192,12 +163,11 @@ def _rows(cases: list[Case], threads: int, size: int) -> list[Row]:
     limits, rows = {case.name: case.seconds for case in cases}, []
     for case in cases:
         low, middle, high = quartiles(case.seconds)
-        row: Row = {"case": case.name, "num_envs": case.num_envs, "observation": case.observation}
+        row: Row = {"case": case.name, "num_envs": case.num_envs}
         row |= {"steps_per_second": 1.0 / middle, "spread": (high - low) / middle}
-        for name, limit in (("kernel", KERNEL[case.noise]), ("lookup", LOOKUP)):
-            pairs = zip(limits[limit], case.seconds, strict=True)
-            row[f"ratio_to_{name}"] = statistics.median(least / own for least, own in pairs)
-        rows.append(row | {"error_codes": case.error, "size": size, "threads": threads})
+        pairs = zip(limits[KERNEL[case.noise]], case.seconds, strict=True)
+        row["ratio_to_kernel"] = statistics.median(least / own for least, own in pairs)
+        rows.append(row | {"size": size, "threads": threads})
     return rows
 
 
@@ -270,8 +240,7 @@ def measure_cold_start(quick: bool) -> list[Row]:
     for case, runs in found.items():
         low, middle, high = quartiles([sum(run[:4]) for run in runs])
         row: Row = {"case": case, "threads": CORES, "total_s": middle}
-        row |= {
-            f"{name}_s": median(run[i] for run in runs) for i, name in enumerate((*TIMES, "cpu"))
-        }
+        for name, values in zip((*TIMES, "cpu"), zip(*runs, strict=True), strict=True):
+            row[f"{name}_s"] = statistics.median(values)
         rows.append(row | {"spread": (high - low) / middle})
     return rows

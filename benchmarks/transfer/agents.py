@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,24 +16,17 @@ from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.load import simulate_source_raw
 from ae_env.scenes.polyhaven import list_assets
 from ae_env.scenes.scene import Crop, Split
-from agents.cli.console import progress_bars
 from agents.evaluation.engine import evaluate
+from agents.evaluation.evaluation_plan import groups_in_turn
 from agents.evaluation.intervals import difference_interval, score_interval
-from agents.evaluation.plan import groups_in_turn
 from agents.evaluation.result import EvaluationResult
-from agents.learning.training import (
-    TrainingJob,
-    is_trained,
-    load_config,
-    train_agent,
-)
-from agents.learning.workers import run_in_parallel, send_progress
+from agents.learning.training import TrainingJob, load_config, train_in_parallel
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from agents.rollouts import make_envs
-from benchmarks.ablation import changed_config
+from benchmarks.agents import changed_config
 from benchmarks.fidelity.models import weights
-from benchmarks.harness import Row, sections, table
+from benchmarks.harness import RUNS, Row, sections, table
 from benchmarks.isolated import ROOT
 from simulator import CameraProfile
 
@@ -54,29 +46,29 @@ BOTH = "both"
 
 
 def scenes_of(
-    name: str, crop: Crop, split: Split, camera: CameraProfile, resolution: int | None
+    name: str,
+    crop: Crop,
+    split: Split,
+    camera: CameraProfile,
+    resolution: int | None,
+    high_iso: bool = False,
 ) -> list[Scene]:
-    names = ("bundled", "polyhaven") if name == BOTH else (name,)
-    common: dict[str, Any] = {"camera": camera, "resolution": resolution, "crop": crop}
-    return [scene for one in names for scene in load_scenes(one, split, **common)]
-
-
-def at_high_iso(
-    name: str, split: Split, camera: CameraProfile, resolution: int | None
-) -> list[Scene]:
-    """Scenes of a set, each photographed once at an ISO of 1600 to 6400, drawn by its name.
+    """Scenes of a set; or each photographed once at an ISO of 1600 to 6400, drawn by its name.
 
     What `source="raw"` makes of them but for the ISO: exposure and noise are drawn alike.
     """
-    scenes = scenes_of(name, "box", split, camera, resolution)
-    return [simulate_source_raw(scene, iso_range=HIGH_ISO) for scene in scenes]
+    names = ("bundled", "polyhaven") if name == BOTH else (name,)
+    common: dict[str, Any] = {"camera": camera, "resolution": resolution, "crop": crop}
+    found = [scene for one in names for scene in load_scenes(one, split, **common)]
+    return [simulate_source_raw(s, iso_range=HIGH_ISO) for s in found] if high_iso else found
 
 
 #: What the environment's `scenes` names, as ``"benchmarks.transfer.agents:high_iso_both_box"``.
 both_box: Callable[..., list[Scene]] = partial(scenes_of, BOTH, "box")
-high_iso_both_box: Callable[..., list[Scene]] = partial(at_high_iso, BOTH)
-high_iso_bundled_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled")
-high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small")
+high_iso_both_box: Callable[..., list[Scene]] = partial(both_box, high_iso=True)
+high_iso_bundled_box, high_iso_small_box = (
+    partial(scenes_of, name, "box", high_iso=True) for name in ("bundled", "bundled:small")
+)
 
 
 # -- worlds ---------------------------------------------------------------------------------------
@@ -169,6 +161,10 @@ QUICK = TransferPlan(
 )
 
 
+def plan_of(quick: bool) -> TransferPlan:
+    return QUICK if quick else TransferPlan()
+
+
 def training_set(plan: TransferPlan) -> str:
     """The plan's scenes; the bundled ones where it asks for panoramas and there are none."""
     has_panoramas = all(asset.path is not None for asset in list_assets())
@@ -194,14 +190,15 @@ TOGETHER = "agents together"
 Jobs = dict[tuple[str, str], list[TrainingJob]]
 
 
-def agent_rows(plan: TransferPlan, folder: Path, *, seed: int = 0) -> list[Row]:
-    """Trains what `folder` does not have, judges all agents; a row for each agent and world.
+def measure(seed: int, quick: bool) -> list[Row]:
+    """Trains what is not there yet, judges all agents; a row for each agent and world.
 
     The agents of a world together are a row, too, as so many training seeds. `seed` is that of the
     evaluation; the training seeds are the plan's.
     """
-    jobs = training_jobs(plan, folder)
-    train(jobs)
+    plan = plan_of(quick)
+    jobs = training_jobs(plan, RUNS.parent / f"bench_transfer{'_quick' * quick}")
+    train_in_parallel([job for own in zip(*jobs.values(), strict=True) for job in own])
     result, gains, rows = judged(plan, jobs, seed=seed), {}, []
     for agent, world in jobs:  # the span is the same for all
         gains[agent, world], span = result.group_gains(f"{agent} in {world}")
@@ -213,19 +210,14 @@ def agent_rows(plan: TransferPlan, folder: Path, *, seed: int = 0) -> list[Row]:
         for world in (world for name, world in gains if name == agent):
             members = plan.agents if agent == TOGETHER else (agent,)
             errors = [result.episode_metrics(f"{one} in {world}") for one in members]
-            taken = [[training_seconds(j.out) / 60 for j in jobs[one, world]] for one in members]
             row: Row = {"agent": agent, "world": world, "high_iso": WORLDS[world].high_iso}
             row |= {"simulator": WORLDS[world].simulator, "frames": plan.frames}
             row |= {"crop": CROP, "scorer": plan.scorer, **comparison(gains, span, agent, world)}
             row |= {"num_scenes": len(set(result.scene_ids.tolist()))}
             for name in ("regret", "ev_within_third"):
                 row[name] = float(np.mean([own[name].mean() for own in errors]))
-            row["minutes"] = float(np.mean([np.median(own) for own in taken]))
-            rows.append(row | {"minutes_by_seed": [m for own in taken for m in own]})
+            rows.append(row)
     return rows
-
-
-# -- training -------------------------------------------------------------------------------------
 
 
 def training_jobs(plan: TransferPlan, folder: Path) -> Jobs:
@@ -250,47 +242,6 @@ def common_options(plan: TransferPlan) -> dict[str, Any]:
     return {"resolution": RESOLUTION, "crop": CROP, "scorer": plan.scorer}
 
 
-def train(jobs: Jobs) -> None:
-    everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
-    waiting = [job for job in everything if not is_trained(job.config, job.out)]
-    with progress_bars() as progress, ExitStack() as bars:
-        whole = bars.enter_context(progress(f"{len(waiting)} trainings"))
-        shares = dict.fromkeys((job.name for job in waiting), 0.0)
-
-        def report(name: str, done: int, total: int) -> None:
-            shares[name] = done / total
-            whole(int(1000 * sum(shares.values())), 1000 * len(shares), name)
-
-        run_in_parallel(_train, waiting, progress=report)
-
-
-def _train(job: TrainingJob) -> None:
-    """In a worker: trains one agent, and adds the time that it takes to what it took before."""
-    last, began = 0, time.perf_counter()
-    before = training_seconds(job.out) if Path(f"{job.out}.checkpoint").is_file() else 0.0
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-
-    def report(done: int, total: int, _: Mapping[str, float]) -> None:
-        nonlocal last
-        if done == total or done - last >= total // 100:
-            last = done
-            seconds = before + time.perf_counter() - began
-            _seconds_file(job.out).write_text(f"{seconds:.1f}\n", encoding="ascii")
-            send_progress(job.name, done, total)
-
-    train_agent(job.config, job.out, progress=report)
-
-
-def training_seconds(out: Path) -> float:
-    """How long a training has taken, its scenes and their networks included; 0 if unknown."""
-    file = _seconds_file(out)
-    return float(file.read_text(encoding="ascii")) if file.is_file() else 0.0
-
-
-def _seconds_file(out: Path) -> Path:
-    return Path(f"{out}.seconds")
-
-
 # -- judging --------------------------------------------------------------------------------------
 
 
@@ -304,9 +255,7 @@ def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult
         f"{agent} in {world}": [make_policy(f"{agent}:{job.out}", context) for job in own]
         for (agent, world), own in jobs.items()
     }
-    with progress_bars() as progress, progress("evaluation") as task:
-        given: Any = {"episodes_per_scene": plan.episodes, "seed": seed, "progress": task}
-        return evaluate(policies, options, **given)
+    return evaluate(policies, options, episodes_per_scene=plan.episodes, seed=seed)
 
 
 def comparison(
@@ -329,34 +278,13 @@ def comparison(
 
 # -- tables ---------------------------------------------------------------------------------------
 
-#: Largest drop that is asked for.
-MOST_DROP = 0.015
 _COLUMNS = """trained in = `{world}` |
 normalised score = {normalised_score:.3f} [{ci95[0]:.3f}, {ci95[1]:.3f}] |
 drop against `truth` = {drop:+.3f} [{drop_ci95[0]:+.3f}, {drop_ci95[1]:+.3f}] |
 more than in `EXP` =
 {more_than_exp:+.3f} [{more_than_exp_ci95[0]:+.3f}, {more_than_exp_ci95[1]:+.3f}] |
-within 1/3 EV = {ev_within_third:.0%} | minutes to train = {minutes:.1f}"""
-_ASKED = """agent = {agent} | trained in = `{world}` | asked = {asked} | measured = {measured} |
-met = {met}"""
+within 1/3 EV = {ev_within_third:.0%}"""
 
 
-def agent_tables(rows: Sequence[Row]) -> dict[str, str]:
-    by_agent = sections(rows, "{agent}", lambda own: table(own, _COLUMNS))
-    return {"verdicts": table(verdicts(rows), _ASKED), "agents": by_agent}
-
-
-def verdicts(rows: Sequence[Row]) -> Iterator[Row]:
-    for row in (row for row in rows if row["simulator"] == "compact"):
-        name, asked, met = "drop", f"drop below {MOST_DROP}", row["drop"] < MOST_DROP
-        if row["high_iso"]:
-            if row.get("more_than_exp") is None:
-                continue
-            name, asked = "more_than_exp", "drop smaller than EXP's beyond the interval"
-            met = row[f"{name}_ci95"] is not None and row[f"{name}_ci95"][0] > 0.0
-        ends = (
-            ""
-            if row[f"{name}_ci95"] is None
-            else " [{:+.3f}, {:+.3f}]".format(*row[f"{name}_ci95"])
-        )
-        yield row | {"asked": asked, "met": met, "measured": f"{row[name]:+.3f}{ends}"}
+def shown(rows: Sequence[Row]) -> str:
+    return sections(rows, "{agent}", lambda own: table(own, _COLUMNS))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -21,10 +20,9 @@ from ae_env.scenes import Scene
 from ae_env.scenes.load import SceneNetworks, simulate_source_raw
 from ae_env.scenes.scene import Crop
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from agents.cli.console import progress_bars
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.rollouts import RolloutPlan, make_envs
-from benchmarks.harness import FinishedParts, Row, cell, pivot, sections, table
+from benchmarks.harness import Row, cell, pivot, sections, table
 from benchmarks.transfer import agents as worlds
 
 #: What is measured of a predicted table, each the better the smaller but the first.
@@ -35,31 +33,13 @@ Measured = dict[str, Any]
 Totals = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
-def table_rows(plan: worlds.TransferPlan, finished: FinishedParts, *, seed: int = 0) -> list[Row]:
-    """A row for each crop, source ISO, source exposure and simulator.
+def measure(number: int, crop: Crop, iso: int, seed: int, quick: bool) -> list[Row]:
+    """A row for each source exposure and simulator, of the plan's `number`-th set of tables.
 
-    `finished` keeps what is measured, so that a run that was stopped continues; `seed` is that of
-    motion and defocus, and of the photographs.
+    `seed` is that of motion and defocus, and of the photographs.
     """
-    rows: list[Row] = []
-    sets = [(part, crop, iso) for part in plan.tables for crop in part.crops for iso in part.isos]
-    with progress_bars() as progress, progress("score tables") as task:
-        for number, (part, crop, iso) in enumerate(sets):
-            name = f"{part.scorer} {crop} ISO {iso}"
-            task(number, len(sets), name)
-            measure = partial(_measure, plan, part, crop, iso, seed)
-            found = finished.get(f"{name} {part} {worlds.training_set(plan)}", measure)
-            for ev, measured in zip(part.evs, found, strict=True):
-                common = {"scorer": part.scorer, "crop": crop, "iso": iso, "ev": ev}
-                rows += [common | row for row in summary(measured)]
-        task(1, 1)
-    return rows
-
-
-def _measure(
-    plan: worlds.TransferPlan, part: worlds.TableSet, crop: Crop, iso: int, seed: int
-) -> list[list[Measured]]:
-    """What is measured of every scene and simulator: a list for each source exposure."""
+    plan = worlds.plan_of(quick)
+    part = plan.tables[number]
     options = EnvOptions(scorer=part.scorer, resolution=worlds.RESOLUTION)
     scorer = options.make_scorer()
     tables = ScoreTables(options.make_grid(), options.make_camera(), scorer)
@@ -70,9 +50,9 @@ def _measure(
     for name in filter(worlds.has_weights, part.simulators):
         given = worlds.simulator_argument(name)
         simulators[name] = None if given is None else SceneNetworks(given, cache=False)
-    found: list[list[Measured]] = []
+    rows: list[Row] = []
     for ev in part.evs:
-        found.append([])
+        found: list[Measured] = []
         for scene, own, right in zip(scenes, moves, true, strict=True):
             taken = simulate_source_raw(scene, seed=seed, iso=iso, ev=ev)
             for name, networks in simulators.items():
@@ -82,8 +62,10 @@ def _measure(
                 row: Measured = {"ms": 1000.0 * (time.perf_counter() - began)}
                 row |= {"simulator": name, "group": scene.group}
                 row["saturated"] = taken.prepared.saturated_share
-                found[-1].append(row | errors(table, right, scorer.totals))
-    return found
+                found.append(row | errors(table, right, scorer.totals))
+        common = {"scorer": part.scorer, "crop": crop, "iso": iso, "ev": ev}
+        rows += [common | row for row in summary(found)]
+    return rows
 
 
 def drawn_moves(scenes: Sequence[Scene], seed: int) -> list[dict[str, Any]]:
@@ -166,17 +148,17 @@ _HEADINGS = {
 _SOURCE, _SIMULATOR = "source = ISO {iso}, {ev:+d} EV", "`{simulator}`"
 
 
-def score_tables(rows: Sequence[Row]) -> dict[str, str]:
+def shown(rows: Sequence[Row]) -> str:
     """Tables of each scorer and crop; a star where an interval leaves out zero."""
-    shown = []
+    found = []
     for row in rows:
         title = f"`{row['scorer']}`, frames {_CROPS[row['crop']]}"
         stars = {}
         for name in MEASURES[1:]:
             low, high = row.get(f"{name}_to_exp_ci95") or (0.0, 0.0)
             stars[f"{name}_star"] = "*" * (low > 0.0 or high < 0.0)
-        shown.append(row | {"title": title, **stars})
-    return {"tables": sections(shown, "{title:md}", _of_set)}
+        found.append(row | {"title": title, **stars})
+    return sections(found, "{title:md}", _of_set)
 
 
 def _of_set(rows: list[Row]) -> str:

@@ -1,7 +1,5 @@
 """Error against run time: every method, the plan's predictions, what is left out.
 
-    ae-env bench work-precision
-
 Needs trained weights as ``ae-env bench simulator`` does: ``compact`` comes with the package,
 ``paper``, ``pc`` and ``dl`` are trained once where ``runs/simulator`` does not hold them.
 
@@ -11,9 +9,8 @@ a round in which all methods take their turn, in another order each time.
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,25 +19,16 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from benchmarks import harness
 from benchmarks.fidelity.models import train_missing
-from benchmarks.harness import (
-    Part,
-    Report,
-    Row,
-    benchmark,
-    clipped,
-    data_root,
-    psnr,
-    quartiles,
-    sections,
-    table,
-)
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, sections, table
 from benchmarks.isolated import CORES, ROOT, timed
 from benchmarks.work_precision import plans
-from benchmarks.work_precision.methods import DEFAULT, Method, all_methods
+from benchmarks.work_precision.methods import Method, all_methods
 from benchmarks.work_precision.plans import GRID, SIZES, Trial, trials
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage
 from simulator.noise.noise_level_function import noise_variance
+from simulator.utils.files import data_folder as data_root
 
 #: Processes among which the scenes of the plan's predictions are shared out: of the validation
 #: split, which the plan's constants were calibrated on, and of the test split.
@@ -70,10 +58,10 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         _captured(method, small.raw(seed), small.states(1), seed)
     for index, trial in enumerate(chosen):
         _one_trial(records, methods, trial, trial.states(count), seed + 1000 * index, index)
-    floor, rows = _median(records.pop(REFERENCE)["noise"]), []
+    floor, rows = float(np.median(records.pop(REFERENCE)["noise"] or np.nan)), []
     for method in methods:
         own = records[method.key]
-        low, middle, high = quartiles(own["ms"])
+        low, middle, high = harness.quartiles(own["ms"])
         row: Row = {"part": "precision", "method": method.name, "height": height, "width": width}
         row |= {"dtype": method.dtype, "tolerance": method.tolerance}
         row |= {"mode": "transition" if method.prepare is None else "shared"}
@@ -82,16 +70,12 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         for percent in (10, 90):
             row[f"psnr_db_{percent}_percent"] = float(np.quantile(own["psnr"], percent / 100))
         row |= {"relative_rmse": float(np.mean(own["rmse"])), "noise_variance_floor": floor}
-        row |= {"noise_variance_error": _median(own["noise"])}
+        row |= {"noise_variance_error": float(np.median(own["noise"] or np.nan))}
         rows.append(row | {"scenes": len(chosen), "states_per_scene": count})
     points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
     for row, best in zip(rows, pareto_front(points), strict=True):
         row["pareto"] = best
     return rows
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if len(values) else None
 
 
 def _one_trial(
@@ -211,13 +195,7 @@ _COLOURS = {
 _REACH = 6.0
 #: A part makes up nearly all of an error beyond this share of it; smaller errors are not sorted.
 _MOST, _LEAST, _QUANTILES = 0.9, 0.02, {"low": 0.1, "middle": 0.5, "high": 0.9}
-#: Least factor that a sweep is to be faster by, and by how much its PSNR may be lower [dB].
-TARGETS = {"paper, no repetition": (100.0, 0.0), "paper full": (200.0, 0.0)}
 
-
-_TARGET = """sweep with = {method} | at = {height} x {width} | against = {against} |
-times faster = {ratio:,.0f} | asked = {faster:g} | PSNR [dB] = {gain_db:+.2f} |
-asked at least = -{lower:g} | verdict = {verdict}"""
 _PRECISION = """method = {name:md} | type = {dtype} | ms per state = {each} ± {spread} |
 ms per sweep = {sweep} | PSNR [dB] = {psnr_db:.2f} |
 10 to 90 % = {psnr_db_10_percent:.1f} to {psnr_db_90_percent:.1f} |
@@ -225,7 +203,7 @@ relative RMSE = {relative_rmse:.4f} | noise = {noise_variance_error:.1%}"""
 _SCENES = """{height} x {width}: {scenes} scenes, {states_per_scene} states of each, two \
 photographs; floor of the noise: {noise_variance_floor:.1%}"""
 _BOUND = """tolerance = {tolerance:g} | cases = {cases} | networks = {networks} |
-predicted = {predicted:.3g} | measured = {measured:.3g} ({ci95[0]:.2g} to {ci95[1]:.2g}) |
+predicted = {predicted:.3g} | measured = {measured:.3g} |
 90 % bound holds = {covered:.0%} | kept = {said:.0%} | truly = {kept:.0%}"""
 _FACTORS = """part = {part} | cases = {cases} | 10 % = {low:.2f} | median = {middle:.2f} |
 90 % = {high:.2f} | 90 % bound holds = {covered:.0%}"""
@@ -237,49 +215,30 @@ times faster = {times:,.0f} | predicted error = {predicted_mean:.3f}, {predicted
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    rows: list[Row] = []
-    for own in results.values():
-        rows += own if isinstance(own, list) else [own]
+    rows = [r for own in results.values() for r in (own if isinstance(own, list) else [own])]
     precise, bounds, kinds = (
         [r for r in rows if r["part"] == part] for part in ("precision", "bound", "left_out")
     )
     tests, chosen = ([r for r in bounds if r["split"] == s] for s in ("test", "validation"))
-    targets, shown = list(_targets(precise)), []
+    shown = []
     for row in precise:
         sweep, name = row["ms_per_sweep"], row["method"]
         texts = {"each": _ms(row["ms_per_state"]), "spread": _ms(row["ms_spread"])}
         texts["sweep"] = _ms(sweep) if row["mode"] == "shared" else f"({sweep:,.0f})"
         shown.append(row | texts | {"name": f"**{name}**" if row["pareto"] else name})
     tables = {
-        "targets": table(targets, _TARGET),
         "precision": sections(shown, _SCENES, lambda own: table(own, _PRECISION)),
         "bound": sections(_by_tolerance(tests), "{kind}", lambda own: table(own, _BOUND)),
         "factors": table(_by_part(chosen), _FACTORS),
         "left-out": table(kinds, _LEFT_OUT),
     }
     figures: dict[Any, Figure] = {QUICK if meta["quick"] else HEADLINE: _headline(precise)}
-    more = {"threads": CORES, "real_files": data_root() is not None, "targets": targets}
+    more = {"threads": CORES, "real_files": data_root() is not None}
     return Report(rows, tables, meta=more, figures=figures)
 
 
 def _ms(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def _targets(rows: list[Row]) -> Iterator[Row]:
-    """Every planned sweep in float32 against the full runs, by size."""
-    rows = [row for row in rows if row["dtype"] == "float32"]
-    for row, other in itertools.product(rows, rows):
-        shared = row["tolerance"] == DEFAULT and row["mode"] == "shared"
-        if not shared or row["height"] != other["height"] or other["method"] not in TARGETS:
-            continue
-        faster, lower = TARGETS[other["method"]]
-        ratio = other["ms_per_sweep"] / row["ms_per_sweep"]
-        gain = row["psnr_db"] - other["psnr_db"]
-        target = {key: row[key] for key in ("method", "height", "width")}
-        target |= {"against": other["method"], "ratio": ratio, "gain_db": gain, "faster": faster}
-        met = ratio >= faster and gain >= -lower
-        yield target | {"lower": lower, "verdict": "reached" if met else "missed"}
 
 
 def _by_tolerance(rows: list[Row]) -> list[Row]:
@@ -295,7 +254,7 @@ def _by_tolerance(rows: list[Row]) -> list[Row]:
         row["networks"] = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
         row |= {key: own[key].median() for key in ("predicted", "measured")}
         row |= {key: own[key].mean() for key in ("covered", "said")}
-        found.append(row | {"ci95": _interval(own), "kept": kept.mean() if len(kept) else None})
+        found.append(row | {"kept": kept.mean() if len(kept) else None})
     return found
 
 
@@ -314,17 +273,6 @@ def _by_part(rows: list[Row]) -> list[Row]:
         row |= {name: np.quantile(ratios, share) for name, share in _QUANTILES.items()}
         found.append(row | {"covered": np.mean([r["measured"] <= r["bound"] for r in own])})
     return found
-
-
-def _interval(rows: pd.DataFrame) -> list[float]:
-    """95 % bootstrap interval of the median error over scenes."""
-    groups = [own.to_numpy() for _, own in rows.groupby("scene", sort=False)["measured"]]
-    rng = np.random.default_rng(0)
-    medians = [
-        np.median(np.concatenate([groups[i] for i in rng.integers(len(groups), size=len(groups))]))
-        for _ in range(1000)
-    ]
-    return [float(q) for q in np.quantile(medians, [0.025, 0.975])]
 
 
 def _headline(rows: list[Row]) -> Figure:
@@ -362,13 +310,12 @@ def parts(seed: int, quick: bool) -> list[Part]:
     """Parts to measure; a full run first trains the networks that are missing."""
     if not quick:
         train_missing()
-    given = {"seed": seed, "quick": quick}
-    found = [Part(f"precision {size[0]}", measure, {"size": size, **given}) for size in SIZES]
+    found = [Part(f"precision {size[0]}", measure, {"size": size}) for size in SIZES]
     for split, shares in _SHARES.items():
         for share in range(1 if quick else shares):
-            arguments = {"split": split, "share": share, "shares": shares, **given}
+            arguments = {"split": split, "share": share, "shares": shares}
             found.append(Part(f"bound {split} {share}", plans.bound, arguments))
-    return found + [Part(kind, plans.left_out, {"kind": kind, **given}) for kind in plans.KINDS]
+    return found + [Part(kind, plans.left_out, {"kind": kind}) for kind in plans.KINDS]
 
 
 run = benchmark("work-precision", parts, report)

@@ -17,15 +17,10 @@ from torch import Tensor, nn
 from benchmarks.denoising import Denoiser, classical
 from benchmarks.fidelity.models import baseline, load_models, weights
 from benchmarks.harness import recorded
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    exposure_ratio,
-)
-from simulator.capture.exposure import DEFAULT_TOLERANCE
+from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio
+from simulator.capture.decision import DEFAULT_TOLERANCE
+from simulator.capture.prepared_scene import PreparedScene
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.compute import computes_bfloat16
 
 Dtype = Literal["float32", "bfloat16"]

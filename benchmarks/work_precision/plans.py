@@ -20,6 +20,7 @@ import functools
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,19 +32,12 @@ from ae_env import ExposureGrid
 from benchmarks.harness import Row, cropped, data_root
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    get_camera,
-    incident_ev100,
-)
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, incident_ev100
 from simulator.camera_simulator import Depth
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
-from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import Split, reference_scenes
 
 #: Height and width [packed pixel].
@@ -141,10 +135,8 @@ def _in_turn(kinds: dict[str, list[ReferenceScene]], counts: dict[str, int]) -> 
     columns = [kinds[kind][:count] for kind, count in counts.items()]
     chosen = [c[i] for i in range(max(counts.values())) for c in columns if i < len(c)]
     camera = ReferenceCamera(get_camera(CAMERA))
-    return tuple(
-        Trial(scene, source_settings(scene, *SOURCES[i % len(SOURCES)]), camera)
-        for i, scene in enumerate(chosen)
-    )
+    sources = [source_settings(s, *SOURCES[i % len(SOURCES)]) for i, s in enumerate(chosen)]
+    return tuple(Trial(*own, camera) for own in zip(chosen, sources, strict=True))
 
 
 def _scenes(
@@ -153,9 +145,8 @@ def _scenes(
     """Scenes of exactly `size` by kind."""
     profile = get_camera(CAMERA)
     found = reference_scenes(split, profile, number=groups, size=drawn, data=data_root())
-    kinds: dict[str, list[ReferenceScene]] = {
-        kind: [] for kind in ("depth", "flat", "photograph", "radiance")
-    }
+    names = ("depth", "flat", "photograph", "radiance")
+    kinds: dict[str, list[ReferenceScene]] = {kind: [] for kind in names}
     for scene in found:
         if min(scene.size) >= min(size) and max(scene.size) >= max(size):
             known = scene.kind if scene.kind in kinds else "flat"
@@ -194,13 +185,13 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
             for tolerance in (DEFAULT,) if position % _EVERY else TOLERANCES:
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
-                planned = _Draws(*(torch.stack(own) for own in zip(*pairs, strict=True)))
+                light, added = (torch.stack(own) for own in zip(*pairs, strict=True))
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
                 row |= {"settings": str(settings), "tolerance": tolerance}
                 row |= {"network": plan.network, "errors": dict(plan.errors)}
                 row |= {"predicted": plan.predicted_error, "bound": plan.error_bound}
-                rows.append(row | {"measured": planned.distance(truth, wanted, shows)})
+                rows.append(row | {"measured": distance(light, added, truth, wanted, shows)})
     return rows
 
 
@@ -238,29 +229,23 @@ def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Te
     return light, missing_variance(light, table, exposure.remaining_variance).clamp(min=0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """Captures of one scene at the same settings before their noise is drawn."""
+def distance(light: Tensor, added: Tensor, truth: Tensor, wanted: Tensor, shows: Tensor) -> float:
+    """Distance of captures to those of mean `truth` and variance `wanted`, in units of `shows`.
 
-    light: Tensor
-    added: Tensor
+    The captures are draws (N, 4, H, W) of one scene: `light` before its last noise is drawn, and
+    the variance `added` by that. Deviations are pooled over a neighbourhood.
+    """
 
-    def deviation(self) -> Tensor:
-        """(4, H, W) standard deviation of the capture, pooled over a neighbourhood."""
-        return _pooled(_variance(self.light.double()) + self.added.double().mean(dim=0)).sqrt()
+    def apart(half: slice) -> Tensor:
+        variance = _variance(light[half].double()) + added[half].double().mean(dim=0)
+        return _pooled(variance).sqrt() - _pooled(wanted).sqrt()
 
-    def distance(self, truth: Tensor, wanted: Tensor, shows: Tensor) -> float:
-        """Distance to captures of mean `truth` and variance `wanted`, in units of `shows`."""
-        count = len(self.light)
-        error = self.light.double() - truth
-        spread = _variance(error) / shows
-        means = error.mean(dim=0).square() / shows - spread / count
-        first, second = (
-            _Draws(self.light[half], self.added[half]).deviation() - _pooled(wanted).sqrt()
-            for half in (slice(0, None, 2), slice(1, None, 2))
-        )
-        square = float((means + first * second / shows).mean())
-        return max(0.0, square) ** 0.5
+    error = light.double() - truth
+    spread = _variance(error) / shows
+    means = error.mean(dim=0).square() / shows - spread / len(light)
+    product = apart(slice(0, None, 2)) * apart(slice(1, None, 2))
+    square = float((means + product / shows).mean())
+    return max(0.0, square) ** 0.5
 
 
 def _pooled(variance: Tensor) -> Tensor:
@@ -301,10 +286,7 @@ def left_out(kind: str, seed: int, quick: bool) -> Row:
     predicted, times, every = [], [], []
     examples = [_source(t, taken, seed) for t in known[: 1 if quick else SCENES]]
     for source in examples:
-
-        def prepared(source: Any = source) -> PreparedScene:
-            return own.prepare(source, tolerance=DEFAULT, **told)
-
+        prepared: Any = partial(own.prepare, source, tolerance=DEFAULT, **told)
         for plan in map(prepared().plan, GRID):
             for step in plan.steps:
                 share = int(step.runs) / (len(examples) * len(GRID))
@@ -313,10 +295,8 @@ def left_out(kind: str, seed: int, quick: bool) -> Row:
         some = [GRID[(i * len(GRID) // FULL_STATES + i) % len(GRID)] for i in range(FULL_STATES)]
         for _ in range(1 if quick else REPEATS):
             times.append(timed(lambda p=prepared: p().expose(GRID)))  # type: ignore[misc]
-            every += [
-                timed(lambda s=source, x=x: own.simulate(s, x, tolerance=None, **told))  # type: ignore[misc]
-                for x in some
-            ]
+            full_run = partial(own.simulate, source, tolerance=None, **told)
+            every += [timed(partial(full_run, settings)) for settings in some]
     sweep, full = 1e3 * float(np.median(times)), 1e3 * float(np.mean(every)) * len(GRID)
     row = {"part": "left_out", "kind": kind, "scenes": len(examples), "share": names}
     row |= {"predicted_mean": float(np.mean(predicted)), "predicted_largest": max(predicted)}

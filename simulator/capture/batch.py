@@ -17,7 +17,7 @@ import numpy as np
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import Pool
-from simulator.capture.exposure import LIGHT_LIMIT, Exposure, decide
+from simulator.capture.decision import LIGHT_LIMIT, Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (

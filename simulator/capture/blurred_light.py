@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from simulator.capture.exposure import LIGHT_LIMIT, Exposure
+from simulator.capture.decision import LIGHT_LIMIT, Exposure
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from simulator.camera import get_camera
-from simulator.capture.exposure import SIGNAL_LIMIT, Exposure, Step
+from simulator.capture.decision import SIGNAL_LIMIT, Exposure, Step
 from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
 from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction, noise_variance
 from simulator.raw.develop import ABOVE_WHITE

@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
-from simulator.capture.exposure import (
+from simulator.capture.decision import (
     DEFAULT_TOLERANCE,
     Exposure,
     check_tolerance,

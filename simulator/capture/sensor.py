@@ -37,7 +37,7 @@ import torch
 from scipy.special import ndtri
 
 from simulator.camera import CameraProfile
-from simulator.capture.exposure import PEDESTAL, SIGNAL_LIMIT, Exposure
+from simulator.capture.decision import PEDESTAL, SIGNAL_LIMIT, Exposure
 from simulator.noise.generator import BLOCK, draw_block, drawn_normals
 from simulator.noise.noise_level_function import ReadNoise, plane_tensor
 from simulator.settings import CameraSettings

@@ -10,7 +10,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.raw.develop import XYZ_FROM_SRGB
-from simulator.reference.camera import lens_blur, sample_mosaic
+from simulator.reference.reference_camera import lens_blur, sample_mosaic
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 
 #: Signal of a perfectly white diffuse surface at the incident-light exposure, ``x = 0.663 * R``.

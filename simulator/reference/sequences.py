@@ -16,7 +16,7 @@ from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, s
 from simulator.utils.checks import check_word
 
 if TYPE_CHECKING:
-    from simulator.reference.camera import ReferenceScene
+    from simulator.reference.reference_camera import ReferenceScene
 
 Stage = Literal["exposure", "noise", "aperture", "all"]
 

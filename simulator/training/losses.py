@@ -16,7 +16,7 @@ from simulator.networks.aperture_module import (
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
 from simulator.optics.discs import DiscBank, added_blur
-from simulator.training.data import Batch, NoiseBatch
+from simulator.training.crops import Batch, NoiseBatch
 
 #: Weight of the loss on the logarithm of the circle of confusion beside that on the picture.
 _MAP_WEIGHT = 0.1

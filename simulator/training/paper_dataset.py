@@ -31,9 +31,9 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import LOW_ISO, Pair, any_pairs, is_cleaner, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.data import Batch, no_progress, stacked, stated_fields
+from simulator.training.crops import Batch, no_progress, stacked, stated_fields
 from simulator.training.losses import expose
-from simulator.training.train import (
+from simulator.training.trainer import (
     SimulatorConfig,
     TrainingProgress,
     first_modules,

@@ -49,10 +49,10 @@ from simulator.radiance.procedural import (
     fractal_noise,
 )
 from simulator.raw.read import read_raw
-from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene, packed_pitch
+from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene, packed_pitch
 from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
-from simulator.training.data import DetailPicture
+from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_integer, check_word
 
 logger = logging.getLogger(__name__)

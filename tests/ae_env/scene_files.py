@@ -16,7 +16,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 from simulator.raw.develop import develop
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from tests.simulator.training.scenes import scene
 
 #: Eight states over seven stops; at the middle ones a white card is at about half of white.

@@ -1,7 +1,10 @@
 """The environment contract, the checkers of its consumers, its arguments and its pictures."""
 
+import gc
 import math
+import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -26,6 +29,8 @@ from simulator import develop
 from tests.ae_env.environments import SMALL, assert_equal, make_env, make_envs, rollout
 from tests.ae_env.scorer_images import CAMERA, make_scene
 
+#: Pages of memory of this process.
+STATM = Path("/proc/self/statm")
 INFO_KEYS = {
     *("scene_id", "state", "iso", "exposure_time", "f_number", "ev100"),
     *("clipped_high", "clipped_low", "excess_noise", "predicted_error", "modules", "rewards"),
@@ -49,6 +54,18 @@ def test_same_seed_same_rollout(kind: str) -> None:
     unseen = make_env(observation=kind, sensors=False)
     assert set(unseen.observation_space) == {"raw", "settings"}
     np.testing.assert_array_equal(unseen.reset(seed=7)[0]["raw"], first[0][0]["raw"])
+
+
+@pytest.mark.skipif(not STATM.is_file(), reason="the memory of a process is Linux's to tell")
+def test_a_long_run_takes_no_more_memory() -> None:
+    env, rng, pages = make_env(max_episode_steps=None), np.random.default_rng(0), list[int]()
+    for episode in range(60):
+        env.reset(seed=episode)
+        for _ in range(30):
+            env.step(rng.integers(64))
+        gc.collect()
+        pages.append(int(STATM.read_text().split()[1]))
+    assert (max(pages[20:]) - pages[20]) * os.sysconf("SC_PAGE_SIZE") < 16 * 2**20
 
 
 def test_spaces_and_infos_are_as_documented() -> None:

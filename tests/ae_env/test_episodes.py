@@ -25,7 +25,7 @@ from simulator.camera import get_camera
 from simulator.capture.sensor import clip_and_quantise, exposed_light, frame_normals, noise_keys
 from simulator.noise.noise_level_function import ReadNoise
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from tests.ae_env.environments import assert_equal, assert_same, check_parity, make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 

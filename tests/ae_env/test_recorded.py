@@ -17,7 +17,7 @@ from ae_env.observation import encode_observation
 from ae_env.scenes import Scene, load_scenes, recorded
 from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from tests.ae_env.environments import ID, check_parity, make_env
 from tests.ae_env.scene_files import (
     GRID,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation, encode_sensors, encode_settings
 from agents.policy import PolicyContext
 from simulator.camera import get_camera
+from tests.ae_env.environments import make_envs
 
 SIZE = 64
 
@@ -30,9 +30,7 @@ def context() -> PolicyContext:
 def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
     """Frames of scenes (light relative to a grey card at its own EV) taken at grid states."""
 
-    def take(
-        light: np.ndarray, scene_ev: float, states: Any, speed: float = 0.0, defocus: float = 0.1
-    ) -> dict[str, np.ndarray]:
+    def take(light: np.ndarray, scene_ev: float, states: Any, speed=0.0, defocus=0.1) -> dict:
         states = np.atleast_1d(states)
         # Independent of the code under test: x = 0.12 * light * 2^(scene EV - state EV).
         gain = 2.0 ** (scene_ev - context.grid.ev100[states])
@@ -55,17 +53,12 @@ def coarse_plots() -> None:
     matplotlib.rcParams["figure.dpi"] = 40
 
 
-#: Few small scenes and frames: what the trainings of the tests run on.
-TINY = {"scenes": "bundled:small", "resolution": 36}
-
-
 @pytest.fixture
 def make_tiny_envs() -> Iterator[Callable[..., gym.vector.VectorEnv]]:
     made: list[gym.vector.VectorEnv] = []
 
     def make(num_envs: int = 4, mode: str = "SAME_STEP", **arguments: Any) -> gym.vector.VectorEnv:
-        options = {**TINY, "num_envs": num_envs, "autoreset_mode": mode, **arguments}
-        made.append(gym.make_vec("ae_env/AutoExposure-v0", **options))
+        made.append(make_envs(num_envs, autoreset_mode=mode, **arguments))
         return made[-1]
 
     yield make

@@ -16,10 +16,7 @@ from ae_env.registration import ENV_IDS
 from agents import PolicyContext, make_policy
 from tests.ae_env.environments import SMALL
 
-#: The repository.
 ROOT = Path(__file__).parents[2]
-
-
 every_task = pytest.mark.parametrize("task", ENV_IDS)
 
 

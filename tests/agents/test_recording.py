@@ -4,7 +4,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -12,6 +11,7 @@ from ae_env import UserCodeError
 from agents import Policy, PolicyContext, make_policy
 from agents.recording import record_dataset
 from agents.rollouts import fitting_arguments, training_arguments
+from tests.ae_env.environments import make_envs
 from tests.ae_env.scene_files import GRID, write_raws
 
 TASK = "ae_env/AutoExposure-v0"
@@ -26,7 +26,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def context() -> PolicyContext:
-    return PolicyContext.from_envs(gym.make_vec(f"ae_env:{TASK}", num_envs=1, **SMALL))
+    return PolicyContext.from_envs(make_envs(1, split="test"))
 
 
 @pytest.mark.parametrize("name", ["centre_weighted:P", "oracle"])
@@ -53,9 +53,7 @@ class Stops(Policy):
         raise KeyError("lost")
 
 
-def test_what_is_unfinished_is_removed_and_names_are_checked(
-    folder: Path, context: PolicyContext
-) -> None:
+def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context):
     with pytest.raises(UserCodeError, match=r"'stops'.*KeyError: 'lost'"):
         record_dataset(Stops(context), "stops", TASK, SMALL, "mine-v0", episodes=1)
     assert list(folder.iterdir()) == []
@@ -81,9 +79,7 @@ def test_recorded_grids_are_trained_for_on_their_own_states(tmp_path: Path) -> N
     assert fitting_arguments(judged, 36) == {**judged, "scenes": "bundled"}  # what is named stays
 
 
-def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(
-    ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(ae_env, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     few: tuple[dict[str, Any], bool] = ({"scenes": "bundled:small", "grid": STATES}, True)
     monkeypatch.setattr("agents.rollouts.training_arguments", lambda *_: few)

@@ -69,9 +69,7 @@ def test_every_state_of_every_scene_is_in_the_tables(done: Path) -> None:
     assert float(mean) == pytest.approx(0.16 * 64 / 1000, rel=0.03)
 
 
-def test_a_file_that_cannot_be_read_is_on_the_side(
-    folder: Path, done: Path, tmp_path: Path
-) -> None:
+def test_a_file_that_cannot_be_read_is_on_the_side(folder, done, tmp_path):
     (bad,) = done.glob("bad-*")
     assert (bad.name, "night-3.dng" in bad.read_text()) == ("bad-00001.jsonl", True)
     assert set(pq.read_table(done / "tables-00001.parquet")["file"].to_pylist()) == {"night-2.dng"}
@@ -95,9 +93,7 @@ def test_a_run_continues_with_the_shards_that_are_missing(folder: Path, done: Pa
         run(make(folder, done, scorer="mertens"), "local", lambda *_: None)
 
 
-def test_what_cannot_run_leaves_no_folder(
-    ae_env, folder: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_what_cannot_run_leaves_no_folder(ae_env, folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     out = tmp_path / "tables"
     for on, status, message in (
@@ -111,9 +107,7 @@ def test_what_cannot_run_leaves_no_folder(
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Ray, of its own settings
-def test_a_cluster_of_two_nodes_loses_nothing_with_a_worker(
-    folder: Path, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_of_two_nodes_loses_nothing_with_a_worker(folder, done, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="needs the extra ray, in an environment of its own")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     import ray

@@ -133,8 +133,27 @@ def test_bad_values_are_named(name: str, value: object) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("iso", 1e-3, 1e8), ("exposure_time", 1e-9, 1e5), ("f_number", 0.5, 1024.0)],
+)
+def test_ranges_include_their_ends(name: str, low: float, high: float) -> None:
+    arguments = {"iso": 100.0, "exposure_time": 0.5, "f_number": 4.0}
+    assert repr(CameraSettings(**arguments)) == (
+        "CameraSettings(iso=100.0, exposure_time=0.5, f_number=4.0)"
+    )
+    for value in (low, high):
+        assert getattr(CameraSettings(**arguments | {name: value}), name) == value
+    for value in (0.999 * low, 1.001 * high):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            CameraSettings(**arguments | {name: value})
+
+
+@pytest.mark.parametrize(
     ("exposure_time", "text"),
-    [(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.5, "1/2 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+    [
+        *[(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.3, "1/3.333 s"), (0.4, "0.4 s")],
+        *[(0.5, "1/2 s"), (0.6, "0.6 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+    ],
 )
 def test_format(exposure_time: float, text: str) -> None:
     assert format_exposure_time(exposure_time) == text
@@ -142,9 +161,6 @@ def test_format(exposure_time: float, text: str) -> None:
 
 
 SETTINGS = settings_within()
-
-
-# -- for any input --------------------------------------------------------------------
 
 
 @given(SETTINGS, SETTINGS, SETTINGS)
@@ -223,33 +239,26 @@ def test_elds_cameras_are_its_calibration(data_dir, name, entry, inferred):
 
 def test_row_noise_between_the_calibrated_isos() -> None:
     """Over log ISO, inside a segment; in the 70D's table at 100 and 200, the D850's at 200."""
-    half, low = (
-        get_camera("canon_70d").read_noise(100 * math.sqrt(2), 3),
-        ReadNoise(0.0459616, 0.14286),
-    )
+    camera = get_camera("canon_70d")
+    half = camera.read_noise(100 * math.sqrt(2), 3)
     assert half.box_factor == 3
-    assert half.row == pytest.approx((0.0459616 + get_camera("canon_70d").read_noise(200).row) / 2)
+    assert half.row == pytest.approx((0.0459616 + camera.read_noise(200).row) / 2)
     assert half.shape == pytest.approx((0.14286 + 0.11429) / 2)
-    assert get_camera("canon_70d").read_noise(50) == low
+    assert camera.read_noise(50) == ReadNoise(0.0459616, 0.14286)
     d850 = get_camera("nikon_d850")
     assert d850.read_noise(399) == d850.read_noise(200) != d850.read_noise(400)
 
 
-def test_a_segment_begins_at_its_iso_not_at_its_first_calibration() -> None:
-    camera = replace(get_camera("nikon_z6"), segments=(700.0,))
-    for iso, base, read in ((699, 400, 5.22487909303224e-08), (750, 800, 2.22569604502207e-08)):
-        scaled = (iso / base) ** 2 * (read - ROUNDING) + ROUNDING
-        assert camera.nlf(iso).read[1] == pytest.approx(scaled)
-    assert camera.nlf(750).shot[1] == pytest.approx(750 / 800 * 6.19623102159152e-05)
-
-
-@pytest.mark.parametrize("name", list_cameras())
+@pytest.mark.parametrize("name", [*list_cameras(), "nikon_z6 from 700"])
 def test_noise_at_every_iso_is_the_nearest_calibrations(name: str) -> None:
-    """From ISO 50 to 409600: interpolated by NumPy, scaled beyond, the rounding apart."""
-    camera = get_camera(name)
+    """From ISO 50 to 409600: interpolated by NumPy, scaled beyond, the rounding apart.
+
+    A segment begins at its ISO, not at its first calibration."""
+    camera = get_camera(name.partition(" ")[0])
+    camera = replace(camera, segments=(700.0,)) if "from" in name else camera
     edges = [0.0, *camera.segments, math.inf]
     rounding = np.repeat([0.0, 1.0], 4) / 12 / camera.span[0] ** 2
-    for iso in np.geomspace(50.0, 409_600.0, 60).tolist():
+    for iso in [699.0, 700.0, 750.0, *np.geomspace(50.0, 409_600.0, 60).tolist()]:
         low, high = max(e for e in edges if e <= iso), min(e for e in edges if e > iso)
         own = [i for i in sorted(camera.nlf_by_iso) if low <= i < high]
         known = np.array([[*n.shot, *n.read] for n in map(camera.nlf, own)])

@@ -10,7 +10,12 @@ import torch
 
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.optics.discs import added_blur
-from simulator.reference.camera import ReferenceCamera, ReferenceScene, lens_blur, sample_mosaic
+from simulator.reference.reference_camera import (
+    ReferenceCamera,
+    ReferenceScene,
+    lens_blur,
+    sample_mosaic,
+)
 from simulator.training.scenes import detail_pictures, reference_scenes
 
 

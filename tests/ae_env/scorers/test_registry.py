@@ -245,6 +245,9 @@ def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for(
     assert mixed.closed_form
     assert mixed.depends_on == "blur"
     assert make_scorer("balanced").depends_on == "image"
+    for wrong in (0.0, -1.0, math.inf, math.nan, "1"):
+        with pytest.raises(ValueError, match="`weights`"):
+            CompositeScorer({"own": Own()}, {"own": wrong})
     captures = make_captures(random_scene(), [GRID[20]] * 3)
     images = torch.rand(3, 4, 40, 40)
     scorer = make_scorer(Own())
@@ -255,6 +258,19 @@ def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for(
     assert both.score_parts(images, captures)["picture"].tolist() == [0.75] * 3
     with pytest.raises(ValueError, match="needs `images`"):
         make_scorer(Own())(None, captures)
+
+
+def test_a_slow_scorer_is_named_once(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    captures, clock = make_captures(random_scene(), [GRID[20]]), [100.0]
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    for name, seconds in (("quick", 4.9), ("slow", 5.1), ("slow", 5.1)):
+
+        def rate(images: torch.Tensor, _: Any, seconds: float = seconds) -> torch.Tensor:
+            clock[0] += seconds
+            return mean_signal(images, captures)
+
+        CompositeScorer({name: Own(rate)})(torch.zeros(1, 4, 8, 8), captures)
+    assert [record.args[0] for record in caplog.records] == ["slow"]
 
 
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
@@ -325,6 +341,8 @@ def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind: Any) -> N
     totals = Balanced().combine({name: kind(values) for name, values in scores.items()})
     assert 0.0 <= float(totals.min()) <= float(totals.max()) <= 1.0
     assert Balanced().combine(dict.fromkeys(scores, kind(np.ones(3)))).tolist() == [1.0] * 3
+    means = CompositeScorer({"own": Own()}).combine({"own": kind([-1e-9, 0.5, 1.0 + 1e-9])})
+    assert means.tolist() == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("total", [math.nan, math.inf, -0.1, 1.1])

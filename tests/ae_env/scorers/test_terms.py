@@ -99,8 +99,12 @@ def test_black_and_white_frames_score_below_a_twentieth(value: float) -> None:
 def test_noise_is_that_of_the_cameras_own_pixels() -> None:
     """Box-averaging does not make ISO free: only a frame's values are less noisy."""
     tables = ScoreTables(GRID, CAMERA, make_scorer("noise"))
-    wanted, found = (tables.table(random_scene(box_factor=k)).mean for k in (1, 31))
-    np.testing.assert_allclose(found, wanted, atol=0.01)
+    for source in (NoiseLevelFunction.zero(), CAMERA.nlf(6400)):
+        wanted, found = (
+            tables.table(random_scene(box_factor=k, nlf=source.scaled(1 / k**2))).mean
+            for k in (1, 31)
+        )
+        np.testing.assert_allclose(found, wanted, atol=0.01)
 
 
 def test_values_by_hand() -> None:
@@ -139,6 +143,8 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
     captures = replace(captures, noisy=False)
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx([1.0] * 4)
+    black = images * torch.tensor([0.0, -2e-4, -9e-4, 0.0])[:, None, None, None]
+    assert make_scorer("noise")(black, captures).tolist() == [0.0] * 4  # no signal, and no noise
 
 
 def test_bands_by_hand() -> None:
@@ -438,3 +444,14 @@ def test_a_term_with_a_scale_of_its_own_has_it() -> None:
         for part in (plain, other)
     )
     np.testing.assert_allclose(second, np.sqrt(first), atol=0.01)
+
+
+def test_a_composite_of_ones_own_is_called() -> None:
+    class Mine(CompositeScorer):
+        def __call__(self, images: torch.Tensor | None, captures: Any) -> torch.Tensor:
+            return torch.full((len(captures),), 0.25)
+
+    scorer = CompositeScorer({"mine": Mine({"noise": Noise()}), "noise": Noise()})
+    table = ScoreTables(SMALL, CAMERA, scorer).table(_scene())
+    np.testing.assert_array_equal(table.parts["mine"], 0.25)
+    assert np.ptp(table.parts["noise"]) > 0.1

@@ -42,11 +42,8 @@ def disc_area(f_number: float, depth: float) -> float:
     """Packed pixels in the disc that the larger aperture adds to the blur at f/5.6, in theory."""
     # c = f^2 / N (1/s - 1/z) / (1 - f/s); marked 5.6 stands for 4 sqrt 2, 1.4 for sqrt 2.
     exact = {5.6: 2**2.5, 1.4: 2**0.5}
-    discs = [
-        0.05**2 / exact[n] * abs(1 / 2 - 1 / depth) / (1 - 0.05 / 2) / 10e-6
-        for n in (f_number, 5.6)
-    ]
-    return np.pi / 4 * (discs[0] ** 2 - discs[1] ** 2)
+    disc = 0.05**2 * abs(1 / 2 - 1 / depth) / (1 - 0.05 / 2) / 10e-6  # at f/1
+    return np.pi / 4 * disc**2 * (exact[f_number] ** -2 - exact[5.6] ** -2)
 
 
 def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator) -> None:
@@ -69,24 +66,17 @@ def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator
     assert out.metadata["largest_disc_px"] == pytest.approx(np.sqrt(area / np.pi * 4), rel=1e-6)
 
 
-def test_no_light_of_what_is_behind_falls_on_what_is_in_focus(simulator) -> None:
+def test_what_is_before_the_focus_spreads_over_its_neighbours_and_nothing_else(simulator) -> None:
     light = torch.full((4, 64, 96), 0.8)
     light[:, :, :48] = 0.02
-    depth = np.full((128, 192), 20.0)  # at the pitch of the sensor
-    depth[:, :96] = 2.0
-    out = refocus(make_raw(light), 1.4, depth=depth, lens=LENS, simulator=simulator)
+    left, both = np.arange(96) < 48, {"lens": LENS, "simulator": simulator}
+    depth = np.where(left, 2.0, 20.0).repeat(2)[None].repeat(128, 0)  # at the sensor's pitch
+    out = refocus(make_raw(light), 1.4, depth=depth, **both)
     assert out.data[:, :, :48].equal(light[:, :, :48])  # kept bit by bit
     # Nor does the dark thing in front darken the wall behind it.
     np.testing.assert_allclose(out.data[:, :, 48:].numpy(), 0.8, atol=0.03)
-
-
-def test_what_is_before_the_focus_spreads_over_what_is_sharp(simulator) -> None:
-    light = torch.full((4, 64, 96), 0.8)
-    light[:, :, :48] = 0.02
-    depth = np.full((64, 96), 2.0)
-    depth[:, :48] = 1.8
-    out = refocus(make_raw(light), 1.4, depth=depth, lens=LENS, simulator=simulator).data
-    profile = out[0, 32].numpy()
+    depth = np.where(left, 1.8, 2.0)[None].repeat(64, 0)
+    profile = refocus(make_raw(light), 1.4, depth=depth, **both).data[0, 32].numpy()
     assert profile[49] < 0.6
     assert profile[45] > 0.1
     np.testing.assert_allclose(profile[-8:], 0.8, rtol=1e-6)
@@ -134,9 +124,6 @@ def test_bad_arguments(simulator, arguments, named: str) -> None:
         refocus(raw, **given)
 
 
-# -- depth maps -----------------------------------------------------------------------------------
-
-
 def test_millimetres_with_a_hole_disparity_and_an_exr(tmp_path) -> None:
     millimetres = np.array([[500, 1000, 0], [2000, 4000, 65535]], np.uint16)
     Image.fromarray(millimetres).save(tmp_path / "depth.png")
@@ -172,9 +159,6 @@ def test_bad_maps(tmp_path) -> None:
     for wrong in ({"kind": "metres"}, {"kind": "disparity"}, {"scale": 0.0}):
         with pytest.raises(ValueError, match=r"`kind` \(='metres'|`scale` \(=(None|0\.0)\)"):
             read_depth(tmp_path / "photo.jpg", **wrong)
-
-
-# -- fusion of a bracket --------------------------------------------------------------------------
 
 
 def test_pictures_that_are_alike_fuse_to_themselves() -> None:

@@ -1,15 +1,14 @@
 """Schedules, and the policies that follow them."""
 
+import functools
 import itertools
 import math
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env import ExposureGrid
 from ae_env.merging import log_error, merge
 from ae_env.observation import encode_sensors
@@ -25,7 +24,7 @@ from agents.bracketing.policies import (
 from agents.policy import BracketLimits, Policy, PolicyContext
 from agents.policy_names import make_policy
 from simulator.camera import get_camera
-from tests.ae_env.environments import SMALL
+from tests.ae_env import environments
 
 ID = "ae_env/ExposureBracket-v0"
 CAMERA = get_camera("nikon_z6")
@@ -33,14 +32,12 @@ GRID = ExposureGrid((100, 1600), (1 / 1000, 1 / 60, 1 / 4), (4,))
 LIMITS = BracketLimits(budget=0.3, max_frames=2, box_factor=4)
 
 
-def make_envs(count: int = 4, **arguments: Any) -> gym.vector.VectorEnv:
-    options = {**SMALL, "autoreset_mode": "DISABLED", **arguments}
-    return gym.make_vec(ID, num_envs=count, **options)
+make_envs = functools.partial(environments.make_envs, task=ID, autoreset_mode="DISABLED")
 
 
 @pytest.fixture(scope="module")
 def context() -> PolicyContext:
-    return PolicyContext.from_envs(make_envs())
+    return PolicyContext.from_envs(make_envs(4))
 
 
 def test_every_schedule_that_fits_is_there_once() -> None:
@@ -91,11 +88,11 @@ def test_expected_errors_are_those_of_merged_frames() -> None:
 
 def test_fixed_steps_around_the_metered_state() -> None:
     """EV100 10 metered: 1/60 s at ISO 100; +-4 EV are 1/1000 s and 1/4 s, in 0.301 s together."""
-    context = PolicyContext.from_envs(make_envs(budget=0.31))
+    context = PolicyContext.from_envs(make_envs(4, budget=0.31))
     policy, grid = FixedBracket(context, step=4), context.grid
     wanted = policy._plan(np.array([grid.ev100[grid.index(0, 3, 0)] + d for d in (0, 4, -4)]))
     assert wanted.tolist() == [grid.index(0, 3, 0), grid.index(0, 1, 0), grid.index(0, 5, 0)]
-    short = FixedBracket(PolicyContext.from_envs(make_envs(budget=0.1)), step=4)
+    short = FixedBracket(PolicyContext.from_envs(make_envs(4, budget=0.1)), step=4)
     chosen = short._plan(np.array([10.0, 14.0, 6.0]))
     times = [grid[int(s)].exposure_time for s in chosen]
     assert sum(times) + 2 / 60 <= 0.1
@@ -167,16 +164,14 @@ def test_the_agent_that_ships_is_ahead_of_the_schedule_on_unseen_scenes() -> Non
     envs = make_envs(16, split="test", resolution=64)
     context = PolicyContext.from_envs(envs)
     schedule = make_policy("bracket:hasinoff?headroom=6&longest=1/15", context)
-    found = [
-        run_brackets(policy, envs, count=2)["quality"].mean()
-        for policy in (make_policy("bracket", context), schedule)
-    ]
-    assert found[0] > found[1]
+    policies = make_policy("bracket", context), schedule
+    ours, theirs = (run_brackets(p, envs, count=2)["quality"].mean() for p in policies)
+    assert ours > theirs
 
 
 def test_mistakes_are_named(context: PolicyContext) -> None:
     other = PolicyContext(context.grid, context.camera, context.observation_space)
-    statistics = PolicyContext.from_envs(make_envs(observation="statistics"))
+    statistics = PolicyContext.from_envs(make_envs(4, observation="statistics"))
     for name, where, message in (
         ("bracket", other, "ExposureBracket-v0"),
         ("bracket:planned", statistics, "`observation`='uint8'"),
@@ -187,8 +182,8 @@ def test_mistakes_are_named(context: PolicyContext) -> None:
     schedule = make_policy("bracket:hasinoff", context)
     schedule.reset(4)
     with pytest.raises(ValueError, match="fit"):
-        schedule.act(make_envs().reset(seed=0)[0])
+        schedule.act(make_envs(4).reset(seed=0)[0])
     policy: Any = Policy(context)
     policy.act = lambda observations, masks=None: np.full(4, 999)
     with pytest.raises(UserCodeError, match=r"'mine': state 999 is not in \[0, 25\)"):
-        run_brackets(policy, make_envs(), name="mine")
+        run_brackets(policy, make_envs(4), name="mine")

@@ -1,17 +1,30 @@
-"""`evaluate`: every policy on the same episodes, whatever the batch or the forbidden states."""
+"""`evaluate` and plans: every policy on the same episodes, whatever the batch; runs resume."""
 
 import dataclasses
+import itertools
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 from ae_env import UserCodeError
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
-from agents import Policy, evaluate, fit_policies, make_policy, run_plan
-from agents.evaluation.plan import EvaluationPlan, plan_scenes
+from agents import Policy, evaluate, fit_policies, make_policy
+from agents.evaluation import engine
+from agents.evaluation.evaluation_plan import (
+    Condition,
+    EvaluationPlan,
+    digest,
+    load_plan,
+    plan_episodes,
+    plan_scenes,
+    start_state,
+)
+from agents.evaluation.jobs import policy_content, run_plan
 from agents.policy import PolicyContext
 from agents.rollouts import make_envs
 
@@ -116,7 +129,8 @@ def test_forbidden_states_are_neither_chosen_nor_taken(small, few, fitted):
     assert allowed[rows, result.start_states].all()
     for name, track in result.tracks.items():
         assert allowed[rows[:, None], track.states[0]].all(), name
-    assert (result.tracks["best_fixed"].states[0, :, 0] >= 61).all()
+    best_fixed = np.where(allowed, np.arange(64), -1).max(axis=1)
+    assert (result.tracks["best_fixed"].states[0] == best_fixed[:, None]).all()
     # The oracle is the best of the allowed states, and random the mean over them.
     best = np.where(allowed, result.scores[:, 0], -1.0).max(axis=1)
     np.testing.assert_allclose(result.oracle, best, atol=1e-7)
@@ -166,3 +180,231 @@ def test_other_scorers_rate_chosen_states_over_frames_then_groups(tmp_path):
     for policy, track in result.tracks.items():
         means = [tables.table(result.scenes[j]).mean[track.states[0, j]].mean() for j in (0, 1)]
         assert table["brightness"][policy] == pytest.approx(np.mean(means), abs=1e-9)
+
+
+PLAN = EvaluationPlan(environment=OPTIONS, max_scenes=5)
+
+
+def test_delays_multiply_the_conditions_that_have_none_of_their_own():
+    plan = EvaluationPlan(
+        conditions={"late": Condition(delay=3), "static": Condition()}, delays=(0, 2)
+    )
+    found = {name: c.delay for name, c in plan.all_conditions.items()}
+    assert found == {"late": 3, "static": 0, "static/delay2": 2}
+    assert [name for name, c in plan.all_conditions.items() if c.at_rest] == ["static"]
+    assert plan.static_condition == "static"
+    changing = EvaluationPlan(conditions={"sine": Condition(lighting="sine")})
+    assert changing.static_condition == "sine"  # there is no other
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"starts": ["drak"]}, r"`starts` \(='drak'\)"),
+        ({"seeds": [0, 0]}, "seeds\n"),
+        ({"conditions": {"hard": {}}}, "`conditions`"),
+        ({"conditions": {"a": {"budget": 1.0}}}, "`conditions`"),
+        ({"conditions": {"a": {"lighting": "disco"}}}, "condition 'a': `lighting`"),
+        ({"conditions": {"a": {"delay": 99}}}, r"`delay` \(=99\)"),
+        ({"conditions": {"a": {"delay": 3}}, "frames": 3}, r"`delay` \(=3\)"),
+        ({"environment": {"lighting": "sine"}}, "`environment` .* `lighting`"),
+        ({"budgets": [0.0]}, r"budgets\.0\n"),
+        ({"budgets": [0.1], "environment": {"budget": 1}}, "`environment` .* `budget`"),
+        ({"budgets": [0.1], "frames": 3}, "`frames`"),
+        ({"max_frames": 2}, "`max_frames`"),
+    ],
+)
+def test_mistakes_in_a_plan_are_told(entries, message):
+    with pytest.raises(ValueError, match=message):
+        EvaluationPlan.model_validate(entries)
+
+
+#: Of the plans as they were when they were published: their digests must not move.
+PUBLISHED = {
+    "ae_bench_v1": "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd",
+    "ae_bench_v2_still": "856f17927b9315102f1ff743f630fa0c315a1e8d9ab029d2335aca23c8eba6e0",
+    "ae_bench_v2_video": "ae0cafd1d4b00e651ecbc12fe7e7dbd565619a40c56a5007352e6141d279bbe3",
+    "ae_bench_v2_bracket": "bb8f3ec9034d3ec41c93463cd8054ba24ef816ee16dd51b30df48f12518a8bed",
+}
+
+
+def test_digests_are_of_the_episodes_and_do_not_move():
+    assert {name: digest(load_plan(name).protocol()) for name in PUBLISHED} == PUBLISHED
+    turned = dict(reversed([*PLAN.model_dump(mode="json").items()]))
+    again = EvaluationPlan.model_validate({**turned, "policies": ["spot:P"], "hash": "x"})
+    assert digest(again.protocol()) == digest(PLAN.protocol())
+    assert digest(PLAN.changed(frames=9).protocol()) != digest(PLAN.protocol())
+    counts = [len(load_plan(n).all_conditions) for n in ("quick", "standard", "bracket")]
+    assert counts == [4, 24, 2]
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return plan_scenes(PLAN)
+
+
+def test_starts_are_the_ends_of_the_grid_and_the_right_exposure(scenes):
+    scene, grid = scenes[0], PLAN.options().make_grid()
+    dark, middle, bright = (start_state(s, scene, grid) for s in ("dark", "middle", "bright"))
+    # f/11 (11.3), 1/1000 s, ISO 100 and f/4, 1/2 s, ISO 6400.
+    assert grid.ev100[dark] == pytest.approx(np.log2(128 * 1000), abs=0.01)
+    assert grid.ev100[bright] == pytest.approx(np.log2(16 * 2 / 64), abs=0.01)
+    assert abs(grid.ev100[middle] - scene.ev100) == np.abs(grid.ev100 - scene.ev100).min()
+    assert start_state("random", scene, grid) is None
+    allowed = np.ones(64, bool)
+    allowed[[dark, middle]] = False
+    holes = dataclasses.replace(scene, allowed=allowed)
+    assert grid.ev100[start_state("dark", holes, grid)] == pytest.approx(16, abs=0.1)
+    assert start_state("middle", holes, grid) != middle
+
+
+def test_episodes_of_another_start_share_everything_but_the_start(scenes):
+    given = PLAN.changed(environment={**PLAN.environment, "scenes": scenes[:1]})
+    assert "dead_leaves" in str(given.describe()["environment"]["scenes"])
+    with pytest.raises(ValueError, match="JSON value"):  # objects are described, but no protocol
+        given.protocol()
+    plan = PLAN.changed(seeds=(0, 7), starts=("dark", "bright"))
+    episodes = plan_episodes(plan, scenes, PLAN.options().make_grid())
+    assert episodes.seeds[:10] == episodes.seeds[10:]
+    assert len(set(episodes.seeds)) == 10
+    assert episodes.seeds[5] == 7 * 2**20
+    assert episodes.starts[:10] != episodes.starts[10:]
+    assert episodes.scene.tolist() == [0, 1, 2, 3, 4] * 4
+
+
+STEP = {"lighting": {"kind": "step", "stops": 4, "at": 3}}
+CONDITIONS = {"static": {}, "step+4": STEP, "step+4/late": {**STEP, "delay": 1}}
+JOBS = PLAN.changed(conditions=CONDITIONS, frames=8, starts=("dark", "bright"))
+JOBS = JOBS.changed(policies=("matrix:P", "random", "oracle"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("parts")
+
+
+@pytest.fixture(scope="module")
+def results(folder):
+    return run_plan(JOBS, folder)
+
+
+def test_the_oracle_is_right_in_every_frame_but_the_one_of_the_step(results):
+    static, step = results["static"], results["step+4"]
+    assert np.abs(static.episode_metrics("oracle")["regret"]).max() < 1e-12
+    q = np.take_along_axis(step.scores, step.tracks["oracle"].states[0][..., None], axis=-1)[..., 0]
+    regret = step.scores.max(-1) - q  # (E, T)
+    assert np.abs(np.delete(regret, 2, axis=1)).max() < 1e-6  # frame 3 has index 2
+    assert regret[:, 2].mean() > 0.05
+    assert (step.settling == 3).all()
+    assert (static.settling == 0).all()
+    assert (step.episode_metrics("oracle")["frames_to_converge"] == 1).all()
+    late = results["step+4/late"]
+    assert late.episode_metrics("oracle")["frames_to_converge"].max() == 2
+    # Light and delay are those of the conditions.
+    np.testing.assert_array_equal(static.scores[:, 0], step.scores[:, 0])
+    np.testing.assert_array_equal(step.scores[:, 2], step.scores[:, 7])
+    np.testing.assert_array_equal(late.scores, step.scores)  # the light is not delayed
+    for track in late.tracks.values():
+        np.testing.assert_array_equal(track.states[0][:, 0], late.start_states)
+
+
+def _arrays(folder: Path) -> dict[str, bytes]:
+    """Arrays of the parts in a folder; the times that they took differ."""
+    files = {file.relative_to(folder): load_file(file) for file in folder.rglob("*.safetensors")}
+    return {f"{f} {name}": a.tobytes() for f, own in files.items() for name, a in own.items()}
+
+
+def test_a_stopped_run_continues_with_what_it_lacks(results, folder, tmp_path, monkeypatch, caplog):
+    real, ran = engine.run_batch, []
+
+    def counted(name, *args, **kwargs):
+        if name == "random" and not ran:
+            raise KeyboardInterrupt
+        ran.extend([name] if args[3] == JOBS.frames else [])  # not the timing of one camera
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(engine, "run_batch", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_plan(JOBS.changed(policies=("random", "matrix:P")), tmp_path)
+    assert len(list(tmp_path.glob("light/*"))) == 2  # two lights, whatever the delay
+    assert not list(tmp_path.rglob(".*"))
+    ran.append("")
+    run_plan(JOBS, tmp_path)
+    assert _arrays(tmp_path) == _arrays(folder)
+    victims = sorted(tmp_path.glob("policy/*"))[:2]
+    victims[0].unlink()
+    damaged = bytearray(victims[1].read_bytes())
+    damaged[-9] ^= 255
+    victims[1].write_bytes(damaged)
+    ran.clear()
+    ran.append("")
+    for _ in range(2):
+        run_plan(JOBS, tmp_path)
+        assert len(ran) == 3  # one batch of episodes each, in the first of these runs
+    assert str(victims[1]) in caplog.text
+    assert _arrays(tmp_path) == _arrays(folder)
+
+
+@pytest.mark.usefixtures("quick_spawn")
+def test_two_processes_give_what_one_does(results, folder, tmp_path):
+    run_plan(JOBS, tmp_path, workers=2)
+    assert _arrays(tmp_path) == _arrays(folder)
+
+
+def test_mistakes_are_told_before_any_work(tmp_path):
+    for entries, name in (
+        ({"policies": ("randm",)}, "`policy`"),
+        ({"policies": ()}, "`policies`"),
+        ({"other_scorers": ("mid_gray",)}, "`other_scorers`"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            run_plan(JOBS.changed(**entries), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_brackets_have_the_same_episodes_for_all_policies_and_resume(tmp_path, monkeypatch):
+    """A schedule of one frame, run twice under two names, has the same results; seeds count."""
+    names = tuple(f"bracket:fixed?step={step}" for step in ("0", "0.0", "4"))
+    given = {"environment": PLAN.environment, "max_scenes": 6, "budgets": (0.05, 0.3)}
+    plan = EvaluationPlan(**given, policies=names)
+    results = run_plan(plan, tmp_path)
+    assert list(results) == ["0.05 s", "0.3 s"]
+    for result in results.values():
+        first, again, other = (result.episode_metrics(name) for name in names)
+        for name in ("quality", "log_error", "unseen", "frames"):
+            assert first[name].shape == (1, 6)
+            np.testing.assert_array_equal(first[name], again[name])
+        assert (first["frames"] == 1).all()
+        assert (other["frames"] == 3).all()
+
+    def quality(seeds: tuple[int, ...]) -> list[float]:
+        found = run_plan(plan.changed(seeds=seeds, policies=names[:1]), tmp_path)["0.3 s"]
+        return found.episode_metrics(names[0])["quality"][0].tolist()
+
+    both = quality((0, 1))
+    assert both == quality((0,)) + quality((1,))
+    monkeypatch.setattr(engine, "run_brackets", None)  # nothing is run again
+    assert quality((0, 1)) == both
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("matrix:tuned?weights={0}/a", {"a", "a.safetensors", "a.json"}),
+        ("ppo:{0}/a?device=cpu", {"a", "a.safetensors", "a.json"}),
+        ("recorded:{0}", {"a", "a.safetensors", "a.json", "a.py", "other.py", "sub/b.py"}),
+        ("{0}/a.py:C", {"a.py", "other.py"}),  # which it may import
+    ],
+)
+def test_what_a_name_points_to_counts_and_nothing_else(name, counts, tmp_path):
+    (tmp_path / "sub").mkdir()
+    files = ("a", "a.safetensors", "a.json", "a.py", "other.py", "sub/b.py")
+    for file in files:
+        (tmp_path / file).write_text("before")
+    contents = [policy_content(name.format(tmp_path))]
+    for file in files:
+        (tmp_path / file).write_text("after!")
+        contents.append(policy_content(name.format(tmp_path)))
+    changed = [after != before for before, after in itertools.pairwise(contents)]
+    assert {file for file, own in zip(files, changed, strict=True) if own} == counts
+    assert policy_content("ppo") != policy_content("regression") != policy_content("spot") == ""

@@ -1,10 +1,8 @@
 """PPO and regression: they learn, the seed decides, a stopped training goes on; their files."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +13,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.learning.networks import Session
+from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.ppo import PPOTraining, train_ppo
 from agents.learning.regression import (
     RegressionPolicy,
@@ -23,7 +22,6 @@ from agents.learning.regression import (
     ScoreRegressor,
     train_regression,
 )
-from agents.learning.weights import load_agent, save_agent
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from simulator.utils.files import sibling
@@ -75,9 +73,7 @@ REGRESSION = RegressionTraining(frames=160, width=16, seed=5)
     ("train", "training", "stopped_at", "done"),
     [(train_ppo, TRAINING, 56, 48), (train_regression, REGRESSION, 100, 100)],
 )
-def test_a_stopped_training_goes_on(
-    train: Any, training: Any, stopped_at: int, done: int, make_tiny_envs, tmp_path: Path
-) -> None:
+def test_a_stopped_training_goes_on(train, training, stopped_at, done, make_tiny_envs, tmp_path):
     """PPO from its last complete update of 4 x 4 frames."""
     path, seen = tmp_path / "agent.checkpoint", []
 
@@ -131,9 +127,7 @@ def test_predictions_are_weighted_by_their_precision(context: PolicyContext, pho
         assert policy.act(frame, masks).tolist() == best.argmax(axis=1).tolist()
 
 
-def test_episodes_do_not_mix_and_frames_of_other_light_are_forgotten(
-    context: PolicyContext, photograph
-) -> None:
+def test_episodes_do_not_mix_and_frames_of_other_light_are_forgotten(context, photograph):
     """The first camera's light falls by a stop; the second's stays, at other settings."""
     first, then = np.full((2, 2, 64), 0.1)
     first[:, 3], then[:, 9] = 0.9, 0.8  # 0.5 * (0.9 + 0.1) against 0.5 * (0.8 + 0.1)
@@ -169,9 +163,7 @@ def test_training_lowers_the_loss(make_tiny_envs) -> None:
         (train_ppo, TRAINING.model_copy(update={"total_timesteps": 32})),
     ],
 )
-def test_the_seed_alone_decides_and_progress_is_complete(
-    train: Callable[..., nn.Module], training: Any, make_tiny_envs
-) -> None:
+def test_the_seed_alone_decides_and_progress_is_complete(train, training, make_tiny_envs):
     seen: list[tuple[int, int, dict[str, float]]] = []
 
     def weights(seed: int) -> dict[str, torch.Tensor]:
@@ -242,9 +234,7 @@ def test_weights_that_are_not_finite_replace_none(agent: Path, context: PolicyCo
         (".json", {"kind": "ppo"}, "'ppo'"),
     ],
 )
-def test_damaged_and_wrong_files(
-    agent: Path, context: PolicyContext, suffix: str, content: Any, message: str
-) -> None:
+def test_damaged_and_wrong_files(agent, context, suffix, content, message):
     file = sibling(agent, suffix)
     if isinstance(content, dict):
         card = json.loads(file.read_text())
@@ -263,14 +253,13 @@ def test_another_grid_or_observation_than_the_trained(agent: Path, context: Poli
     inside = {"isos": (100, 200), "exposure_times": (0.01, 0.1), "f_numbers": (4.0, 8.0)}
     make_policy(f"regression:{agent}", replace(context, grid=ExposureGrid(**inside)))
     space = gym.spaces.Dict({n: context.observation_space[n] for n in ("raw", "settings")})
-    others: list[tuple[str, dict[str, Any]]] = [("sensors = True", {"observation_space": space})]
-    for message, changes in (
-        ("isos from 100 to 6400", {"isos": (50, 200)}),
-        ("exposure_times from 0.001 to 0.5", {"exposure_times": (0.01, 1.0)}),
-        ("f_numbers from 4 to 11", {"f_numbers": (4.0, 16.0)}),
-    ):
-        others.append((message, {"grid": ExposureGrid(**inside | changes)}))
-    for message, other in others:
+    grids = {
+        "isos from 100 to 6400": {"isos": (50, 200)},
+        "exposure_times from 0.001 to 0.5": {"exposure_times": (0.01, 1.0)},
+        "f_numbers from 4 to 11": {"f_numbers": (4.0, 16.0)},
+    }
+    others = {message: {"grid": ExposureGrid(**inside | own)} for message, own in grids.items()}
+    for message, other in {**others, "sensors = True": {"observation_space": space}}.items():
         with pytest.raises(ValueError, match=message):
             make_policy(f"regression:{agent}", replace(context, **other))
     with pytest.raises(ValueError, match="either `weights` or `network`"):

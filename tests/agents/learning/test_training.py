@@ -27,12 +27,8 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
 
 
 def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
-    return training.AgentConfig(
-        agent=agent,  # type: ignore[arg-type]
-        num_envs=4,
-        environment=ENVIRONMENT,
-        training=HYPERPARAMETERS[agent] | changes,
-    )
+    own = {"environment": ENVIRONMENT, "training": HYPERPARAMETERS[agent] | changes}
+    return training.AgentConfig(agent=agent, num_envs=4, **own)
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -167,9 +163,7 @@ def test_workers_do_not_outlive_a_killed_parent(forkserver: Any) -> None:
         time.sleep(0.05)
 
 
-def test_a_curve_has_means_over_parts_and_a_training_that_resumes_repeats_no_frames(
-    tmp_path: Path,
-) -> None:
+def test_a_curve_has_means_over_parts_and_a_training_that_resumes_repeats_no_frames(tmp_path):
     path = tmp_path / "agent.csv"
 
     def report(name: str, values: dict[int, float]) -> dict[str, list[float]]:
@@ -224,9 +218,7 @@ def _command(folder: Path, number: int) -> None:
         (signal.SIGKILL, -signal.SIGKILL, 3),  # what was written before counts
     ],
 )
-def test_a_stopped_command(
-    number: int, status: int, steps: int, forkserver: Any, tmp_path: Path
-) -> None:
+def test_a_stopped_command(number, status, steps, forkserver, tmp_path):
     config, out, seen = tiny(), tmp_path / "agent", []
     (tmp_path / "mine.yaml").write_text(json.dumps(config.model_dump(mode="json")))
     process = forkserver.Process(target=_command, args=(tmp_path, number), daemon=True)

@@ -1,6 +1,7 @@
 """A meter and a program in the loop: with synthetic frames, and with the environment."""
 
 import functools
+import math
 from contextlib import closing
 from typing import Any
 
@@ -48,6 +49,8 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
         (4.0, 0.004, 0.25, "", 4.0),
         (12.0, 0.004, 4.0, "", 12.0),
         (9.0, 2.0, 4.0, "?compensation=2", 7.0),  # brighter: the best of a darker scene
+        (12.0, 0.004, 4.0, "?foresight=trend", 12.0),
+        (12.0, 0.004, 4.0, "?foresight=model", 12.0),  # of light that rests
     ):
         policy = make_policy(f"average:tuned{option}", context, weights=weights)
         wanted = _best_state(np.array([[looked_up, np.log2(speed), np.log2(defocus)]]))[0]
@@ -66,11 +69,48 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
 
 def test_sensors_are_averaged_over_the_frames(context, photograph):
     policy = MeteringPolicy(context, "average", "P")
-    for speeds, mean in (((0.5, 2.0, 1.0), 0.0), ((0.5,), -1.0)):  # of -1, 1, 0 stops
+    # Of -1, 1, 0 stops; what stands still counts as the slowest that the sensor tells.
+    for speeds, mean in (((0.5, 2.0, 1.0), 0.0), ((0.5,), -1.0), ((0.0,), -9.0)):
         policy.reset(1)
         for speed in speeds:
             readings = policy.observe(photograph(GREY, 8.0, 20, speed=speed, defocus=1.0))
         assert readings[0, 1] == pytest.approx(mean, abs=1e-5)
+
+
+@pytest.mark.parametrize(("program", "keeps"), [("P", True), ("A", False), ("tuned", True)])
+def test_of_equal_states_some_programs_keep_the_last(context, photograph, tmp_path, program, keeps):
+    """At the speed where another state becomes the best one: it has to be better by more."""
+    weights = {"weights": _fitted().save(tmp_path / "tuned.safetensors")}
+    policy = MeteringPolicy(context, "average", program, **(weights if program == "tuned" else {}))
+
+    def chosen(*stops):
+        """The last choice after frames of these speeds, of which the mean counts."""
+        policy.reset(1)
+        frames = [photograph(GREY, 7.0, 20, speed=2.0**s, defocus=0.5) for s in stops]
+        return int([policy.act(frame)[0] for frame in frames][-1])
+
+    low, high = -6.0, 2.0
+    first = chosen(low)
+    assert chosen(high) != first
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (middle, high) if chosen(middle) == chosen(low) else (low, middle)
+    assert chosen(low, 2 * high - low) == (chosen(low) if keeps else chosen(high))
+    assert chosen(low, high + 4.0) != chosen(low)  # by far more
+
+
+def test_only_a_reading_of_highlights_is_a_ceiling(context, photograph):
+    """Grey at 0.12 of white: at 0.9 where it is 2.9 EV darker; no choice is brighter than that."""
+    for name, metered, is_ceiling in (
+        ("average", 0.0, False),
+        ("highlight_weighted", math.log2(0.12 / 0.9), True),
+    ):
+        policy, over = make_policy(f"{name}:P", context), []
+        for ev in np.arange(6.0, 13.0, 0.5):
+            policy.reset(1)
+            (state,) = policy.act(photograph(GREY, ev, context.grid.nearest(ev)))
+            over.append(ev + metered - context.grid.ev100[state])
+        assert bool(max(over) < 0.2) is is_ceiling  # a sixth of a stop and the codes
 
 
 def test_a_policy_that_was_not_reset_says_so(context, photograph):

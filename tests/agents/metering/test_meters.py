@@ -31,13 +31,20 @@ def test_a_grey_card_reads_the_incident_ev(context, photograph, name):
 
 def test_weighted_mean_matches_a_direct_sum(context, photograph):
     light = np.random.default_rng(0).uniform(0.2, 3.0, (64, 64))
-    frame = photograph(light, 9.0, context.grid.nearest(9.0))
     y, x = np.mgrid[:64, :64]
     inside = np.hypot(x - 31.5, y - 31.5) <= 16
+    light[inside] *= 2.0
+    frame = photograph(light, 9.0, context.grid.nearest(9.0))
     mean = 0.75 * light[inside].mean() + 0.25 * light[~inside].mean()
     reading = make_meter("centre_weighted", context.camera)(frame)
     assert reading.ev100[0] == pytest.approx(9.0 + math.log2(mean), abs=0.02)
     assert (weight_map("spot", 128, 128) > 0).mean() == pytest.approx(0.04, abs=0.002)
+    for name in ("spot", "centre_weighted"):
+        for height, width in ((48, 64), (57, 33)):
+            weights = weight_map(name, height, width)
+            assert weights.sum() == pytest.approx(1.0)
+            for mirrored in (weights[::-1], weights[:, ::-1]):
+                np.testing.assert_array_equal(mirrored, weights)
     with pytest.raises(ValueError, match="`meter`"):
         make_meter("matric", context.camera)
 

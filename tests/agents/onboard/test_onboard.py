@@ -1,5 +1,6 @@
 """Exported agents against those in torch, and a camera that is driven by one."""
 
+import functools
 import runpy
 import subprocess
 import sys
@@ -7,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -18,18 +18,17 @@ from agents import PolicyContext, make_policy
 from agents.onboard.controller import Controller, ExposureState
 from agents.onboard.export import export_agent
 from simulator.camera import get_camera
+from tests.ae_env.environments import make_envs
 
 ROOT = Path(__file__).parents[3]
 
 
-def make_envs(num_envs: int, **arguments: Any) -> gym.vector.VectorEnv:
-    given = {"scenes": "bundled:small", "split": "test", "max_episode_steps": None, **arguments}
-    return gym.make_vec("ae_env:ae_env/AutoExposure-v0", num_envs=num_envs, **given)
+small_envs = functools.partial(make_envs, split="test", max_episode_steps=None, resolution=64)
 
 
 @pytest.fixture(scope="module")
 def context() -> PolicyContext:
-    return PolicyContext.from_envs(make_envs(1))
+    return PolicyContext.from_envs(small_envs(1))
 
 
 @pytest.fixture(scope="module", params=["regression", "ppo"])
@@ -42,7 +41,7 @@ def test_decisions_of_whole_episodes_are_those_of_torch(exported: Any) -> None:
     """In light that jumps, so that the memory is kept and forgotten; a batch is not frozen."""
     policy, file = exported
     for num_envs, stops in ((1, 4), (9, -2)):
-        envs = make_envs(num_envs, lighting={"kind": "step", "stops": stops, "at": 4})
+        envs = small_envs(num_envs, lighting={"kind": "step", "stops": stops, "at": 4})
         controller = Controller(file, num_envs)
         policy.reset(num_envs)
         shown, _ = envs.reset(seed=1)
@@ -102,9 +101,7 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> No
         assert 0.02 < signal < 0.7
 
 
-def test_what_cannot_be_exported_or_loaded_is_named(
-    exported: Any, context: PolicyContext, tmp_path: Path
-) -> None:
+def test_what_cannot_be_exported_or_loaded_is_named(exported, context, tmp_path):
     file = tmp_path / "x.onnx"
     for name in ("matrix:P", "regression?foresight=trend"):
         with pytest.raises(ValueError, match="`policy`"):

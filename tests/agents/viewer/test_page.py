@@ -14,6 +14,7 @@ import urllib.request
 from contextlib import contextmanager
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -148,6 +149,24 @@ def test_starts_at_the_best_state_and_marks_where_a_policy_stands(page):
     page.get_by_role("option", name="average", exact=True).click()
     expect(page.get_by_text(re.compile(r"^A average: ISO"))).to_be_visible()
     expect(page.locator(".state", has_text="A")).to_have_count(1)
+
+
+def test_a_key_on_a_slider_shows_its_picture_at_once(page, capsys):
+    """From the key to the frame of the screen after the picture has loaded: see docs/viewer.md."""
+    page.evaluate("""() => {
+      window.times = []; let begun = 0;
+      document.addEventListener('keydown', () => { begun = performance.now(); }, true);
+      document.querySelector('.stage img').addEventListener('load', () => requestAnimationFrame(
+        () => { if (begun) window.times.push(performance.now() - begun); begun = 0; }));
+    }""")
+    slider(page, "Shutter").focus()
+    for i in range(8):
+        page.keyboard.press("ArrowRight" if i % 4 < 2 else "ArrowLeft")
+        page.wait_for_function("n => window.times.length > n", arg=i)
+    median = float(np.median(page.evaluate("window.times")))
+    with capsys.disabled():
+        print(f"from a key to its picture: {median:.0f} ms", end=" ")
+    assert median < 2000.0
 
 
 def test_zooms_to_the_pixels_and_compares_two_states_with_a_divider(page):

@@ -135,12 +135,10 @@ def soft_raw(f_number):
 def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown():
     raw = soft_raw(8)
     simulator = CameraSimulator.from_pretrained("nano", device="cpu", cache=None)
-    far, unknown = (
-        ViewedScene(OpenedScene(Scene.from_raw(raw, scene_id="made")), simulator, depth=depth)
-        .picture(View(CameraSettings(100, 1 / 256, 4)))
-        .capture
-        for depth in ("far", "unknown")
-    )
+    opened = OpenedScene(Scene.from_raw(raw, scene_id="made"))
+    view = View(CameraSettings(100, 1 / 256, 4))
+    seen = (ViewedScene(opened, simulator, depth=depth) for depth in ("far", "unknown"))
+    far, unknown = (each.picture(view).capture for each in seen)
     sharp, soft = (1, slice(None), slice(60)), (1, slice(None), slice(84, None))
     assert float(unknown[sharp].std()) == pytest.approx(float(far[sharp].std()), rel=0.01)
     assert float(unknown[soft].std()) < 0.7 * float(far[soft].std())

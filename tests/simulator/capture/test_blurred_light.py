@@ -16,7 +16,7 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_cam
 from simulator.capture import batch as batch_module
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import Noise, Transitions, noise_keys, record

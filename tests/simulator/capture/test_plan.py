@@ -11,10 +11,10 @@ from scipy.integrate import quad
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
-from simulator.capture.exposure import Exposure, Step
+from simulator.capture.decision import Exposure, Step
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
-from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT
+from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT, KEPT_BLUR_ERROR, MISSED_BLUR
 from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import (
     DenoisedLight,
@@ -137,6 +137,8 @@ def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
         plan.tolerance = 1.0
     large = PreparedScene(torch.full((4, 500, 1000), 0.1), SOURCE, Z6, ZERO).plan(SOURCE)
     assert large.explain().endswith("cost 44 million operations, about 44 ms a capture")
+    monkeypatch.undo()
+    assert 1e-13 < plan_module.seconds_per_operation() < 1e-6  # of whatever machine
 
 
 # Deciding on numbers alone
@@ -376,15 +378,22 @@ def test_each_decision_says_what_it_costs() -> None:
         assert plan.predicted_error == pytest.approx(found, rel=1e-3)
         assert plan.error_bound == pytest.approx(math.hypot(bound, _LEAST_BOUND), rel=1e-3)
         assert plan.network == ("nano" if found == 0.1 else None)
+        assert ("out of reach" in plan.explain()) is (plan is tiny)
+        assert ("kept)" in plan.explain()) is (plan is not tiny)
+    # Rounding has no factor of its own.
+    rounded = replace(loose, errors={**loose.errors, "left out": 0.0, "rounding": 0.4})
+    assert rounded.error_bound == pytest.approx(math.hypot(0.4, _LEAST_BOUND))
+    assert "kept, except for errors" in rounded.explain()
     alone = replace(made, denoised_lights=()).plan(settings)
     assert alone.errors["left out"] == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize("ratio", [2.0, 1.0, 0.5, 1 / 64])
+@pytest.mark.parametrize("ratio", [2.0, 1.25, 1.0, 0.5, 1 / 64])
 def test_what_clipped_highlights_hide_by_quadrature(ratio: float) -> None:
     """A share of light x >= 1 of density 1 / x^2, taken to be 2, in a tenth of the pixels."""
-    noise = 1e-4
-    camera = replace(Z6, segments=(), nlf_by_iso={100.0: UNIT.scaled(noise)})
+    target = NoiseLevelFunction((2e-4,) * 4, (1e-4,) * 4)
+    noise = 1e-4 + 2e-4 * ratio  # of what is white in the source
+    camera = replace(Z6, segments=(), nlf_by_iso={100.0: target})
     saturated = torch.zeros(10, 12, dtype=torch.bool)
     saturated[0] = True
     settings = CameraSettings(100, 1 / 64, 8)
@@ -399,6 +408,8 @@ def test_what_clipped_highlights_hide_by_quadrature(ratio: float) -> None:
     bound = math.hypot(_BOUND["clipped highlights"] * error, plan.errors["rounding"], _LEAST_BOUND)
     assert plan.error_bound == pytest.approx(bound)
     assert plan.clipped_source == pytest.approx(0.1)
+    clear = replace(made, saturated=None).plan(CameraSettings(100, ratio / 64, 8))
+    assert clear.clipped_source == clear.errors["clipped highlights"] == 0.0
 
 
 def test_unknown_depth_and_iso_add_to_the_error_only_where_they_play_a_part() -> None:
@@ -406,6 +417,8 @@ def test_unknown_depth_and_iso_add_to_the_error_only_where_they_play_a_part() ->
     plans = {iso: prepared().plan(CameraSettings(iso, 1 / iso, 8)) for iso in (6400, 12800)}
     assert plans[6400].errors["ISO"] == plans[6400].extrapolated == 0.0
     assert 0.01 < plans[12800].errors["ISO"] < 0.3
+    clean = prepared().plan(CameraSettings(12800, 1 / 12800, 8), noise=False)
+    assert clean.errors["ISO"] == clean.extrapolated == 0.0  # it has no noise
     source = prepared()
     changed = source.expected(OPENER).double() - LIGHT
     shot, read = (np.array(v)[:, None, None] for v in (Z6.nlf(1600).shot, Z6.nlf(1600).read))
@@ -423,3 +436,24 @@ def test_unknown_depth_and_iso_add_to_the_error_only_where_they_play_a_part() ->
     for white in (CameraSettings(12800, 1, 4), CameraSettings(12800, 1, 16)):
         assert bright.plan(white).errors["unknown depth"] == 0.0
         assert bright.plan(white, noise=False).errors["unknown depth"] > 0.0
+
+
+@pytest.mark.parametrize("f_number", [4, 16])
+def test_unknown_depth_of_a_wave_by_hand(f_number: int) -> None:
+    """A wave of 16 pixels in focus throughout, or blurred by 2 pixels, against noise of 1e-3.
+
+    Half a disc's second moment, d^2 / 16, times the wave's Laplacian. Of f/4, what could not be
+    seen at f/8 grows by the square of 2; of f/16, three quarters of what is blurred stays so.
+    """
+    t, noise = 2 * math.pi / 16, NoiseLevelFunction((0.0,) * 4, (1e-6,) * 4)
+    light = 0.3 + 0.1 * torch.cos(t * (torch.arange(64, dtype=torch.float64) + 0.5)).float()
+    light = light.expand(4, 64, 64).contiguous()
+    per_square = (2 - 2 * math.cos(t)) / 32 * 0.1 / 2**0.5 / 1e-3
+    wanted, diameter = MISSED_BLUR**2 * 3, 0.0
+    if f_number == 16:
+        wanted, diameter = KEPT_BLUR_ERROR * 2.0**2 * 0.75, 2.0
+    blur = MapApertureBlur(light, torch.full((64, 64), diameter), 8.0)
+    body, source = Z6.with_nlf(100, noise), CameraSettings(100, 1 / 64, 8)
+    made = PreparedScene(light, source, body, ZERO, aperture_blur=blur)
+    plan = made.plan(CameraSettings(100, (f_number / 8) ** 2 / 64, f_number))
+    assert plan.errors["unknown depth"] == pytest.approx(wanted * per_square, rel=2e-3)

@@ -246,6 +246,8 @@ def test_frames_are_written_where_they_are_wanted() -> None:
     place = torch.full((3, 4, SIDE, SIDE), -7.0)
     frames = prepared().expose([LOW, HIGH], seed=3, out=place[1:])
     assert frames.data_ptr() == place[1:].data_ptr()
+    for default in (prepared().capture(HIGH)[0], prepared().expose([HIGH])[0]):
+        assert torch.equal(default, prepared().expose([HIGH], seed=0)[0])
     assert torch.equal(frames, prepared().expose([LOW, HIGH], seed=3))
     assert bool((place[0] == -7.0).all())
     assert prepared().expose([]).shape == (0, 4, SIDE, SIDE)
@@ -258,7 +260,7 @@ def test_bad_scenes_and_sweeps_are_refused():
     scenes = {"light": [torch.zeros(3, 8, 8), torch.full((4, 8, 8), math.nan)]}
     scenes |= {
         "layout": [Layout(torch.zeros(8, 8))],
-        "image_speed": [-1.0],
+        "image_speed": [-1.0, 1000.1],
         "tolerance": [math.inf],
     }
     scenes |= {"defocus": [math.nan, 513.0], "gain": [-1.0, "1", None, math.inf, math.nan]}
@@ -287,9 +289,11 @@ def test_shares_are_means_over_pixels() -> None:
     shares = layout.shares
     assert shares.share.sum() == pytest.approx(1.0)
     mean = (shares.share * shares.defocus).sum()
-    assert mean == pytest.approx(float(layout.defocus.mean()), abs=2e-3)
-    found = shares.share[shares.subject].sum()
-    assert found == pytest.approx(float(layout.subject.double().mean()))
+    assert mean == pytest.approx(float(layout.defocus.mean()), abs=4e-4)  # rounded to 1/255
+    found = shares.share[shares.subject]
+    assert found.sum() == pytest.approx(float(layout.subject.double().mean()))
+    mean = (found * shares.defocus[shares.subject]).sum() / found.sum()
+    assert mean == pytest.approx(float(layout.defocus[layout.subject].mean()), abs=6e-4)
 
 
 def test_behind_the_subject_is_the_nearest_background() -> None:
@@ -319,6 +323,8 @@ def test_averages_and_windows() -> None:
     assert float(small.defocus[1, 0]) == pytest.approx(float(layout.defocus[tile].mean()))
     wanted = bool(layout.subject[tile].double().mean() > 0.5)
     assert (False if small.subject is None else bool(small.subject[1, 0])) == wanted
+    halves = torch.tensor([[True, False, True, True]] * 2)  # a half is not most of it
+    assert Layout(torch.zeros(2, 4), halves).averaged(2).subject.tolist() == [[False, True]]
     for everywhere in (False, True):  # nothing and everything are no subject
         assert Layout(torch.zeros(4, 4), torch.full((4, 4), everywhere)).subject is None
 
@@ -335,7 +341,7 @@ def test_averages_and_windows() -> None:
         (lambda: Layout(torch.zeros(2, 2), [[True]]), "subject"),
         (lambda: Layout.from_depth(torch.zeros(2, 2), 1.0, in_focus=0.1), "depth"),
         (lambda: Layout.from_depth(torch.ones(2, 2), 0.0, in_focus=0.1), "distance"),
-        (lambda: Layout.from_depth(torch.ones(2, 2), 1.0, in_focus=5.0), "in_focus"),
+        (lambda: Layout.from_depth(torch.ones(2, 2), 1.0, in_focus=1.01), "in_focus"),
     ],
 )
 def test_errors_name_the_argument(make, name: str) -> None:

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (
@@ -189,6 +189,9 @@ def test_bands_come_before_the_noise() -> None:
         assert measured == pytest.approx(wanted - taken, rel=5 * math.sqrt(2 / 5000))
     plain = Transitions.of([light], [Exposure(1.0, ZERO, target)])
     assert plain.in_bands(rows).shares() == [None]
+    for noisy in (replace(source, read=(0.0,) * 4), replace(source, shot=(0.0,) * 4)):
+        (own,) = Transitions.of([light], [Exposure(1.0, noisy, target)]).in_bands(rows).shares()
+        assert own[:, 0].tolist() == [0.5, 1.5]
     share = torch.full((2, 5000), 0.5)
     blurred = replace(exposure, remaining_variance=share)
     (known,) = Transitions.of([light], [blurred]).in_bands(rows).shares()
@@ -203,6 +206,7 @@ def test_bands_come_before_the_noise() -> None:
         NoiseLevelFunction((1e-5,) * 4, (4e-6,) * 4),  # more read noise, less shot noise
         NoiseLevelFunction((5e-4,) * 4, (1e-9,) * 4),  # the other way round
         NoiseLevelFunction(Z6.nlf(800).exposed(2.0).shot, (1e-6,) * 4),  # the same shot noise
+        Z6.nlf(800).exposed(2.0),  # the same noise
         NoiseLevelFunction((1e-5, 1e-5, 1e-5, 1e-2), (1e-9, 1e-9, 1e-9, 1e-2)),  # of one plane
     ],
 )
@@ -222,6 +226,23 @@ def test_balance_of_noise_pixel_by_pixel(target: NoiseLevelFunction, blurred_noi
     excess, lacks = noise_balance(torch.from_numpy(light).float(), exposure)
     assert excess == pytest.approx((beyond / wanted).mean(), rel=1e-4, abs=1e-7)
     assert lacks == bool((wanted > given).any())
+
+
+def test_the_averaged_table_has_what_a_blur_leaves_in_the_mean() -> None:
+    """A quarter and three quarters are a half: the other half of the source's noise is lacking."""
+    source, target, share = Z6.nlf(400), Z6.nlf(6400), torch.full((2, 4), 0.25)
+    share[0] = 0.75
+    exposures = [
+        Exposure(1.0, source, target),
+        Exposure(1.0, source, target, remaining_variance=share),
+    ]
+    transitions = Transitions.of([torch.zeros(4, 2, 4)] * 2, exposures)
+    assert Transitions(transitions.light, transitions.table).averaged_table().shape == (2, 5, 4)
+    for table, left in zip(transitions.averaged_table(), (1.0, 0.5), strict=True):
+        given, wanted = ([np.array(n.shot), np.array(n.read)] for n in (source, target))
+        np.testing.assert_allclose(table[3:], np.multiply(left, given), rtol=1e-6)
+        lacking = np.array(wanted) - np.multiply(left, given)
+        np.testing.assert_allclose(table[1:3], lacking, rtol=1e-6)
 
 
 def test_recording_nothing_and_on_other_devices() -> None:

@@ -11,13 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 
-def pair(inputs: int, outputs: int) -> nn.Sequential:
-    def half(channels: int) -> list[nn.Module]:
-        return [nn.Conv2d(channels, outputs, 3, padding=1), nn.BatchNorm2d(outputs), nn.ReLU()]
-
-    return nn.Sequential(*half(inputs), *half(outputs))
-
-
 class ExposureNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -34,20 +27,25 @@ class Holder(nn.Module):
         setattr(self, name, entry)
 
 
+def level(inputs: int, outputs: int) -> nn.Module:
+    layers: list[nn.Module] = []
+    for channels in (inputs, outputs):
+        layers += [nn.Conv2d(channels, outputs, 3, padding=1), nn.BatchNorm2d(outputs), nn.ReLU()]
+    return Holder("conv", Holder("conv", nn.Sequential(*layers)))
+
+
+def lower(inputs: int, outputs: int) -> nn.Module:
+    return Holder("mpconv", nn.Sequential(nn.MaxPool2d(2), level(inputs, outputs).conv))
+
+
 class UNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        double = {"inc": (8, 64)}
-        double |= {"down1": (64, 128), "down2": (128, 256), "down3": (256, 512)}
-        double |= {"down4": (512, 512), "up1": (1024, 256), "up2": (512, 128)}
-        double |= {"up3": (256, 64), "up4": (128, 64)}
-        for name, sizes in double.items():
-            entry: nn.Module = Holder("conv", pair(*sizes))
-            if name.startswith("down"):
-                entry = Holder("mpconv", nn.Sequential(nn.MaxPool2d(2), entry))
-            else:
-                entry = Holder("conv", entry)
-            setattr(self, name, entry)
+        self.inc = level(8, 64)
+        self.down1, self.down2 = lower(64, 128), lower(128, 256)
+        self.down3, self.down4 = lower(256, 512), lower(512, 512)
+        self.up1, self.up2 = level(1024, 256), level(512, 128)
+        self.up3, self.up4 = level(256, 64), level(128, 64)
         self.outc = Holder("conv", nn.Conv2d(64, 4, 1))
 
     def forward(self, x: Tensor) -> Tensor:

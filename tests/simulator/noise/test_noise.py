@@ -20,9 +20,10 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
-from simulator.capture.exposure import Exposure
+from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.sensor import (
     Transitions,
@@ -44,7 +45,7 @@ from simulator.noise.noise_level_function import (
     tukey_lambda,
 )
 from simulator.optics.discs import disc_kernel
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))
@@ -75,6 +76,9 @@ def test_arithmetic() -> None:
     assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
     assert nlf.scaled(1 / 16).read == pytest.approx((2.5e-9, 1.875e-9, 1.875e-9, 1.25e-9))
     assert ZERO.is_zero
+    for beyond in (nlf, replace(nlf, extrapolation=2.0)):  # whatever is done with it
+        made = beyond.exposed(8), beyond.scaled(0.5), beyond.at_least(ZERO)
+        assert [n.extrapolation for n in made] == [0.0 if beyond is nlf else 2.0] * 3
     assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
     most = NoiseLevelFunction((1.0,) * 4, (1.0,) * 4).exposed(1e30)
     assert (most.shot, most.read) == ((1e24,) * 4, (1e24,) * 4)
@@ -146,13 +150,15 @@ def kurtosis(shape: float) -> float:
     return moment(shape, 4) / moment(shape, 2) ** 2 - 3
 
 
-@pytest.mark.parametrize("shape", [-0.2, -0.1, 0.0, 0.05, 0.135, 0.3])
+@pytest.mark.parametrize("shape", [-0.2, -0.1, 0.0, 0.05, 0.135, 0.3, 1.0])
 def test_draws_are_quantiles_of_variance_one(shape: float) -> None:
     z = np.array([-4.0, -1.5, 0.0, 0.3, 2.0])
     deviation = math.sqrt(moment(shape, 2))
     expected = [quantile(norm.cdf(x), shape) / deviation for x in z]
     drawn = tukey_lambda(torch.from_numpy(z), shape).numpy()
     np.testing.assert_allclose(drawn, expected, rtol=1e-6, atol=1e-12)
+    pixels = ReadNoise(0.0, shape).pixel_part(torch.tensor(4.0), torch.from_numpy(z))
+    np.testing.assert_allclose(pixels, 2.0 * drawn)  # one pixel, no rows
 
 
 @pytest.mark.parametrize(("shape", "k"), [(-0.1, 1), (-0.1, 3), (0.05, 2), (0.3, 2), (0.13, 4)])
@@ -245,6 +251,11 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     )
     np.testing.assert_array_equal(numbers, np.rint(signals.numpy() * SPAN + 3000))
     assert (low, high) == ((signals <= 2**-10).sum(), (signals >= 1 - 1e-6).sum())
+    assert record(transitions, known, count=True, **given).tolist() == [[low, high]]
+    codes = np.empty((1, 4, 9, 70), np.uint8)
+    assert record(transitions, known, codes=codes, **given).tolist() == [[0, 0]]
+    np.testing.assert_array_equal(codes, encode_observation(signals))
+    assert record(transitions, known, signals=signals, **given).tolist() == [[0, 0]]
 
 
 def test_what_is_not_calibrated_is_refused() -> None:
@@ -255,7 +266,10 @@ def test_what_is_not_calibrated_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match="nikon_z6"):
             call()
-    for wrong, message in (((1.0, 0.0), "`row`"), ((0.1, -0.25), "`shape`")):
+    for wrong, message in (
+        *(((row, 0.0), "`row`") for row in (1.0, -0.01)),
+        *(((0.1, shape), "`shape`") for shape in (-0.25, 1.01)),
+    ):
         with pytest.raises(ValueError, match=message):
             ReadNoise(*wrong)
 
@@ -307,7 +321,7 @@ def test_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: 
 def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
     given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
     states = [CameraSettings(*values) for values in given]
-    for seed in (7, np.int64(8), MASK):
+    for seed in (7, np.int64(8), MASK):  # the last is the largest
         keys = sweep_keys(seed, states)
         assert keys.tolist() == [key_of(int(seed), *values) for values in given]
     assert len(sweep_keys(7, [])) == 0

@@ -15,7 +15,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
 from simulator.reference import sequences
-from simulator.reference.camera import (
+from simulator.reference.reference_camera import (
     BodyError,
     ReferenceCamera,
     ReferenceScene,

@@ -7,7 +7,7 @@ import torch
 
 from simulator import CameraSettings, RawImage
 from simulator.optics.thin_lens import Lens
-from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
 from simulator.training.paper_dataset import packed_camera, write_packed_sequence
 
 #: 640 lux is EV100 8: a white card gives 0.663 of sensor white here.

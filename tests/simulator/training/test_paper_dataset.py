@@ -17,7 +17,7 @@ from simulator import CameraSettings, RawImage, get_camera
 from simulator.networks.weights import load_modules
 from simulator.training import paper_dataset
 from simulator.training.paper_dataset import packed_camera, read_dataset, split_dataset
-from simulator.training.train import SimulatorConfig, StageConfig, first_modules
+from simulator.training.trainer import SimulatorConfig, StageConfig, first_modules
 from tests.simulator.training.scenes import SETTINGS, write_dataset
 
 #: NoiseProfile of a Nikon Z6 raw at ISO 800, as exiftool prints it: (shot, read) of R, G, B.

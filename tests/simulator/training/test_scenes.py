@@ -13,9 +13,9 @@ from skimage.data import stereo_motorcycle
 
 from simulator import CameraSettings, get_camera
 from simulator.radiance.procedural import KINDS
-from simulator.reference.camera import DRAPED, ReferenceScene
+from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from simulator.training import scenes as pictured
-from simulator.training.data import DetailPicture
+from simulator.training.crops import DetailPicture
 from simulator.training.scenes import reference_scenes
 from tests.ae_env.scene_files import write_exr, write_hdr
 

@@ -28,10 +28,16 @@ from simulator.capture.statistics import BLOCK, Residual, ResidualStatistics, wi
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import build_modules, load_modules, save_modules
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import DRAPED, MOSAIC, BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import (
+    DRAPED,
+    MOSAIC,
+    BodyError,
+    ReferenceCamera,
+    ReferenceScene,
+)
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
-from simulator.training.data import (
+from simulator.training.crops import (
     Batch,
     DetailCrops,
     DetailPicture,

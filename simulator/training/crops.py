@@ -14,7 +14,7 @@ from torch import Tensor
 from simulator.camera import CameraProfile
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.camera import (
+from simulator.reference.reference_camera import (
     ReferenceCamera,
     ReferenceScene,
     average_planes,

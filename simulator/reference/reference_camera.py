@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from simulator.camera import BayerPattern, CameraProfile
-from simulator.capture.exposure import SIGNAL_LIMIT
+from simulator.capture.decision import SIGNAL_LIMIT
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import plane_tensor

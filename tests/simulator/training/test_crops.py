@@ -17,11 +17,11 @@ from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, Preset
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DiscBank
-from simulator.reference.camera import ReferenceCamera
+from simulator.reference.reference_camera import ReferenceCamera
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import losses
-from simulator.training.data import (
+from simulator.training.crops import (
     Batch,
     DetailCrops,
     DetailPicture,

@@ -22,10 +22,10 @@ from simulator import get_camera
 from simulator.capture.statistics import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
-from simulator.reference.camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
-from simulator.training import train
-from simulator.training.data import DetailCrops, DetailPicture, ReferencePairs, draw_sequences
-from simulator.training.train import SimulatorConfig, StageConfig, make_accelerator, validate
+from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
+from simulator.training import trainer
+from simulator.training.crops import DetailCrops, DetailPicture, ReferencePairs, draw_sequences
+from simulator.training.trainer import SimulatorConfig, StageConfig, make_accelerator, validate
 from simulator.utils.config_file import load_yaml
 from tests.simulator.training.scenes import scene
 
@@ -52,15 +52,15 @@ def pictures(config: SimulatorConfig, split: str) -> list[DetailPicture]:
 @pytest.fixture(autouse=True, scope="module")
 def quick_calibration():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("simulator.training.train._CROPS", 8)
-        patch.setattr("simulator.training.train._SIDE", 16)
+        patch.setattr("simulator.training.trainer._CROPS", 8)
+        patch.setattr("simulator.training.trainer._SIDE", 16)
         yield
 
 
 def save(folder, *given, progress=lambda *_: None, scenes=scenes, **changes):
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
-    return train.train_and_save(
+    return trainer.train_and_save(
         made, file, make_scenes=scenes, make_pictures=pictures, tensorboard=True, **options
     )
 
@@ -113,7 +113,7 @@ def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):
     assert again.read_bytes() == before
     assert card_of(again)["stages"] == card["stages"]
     assert not any("training" in task for task in calls)
-    first, other = (train.first_modules(config(seed=seed))[0].state_dict() for seed in (0, 1))
+    first, other = (trainer.first_modules(config(seed=seed))[0].state_dict() for seed in (0, 1))
     assert not torch.equal(first["noise.network.head.weight"], other["noise.network.head.weight"])
     monkeypatch.setitem(sys.modules, "accelerate", None)
     with pytest.raises(ImportError, match=r"pip install 'ae-env\[train\]'"):
@@ -175,8 +175,8 @@ def test_what_a_scene_teaches():
         one = replace(scene(depth=kind == DRAPED), kind=kind, in_focus=in_focus)
         stages = ("exposure", "aperture", "baseline")
         # Private, as a whole training would take minutes to show it.
-        assert [stage for stage in stages if train._is_useful_for(one, stage)] == teaches
-    found = train.scenes_of(config(scenes={"procedural": 4, "size": 32}), "train")
+        assert [stage for stage in stages if trainer._is_useful_for(one, stage)] == teaches
+    found = trainer.scenes_of(config(scenes={"procedural": 4, "size": 32}), "train")
     # Three of four procedural scenes have depth; the fourth is draped over two depths.
     assert Counter(s.kind for s in found if s.depth is not None) == {"depth": 3, "draped": 2}
     assert all(s.size == (32, 32) and s.sampled and s.illuminance for s in found)
@@ -190,7 +190,7 @@ class Watch:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.cpu, self.wall, self.steps, self.stop, self.broken = 1000.0, 50.0, [], -1, -1
         monkeypatch.setattr("time.process_time", lambda: self.cpu)
-        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
+        monkeypatch.setattr(trainer.time, "monotonic", lambda: self.wall)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> torch.Tensor:
         assert (size, crop, process) == (3, 16, 0)
@@ -218,7 +218,7 @@ def run(file: Path, watch: Watch, **budget: float) -> tuple[Loss, dict[str, Any]
     accelerator = make_accelerator(config("pc"), "cpu", None)
     options = {"checkpoint": file, "identity": "one"}
     args = "noise", loss, loss.trained, watch, stage, accelerator
-    return loss, train.train_stage(*args, **options)
+    return loss, trainer.train_stage(*args, **options)
 
 
 @pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}, {"steps": 9, "average": 0.7}])
@@ -267,7 +267,7 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_pa
 def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch = Watch(monkeypatch)
     for on_cpu, seconds in ((True, 30.0), (False, 90.0)):
-        clock = train.Clock(StageConfig(minutes=2), on_cpu=on_cpu)
+        clock = trainer.Clock(StageConfig(minutes=2), on_cpu=on_cpu)
         clock.start()
         watch.cpu, watch.wall = watch.cpu + 30.0, watch.wall + 90.0
         clock.tick()
@@ -330,9 +330,11 @@ class Known(NoiseModule):
 def calibrated(left: float, shift: Any) -> Residual:
     picture = DetailPicture("a", "a", "mosaic", torch.full((4, 64, 64), 0.5))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("simulator.training.train._SIDE", 32)
-        patch.setattr("simulator.training.train._CROPS", 64)
-        return train.calibrate(Known(left, shift), DetailCrops([picture], [get_camera("nikon_z6")]))
+        patch.setattr("simulator.training.trainer._SIDE", 32)
+        patch.setattr("simulator.training.trainer._CROPS", 64)
+        return trainer.calibrate(
+            Known(left, shift), DetailCrops([picture], [get_camera("nikon_z6")])
+        )
 
 
 @pytest.mark.parametrize(("left", "shift"), [(0.0, 0.3), (0.8, -0.2)])
