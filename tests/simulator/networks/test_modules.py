@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-import scipy.ndimage
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
@@ -154,8 +153,8 @@ def test_defocus_is_judged_at_the_weighted_quantile(spread: float) -> None:
     expected = []
     for picture, values in zip(image.double().numpy(), diameter, strict=True):
         grey = picture.mean(axis=0)
-        mean = scipy.ndimage.uniform_filter(grey, 9, mode="nearest")
-        square = scipy.ndimage.uniform_filter((grey - mean) ** 2, 9, mode="nearest")
+        mean = uniform_filter(grey, 9, mode="nearest")
+        square = uniform_filter((grey - mean) ** 2, 9, mode="nearest")
         weight = np.minimum(square / mean**2, 0.05).ravel()
         order = np.argsort(values.ravel())
         share = np.cumsum(weight[order]) / weight.sum()

@@ -216,26 +216,16 @@ def test_everything_that_changes_the_result_is_seen(where: Any, folder: Path) ->
     assert len(runs) == before
 
 
-@pytest.mark.parametrize("change", ["plain", "fused", "loaded", "data", "module"])
+@pytest.mark.parametrize("change", ["counted", "uncounted", "module"])
 def test_other_weights_are_seen(change: str) -> None:
-    """A step of training, or whatever else changes weights where they are."""
+    """In place, whether torch counts it or, as of a fused optimiser's step, does not."""
     simulator, raw = _simulator(), _raw()
     before = _denoised(simulator, raw)
     if change == "module":
         simulator.noises = (copy.deepcopy(simulator.noises[0]),)
-    module = simulator.noise
-    assert module is not None
-    if change in ("plain", "fused"):
-        module.requires_grad_(True)
-        optimiser = torch.optim.Adam(module.parameters(), lr=1e-3, fused=change == "fused")
-        for p in module.parameters():
-            p.grad = torch.ones_like(p)
-        optimiser.step()
-        module.requires_grad_(False)
-    elif change == "loaded":
-        module.load_state_dict({k: 1.01 * v for k, v in module.state_dict().items()})
-    else:
-        next(iter(module.parameters())).data.mul_(1.01)
+    weights = next(simulator.noise.parameters())
+    weights = weights.detach() if change == "counted" else weights.data
+    weights.mul_(1.01)
     after = _denoised(simulator, raw)
     assert torch.equal(after, simulator.denoise(simulator.prepare(raw)))
     assert not torch.equal(after, before)
