@@ -353,18 +353,3 @@ def test_workers_that_are_forked_from_a_process_with_environments(tmp_path: Path
     variables["AE_ENV_CACHE"] = str(tmp_path)
     command = [sys.executable, "-c", code]
     assert subprocess.check_output(command, env=variables, timeout=300) == b"(2,)\n"
-
-
-STATM = Path("/proc/self/statm")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not STATM.exists(), reason="needs /proc")
-def test_memory_stays_flat() -> None:
-    envs, pages = make_envs(64, autoreset_mode="SAME_STEP"), list[int]()
-    envs.reset(seed=0)
-    for step, actions in enumerate(np.random.default_rng(0).integers(64, size=(200, 64))):
-        envs.step(actions)
-        if step in (50, 199):
-            pages.append(int(STATM.read_text().split()[1]))
-    assert 4096 * (pages[1] - pages[0]) < 6 * 2**20
