@@ -105,7 +105,7 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("features", "--weights", "a"), "`weights` (='a')"),
         (("throughput", "--against", "none"), "`against` (='none')"),
         (("recorded", "none"), "`scenes` (='recorded:"),
-        (("recorded", "runs"), "must hold captures"),
+        (("recorded", "runs"), "`scenes` (='recorded:runs')"),
         (("recorded", "runs", "--weights", "a"), "`weights` (='a')"),
     ],
 )
