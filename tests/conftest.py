@@ -54,9 +54,12 @@ def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def the_same_random_numbers() -> None:
-    """A test that draws from torch's own generator draws the same on every run, in any order."""
+def the_same_random_numbers_and_threads() -> Iterator[None]:
+    """A test draws the same from torch's own generator on every run, in any order."""
     torch.manual_seed(0)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ from simulator import NoiseLevelFunction, exposure_ratio
 from simulator.networks.weights import build_modules, save_modules
 from simulator.training.paper_dataset import split_dataset
 from simulator.training.scenes import detail_split
-from tests.ae_env.recorded_files import GRID, capture, write_raws
+from tests.ae_env.scene_files import GRID, capture, write_raws
 from tests.simulator.training.scenes import scene as photographed
 from tests.simulator.training.scenes import write_dataset
 
@@ -105,7 +105,7 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("features", "--weights", "a"), "`weights` (='a')"),
         (("throughput", "--against", "none"), "`against` (='none')"),
         (("recorded", "none"), "`scenes` (='recorded:"),
-        (("recorded", "runs"), "must hold captures"),
+        (("recorded", "runs"), "`scenes` (='recorded:runs')"),
         (("recorded", "runs", "--weights", "a"), "`weights` (='a')"),
     ],
 )

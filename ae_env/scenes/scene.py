@@ -197,7 +197,7 @@ class Scene:
             scene_id: Unique name.
             group: Source group; `scene_id` by default.
             nlf: Noise left in `packed`; none by default.
-            illuminance, white_balance, kind, **fields: See `Scene`.
+            illuminance, white_balance, kind, fields: As in `Scene`.
 
         Raises:
             ValueError: If a value has the wrong shape or lies outside its range.

@@ -63,12 +63,13 @@ def test_a_long_run_takes_no_more_memory() -> None:
         env.reset(seed=episode)
         for _ in range(30):
             env.step(rng.integers(64))
-        gc.collect()
-        pages.append(int(STATM.read_text().split()[1]))
-    assert (max(pages[20:]) - pages[20]) * os.sysconf("SC_PAGE_SIZE") < 16 * 2**20
+        if episode in (20, 59):
+            gc.collect()
+            pages.append(int(STATM.read_text().split()[1]))
+    assert (pages[1] - pages[0]) * os.sysconf("SC_PAGE_SIZE") < 16 * 2**20
 
 
-def test_spaces_are_as_documented() -> None:
+def test_spaces_and_infos_are_as_documented() -> None:
     env = make_env(resolution=40)
     box, space = gym.spaces.Box, env.observation_space
     assert space["raw"] == box(0, 255, (4, 40, 40), np.uint8)
@@ -78,9 +79,6 @@ def test_spaces_are_as_documented() -> None:
     assert dn.high.max() == env.unwrapped.camera.white_level
     assert env.action_space == gym.spaces.Discrete(64)
     assert env.get_wrapper_attr("action_masks")().tolist() == [True] * 64
-
-
-def test_info_has_the_same_keys_and_plain_numbers() -> None:
     env = make_env(with_oracle=True)
     _, first = env.reset(seed=0)
     _, reward, terminated, truncated, second = env.step(5)
@@ -108,26 +106,7 @@ def test_reset_options_choose_scene_state_and_frame() -> None:
         episodes.append(env.unwrapped.episode())
     assert shown[1] < shown[0]
     # The draws do not depend on the options: the episode is the same otherwise.
-    assert len({(episode.speed, episode.defocus) for episode in episodes}) == 1
-
-
-def test_noise_depends_on_the_frame_and_on_nothing_else() -> None:
-    env = make_env()
-    first, _ = env.reset(seed=2, options={"state": 20})
-    second, *_ = env.step(20)
-    assert (first["raw"] != second["raw"]).any()  # the same state again, other noise
-    env.reset(seed=2, options={"state": 40})
-    np.testing.assert_array_equal(env.step(20)[0]["raw"], second["raw"])
-
-
-def test_global_random_state_is_left_alone() -> None:
-    drawn = []
-    for work in (lambda: None, lambda: rollout(1)):
-        torch.manual_seed(0)
-        np.random.seed(0)  # noqa: NPY002
-        work()
-        drawn.append((float(torch.rand(1)), np.random.rand()))  # noqa: NPY002
-    assert drawn[0] == drawn[1]
+    assert len({(e.speed, e.defocus, e.noise_seed) for e in episodes}) == 1
 
 
 def test_returned_arrays_are_never_reused() -> None:
@@ -192,10 +171,9 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("scenes", ["bundled", "polyhaven"])
 def test_oracle_is_spread_over_every_control(scenes: str) -> None:
-    """No single value of a control may be the oracle's in more than half of the episodes."""
     if scenes == "polyhaven" and any(asset.path is None for asset in list_assets()):
         pytest.skip("needs the maps of Poly Haven (AE_ENV_DATA)")
-    env = make_env(scenes=scenes, split="test", resolution=64).unwrapped
+    env = make_env(scenes=scenes, split="test", resolution=36).unwrapped
     states = []
     for i in range(len(env.scenes)):
         env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
@@ -204,11 +182,17 @@ def test_oracle_is_spread_over_every_control(scenes: str) -> None:
         assert np.bincount(control).max() <= 0.5 * len(states)
 
 
-def test_cached_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blurred light is cached where memory allows; frames must not depend on it."""
+def test_cached_light_changes_nothing_and_random_states_are_left_alone(monkeypatch) -> None:
     cached = rollout(5, depth=3.0, motion=0.5)
     monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
     assert_equal(rollout(5, depth=3.0, motion=0.5), cached)
+    drawn = []
+    for work in (lambda: None, lambda: rollout(1)):
+        torch.manual_seed(0)
+        np.random.seed(0)  # noqa: NPY002
+        work()
+        drawn.append((float(torch.rand(1)), np.random.rand()))  # noqa: NPY002
+    assert drawn[0] == drawn[1]
 
 
 FEW = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
@@ -256,8 +240,6 @@ def test_paths_are_drawn_in_their_own_colours() -> None:
 
 def test_caption_and_size_of_a_frame(caplog: pytest.LogCaptureFixture) -> None:
     env = _env(resolution=40)
-    with pytest.raises(gym.error.ResetNeeded):
-        env.unwrapped.render()
     env.reset(seed=1, options={"state": 0})
     first = env.render()
     assert first.shape == (280, 280, 3)  # seven times 40
@@ -307,15 +289,6 @@ TAKES: dict[str, list[Any]] = {
 TAKES_VECTOR = {"num_envs": [], "max_episode_steps": [None, HUGE], "autoreset_mode": []}
 
 
-def _cases(taken: bool) -> list[Any]:
-    return [
-        pytest.param(name, value, id=f"{name}-{i}")
-        for name, known in {**TAKES, **TAKES_VECTOR}.items()
-        for i, value in enumerate(ODD)
-        if any(type(k) is type(value) and k == value for k in known) == taken
-    ]
-
-
 class Work(Exception):
     """Scenes were loaded."""
 
@@ -328,22 +301,14 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EnvOptions, "scenes_on_demand", load)
 
 
-def test_the_tables_have_every_argument() -> None:
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(("name", "takes"), [*TAKES.items(), *TAKES_VECTOR.items()])
+def test_odd_values_are_refused_but_those_that_an_argument_takes(name: str, takes: Any) -> None:
     assert {"scenes", *TAKES} == {*EnvOptions.__dataclass_fields__, "render_mode"}
-
-
-@pytest.mark.usefixtures("idle")
-@pytest.mark.parametrize(("name", "value"), _cases(False))
-def test_odd_values(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"`{name}"):
-        AutoExposureVectorEnv(**{**SMALL, name: value})
-
-
-@pytest.mark.usefixtures("idle")
-@pytest.mark.parametrize(("name", "value"), _cases(True))
-def test_values_that_are_fine(name: str, value: Any) -> None:
-    with pytest.raises(Work):
-        AutoExposureVectorEnv(**{**SMALL, name: value})
+    for value in ODD:
+        taken = any(type(known) is type(value) and known == value for known in takes)
+        with pytest.raises(Work if taken else ValueError, match=None if taken else f"`{name}"):
+            AutoExposureVectorEnv(**{**SMALL, name: value})
 
 
 GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
@@ -436,7 +401,7 @@ def test_refused_resets_and_steps_change_nothing(for_many: bool) -> None:
         assert_equal(env.reset(seed=first), twin.reset(seed=second))
 
 
-def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
+def test_scenes_are_loaded_once_for_each_camera_and_splits_are_disjoint() -> None:
     train = EnvOptions(**SMALL).load_scenes()
     EnvOptions(**SMALL).load_scenes().clear()  # a list of one's own
     again = EnvOptions(**SMALL).load_scenes()
@@ -444,9 +409,6 @@ def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
     test, both = (EnvOptions(split=split, **SMALL).load_scenes() for split in ("test", "all"))
     assert {s.group for s in train}.isdisjoint({s.group for s in test})
     assert [s.scene_id for s in both] == [s.scene_id for s in train + test]
-
-
-def test_cameras_of_one_name_have_scenes_of_their_own() -> None:
     other = replace(CAMERA, colour_matrix=CAMERA.colour_matrix[::-1])
     for one in (CAMERA, other):
         assert EnvOptions(camera=one, **SMALL).load_scenes()[0].camera == one

@@ -1,6 +1,7 @@
 """Real captures as scenes and environments: which file is which state, what is shown, bad input."""
 
 import functools
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -8,26 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from PIL import Image
-from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
-from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.recorded import (
-    RecordedOptions,
-    index_recorded,
-    recorded_grid,
-    settings_in_name,
-    state_of,
-)
+from ae_env.scenes import Scene, load_scenes, recorded
 from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
 from simulator.reference.reference_camera import ReferenceCamera
 from tests.ae_env.environments import ID, check_parity, make_env
-from tests.ae_env.recorded_files import (
+from tests.ae_env.scene_files import (
     GRID,
     capture,
     write_picture,
@@ -41,7 +33,7 @@ CAMERA = get_camera("nikon_z6")
 load = functools.partial(load_scenes, split="all", camera=CAMERA, resolution=None)
 
 
-def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
+def test_raws_are_shown_as_they_are_and_pictures_developed_back(tmp_path: Path) -> None:
     write_raws(tmp_path / "desk")
     (scene,) = load(f"recorded:{tmp_path}?iso=50")  # what the files state comes first
     assert scene.allowed.all()
@@ -54,10 +46,20 @@ def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
     expected = scene.recorded.reshape(8, 4, 20, 2, 20, 2).mean(dim=(3, 5))
     torch.testing.assert_close(small.recorded, expected, rtol=0.0, atol=1e-6)
     assert small.box_factor == 2
-    body = RecordedOptions(tmp_path).camera(get_camera("canon_70d"))  # that of the raws
+    body = recorded.RecordedOptions(tmp_path).camera(get_camera("canon_70d"))  # that of the raws
     assert body.black_level == CAMERA.black_level
     for iso in (100.0, 1600.0):  # a DNG states one pair of numbers for both greens
         np.testing.assert_allclose(body.nlf_by_iso[iso].shot, CAMERA.nlf(iso).shot, rtol=0.02)
+    for settings in GRID:
+        name = f"iso{settings.iso:.0f}_1-{1 / settings.exposure_time:.0f}s_f{settings.f_number:g}"
+        write_picture(tmp_path / "shown" / f"{name}.png", settings)
+    (scene,) = load(f"recorded:{tmp_path / 'shown'}")
+    pictures = [Image.open(path) for path in sorted((tmp_path / "shown").iterdir())]
+    sums = {np.asarray(picture).astype(int).sum() for picture in pictures}
+    developed = develop(scene.recorded, scene.white_balance, scene.camera.colour_matrix)
+    shown = (developed * 255.0).round().int()
+    assert {int(rgb.sum()) for rgb in shown} == sums  # the same codes as in the files
+    assert scene.camera.nlf(100) == CAMERA.nlf(100)
 
 
 def test_the_light_is_that_of_all_captures(tmp_path: Path) -> None:
@@ -76,19 +78,6 @@ def test_the_light_is_that_of_all_captures(tmp_path: Path) -> None:
     assert merged < 0.9 * min(errors)
 
 
-def test_pictures_are_developed_back(tmp_path: Path) -> None:
-    for settings in GRID:
-        name = f"iso{settings.iso:.0f}_1-{1 / settings.exposure_time:.0f}s_f{settings.f_number:g}"
-        write_picture(tmp_path / "desk" / f"{name}.png", settings)
-    (scene,) = load(f"recorded:{tmp_path}")
-    pictures = [Image.open(path) for path in sorted((tmp_path / "desk").iterdir())]
-    sums = {np.asarray(picture).astype(int).sum() for picture in pictures}
-    developed = develop(scene.recorded, scene.white_balance, scene.camera.colour_matrix)
-    shown = (developed * 255.0).round().int()
-    assert {int(rgb.sum()) for rgb in shown} == sums  # the same codes as in the files
-    assert scene.camera.nlf(100) == CAMERA.nlf(100)
-
-
 def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
     for number, settings in enumerate(GRID):
         picture = tmp_path / "exif" / f"IMG_{number}.jpg"
@@ -101,67 +90,58 @@ def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
     # They complete each other.
     rows = [f"{number}.jpg,f{settings.f_number:g}" for number, settings in enumerate(GRID)]
     (tmp_path / "a" / "settings.csv").write_text("\n".join(["file,aperture", *rows]))
-    files = index_recorded(tmp_path / "a", {})
+    files = recorded.index_recorded(tmp_path / "a", {})
     assert [f.scene for f in files] == ["a"] * 8
-    assert recorded_grid(files) == GRID
+    assert recorded.recorded_grid(files) == GRID
     # Nominal and exact values are one state.
     grid = ExposureGrid((100,), (1 / 128, 1 / 64), (2.8, 5.6))
-    assert state_of(CameraSettings(100, 1 / 125, 5.6569), grid) == 1
-    assert state_of(CameraSettings(100, 1 / 60, 5.6), grid) is None  # 6.7 % off
-    assert state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
+    assert recorded.state_of(CameraSettings(100, 1 / 125, 5.6569), grid) == 1
+    assert recorded.state_of(CameraSettings(100, 1 / 60, 5.6), grid) is None  # 6.7 % off
+    assert recorded.state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
 
 
-def test_states_without_a_capture_are_forbidden_and_said(tmp_path, caplog):
-    write_raws(tmp_path / "a")
-    write_raws(tmp_path / "b", [s for i, s in enumerate(GRID) if i not in (2, 5)], seed=1)
-    a, b = load(f"recorded:{tmp_path}")
+def test_states_without_a_capture_are_forbidden_and_said(raws, caplog) -> None:
+    a, b = load(f"recorded:{raws}")
     assert a.allowed.all()
-    assert np.flatnonzero(~b.allowed).tolist() == [2, 5]
-    assert not b.recorded[[2, 5]].any()
+    assert np.flatnonzero(~b.allowed).tolist() == [*HOLES]
+    assert not b.recorded[[*HOLES]].any()
     (message,) = caplog.messages
     assert "1 of 2 recorded scenes lack states" in message
-    assert "'b' lacks 2 of 8, the first is ISO 100, 1/125 s, f/4" in message
+    assert "'b' lacks 2 of 8, the first is ISO 1600, 1/1000 s, f/8" in message
     # A grid of one's own leaves out what it does not have.
-    (a, b) = load(f"recorded:{tmp_path}", grid=ExposureGrid((1600,), (1 / 1000, 1 / 125), (4,)))
+    (a, b) = load(f"recorded:{raws}", grid=ExposureGrid((100, 1600), (1 / 1000,), (4,)))
     assert a.recorded.shape[0] == b.recorded.shape[0] == 2
-    torch.testing.assert_close(a.recorded[1], capture(GRID[6]).data)
+    torch.testing.assert_close(a.recorded[1], capture(GRID[4]).data)
 
 
-def _spoil(path: Path, fault: str) -> None:
-    folder = path.parents[3]
-    if fault == "cut":
-        path.write_bytes(path.read_bytes()[:300])
-    elif fault == "twice":
-        shutil.copy(path, path.with_suffix(".png"))
-    elif fault == "other size":
-        with Image.open(path) as picture:
-            picture.resize((44, 40)).save(path)
-    elif fault == "no table":
-        (folder / "grid-options-2x2x2.csv").unlink()
-    elif fault == "16 bits":
-        path.unlink()
-        Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
-    elif fault == "one state":
-        for other in set((folder / "l1").iterdir()) - {folder / "l1" / "param_3"}:
-            shutil.rmtree(other)
+def only_one_state(path: Path) -> None:
+    for number in (1, 2, *range(4, 9)):
+        shutil.rmtree(path.parents[2] / f"param_{number}")
+
+
+def only_16_bits(path: Path) -> None:
+    path.unlink()
+    Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"),
+    ("spoil", "message"),
     [
-        ("cut", r"recorded file '.*param_3.*val_1.JPEG' cannot be read: "),
-        *(("twice", "'l1/n00000001/val_1' must have"), ("no table", "val_0.JPEG")),
-        ("other size", r"val_1.JPEG' \(\(40, 44\) packed"),
-        ("16 bits", r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
-        ("", r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
-        ("one state", "1 of 1 captures in the grid, .*param_3"),
+        (lambda file: os.truncate(file, 300), r"file '.*param_3.*val_1.JPEG' cannot be read: "),
+        (lambda file: shutil.copy(file, file.with_suffix(".png")), "l1/n00000001/val_1' must have"),
+        (lambda file: Image.new("RGB", (44, 40)).save(file), r"val_1.JPEG' \(\(40, 44\) packed"),
+        (lambda file: (file.parents[3] / "grid-options-2x2x2.csv").unlink(), "val_0.JPEG"),
+        (only_16_bits, r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
+        (None, r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
+        (only_one_state, "1 of 1 captures in the grid, .*param_3"),
     ],
 )
-def test_bad_files_get_one_line_that_names_them(tmp_path: Path, fault: str, message: str) -> None:
+def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil: Any, message: str) -> None:
     write_states(tmp_path)
-    _spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG", fault)
+    if spoil:
+        spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
     with pytest.raises(ValueError, match=message) as error:
-        load(f"recorded:{tmp_path}", resolution=None if fault else 64)
+        load(f"recorded:{tmp_path}", resolution=None if spoil else 64)
     assert "\n" not in str(error.value)
 
 
@@ -191,7 +171,7 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(text, errors="surrogateescape")
     with pytest.raises(ValueError, match=message):
-        index_recorded(tmp_path, {})
+        recorded.index_recorded(tmp_path, {})
 
 
 @pytest.mark.parametrize(
@@ -205,11 +185,12 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
 def test_options(tmp_path: Path, spec: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load(spec)
-    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
-    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
+    options = recorded.RecordedOptions
+    found = options.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == options(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
     names = [f"iso{i}_1-{i}s_f{i / 100}.png" for i in range(100, 1800, 100)]
     with pytest.raises(ValueError, match="4913 combinations; at most 4096"):
-        recorded_grid(index_recorded(touch(tmp_path, *names), {}))
+        recorded.recorded_grid(recorded.index_recorded(touch(tmp_path, *names), {}))
 
 
 @pytest.mark.parametrize(
@@ -232,32 +213,29 @@ def test_options(tmp_path: Path, spec: object, message: str) -> None:
 def test_settings_in_names(name: str, settings: tuple[float | None, ...], rest: str) -> None:
     names = ("iso", "exposure_time", "f_number")
     expected = {k: v for k, v in zip(names, settings, strict=True) if v is not None}
-    found, left = settings_in_name(name)
+    found, left = recorded.settings_in_name(name)
     assert found == pytest.approx(expected)
     assert left == rest
 
 
-def test_imagenet_es(tmp_path: Path) -> None:
+def test_imagenet_es_and_video_stacks(tmp_path: Path) -> None:
     grid = ExposureGrid((200, 12800), (1 / 1250, 0.4), (5, 13))
     write_states(tmp_path, seeds=(3,), grid=grid)
     shutil.copytree(tmp_path / "l1", tmp_path / "l5")
-    files = index_recorded(tmp_path, {})
+    files = recorded.index_recorded(tmp_path, {})
     assert [f.scene for f in files] == [f"l{i}/n00000003/val_3" for i in (1, 5) for _ in range(8)]
     # Both lights of a picture stay on one side of a split.
     assert {f.group for f in files} == {"n00000003/val_3"}
-    assert recorded_grid(files) == grid
+    assert recorded.recorded_grid(files) == grid
     by_folder = {f.path.parts[-3]: f.settings for f in files}
     assert by_folder == {f"param_{i + 1}": s for i, s in enumerate(grid)}
-
-
-def test_video_stacks(tmp_path: Path) -> None:
-    write_video(tmp_path, frames=11, times=("1-1000s", "1-60s"))
-    scenes = load({"recorded": tmp_path, "iso": 400, "f_number": 4})
+    write_video(tmp_path / "video", frames=11, times=("1-1000s", "1-60s"))
+    scenes = load({"recorded": tmp_path / "video", "iso": 400, "f_number": 4})
     assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]
     assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
     # Frames in the files' names are the same.
     flat = touch(tmp_path / "flat", *(f"v/frame_{i}_1-{t}s.png" for i in (9, 10) for t in (8, 15)))
-    files = index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
+    files = recorded.index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
     assert [(f.sequence, f.frame) for f in files] == [("v", 9), ("v", 9), ("v", 10), ("v", 10)]
 
 
@@ -353,7 +331,6 @@ def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str,
 
 
 def test_the_table_is_what_stepping_gives(raws: Path) -> None:
-    """The oracle of a recorded grid is the best of the rewards that its captures earn."""
     for scorer in ("balanced", {"entropy": 0.5, "noise": 0.5}):
         env = make_env(**arguments(raws, scorer=scorer, with_oracle=True))
         base: Any = env.unwrapped
@@ -368,17 +345,17 @@ def test_the_table_is_what_stepping_gives(raws: Path) -> None:
         assert info["oracle_state"] == rewards.argmax()
 
 
-def test_native_vector_environments_show_the_same(raws: Path, video: dict[str, Any]) -> None:
+def test_many_and_copies_in_another_process_show_the_same(raws, video, forkserver) -> None:
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
         check_parity(0, 4, max_episode_steps=3, **given)
+    env = make_env(**arguments(raws)).unwrapped
+    with forkserver.Pool(1) as pool:
+        np.testing.assert_array_equal(pool.apply(first_frame, (env,)), first_frame(env))
 
 
-def test_the_checkers_find_nothing(raws: Path, video: dict[str, Any]) -> None:
-    for scenes in (raws, video):
-        env = make_env(**arguments(scenes)).unwrapped
-        check_env(env)
-        check_for_sb3(env)
+def first_frame(env: Any) -> np.ndarray:
+    return env.reset(seed=4)[0]["raw"]
 
 
 def test_a_changed_folder_is_read_again(tmp_path: Path) -> None:

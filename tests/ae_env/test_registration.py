@@ -22,7 +22,7 @@ from tests.ae_env.environments import ID, SMALL, assert_equal, make_env
 from tests.ae_env.scorer_images import Own
 
 
-def test_spec_round_trips_through_json_and_pickle() -> None:
+def test_spec_round_trips_and_in_process_arguments_say_so() -> None:
     given = {"observation": "linear", "costs": {"switch": 0.1}, "lighting": {"kind": "ramp"}}
     env = make_env(scorer="ae_env.scorers.terms:Noise", **given)
     env.reset(seed=3)
@@ -32,9 +32,6 @@ def test_spec_round_trips_through_json_and_pickle() -> None:
         again = gym.make(spec)
         again.reset(seed=3)
         assert_equal(again.step(11), expected)
-
-
-def test_in_process_arguments_say_so_when_json_is_asked_for() -> None:
     env = make_env(scorer=Own())
     env.reset(seed=0)
     assert 0.0 <= env.step(0)[1] <= 1.0
@@ -45,22 +42,19 @@ def test_in_process_arguments_say_so_when_json_is_asked_for() -> None:
         env.spec.to_json()
 
 
-def test_import_is_light_and_registers_once() -> None:
-    code = (
-        "import sys, gymnasium, ae_env, ae_env.registration as r; r.register_envs(); dir(ae_env);"
-        f"assert {ID!r} in gymnasium.registry; "
-        "sys.exit(bool({'torch', 'numba', 'yaml', 'matplotlib'} & set(sys.modules)))"
-    )
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-
-
-def test_public_names_resolve_and_nothing_else_is_listed() -> None:
+def test_public_names_resolve_and_import_is_light() -> None:
     assert set(dir(ae_env)) == {*ae_env.__all__, "__version__"}
     assert all(getattr(ae_env, name).__doc__ for name in ae_env.__all__)
     lightings = {kind.__name__ for kind in ae_env.lighting.KINDS.values()}
     assert {*ae_env.wrappers.__all__} | lightings <= {*ae_env.__all__}
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = ae_env.nonsense
+    code = (
+        "import sys, gymnasium, ae_env, ae_env.registration as r; r.register_envs(); dir(ae_env);"
+        f"assert {ID!r} in gymnasium.registry; "
+        "sys.exit(bool({'torch', 'numba', 'yaml', 'matplotlib'} & set(sys.modules)))"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
 @pytest.mark.parametrize("kind", [ae_env.AutoExposureEnv, ae_env.AutoExposureVectorEnv])
@@ -114,15 +108,12 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
             ae_env.load_preset(str(own))
 
 
-def test_every_package_and_the_presets_are_installed() -> None:
+def test_packages_and_configs_are_installed_and_found_from_anywhere(tmp_path, monkeypatch) -> None:
     """`configs` is no folder of `ae_env`: it must not be forgotten."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["packages"] == ["simulator", "ae_env", "agents"]
     assert wheel["force-include"] == {"configs": "ae_env/configs"}
-
-
-def test_a_config_of_the_package_is_found_from_anywhere(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shipped = find_config(Path("configs/simulator/nano.yaml"))
     assert shipped.is_file()
@@ -135,7 +126,6 @@ def test_a_config_of_the_package_is_found_from_anywhere(tmp_path, monkeypatch) -
 
 
 def test_a_foreign_package_of_a_common_name_is_named(tmp_path: Path) -> None:
-    """Else the first import from it fails with a puzzle."""
     (tmp_path / "simulator").mkdir()
     (tmp_path / "simulator" / "__init__.py").touch()
     code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; import ae_env"
@@ -150,52 +140,45 @@ def test_a_foreign_package_of_a_common_name_is_named(tmp_path: Path) -> None:
 ARGUMENT = "`thing` (='mine.py:Mine')"
 
 
-def _write(file: Path, text: str) -> Path:
-    file.write_text(text)
-    return file
-
-
-def test_a_file_is_run_once_until_it_changes(tmp_path, monkeypatch):
-    file = _write(tmp_path / "my file-1.py", "class Mine:\n    number = 1\n")
+def test_files_are_run_once_until_they_change_and_imports_once(tmp_path, monkeypatch):
+    file = tmp_path / "my file-1.py"
+    file.write_text("class Mine:\n    number = 1\n")
     first = load_from_file(str(file), "Mine", ARGUMENT)
     monkeypatch.chdir(tmp_path)
     assert load_from_file("my file-1.py", "Mine", ARGUMENT) is first
     monkeypatch.setenv("HOME", str(tmp_path))
     assert load_from_file("~/my file-1.py", "Mine", ARGUMENT) is first
-    _write(file, "class Mine:\n    number = 2\n")  # in the same second, of the same length
+    file.write_text("class Mine:\n    number = 2\n")  # in the same second, of the same length
     assert load_from_file(str(file), "Mine", ARGUMENT).number == 2
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "on_the_path.py").write_text("class Base: ...")
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.py").write_text("from on_the_path import Base as Mine")
+    one, two = (load_from_file(str(tmp_path / f"{n}.py"), "Mine", ARGUMENT) for n in ("one", "two"))
+    assert one is two
+    monkeypatch.delitem(sys.modules, "on_the_path")
 
 
 def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> None:
-    """From any folder, a package too; two folders may have helpers of the same names."""
     before, path = set(sys.modules), list(sys.path)
     for number in (1, 2):
         folder = tmp_path / str(number)
         (folder / "own_package").mkdir(parents=True)
-        _write(folder / "own_helper.py", f"number = {number}")
-        _write(folder / "own_package" / "__init__.py", "")
-        _write(folder / "own_package" / "part.py", f"from own_helper import number as n{number}")
+        (folder / "own_helper.py").write_text(f"number = {number}")
+        (folder / "own_package" / "__init__.py").write_text("")
+        part = folder / "own_package" / "part.py"
+        part.write_text(f"from own_helper import number as n{number}")
         text = f"from own_package.part import n{number} as n\nclass Mine:\n    number = n\n"
-        _write(folder / "mine.py", text)
+        (folder / "mine.py").write_text(text)
     files = [str(tmp_path / str(number) / "mine.py") for number in (1, 2)]
     assert [load_from_file(f, "Mine", ARGUMENT).number for f in (*files, files[0])] == [1, 2, 1]
-    _write(tmp_path / "1" / "own_helper.py", "number = 333")
+    (tmp_path / "1" / "own_helper.py").write_text("number = 333")
     with open(files[0], "a") as file:
         file.write("# changed")
     assert load_from_file(files[0], "Mine", ARGUMENT).number == 333
     assert sys.path == path
     for name in set(sys.modules) - before:
         del sys.modules[name]
-
-
-def test_what_is_importable_anyway_is_not_imported_twice(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    _write(tmp_path / "on_the_path.py", "class Base: ...")
-    for name in ("one", "two"):
-        _write(tmp_path / f"{name}.py", "from on_the_path import Base as Mine")
-    one, two = (load_from_file(str(tmp_path / f"{n}.py"), "Mine", ARGUMENT) for n in ("one", "two"))
-    assert one is two
-    monkeypatch.delitem(sys.modules, "on_the_path")
 
 
 @pytest.mark.parametrize(
@@ -210,7 +193,8 @@ def test_what_is_importable_anyway_is_not_imported_twice(tmp_path, monkeypatch):
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: str) -> None:
-    file = _write(tmp_path / "mine.py", text)
+    file = tmp_path / "mine.py"
+    file.write_text(text)
     before = set(sys.modules)
     with pytest.raises(ValueError, match=message) as caught:
         load_from_file(str(file), "Mine", ARGUMENT)

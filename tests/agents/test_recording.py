@@ -12,7 +12,7 @@ from agents import Policy, PolicyContext, make_policy
 from agents.recording import record_dataset
 from agents.rollouts import fitting_arguments, training_arguments
 from tests.ae_env.environments import make_envs
-from tests.ae_env.recorded_files import GRID, write_raws
+from tests.ae_env.scene_files import GRID, write_raws
 
 TASK = "ae_env/AutoExposure-v0"
 SMALL = {"scenes": "bundled:small", "resolution": 36, "split": "test"}

@@ -7,39 +7,18 @@ import math
 import pickle
 import threading
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from ae_env.lighting.moving import read_pans
-from ae_env.scenes import Scene, polyhaven
-from ae_env.scenes.bundled import (
-    DrawnScenes,
-    SceneGroup,
-    add_layout,
-    bundled_scenes,
-    procedural_groups,
-)
+from ae_env.scenes import Scene, bundled, polyhaven
 from ae_env.scenes.load import _LOADED, load_scenes
 from ae_env.scenes.measured_depth import depth_scenes
-from ae_env.scenes.polyhaven import (
-    ILLUMINANCE,
-    Asset,
-    asset_views,
-    cut_values,
-    download,
-    incident_light,
-    light_around,
-    list_assets,
-    mixed_scenes,
-    polyhaven_scenes,
-    split_assets,
-)
+from ae_env.scenes.polyhaven import Asset, incident_light, list_assets
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
 from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
@@ -49,6 +28,7 @@ from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
 from simulator.utils.cache import disk_cache
 from tests.ae_env.environments import assert_equal, make_envs
+from tests.ae_env.scene_files import write_hdr
 from tests.ae_env.scorer_images import make_scene
 
 CAMERA = get_camera("nikon_z6")
@@ -83,7 +63,7 @@ def test_dead_leaves_have_the_spectrum_of_nature() -> None:
     np.testing.assert_allclose(picture.mean(axis=(1, 2), dtype=float), mean, rtol=1e-5)
 
 
-def test_splits_share_no_group_and_half_of_their_groups_are_hard(unseen: list[Scene]) -> None:
+def test_splits_share_no_group_and_half_are_hard_which_fools_a_meter(unseen: list[Scene]) -> None:
     groups = {scene.group: scene.hard for scene in unseen}
     assert len(groups) >= 90
     assert 0.4 <= np.mean(list(groups.values())) <= 0.6
@@ -94,14 +74,11 @@ def test_splits_share_no_group_and_half_of_their_groups_are_hard(unseen: list[Sc
         assert scene.light.min() >= 0
         assert scene.median_speed == (1.0 if scene.kind == "motion" else 0.125)
     assert len({scene.scene_id for scene in unseen}) == len(unseen)
-    train = {f"{kind}-{index:03d}" for kind, index in procedural_groups("train", "large")}
+    train = {f"{kind}-{index:03d}" for kind, index in bundled.procedural_groups("train", "large")}
     train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
     assert len(train) >= 195
     assert not train & groups.keys()
-
-
-def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(unseen: list[Scene]) -> None:
-    """By how many EV one on the mean of the clipped frame would expose too little."""
+    # By how many EV a meter on the mean of the clipped frame would expose too little.
     errors = {
         kind: np.log2([s.light[1].clamp(max=1.0).mean() / 0.12 for s in unseen if s.kind == kind])
         for kind in (*KINDS, "photograph")
@@ -196,7 +173,7 @@ def test_layouts_depend_on_the_name_alone() -> None:
     light = np.random.default_rng(0).random((4, 128, 128))
     named = ("a", light), ("a", light / 2), ("b", light), ("a", light[:, :64, :64])
     fine, again, other, small = (
-        add_layout(make_scene(picture, 100.0, scene_id=name)) for name, picture in named
+        bundled.add_layout(make_scene(picture, 100.0, scene_id=name)) for name, picture in named
     )
     assert fine.layout.subject.any()
     assert torch.equal(fine.layout.defocus, again.layout.defocus)
@@ -210,7 +187,7 @@ def test_layouts_depend_on_the_name_alone() -> None:
 
 
 @pytest.fixture
-def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def empty_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
     _LOADED.clear()
     yield
@@ -219,52 +196,29 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
 
 @pytest.mark.usefixtures("empty_cache")
 @pytest.mark.parametrize("part", ["night", "photograph"])
-def test_drawn_one_by_one_they_are_those_drawn_together(part: str, monkeypatch) -> None:
+def test_drawn_one_by_one_they_are_those_drawn_together(part, tmp_path, monkeypatch) -> None:
     together = load_scenes(f"bundled:{part}", "test", camera=CAMERA, resolution=36)
     request = SceneRequest("test", CAMERA, 36)
-    loaded = bundled_scenes(request, part=part)
-    monkeypatch.setenv("AE_ENV_CACHE", "/dev/null/none")  # nothing is stored, nothing is found
-    drawn = bundled_scenes(request, part=part)
+    loaded = bundled.bundled_scenes(request, part=part)
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "empty"))
+    drawn = bundled.bundled_scenes(request, part=part)
     assert loaded.loaded == list(range(len(together)))
-    assert drawn.loaded != loaded.loaded
+    assert 0 < len(drawn.loaded) < len(drawn)  # what cannot be drawn must fail at once
     assert list(drawn.scene_ids) == [scene.scene_id for scene in together]
     for index in np.random.default_rng(0).permutation(len(drawn)).tolist():
         for name in ("scene_id", "content", "reference", "ev100"):
             wanted = getattr(together[index], name)
             assert getattr(drawn[index], name) == getattr(loaded[index], name) == wanted
         assert drawn[index] is drawn[index]
-
-
-@pytest.mark.usefixtures("empty_cache")
-def test_no_more_are_drawn_than_are_asked_for_and_the_last_one_stores_them() -> None:
-    made: list[list[str]] = []
-
-    def make(names: list[str]) -> list[Scene]:
-        made.append(names)
-        return [make_scene(np.full((4, 36, 36), 0.1 * len(made)), scene_id=n) for n in names]
-
-    groups = [SceneGroup(g, functools.partial(make, g)) for g in (["a"], ["b", "c"], ["d"])]
-    scenes = DrawnScenes("some", groups, "0" * 64)
-    assert made == [["a"]]  # what cannot be drawn must fail at once
-    assert (len(scenes), scenes.scene_ids) == (4, ("a", "b", "c", "d"))
-    assert scenes[-2].scene_id == "c"
-    assert [scene.scene_id for scene in scenes[:3]] == ["a", "b", "c"]
-    assert made == [["a"], ["b", "c"]]
-    assert disk_cache().get("0" * 64) is None
+    # The last one stores them.
+    assert bundled.bundled_scenes(request, part=part).loaded == loaded.loaded
+    assert drawn[-2:] == drawn[:][-2:]
     with pytest.raises(IndexError):
-        scenes[4]
-    copied = pickle.loads(pickle.dumps(scenes))
-    assert made == [["a"], ["b", "c"], ["d"]]
-    assert disk_cache().get("0" * 64) is not None
-    for one, other in zip(scenes, copied, strict=True):
-        assert (one.scene_id, one.content) == (other.scene_id, other.content)
-    assert len(made) == 3
+        drawn[len(drawn)]
 
 
 @pytest.mark.usefixtures("empty_cache")
 def test_episodes_do_not_depend_on_when_scenes_are_drawn() -> None:
-    """Which scene an episode shows, too: the draw must not wait for what is drawn."""
-
     def episodes() -> list[tuple[object, ...]]:
         _LOADED.clear()
         envs = make_envs(3, scenes="bundled:spot_light", split="test")
@@ -283,7 +237,7 @@ def test_episodes_do_not_depend_on_when_scenes_are_drawn() -> None:
     assert loaded[0] < loaded[1] == 10
 
 
-def test_the_list_splits_places_and_each_kind_is_tested():
+def test_the_list_splits_places_and_each_kind_is_tested(tmp_path, monkeypatch):
     splits = {}
     for asset in list_assets():
         assert splits.setdefault(asset.place, asset.split) == asset.split
@@ -291,6 +245,12 @@ def test_the_list_splits_places_and_each_kind_is_tested():
     tested = {a.kind for a in list_assets() if a.split == "test"}
     assert tested >= {"night", "indoor", "backlit", "forest", "sun", "overcast", "studio", "tunnel"}
     assert list(splits.values()).count("test") >= 15  # enough for intervals
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
+    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
+        load_scenes("polyhaven", "test", camera=CAMERA)
+    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
+        load_scenes("mixed", "train", camera=CAMERA)
 
 
 def panorama(light) -> np.ndarray:
@@ -301,7 +261,7 @@ def panorama(light) -> np.ndarray:
     return np.repeat(grey[None], 3, axis=0).astype(np.float32)
 
 
-def test_an_even_sky_gives_pi_times_its_luminance_and_a_dome_half_of_it_to_a_wall():
+def test_light_on_a_surface_from_an_even_sky_a_dome_and_a_small_lamp():
     even = panorama(lambda lon, lat: 2.0 + 0.0 * lat + 0.0 * lon)
     for azimuth, pitch in ((0, 90), (17, 0), (-120, 35), (0, -90)):
         assert incident_light(even, azimuth, pitch) == pytest.approx(2.0 * math.pi, rel=1e-4)
@@ -310,9 +270,6 @@ def test_an_even_sky_gives_pi_times_its_luminance_and_a_dome_half_of_it_to_a_wal
     for azimuth in (0, 45, 180):
         assert incident_light(dome, azimuth, 0) == pytest.approx(math.pi / 2, rel=1e-3)
     assert incident_light(dome, 0, -90) == pytest.approx(0, abs=1e-6)
-
-
-def test_a_small_lamp_lights_a_surface_by_the_cosine():
     at = math.radians(40), math.radians(20)
 
     def lamp(longitude, latitude):
@@ -328,44 +285,49 @@ def test_a_small_lamp_lights_a_surface_by_the_cosine():
         assert incident_light(light, azimuth, pitch) == pytest.approx(expected, abs=straight / 200)
 
 
+def asset_of(name: str, content: bytes, kind: str = "sun") -> Asset:
+    known = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    return Asset(name=name, kind=kind, split="test", **known)
+
+
 @pytest.fixture
 def an_asset(tmp_path, monkeypatch):
     """Makes an asset of a panorama, as the file that a folder of real files holds."""
 
-    def make(light: np.ndarray, kind: str = "overcast") -> Asset:
-        import cv2
-
+    def make(light: np.ndarray) -> Asset:
         path = tmp_path / "hdri_pool" / "made.hdr"
-        path.parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(path), light.transpose(1, 2, 0)[:, :, ::-1])
+        write_hdr(path, image=light.transpose(1, 2, 0))
         monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
-        content = path.read_bytes()
-        digest = hashlib.sha256(content).hexdigest()
-        return Asset(name="made", kind=kind, split="test", bytes=len(content), sha256=digest)
+        return asset_of("made", path.read_bytes(), "overcast")
 
     return make
 
 
 def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
-    """A view of it is as bright as a white surface that it lights; each view has its own level."""
     even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
-    views = list(asset_views(an_asset(even), CAMERA, size=16, views=50))
+    views = list(polyhaven.asset_views(an_asset(even), CAMERA, size=16, views=50))
     for scene in views:
         assert scene.light[1:3].mean().item() == pytest.approx(WHITE_SIGNAL, rel=0.01)
         assert (scene.sampled, scene.box_factor) == (True, 1)
-    low, high = np.log(ILLUMINANCE["overcast"])
+    low, high = np.log(polyhaven.ILLUMINANCE["overcast"])
     levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
     assert 0 <= levels.min() < levels.max() <= 1
     assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
     assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
+    gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
+    assert polyhaven.cut_values(gradient) == []
+    assert polyhaven.cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
+    assert polyhaven.cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
+    asset = an_asset(np.minimum(gradient, 2.9))
+    assert "highlights are cut" in next(polyhaven.asset_views(asset, CAMERA, size=16)).source
 
 
 def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch):
     """A bright half of the world: the view into it is lit from behind."""
-    monkeypatch.setitem(ILLUMINANCE, "overcast", (1e4, 1e4))
+    monkeypatch.setitem(polyhaven.ILLUMINANCE, "overcast", (1e4, 1e4))
     half = panorama(lambda lon, lat: np.where(np.abs(lon) < np.pi / 2, 1.0, 0.05) + 0.0 * lat)
     lux, seen = [], []
-    for scene in asset_views(an_asset(half), CAMERA, size=16, views=16):
+    for scene in polyhaven.asset_views(an_asset(half), CAMERA, size=16, views=16):
         lux.append(scene.illuminance)
         seen.append(scene.light[1].median().item())
     order = np.argsort(lux)
@@ -373,24 +335,17 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
     assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
 
 
-def test_maps_that_are_cut_say_so(an_asset):
-    gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
-    assert cut_values(gradient) == []
-    assert cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
-    assert cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
-    asset = an_asset(np.minimum(gradient, 2.9))
-    assert "highlights are cut" in next(asset_views(asset, CAMERA, size=16)).source
-
-
 def test_real_scenes_alone_and_mixed(data_dir):
     request = SceneRequest("test", CAMERA, 36)
-    real, again = (polyhaven_scenes(request, views=1) for _ in range(2))  # then from the cache
+    # The second time from the cache.
+    real, again = (polyhaven.polyhaven_scenes(request, views=1) for _ in range(2))
     assert len({s.group for s in real}) >= 15
     assert all(a.content == b.content for a, b in zip(real, again, strict=True))
     for scene in real:
         assert (scene.light.shape, scene.box_factor) == ((4, 36, 36), 7)
-        assert 1e-3 < scene.illuminance <= ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
-    mixed = mixed_scenes(request, list(bundled_scenes(request, part="snow")), len(real))
+        assert 1e-3 < scene.illuminance <= polyhaven.ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
+    drawn = list(bundled.bundled_scenes(request, part="snow"))
+    mixed = polyhaven.mixed_scenes(request, drawn, len(real))
     kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
     assert kinds[True] == kinds[False] == 10
     assert {s.group for s in mixed if s.source.startswith("Poly")} < {s.group for s in real}
@@ -398,18 +353,9 @@ def test_real_scenes_alone_and_mixed(data_dir):
     places = read_pans()
     assert set(places) == {asset.name for asset in list_assets() if asset.split == "test"}
     assert {len(turn) for turn in places.values()} == {72}
-    asset = next(a for a in split_assets("polyhaven", "test") if a.name == "spree_bank")
-    found = light_around(read_radiance(asset.path))
+    asset = next(a for a in polyhaven.split_assets("polyhaven", "test") if a.name == "spree_bank")
+    found = polyhaven.light_around(read_radiance(asset.path))
     np.testing.assert_allclose(places["spree_bank"], found, atol=6e-4)
-
-
-def test_missing_maps_name_the_command(tmp_path, monkeypatch):
-    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
-    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
-        load_scenes("polyhaven", "test", camera=CAMERA)
-    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
-        load_scenes("mixed", "train", camera=CAMERA)
 
 
 CONTENT = {f"map_{i}": bytes([i]) * (5000 + i) for i in range(3)}
@@ -425,11 +371,7 @@ def server(tmp_path, monkeypatch):
     handler = functools.partial(SimpleHTTPRequestHandler, directory=folder)
     running = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=running.serve_forever, daemon=True).start()
-    known = {"kind": "sun", "split": "test"}
-    assets = tuple(
-        Asset(name=name, bytes=len(c), sha256=hashlib.sha256(c).hexdigest(), **known)
-        for name, c in CONTENT.items()
-    )
+    assets = tuple(asset_of(name, content) for name, content in CONTENT.items())
     monkeypatch.setattr(polyhaven, "list_assets", lambda: assets)
     monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
@@ -442,19 +384,19 @@ def server(tmp_path, monkeypatch):
 def test_a_download_fetches_what_is_missing_and_nothing_broken(server, tmp_path, monkeypatch):
     (url, folder), total = server, sum(map(len, CONTENT.values()))
     seen: list[tuple[int, int, str]] = []
-    assert len(download(url=url, progress=lambda *values: seen.append(values))) == 3
+    assert len(polyhaven.download(url=url, progress=lambda *values: seen.append(values))) == 3
     maps = {name: tmp_path / "cache" / "polyhaven" / f"{name}_1k.hdr" for name in CONTENT}
     assert {name: path.read_bytes() for name, path in maps.items()} == CONTENT
     assert (seen[0], seen[-1][:2]) == ((0, total, "map_0"), (total, total))
-    assert download(url=url, progress=None) == []
+    assert polyhaven.download(url=url, progress=None) == []
     maps["map_1"].write_bytes(bytes(len(CONTENT["map_1"])))  # of the right length
-    assert download(url=url, progress=None) == [maps["map_1"]]
+    assert polyhaven.download(url=url, progress=None) == [maps["map_1"]]
     assert maps["map_1"].read_bytes() == CONTENT["map_1"]
     maps["map_1"].unlink()
     (folder / "map_1_1k.hdr").write_bytes(b"another file")
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     with pytest.raises(ConnectionError, match=r"map_1_1k.hdr cannot be fetched"):
-        download(url=url, progress=None)
+        polyhaven.download(url=url, progress=None)
     assert not maps["map_1"].exists()  # no part of a file either
     with pytest.raises(ValueError, match="`url`"):
-        download(url="ftp://a", progress=None)
+        polyhaven.download(url="ftp://a", progress=None)

@@ -1,7 +1,6 @@
 """Scene: normalisation, colours, resizing."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,19 +15,12 @@ from skimage.color import rgb2xyz
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    exposure_ratio,
-    get_camera,
-)
-from simulator.camera import CameraProfile
+from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, exposure_ratio
+from simulator.camera import CameraProfile, get_camera
 from simulator.capture.prepared_scene import Layout
 from simulator.networks.aperture_module import BLUR_FACTOR, DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 from simulator.radiance.light import camera_from_srgb, temperature_tint
-from simulator.raw.image import RawImage
 from tests.ae_env.environments import assert_equal, make_env, rollout
 from tests.ae_env.scene_files import load, write_hdr
 from tests.ae_env.scorer_images import random_scene
@@ -90,18 +82,6 @@ def test_unknown_light_is_anchored_to_the_mean() -> None:
     assert scene.light[1, 5, 5].item() == pytest.approx((0.12 * 100 - 1) / 99, rel=1e-5)
 
 
-def test_clipped_pixels_of_a_raw_are_marked() -> None:
-    data = torch.full((4, 8, 8), 0.5)
-    data[3, 2, 5] = 1.0
-    noise = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    raw = RawImage(data, CameraSettings(200, 0.01, 2.8), PLAIN, nlf=noise)
-    scene = Scene.from_raw(raw, scene_id="r")
-    assert scene.saturated.nonzero().tolist() == [[2, 5]]
-    assert (scene.illuminance, scene.reference) == (None, raw.settings)
-    clean = RawImage(data.clamp(max=0.5), raw.settings, PLAIN, nlf=noise)
-    assert Scene.from_raw(clean, scene_id="r").saturated is None
-
-
 def test_resized_averages_what_the_networks_found() -> None:
     """Denoised light like light; blur by its second moment, in pixels of the new light."""
     rng = np.random.default_rng(0)
@@ -116,9 +96,7 @@ def test_resized_averages_what_the_networks_found() -> None:
     np.testing.assert_allclose(small.defocus_map, np.sqrt(square) / 3, rtol=1e-5)
     native = scene.resized(2, "native")
     np.testing.assert_array_equal(native.defocus_map, diameter[2:4, 3:5])
-
-
-def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
+    # A scene's own blur grows with the aperture and never shrinks.
     diameter = torch.tensor([[1.0, 7.0], [5.0, 5.0]])  # mean square 25
     scene = array_scene(torch.ones(4, 2, 2), defocus_map=diameter)  # at f/4
     assert scene.own_blur(2.0) == pytest.approx(10.0)
@@ -151,7 +129,7 @@ def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
         (lambda: simulate_source_raw(random_scene(nlf=CAMERA.nlf(400))), "`scene`"),
     ],
 )
-def test_what_is_wrong_with_a_scene_is_named(make: Callable[[], Scene], words: str) -> None:
+def test_what_is_wrong_with_a_scene_is_named(make: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -178,9 +156,8 @@ def test_averaging_a_scene_down_keeps_its_mean(light, data, seed):
     top, left = ((n - k * resolution) // 2 for n in light.shape[1:])
     window = slice(top, top + k * resolution), slice(left, left + k * resolution)
     part = light[:, window[0], window[1]].double()
-    torch.testing.assert_close(
-        small.light.double().mean(dim=(1, 2)), part.mean(dim=(1, 2)), rtol=2e-7, atol=1e-5
-    )
+    found, wanted = (planes.double().mean(dim=(1, 2)) for planes in (small.light, part))
+    torch.testing.assert_close(found, wanted, rtol=2e-7, atol=1e-5)
     assert small.nlf.shot[0] == pytest.approx(1e-3 / k**2)
     found = torch.zeros(1) if small.saturated is None else small.saturated
     wanted = marks[window].reshape(resolution, k, resolution, k).amax(dim=(1, 3))
@@ -200,15 +177,12 @@ def my_scenes(split: str, camera: object) -> list[Scene]:
 MINE = my_scenes("all", None)
 
 
-def test_scenes_from_lists_and_attributes() -> None:
+def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
     for split in ("train", "test", "all"):
         assert [s.scene_id for s in load(MINE, split)] == ["all"]
         assert [s.scene_id for s in load(f"{__name__}:MINE", split)] == ["all"]
         assert [s.scene_id for s in load(f"{__name__}:my_scenes", split)] == [split]
     assert load(MINE, resolution=8)[0].box_factor == 2
-
-
-def test_small_folder_is_zero_shot(tmp_path: Path) -> None:
     for i in (10, 2, 1):
         write_hdr(tmp_path / f"map{i}.hdr", i)
     for spec, split, names in (
@@ -247,22 +221,25 @@ DIAMETER = BLUR_FACTOR * math.sqrt(FOUND**2 - DEAD_ZONE**2)
 NOISY = CameraSettings(6400, 1 / 1024, 8)
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """An untrained denoiser, and a defocus map that is the same everywhere."""
-    torch.manual_seed(0)
+def save_networks(folder: Path, *, even: bool) -> tuple[str, Any]:
+    """Untrained networks whose defocus map is around `FOUND`, or the same everywhere."""
+    torch.manual_seed(3)
     modules = build_modules("compact")
     tail: Any = modules["aperture"].network.tail
     with torch.no_grad():
-        tail.weight.zero_()
         tail.bias.fill_(math.log(FOUND + 0.3))
-    path = tmp_path_factory.mktemp("weights") / "tiny"
-    save_modules(path, modules, "compact", {})
-    return str(path.with_suffix(".safetensors"))
+        if even:
+            tail.weight.zero_()
+    save_modules(folder / "tiny", modules, "compact", {})
+    return str(folder / "tiny.safetensors"), modules.eval()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return save_networks(tmp_path_factory.mktemp("weights"), even=True)[0]
 
 
 def noisy_scene() -> Scene:
-    """A photograph at ISO 6400, of 80 x 80 pixels."""
     rng = np.random.default_rng(0)
     nlf = CAMERA.nlf(NOISY.iso)
     light = 0.1 + 0.3 * rng.random((4, 80, 80))
@@ -289,7 +266,6 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
 
 
 def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
-    """All at ISO 100 and 1/15 s, of one picture: rewards rise as frames have less noise."""
     generator = torch.Generator().manual_seed(0)
     light = 0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
     picture = Scene.from_array(light, NOISY, CAMERA, scene_id="flat", illuminance=640.0)
@@ -336,20 +312,23 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
 
 def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:
     """Only the middle of a large frame is looked at, with what the networks see around it."""
-    torch.manual_seed(3)
-    modules = build_modules("compact")
-    tail: Any = modules["aperture"].network.tail
-    with torch.no_grad():
-        tail.bias.fill_(math.log(FOUND + 0.3))  # beyond the dead zone
-    save_modules(tmp_path / "random", modules, "compact", {})
-    networks = SceneNetworks(str(tmp_path / "random.safetensors"))
+    file, modules = save_networks(tmp_path, even=False)
     light = 0.3 * torch.rand((4, 252, 244), generator=torch.Generator().manual_seed(1))
     scene = Scene.from_array(light, CameraSettings(100, 0.01, 8), CAMERA, scene_id="large")
     with torch.no_grad():
-        whole = modules.eval()["aperture"].defocus(light[None], torch.zeros_like(light)[None])[0]
-    native = networks.resized(scene, 16, "native")
+        whole = modules["aperture"].defocus(light[None], torch.zeros_like(light)[None])[0]
+    native = SceneNetworks(file).resized(scene, 16, "native")
     torch.testing.assert_close(native.defocus_map, whole[118:134, 114:130], rtol=1e-3, atol=1e-4)
     assert float(whole.std()) > 1e-3
+
+
+def test_maps_are_kept_and_made_again_where_damaged(weights, tmp_path, monkeypatch, caplog) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    first = SceneNetworks(weights).resized(noisy_scene(), 40).defocus_map
+    (file,) = (tmp_path / "defocus_maps").iterdir()
+    file.write_bytes(b"damaged")
+    assert torch.equal(SceneNetworks(weights).resized(noisy_scene(), 40).defocus_map, first)
+    assert f"{file} is damaged" in caplog.text
 
 
 def test_it_is_metered_by_its_mean_and_drawn_by_name_and_seed():
@@ -359,9 +338,8 @@ def test_it_is_metered_by_its_mean_and_drawn_by_name_and_seed():
     again, other = (simulate_source_raw(random_scene(scene_id="scene-3"), seed=s) for s in (0, 1))
     assert torch.equal(again.light, drawn[3].light)
     assert other.reference != drawn[3].reference
-    darker, metered, brighter = (
-        simulate_source_raw(random_scene(), iso=100.0, ev=e) for e in (-1, 0, 1)
-    )
+    exposed = (simulate_source_raw(random_scene(), iso=100.0, ev=e) for e in (-1, 0, 1))
+    darker, metered, brighter = exposed
     assert metered.light[1:3].mean().item() == pytest.approx(0.12, rel=0.01)
     for taken, ev in ((darker, -1), (brighter, 1)):
         assert exposure_ratio(metered.reference, taken.reference) == pytest.approx(2.0**ev)
@@ -384,7 +362,6 @@ def test_its_noise_is_the_cameras_averaged(box_factor: int) -> None:
 
 
 def test_in_the_environment_everything_comes_from_the_raw():
-    """The neural simulator takes part: cleaner states are denoised, and the plan says its error."""
     given = {"scenes": "bundled:small", "motion": "none", "depth": "far"}
     sources = ({"source": "raw"}, {}, {"source": "raw", "simulator": None})
     env, *others = (make_env(**given, **source) for source in sources)

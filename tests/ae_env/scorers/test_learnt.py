@@ -32,19 +32,16 @@ KERAS = """
     head = keras.layers.Dense(10, activation="softmax", name="dense_1")
     model = keras.Model(base.inputs, head(dropped))
     rng = np.random.default_rng(0)
-    for layer in model.layers:
-        values = []
-        for w in layer.weights:
-            shape, name = tuple(w.shape), w.name
-            if name in ("moving_variance", "gamma"):
-                values.append(rng.uniform(0.7, 1.6, shape))
-            elif name in ("beta", "moving_mean", "bias"):
-                values.append(rng.normal(0.1, 0.3, shape))
-            else:  # He's scale, or the signal dies in the depth
-                fan = np.prod(shape[:2]) if "dw" in layer.name else np.prod(shape[:-1])
-                gain = 24.0 if layer.name == "dense_1" else 2.0
-                values.append(rng.normal(0.0, np.sqrt(gain / fan), shape))
-        layer.set_weights(values)
+    for weight in model.weights:
+        shape = tuple(weight.shape)
+        if weight.name in ("moving_variance", "gamma"):
+            weight.assign(rng.uniform(0.7, 1.6, shape))
+        elif weight.name in ("beta", "moving_mean", "bias"):
+            weight.assign(rng.normal(0.1, 0.3, shape))
+        else:  # He's scale, or the signal dies in the depth
+            fan = np.prod(shape[:2]) if "dw" in weight.path else np.prod(shape[:-1])
+            gain = 24.0 if "dense_1" in weight.path else 2.0
+            weight.assign(rng.normal(0.0, np.sqrt(gain / fan), shape))
     assert model.count_params() == 3_239_114
     with h5py.File(f"{folder}/weights.h5", "w") as file:  # of `save_weights` in Keras 2
         legacy_h5_format.save_weights_to_hdf5_group(file, model)
@@ -71,12 +68,8 @@ def keras_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pictures = rng.random((3, 224, 224, 3)) * np.array([1.0, 0.2, 1.0])[:, None, None, None]
     pictures[2] = np.linspace(0.0, 1.0, 224)[None, :, None] ** np.array([0.5, 1.0, 2.0])
     np.save(folder / "pictures.npy", pictures.astype(np.float32))
-    script = folder / "write.py"
-    script.write_text(textwrap.dedent(KERAS))
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(script), str(folder)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    code = textwrap.dedent(KERAS)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(folder)], check=True)
     return folder
 
 
@@ -160,9 +153,8 @@ def confidences(images: torch.Tensor) -> np.ndarray:
 @pytest.mark.parametrize("batch", ["batch", 1, 2], ids=str)
 @pytest.mark.parametrize("softmax", [False, True], ids=["logits", "probabilities"])
 def test_the_confidence_is_the_largest_probability(tmp_path, monkeypatch, batch, softmax):
-    monkeypatch.setenv(
-        "AE_ENV_CLASSIFIER", str(write_network(tmp_path / "a.onnx", batch, 32, softmax=softmax))
-    )
+    file = write_network(tmp_path / "a.onnx", batch, 32, softmax=softmax)
+    monkeypatch.setenv("AE_ENV_CLASSIFIER", str(file))
     scorer = make_scorer("classifier").parts["classifier"]
     assert scorer.size == 32  # the file's own
     images = pictures()

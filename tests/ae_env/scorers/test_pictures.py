@@ -17,17 +17,9 @@ from skimage.measure import shannon_entropy
 
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import defects as defect_signs
-from ae_env.scorers import make_scorer
+from ae_env.scorers import make_scorer, measures
 from ae_env.scorers.defects import DEFECTS, KNOTS, mapped, severity
 from ae_env.scorers.fidelity import likeness, reference_pictures
-from ae_env.scorers.measures import (
-    histogram_entropy,
-    immerkaer_sigma,
-    shim_gradient,
-    shin_metric,
-    srgb_decode,
-    zhang_gradient,
-)
 from benchmarks import defects as benchmark
 from simulator import CameraSettings, NoiseLevelFunction, incident_ev100
 from simulator.raw.develop import srgb_encode
@@ -65,7 +57,7 @@ def test_shim_is_the_mean_of_the_logarithmic_response() -> None:
     levels = _levels()
     expected = [_shim_pixels(picture).mean() for picture in levels]
     assert min(expected) > 0.05
-    got = shim_gradient(torch.from_numpy(levels / 255.0))
+    got = measures.shim_gradient(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
 
 
@@ -84,7 +76,7 @@ def test_zhang_is_the_weighted_mean_of_sorted_squared_gradients() -> None:
                 angle = math.pi / 2 - math.pi / 2 * (i - n + 1) / (size - n)
             weights.append(math.sin(angle) ** 5)
         expected.append(np.dot(weights, ordered) / sum(weights))
-    got = zhang_gradient(torch.from_numpy(levels / 255.0))
+    got = measures.zhang_gradient(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
     pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
     scores = make_scorer("zhang").parts["zhang"](pictures, None)
@@ -115,7 +107,7 @@ def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
     # Not whole levels, of which many gradients would tie at the percentile.
     levels = 255.0 * random_pictures(3, 40, 60)[:, 0].double().numpy()
     expected = np.array([_shin(picture) for picture in levels])
-    got = shin_metric(torch.from_numpy(levels / 255.0))
+    got = measures.shin_metric(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
     pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
     scores = make_scorer("shin").parts["shin"](pictures, None)
@@ -123,7 +115,7 @@ def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
     np.testing.assert_allclose(scores, mapped, atol=1e-2)  # a level may round the other way
 
 
-def test_snr_is_the_mean_of_decibels() -> None:
+def test_snr_and_dynamic_range_by_hand() -> None:
     light = 0.1 * np.exp(np.random.default_rng(0).normal(0.0, 2.0, (4, 6, 5)))
     states = [CameraSettings(*s) for s in ((100, 1 / 64, 4), (6400, 1 / 64, 4), (400, 1 / 4000, 4))]
     expected = []
@@ -136,61 +128,7 @@ def test_snr_is_the_mean_of_decibels() -> None:
     scores = make_scorer("snr")(None, captures_of(light, states))
     np.testing.assert_allclose(scores.numpy(), expected, rtol=1e-5)
     assert make_scorer("snr").closed_form
-
-
-def test_blind_sigma_is_immerkaers() -> None:
-    luma = random_pictures(3, 20, 31)[:, 0].double()
-    expected = []
-    for picture in 255.0 * luma.numpy():
-        response = np.abs(scipy.signal.convolve2d(picture, KERNEL, mode="valid"))
-        expected.append(math.sqrt(math.pi / 2) / (6 * 29 * 18) * response.sum())
-    np.testing.assert_allclose(immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
-
-
-def test_blind_sigma_of_known_noise() -> None:
-    rows, columns = np.mgrid[0:200, 0:220]
-    slope = 60.0 + 0.3 * rows + 0.2 * columns  # straight slopes leave nothing
-    noisy = slope + 5.0 * np.random.default_rng(2).normal(size=slope.shape)
-    found = immerkaer_sigma(torch.from_numpy(np.stack([noisy, slope]) / 255.0)).tolist()
-    assert found == pytest.approx([5.0, 0.0], rel=0.02, abs=1e-9)
-    pictures = torch.from_numpy(noisy / 255.0).float().expand(1, 3, -1, -1)
-    score = make_scorer("blind_noise").parts["blind_noise"](pictures, None).item()
-    assert score == pytest.approx(1 / (1 + 5.0 / 10), rel=0.03)
-
-
-def _score(name: str, images: torch.Tensor) -> list[float]:
-    return next(iter(make_scorer(name).parts.values()))(images, None).tolist()
-
-
-@pytest.mark.parametrize(
-    ("linear", "score"), [(0.18, 1.0), (0.36, 0.5), (0.09, 0.5), (0.0018, 0.01), (1.0, 0.18)]
-)
-def test_mid_grey_is_halved_by_every_stop(linear: float, score: float) -> None:
-    picture = srgb_encode(torch.full((1, 3, 4, 5), linear))
-    assert _score("mid_grey", picture) == pytest.approx([score], rel=1e-4)
-
-
-def test_mid_grey_takes_the_mean_of_linear_luminance() -> None:
-    pictures = random_pictures(3, 40, 50)[:, :3]
-    encoded = pictures.numpy().astype(np.float64)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    means = [rgb2gray(p.transpose(1, 2, 0)).mean() for p in linear]  # 0.2125, 0.7154, 0.0721
-    expected = [2.0 ** -abs(math.log2(mean / 0.18)) for mean in means]
-    np.testing.assert_allclose(_score("mid_grey", pictures), expected, rtol=2e-3)
-
-
-def test_clipping_counts_samples_of_all_planes() -> None:
-    raw = torch.full((2, 4, 2, 5), 0.5)  # 40 samples each
-    raw[0, 0, 0, :3] = 1.0
-    raw[0, 3, 1, :2] = 0.0
-    raw[1, 1, 0, 0] = 2.0**-9  # the black end itself
-    raw[1, 2, 0, 0] = 2.0**-8
-    raw[1, 2, 1, 0] = 16382 / 16383  # the code below white
-    assert _score("clipping", raw) == pytest.approx([1 - 5 / 40, 1 - 1 / 40])
-
-
-def test_dynamic_range_by_hand() -> None:
-    """The 11th and 991st of 1001 greens, each the mean of G1 and G2, from the noise floor on."""
+    # The 11th and 991st of 1001 greens, each the mean of G1 and G2, from the noise floor on.
     read, shot = (9.0, 2e-6, 6e-6, 9.0), (9.0, 1e-3, 3e-3, 9.0)
     floor = 0.5 * (2e-3 + math.sqrt(4e-6 + 4 * 4e-6))  # of the greens' means, 2e-3 and 4e-6
     none, noisy = NoiseLevelFunction.zero(), NoiseLevelFunction(shot, read)
@@ -209,7 +147,44 @@ def test_dynamic_range_by_hand() -> None:
         assert found == pytest.approx(wanted, rel=1e-5)
 
 
-def test_well_exposedness_is_mertens_product() -> None:
+def test_blind_sigma_is_immerkaers() -> None:
+    luma = random_pictures(3, 20, 31)[:, 0].double()
+    expected = []
+    for picture in 255.0 * luma.numpy():
+        response = np.abs(scipy.signal.convolve2d(picture, KERNEL, mode="valid"))
+        expected.append(math.sqrt(math.pi / 2) / (6 * 29 * 18) * response.sum())
+    np.testing.assert_allclose(measures.immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
+    rows, columns = np.mgrid[0:200, 0:220]
+    slope = 60.0 + 0.3 * rows + 0.2 * columns  # straight slopes leave nothing
+    noisy = slope + 5.0 * np.random.default_rng(2).normal(size=slope.shape)
+    found = measures.immerkaer_sigma(torch.from_numpy(np.stack([noisy, slope]) / 255.0)).tolist()
+    assert found == pytest.approx([5.0, 0.0], rel=0.02, abs=1e-9)
+    pictures = torch.from_numpy(noisy / 255.0).float().expand(1, 3, -1, -1)
+    score = make_scorer("blind_noise").parts["blind_noise"](pictures, None).item()
+    assert score == pytest.approx(1 / (1 + 5.0 / 10), rel=0.03)
+
+
+def _score(name: str, images: torch.Tensor) -> list[float]:
+    return next(iter(make_scorer(name).parts.values()))(images, None).tolist()
+
+
+def test_mid_grey_takes_the_mean_of_linear_luminance() -> None:
+    pictures = random_pictures(3, 40, 50)[:, :3]
+    encoded = pictures.numpy().astype(np.float64)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    means = [rgb2gray(p.transpose(1, 2, 0)).mean() for p in linear]  # 0.2125, 0.7154, 0.0721
+    expected = [2.0 ** -abs(math.log2(mean / 0.18)) for mean in means]
+    np.testing.assert_allclose(_score("mid_grey", pictures), expected, rtol=2e-3)
+
+
+def test_clipping_counts_samples_of_all_planes_and_well_exposedness_is_mertens_product() -> None:
+    raw = torch.full((2, 4, 2, 5), 0.5)  # 40 samples each
+    raw[0, 0, 0, :3] = 1.0
+    raw[0, 3, 1, :2] = 0.0
+    raw[1, 1, 0, 0] = 2.0**-9  # the black end itself
+    raw[1, 2, 0, 0] = 2.0**-8
+    raw[1, 2, 1, 0] = 16382 / 16383  # the code below white
+    assert _score("clipping", raw) == pytest.approx([1 - 5 / 40, 1 - 1 / 40])
     pictures = random_pictures(2, 7, 5)[:, :3]
     weights = np.exp(-((pictures.double().numpy() - 0.5) ** 2) / (2 * 0.2**2))
     expected = weights.prod(axis=1).mean(axis=(1, 2))
@@ -221,10 +196,10 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
     codes = np.stack([rng.integers(0, top, (31, 29)) for top in (2, 17, 200, 256)])
     luma = torch.from_numpy(codes / 255.0)
     expected = [shannon_entropy(picture, base=2) for picture in codes]
-    np.testing.assert_allclose(histogram_entropy(luma).numpy(), expected, rtol=1e-9)
+    np.testing.assert_allclose(measures.histogram_entropy(luma).numpy(), expected, rtol=1e-9)
     for bad in (torch.zeros(2, 3), torch.zeros(1, 2, 3, dtype=torch.uint8)):
         with pytest.raises(ValueError, match="`luma`"):
-            histogram_entropy(bad)
+            measures.histogram_entropy(bad)
     every = torch.arange(256.0).reshape(1, 16, 16) / 255.0
     assert _score("entropy", every[:, None].expand(-1, 3, -1, -1)) == pytest.approx([1.0])
 
@@ -233,7 +208,9 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
 def rendered() -> dict[str, torch.Tensor]:
     """Pictures (L, 3, H, W) of a photograph with each defect at its severities."""
     picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
-    scene = Scene.from_radiance(srgb_decode(picture), CAMERA, scene_id="astronaut").resized(128)
+    scene = Scene.from_radiance(
+        measures.srgb_decode(picture), CAMERA, scene_id="astronaut"
+    ).resized(128)
     generator = torch.Generator().manual_seed(3)
     return {name: benchmark.render(scene, name, generator) for name in DEFECTS}
 
@@ -248,23 +225,26 @@ def test_severity_rises_with_the_defect(defect: str, rendered: dict[str, torch.T
     assert low <= float(found.min()) <= float(found.max()) <= high
 
 
-def test_white_share_and_missing_highlights_by_hand() -> None:
+def test_white_share_missing_highlights_and_veil_by_hand() -> None:
     pictures = torch.full((2, 3, 10, 10), 0.3)
     pictures[0, :, :3] = 1.0
     pictures[1, :, 0, :2] = 0.75  # 2 of 100 pixels: the 99th percentile
     assert defect_signs.white_share(pictures).tolist() == pytest.approx([0.3, 0.0])
     assert defect_signs.missing_highlights(pictures).tolist() == pytest.approx([0.0, 0.25])
+    # A veil is the airlight over the mean.
+    linear = torch.zeros(1, 3, 10, 10)
+    linear[:, :, 5:] = 0.5
+    hazy = 0.6 * linear + 0.4 * 0.5
+    found = defect_signs.veil(srgb_encode(torch.cat([linear, hazy]))).tolist()
+    assert found == pytest.approx([0.0, 0.2 / 0.35], abs=1e-5)
 
 
-def test_colour_cast_is_the_length_of_the_gains_in_stops() -> None:
+def test_colour_cast_in_stops_and_colourfulness_of_hasler_and_suesstrunk() -> None:
     grey = torch.rand(1, 1, 21, 19, generator=torch.Generator().manual_seed(1)) * 0.3 + 0.05
     gains = torch.tensor([2.0**0.6, 1.0, 2.0**-0.8])[None, :, None, None]
     picture = srgb_encode(grey * gains)
     picture[:, :, :4] = torch.tensor([1.0, 0.0, 0.0])[:, None, None]  # a red object
     assert defect_signs.colour_cast(picture).item() == pytest.approx(1.0, abs=1e-4)
-
-
-def test_colourfulness_is_hasler_and_suesstrunks() -> None:
     pictures = random_pictures(3)[:, :3]
     expected = []
     for picture in 255.0 * pictures.double().numpy():
@@ -273,14 +253,6 @@ def test_colourfulness_is_hasler_and_suesstrunks() -> None:
         spread, mean = np.hypot(rg.std(), yb.std()), np.hypot(rg.mean(), yb.mean())
         expected.append(spread + 0.3 * mean)
     np.testing.assert_allclose(defect_signs.colourfulness(pictures), expected, rtol=1e-5)
-
-
-def test_veil_is_the_airlight_over_the_mean() -> None:
-    linear = torch.zeros(1, 3, 10, 10)
-    linear[:, :, 5:] = 0.5
-    hazy = 0.6 * linear + 0.4 * 0.5
-    found = defect_signs.veil(srgb_encode(torch.cat([linear, hazy]))).tolist()
-    assert found == pytest.approx([0.0, 0.2 / 0.35], abs=1e-5)
 
 
 def test_blur_effect_is_cretes() -> None:
@@ -324,7 +296,7 @@ def lab(lightness: float, a: float = 0.0, b: float = 0.0, size: int = 16) -> np.
     return np.broadcast_to(np.array([lightness, a, b]), (size, size, 3)).copy()
 
 
-def test_colour_is_the_published_difference():
+def test_colour_is_the_published_difference_and_structure_that_of_even_lightness():
     """Pairs of Sharma, Wu and Dalal 2005, table 1, of equal lightness: even areas, structure 1."""
     for first, second, difference in (
         ((2.6772, -79.7751), (0.0, -82.7485), 2.0425),
@@ -333,10 +305,7 @@ def test_colour_is_the_published_difference():
     ):
         found = likeness(lab(50.0, *first), lab(50.0, *second))
         assert found == pytest.approx(math.sqrt(math.exp(-difference / 10)), abs=1e-5)
-
-
-def test_structure_is_the_similarity_of_even_lightness():
-    """Without variance SSIM is (2 m n + c) / (m^2 + n^2 + c), c = (0.01 * 100)^2."""
+    # Without variance SSIM is (2 m n + c) / (m^2 + n^2 + c), c = (0.01 * 100)^2.
     found, m, n = likeness(lab(40.0), lab(60.0)), 40.0, 60.0
     structure = (2 * m * n + 1.0) / (m * m + n * n + 1.0)
     # CIEDE2000 of greys is |dL| / S_L, S_L = 1 + 0.015 (L - 50)^2 / sqrt(20 + (L - 50)^2), L = 50.
@@ -344,7 +313,6 @@ def test_structure_is_the_similarity_of_even_lightness():
 
 
 def test_what_a_camera_does_costs():
-    """Of the ideal picture: noise, blur, a stop too much, another white balance."""
     scorer, scene = make_scorer("fidelity"), random_scene(illuminance=1000.0)
     state = CameraSettings(100, 2.0 ** -(math.log2(1000 / 2.5) - 4), 4)
     captures = make_captures(scene, [state] * 5)

@@ -3,10 +3,10 @@
 import dataclasses
 import math
 import sys
-import types
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,14 +16,7 @@ from hypothesis import strategies as st
 
 from ae_env import AutoExposureEnv, AutoExposureVectorEnv
 from ae_env.scenes import Scene
-from ae_env.scorers import (
-    Balanced,
-    CompositeScorer,
-    list_scorers,
-    make_scorer,
-    register_scorer,
-    registry,
-)
+from ae_env.scorers import Balanced, CompositeScorer, list_scorers, make_scorer, registry
 from ae_env.scorers.captures import Captures
 from ae_env.scorers.defects import DEFECTS
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
@@ -106,13 +99,6 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
     mixed = make_scorer({f"{folder}/my_scorer.py:Level": 3.0, "noise": 1.0})
     assert mixed.weights == {"Level": 0.75, "noise": 0.25}
     assert type(mixed.parts["Level"]) is type(relative.parts["Level"])
-    for spec, message in (
-        ("my_scorer.py:Levle", r"`scorer` \(='my_scorer.py:Levle'\).*did you mean 'Lev"),
-        ({"no.py:Level": 1.0}, r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"),
-        ("my_scorer.py:torch", "must be callable"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make_scorer(spec)
 
 
 def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,17 +106,11 @@ def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPa
     facts |= {"niqe": ("NR", True, "-50.0, 150"), "lpips": ("FR", True, "0, 1")}
     facts |= {"open": ("NR", True, "0, inf"), "old": ("NR", None, None)}
 
-    def create_metric(name: str, device: torch.device) -> Any:
-        def metric(images: torch.Tensor) -> torch.Tensor:
-            return 100.0 * images.mean(dim=(1, 2, 3))[:, None]
+    def create_metric(name: str, device: torch.device) -> Mock:
+        known = dict(zip(("metric_mode", "lower_better", "score_range"), facts[name], strict=True))
+        return Mock(side_effect=lambda images: 100 * images.mean(dim=(1, 2, 3))[:, None], **known)
 
-        names = ("metric_mode", "lower_better", "score_range")
-        vars(metric).update(zip(names, facts[name], strict=True))
-        return metric
-
-    module: Any = types.ModuleType("pyiqa")
-    module.create_metric = create_metric
-    monkeypatch.setitem(sys.modules, "pyiqa", module)
+    monkeypatch.setitem(sys.modules, "pyiqa", Mock(create_metric=create_metric))
     images = torch.tensor([0.0, 0.25, 1.0])[:, None, None, None].expand(3, 3, 4, 4)
     higher = make_scorer("pyiqa:musiq")
     assert list(higher.parts) == ["musiq"]
@@ -151,14 +131,14 @@ def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPa
 
 def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
-    register_scorer("mean_signal")(Constant)
-    register_scorer("mean_signal")(Constant)  # a notebook cell run twice
+    registry.register_scorer("mean_signal")(Constant)
+    registry.register_scorer("mean_signal")(Constant)  # a notebook cell run twice
     assert "mean_signal" in list_scorers()
     assert list(make_scorer({"mean_signal": 1, "noise": 1}).parts) == ["mean_signal", "noise"]
     with pytest.raises(ValueError, match="built-in"):
-        register_scorer("noise")(Constant)
+        registry.register_scorer("noise")(Constant)
     with pytest.raises(ValueError, match="identifier"):
-        register_scorer("my score")
+        registry.register_scorer("my score")
 
 
 @pytest.mark.parametrize(
@@ -168,6 +148,7 @@ def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> Non
         ("no_such_module:Thing", "cannot be loaded: "),
         ("ae_env.scorers.terms:Nothing", "cannot be loaded: "),
         ("math:pi", "must be callable"),
+        ({"no.py:Level": 1.0}, r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"),
         ({}, "must map one name or more"),
         (lambda images, captures: None, "must be 'raw' or 'srgb'"),
         *((Own(depends_on="imgae"), "imgae"), (Own(domain="RGB"), "RGB")),
@@ -255,7 +236,7 @@ TENSORS = [f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.typ
 TENSORS += [name for name, value in vars(Captures).items() if isinstance(value, cached_property)]
 
 
-def test_a_mapping_is_the_weighted_mean() -> None:
+def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for() -> None:
     captures = make_captures(random_scene(), [GRID[i] for i in (3, 20, 50)], 0.1, 1.0)
     mixed = make_scorer({"brightness": 3.0, "sharpness": 1.0})
     expected = 0.75 * make_scorer("brightness")(None, captures)
@@ -267,9 +248,6 @@ def test_a_mapping_is_the_weighted_mean() -> None:
     for wrong in (0.0, -1.0, math.inf, math.nan, "1"):
         with pytest.raises(ValueError, match="`weights`"):
             CompositeScorer({"own": Own()}, {"own": wrong})
-
-
-def test_callables_see_the_view_they_ask_for() -> None:
     captures = make_captures(random_scene(), [GRID[20]] * 3)
     images = torch.rand(3, 4, 40, 40)
     scorer = make_scorer(Own())
@@ -320,8 +298,6 @@ def test_rubbish_is_refused(returned: Any) -> None:
 
 @pytest.mark.parametrize("observation", ["uint8", "linear", "dn"])
 def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) -> None:
-    """Neither the observation nor the other scorers see it."""
-
     def blacken(images: torch.Tensor, captures: Captures) -> torch.Tensor:
         images.numpy()[:] = 0.0  # past torch's own counting
         return images.new_zeros(len(images))
@@ -344,8 +320,6 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
 @pytest.mark.parametrize("name", TENSORS)
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
 def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
-    """The scene, which other environments show too, stays as it is."""
-
     def write(images: Any, captures: Captures) -> torch.Tensor:
         getattr(captures, name)[0] *= 0.5
         return torch.zeros(len(captures))

@@ -11,16 +11,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ae_env.scenes import Scene
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    RawImage,
-    develop,
-    get_camera,
-    read_raw,
-    render_srgb,
-)
-from simulator.camera import BayerPattern, CameraProfile
+from simulator import CameraSettings, CameraSimulator, RawImage, develop, read_raw, render_srgb
+from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.raw.develop import (
     apply_tone,
     demosaic_malvar,
@@ -46,7 +38,7 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
+def test_tone_curve_shows_the_grey_card_as_grey_and_is_inverted():
     linear = torch.linspace(0, 1, 10_001, dtype=torch.float64)
     curve = apply_tone(linear, "photographic")
     assert (curve.diff() > 0).all()
@@ -56,6 +48,14 @@ def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
     encoded = srgb_encode(linear.float()).numpy()
     np.testing.assert_allclose(encoded, srgb(linear.numpy()), atol=5e-7)
     assert (np.diff(encoded) >= 0).all()
+    # The inverse, above the sRGB curve's toe by hand: Schlick's curve solved for light.
+    codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16).expand(1, 3, 16, 16)
+    light, same = develop_inverse(codes), develop_inverse(codes.float() / 255.0)
+    assert torch.allclose(light, same, rtol=1e-5, atol=1e-8)
+    shown, p = ((200 / 255 + 0.055) / 1.055) ** 2.4, 1.618
+    by_hand = shown / (p - (p - 1) * shown)
+    assert light[0, 3].flatten()[200].item() == pytest.approx(by_hand, rel=1e-3)
+    assert develop(same).sub(codes / 255.0).abs().max() < 1e-5
 
 
 def test_develop_follows_the_formula():
@@ -68,6 +68,9 @@ def test_develop_follows_the_formula():
     linear = np.linalg.solve(camera_from_srgb, [0.2, 0.2, 0.225])
     assert (out.shape, out.dtype) == ((1, 3, 4, 4), torch.float32)
     np.testing.assert_allclose(out[0, :, 0, 0].numpy(), srgb(linear), atol=1e-6)
+    # Negative pixels survive up to the last clip: a half-size green averages them in.
+    out = develop(torch.tensor([0.0, -0.02, 0.06, 0.0]).reshape(1, 4, 1, 1), tone="linear")
+    assert out[0, 1].item() == pytest.approx(float(srgb(np.array(0.02))), abs=1e-6)
 
 
 @pytest.mark.parametrize("gains", [(2.1, 1.0, 1.5), (0.8, 1.0, 2.9), (1.0, 1.7, 1.0)])
@@ -98,12 +101,6 @@ def test_any_light_is_developed_within_the_range(light, white_balance, tone):
     for exposure_ev in (-32, 0, 32):
         shown = render_srgb(raw, exposure_ev=exposure_ev, tone=tone)
         assert shown.shape == (3, 2 * light.shape[1], 2 * light.shape[2])
-
-
-def test_shadow_noise_keeps_its_mean():
-    """Negative pixels survive up to the last clip: a half-size green averages them in."""
-    out = develop(torch.tensor([0.0, -0.02, 0.06, 0.0]).reshape(1, 4, 1, 1), tone="linear")
-    assert out[0, 1].item() == pytest.approx(float(srgb(np.array(0.02))), abs=1e-6)
 
 
 def test_each_image_of_a_large_batch_is_as_alone():
@@ -157,20 +154,6 @@ def test_a_real_raw_looks_as_libraw_shows_it(data_dir):
     assert np.quantile(np.abs(difference), 0.999) < 1.5
 
 
-def test_the_inverse_takes_codes_and_floating_point() -> None:
-    """Above the sRGB curve's toe by hand: its inverse, then Schlick's curve solved for light."""
-    codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16).expand(1, 3, 16, 16)
-    light, same = develop_inverse(codes), develop_inverse(codes.float() / 255.0)
-    assert torch.allclose(light, same, rtol=1e-5, atol=1e-8)
-    shown, p = ((200 / 255 + 0.055) / 1.055) ** 2.4, 1.618
-    assert light[0, 3].flatten()[200].item() == pytest.approx(
-        shown / (p - (p - 1) * shown), rel=1e-3
-    )
-    assert develop(same).sub(codes / 255.0).abs().max() < 1e-5
-
-
-# -- demosaicking ---------------------------------------------------------------------------------
-
 PATTERNS = [p.value for p in BayerPattern]
 
 
@@ -203,8 +186,6 @@ def test_malvar_on_the_gpu_is_not_rounded():
     on_gpu = demosaic_malvar(packed.cuda(), "GBRG").cpu()
     torch.testing.assert_close(on_gpu, demosaic_malvar(packed, "GBRG"), atol=3e-7, rtol=0)
 
-
-# -- clipped highlights ---------------------------------------------------------------------------
 
 BASE = CameraSettings(100, 1 / 64, 4)
 #: Levels of white: dark, only green clips, blue too, all planes; and a red lamp.
@@ -250,17 +231,18 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     level = torch.tensor([0.5, 1.1, 1.6, 4.0]) * ratio
     expected = level / torch.tensor([2, 1, 1, 1.25])[:, None]
     scene = Scene.from_raw(raw, scene_id="raw")
+    assert (scene.illuminance, scene.reference) == (None, raw.settings)
     for found in (prepared, scene.prepared):
         light = found.expected(settings)[:, 0]
         torch.testing.assert_close(light, expected)
         if ratio >= 1.0:  # as bright as the clipped raw would be
-            assert (
-                light.clamp(max=1.0) - (raw.data[:, 0] * ratio).clamp(max=1.0)
-            ).abs().max() < 1e-6
+            as_clipped = (raw.data[:, 0] * ratio).clamp(max=1.0)
+            assert (light.clamp(max=1.0) - as_clipped).abs().max() < 1e-6
         assert found.saturated is not None
         assert found.saturated.tolist() == [[False, True, True, True]]
     black = RawImage(torch.cat([raw.data, torch.zeros(4, 3, 4)], 1), BASE, Z6, None, BALANCE)
     small = Scene.from_raw(black, scene_id="raw").resized(1).light.flatten()
     torch.testing.assert_close(small, expected.mean(1) / ratio / 4)  # averaged after, not before
     dark = clipped(pixels[0])
+    assert Scene.from_raw(dark, scene_id="raw").saturated is None
     assert CameraSimulator(device="cpu").prepare(dark).light is dark.data

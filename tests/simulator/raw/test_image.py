@@ -15,19 +15,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from simulator import (
-    CameraProfile,
-    CameraSettings,
-    NoiseLevelFunction,
-    RawImage,
-    estimate_nlf,
-    get_camera,
-    list_cameras,
-    read_raw,
-    write_dng,
-)
-from simulator.camera import BayerPattern
-from simulator.raw.dng import DEFAULT_COLOUR_MATRIX
+from simulator import CameraSettings, NoiseLevelFunction, RawImage, estimate_nlf, read_raw
+from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
+from simulator.raw.dng import DEFAULT_COLOUR_MATRIX, write_dng
 from simulator.raw.image import pack_mosaic, unpack_mosaic
 from tests.strategies import cameras, log_uniform, mosaics, settings_within
 
@@ -74,9 +64,6 @@ def test_unpack_clips_to_the_sensor_and_rounds():
     for shape in ((4,), (1, 8), (2, 2, 2)):
         with pytest.raises(ValueError, match="`mosaic`"):
             pack_mosaic(np.zeros(shape, np.uint16), camera())
-
-
-def test_bad_arguments():
     usual = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()}
     bad = {"camera": ["nikon_z6"], "settings": [(100, 0.01)], "nlf": [(1e-4, 1e-6)]}
     bad |= {"box_factor": [0, 1.5], "white_balance": [(1.0, 1.0), (1.0, 0.0, 1.0)]}
@@ -111,8 +98,6 @@ def test_saturated_pixels_of_frames_in_shares(rows):
     raw = RawImage(torch.from_numpy(data), SETTINGS, camera())
     np.testing.assert_array_equal(raw.saturated, expected)
 
-
-# -- DNG files -------------------------------------------------------------------------------------
 
 NLF = NoiseLevelFunction((1.5e-4, 2e-4, 2e-4, 2.5e-4), (1e-6, 2e-6, 2e-6, 3e-6))
 
@@ -179,7 +164,7 @@ def test_writing_and_reading_invert(tmp_path, mosaic, settings, white_balance, b
         assert getattr(back.noise, name) == pytest.approx((red, green, green, blue), rel=1e-12)
 
 
-def test_noise_beyond_the_whole_range_and_none(path):
+def test_noise_beyond_the_range_colour_matrix_and_camera_survive(path):
     nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))
     write_dng(path, make_raw(nlf=nlf, settings=CameraSettings(409_600, 4.0, 1.0)))
     back = read_raw(path)
@@ -187,6 +172,13 @@ def test_noise_beyond_the_whole_range_and_none(path):
     write_dng(path, make_raw(nlf=None))
     with tifffile.TiffFile(path) as tiff:  # nothing is known of its noise
         assert "NoiseProfile" not in tiff.pages.first.tags
+    matrix = ((1.0, -0.25, 0.0), (-0.5, 1.5, 0.125), (0.0, -0.25, 0.75))
+    z6 = replace(get_camera("nikon_z6"), colour_matrix=matrix, colour_matrix_source="measured")
+    write_dng(path, make_raw(z6, nlf=None))
+    back = read_raw(path)
+    assert (back.camera.name, back.camera.colour_matrix_source) == ("nikon_z6", "measured")
+    assert back.camera.colour_matrix == matrix  # not LibRaw's own for this camera
+    assert back.camera.nlf(100) == z6.nlf(100)
 
 
 @pytest.mark.parametrize(
@@ -207,16 +199,6 @@ def test_libraw_reads_the_settings(path, values):
         content = path.read_bytes().replace(*(np.array([1, n], "<u4").tobytes() for n in (60, 30)))
         path.write_bytes(content)
         assert read_raw(path).settings.exposure_time == pytest.approx(1 / 30)
-
-
-def test_colour_matrix_and_camera_survive(path):
-    matrix = ((1.0, -0.25, 0.0), (-0.5, 1.5, 0.125), (0.0, -0.25, 0.75))
-    z6 = replace(get_camera("nikon_z6"), colour_matrix=matrix, colour_matrix_source="measured")
-    write_dng(path, make_raw(z6, nlf=None))
-    back = read_raw(path)
-    assert (back.camera.name, back.camera.colour_matrix_source) == ("nikon_z6", "measured")
-    assert back.camera.colour_matrix == matrix  # not LibRaw's own for this camera
-    assert back.camera.nlf(100) == z6.nlf(100)
 
 
 def test_tags_as_tifffile_reads_them(path):
@@ -245,17 +227,6 @@ def test_tags_as_tifffile_reads_them(path):
     assert known.items() <= read_raw(path).metadata.items()
 
 
-def test_developed_level_is_right(path):
-    """A grey card of 0.18 after white balance comes out of LibRaw's sRGB as 118 of 255."""
-    raw = make_raw(CameraProfile("bench_camera", BayerPattern.GBRG, (512.0,) * 4, 15000, 14))
-    grey = torch.tensor([0.18 / 2.1, 0.18, 0.18, 0.18 / 1.6])[:, None, None].expand(4, 40, 40)
-    write_dng(path, replace(raw, data=grey))
-    as_ours = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (2.4, 12.92)}
-    with rawpy.imread(str(path)) as libraw:
-        picture = libraw.postprocess(**as_ours, adjust_maximum_thr=0.0)
-    np.testing.assert_allclose(picture.reshape(-1, 3).mean(0), [118, 118, 118], atol=1.5)
-
-
 def test_any_size_and_order_of_memory(path):
     """Rows are written a few at a time."""
     mosaic = np.random.default_rng(0).integers(0, 4096, (1300, 10), dtype=np.uint16)
@@ -273,8 +244,6 @@ def test_bad_arguments_leave_what_is_there(tmp_path, path):
     assert path.read_bytes() == before
 
 
-# -- blind estimates of noise ----------------------------------------------------------------------
-
 LEVELS = (0.02, 0.1, 0.18, 0.5)
 
 
@@ -289,13 +258,11 @@ def patches() -> np.ndarray:
 
 
 def photograph(name: str) -> np.ndarray:
-    """A photograph in linear light as planes of one raw."""
     linear = (getattr(skimage.data, name)() / 255.0) ** 2.2
     return np.moveaxis(linear * [0.5, 1.0, 0.65], -1, 0)[[0, 1, 1, 2]]
 
 
 def soft(name: str) -> np.ndarray:
-    """The same a little softer than the pixel grid."""
     return gaussian_filter(photograph(name), (0, 1, 1))
 
 
@@ -334,16 +301,13 @@ def test_noise_that_was_put_in_is_found(light, camera, iso, least, most):
     assert least < low <= high < most
 
 
-def test_clipped_half_does_not_count():
+def test_clipped_halves_dark_frames_and_grey_cards():
     nlf = get_camera("canon_70d").nlf(1600)
     sides = np.full((4, 256, 200), 1.2), np.zeros((4, 256, 90))
     noisy = with_noise(np.concatenate([ramp(), *sides], axis=2), nlf)
     for clipped in (noisy, np.maximum(noisy, 0.0)):  # with a pedestal, and without one
         low, high = worst_ratio(estimate_nlf(clipped), nlf)
         assert 0.85 < low <= high < 1.15
-
-
-def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level():
     rng = np.random.default_rng(6)
     noise = rng.standard_normal((4, 128, 128))
     dark = estimate_nlf(1e-3 * noise)

@@ -14,18 +14,10 @@ import tifffile
 import torch
 from skimage.io import imsave
 
-from simulator import (
-    CameraProfile,
-    CameraSettings,
-    NoiseLevelFunction,
-    RawFileError,
-    RawImage,
-    get_camera,
-    read_raw,
-    write_dng,
-)
-from simulator.camera import BayerPattern
+from simulator import CameraSettings, NoiseLevelFunction, RawFileError, RawImage, read_raw
+from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.raw import read as read_module
+from simulator.raw.dng import write_dng
 from simulator.raw.metadata import camera_identity, is_raw_container, read_directories
 
 SETTINGS = CameraSettings(iso=100, exposure_time=1 / 60, f_number=4.0)
@@ -128,9 +120,7 @@ def test_levels_colour_and_metadata(tmp_path):
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
     assert "ColorMatrix of the file" in camera.colour_matrix_source
     np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)  # the rotation is not applied
-
-
-def test_second_colour_matrix_is_daylight(tmp_path):
+    # Of two colour matrices that of daylight is taken.
     tags = {
         "CalibrationIlluminant1": ("H", (17,)),
         "ColorMatrix2": ("2i", fractions(2 * np.eye(3))),
@@ -172,7 +162,7 @@ def test_noise_profile_wins_if_it_can_be_one(tmp_path, caplog, profile, shot, re
     assert (camera.name, camera.black_level[0], camera.white_level) == ("canon_70d", 64, 4095)
 
 
-def test_camera_argument(path):
+def test_cameras_that_are_given_or_estimated(path, tmp_path):
     named = read_raw(path, settings=SETTINGS, camera="nikon_z6")
     assert_on_12_bits(named, get_camera("nikon_z6"))
     assert named.camera.white_level == 4095
@@ -180,17 +170,9 @@ def test_camera_argument(path):
     raw = read_raw(path, settings=SETTINGS, camera=own)
     assert raw.camera == own
     assert raw.data[0, 0, 0] == pytest.approx((int(MOSAIC[0, 0]) - 50) / 3950)
-    for camera in (
-        replace(own, cfa=BayerPattern.GBRG),
-        get_camera("nikon_z6"),
-        "nikon_z",
-        3,
-    ):
+    for camera in (replace(own, cfa=BayerPattern.GBRG), get_camera("nikon_z6"), "nikon_z", 3):
         with pytest.raises(ValueError, match="`camera`"):
             read_raw(path, settings=SETTINGS, camera=camera)
-
-
-def test_unknown_camera_is_estimated_and_declared(tmp_path):
     rng = np.random.default_rng(1)
     light = np.broadcast_to(np.linspace(0.02, 0.8, 384), (256, 384))
     noisy = rng.normal(light, np.sqrt(4e-4 * light + 4e-6))
@@ -353,16 +335,7 @@ def test_damaged_files_are_read_or_refused(path, own_dng, name):
     assert 15 < refused < 150
 
 
-def test_white_beyond_the_bits_of_a_sample():
-    """Private, as there is no such file to test on: Sony's ARW compress 14 bits to 12."""
-    tags = {"PhotometricInterpretation": (32803,), "BitsPerSample": (12,)}
-    stated = tags | {"WhiteLevel": (15360,)}
-    for own, brightest, wanted in ((tags, 900, 15360), (stated, 14000, 15360), (stated, 900, 4095)):
-        mosaic, path = np.full((2, 2), brightest, np.uint16), Path("a.arw")
-        assert read_module._white_level(path, 15360.0, [512.0] * 4, [own], mosaic) == wanted
-
-
-def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path, caplog):
+def test_white_levels_that_are_wrong_or_beyond_the_bits_of_a_sample(tmp_path, caplog):
     """Its brightest sample is four times that level; darker files do not show that it is wrong."""
     camera = CameraProfile("sensor", BayerPattern.RGGB, (64.0,) * 4, 4095, 12)
     given = {"settings": SETTINGS, "nlf": NLF, "camera": camera}
@@ -377,9 +350,12 @@ def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path, caplog):
     dark = write_sample_dng(tmp_path / "b.dng", MOSAIC // 5, WhiteLevel=("I", (1000,)))
     with pytest.raises(ValueError, match="`camera`"):
         read_raw(dark, **given)
-
-
-# -- tags and other containers ---------------------------------------------------------------------
+    # Private, as there is no such file to test on: Sony's ARW compress 14 bits to 12.
+    tags = {"PhotometricInterpretation": (32803,), "BitsPerSample": (12,)}
+    stated = tags | {"WhiteLevel": (15360,)}
+    for own, brightest, wanted in ((tags, 900, 15360), (stated, 14000, 15360), (stated, 900, 4095)):
+        mosaic, path = np.full((2, 2), brightest, np.uint16), Path("a.arw")
+        assert read_module._white_level(path, 15360.0, [512.0] * 4, [own], mosaic) == wanted
 
 
 def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
@@ -424,7 +400,6 @@ def test_identities_of_other_containers(tmp_path):
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
 @pytest.mark.parametrize("kind", [1, 3, 4, 12])
 def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
-    """Every tag there is claims `count` values, in a file that is long enough for them."""
     codes = sorted({*range(254, 345), *tifffile.TIFF.TAG_READERS, *range(50706, 50830), 34665})
     path = tmp_path / "a.dng"
     path.write_bytes(tiff([(code, kind, count, 4096) for code in codes]))
@@ -436,7 +411,7 @@ def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
     tracemalloc.stop()
 
 
-def test_structures_that_never_end_are_left():
+def test_structures_that_never_end_are_left_and_a_damaged_tag_costs_no_other():
     # A directory that is its own sub-directory, EXIF directory and successor.
     loop = [(CODE[name], 4, 1, 8) for name in ("SubIFDs", "ExifTag")]
     assert read_directories(io.BytesIO(tiff(loop, following=8))) == []
@@ -448,17 +423,8 @@ def test_structures_that_never_end_are_left():
     heap = struct.pack("<H", 64) + 64 * struct.pack("<HII", 0x2800, 2 + 64 * 10 + 4, 0)
     content = struct.pack("<2sI8s", b"II", 14, b"HEAPCCDR") + heap + struct.pack("<I", 0)
     assert camera_identity(io.BytesIO(content), []) == ("", "")
-
-
-def test_one_damaged_tag_costs_no_other():
     no_such_type, beyond_the_end = (CODE["Make"], 99, 1, 0), (CODE["StripOffsets"], 4, 7, 2**31)
     content = tiff([no_such_type, beyond_the_end, (CODE["WhiteLevel"], 4, 1, 4095)])
-    for magic, found in (
-        (42, 1),
-        (0x4F52, 1),
-        (0x5352, 1),
-        (0x55, 1),
-        (0, 0),
-    ):  # Olympus, Panasonic
+    for magic, found in ((42, 1), (0x4F52, 1), (0x5352, 1), (0x55, 1), (0, 0)):
         file = io.BytesIO(content[:2] + struct.pack("<H", magic) + content[4:])
         assert read_directories(file) == found * [{"WhiteLevel": (4095,)}]

@@ -14,6 +14,7 @@ from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
+from simulator.reference import sequences
 from simulator.reference.reference_camera import (
     BodyError,
     ReferenceCamera,
@@ -22,15 +23,7 @@ from simulator.reference.reference_camera import (
     lens_blur,
     sample_mosaic,
 )
-from simulator.reference.sequences import (
-    EXPOSURE_TIMES,
-    ISO_SPEEDS,
-    Sequence,
-    draw_settings,
-    exposure_error,
-    grey_signal,
-    select_pairs,
-)
+from simulator.reference.sequences import Sequence, select_pairs
 from simulator.settings import CameraSettings
 
 BASE = CameraSettings(100, 1 / 64, 4)
@@ -92,9 +85,6 @@ def test_photosites_averages_and_marked_stops_in_the_blur():
     torch.testing.assert_close(native.blur_diameter(fine, 4.0), expected)
     # f/5.6 stands for 4 sqrt(2), f/11 for 8 sqrt(2)
     torch.testing.assert_close(native.blur_diameter(shot, 11.0), expected / (2 * math.sqrt(2)))
-
-
-def test_scene_without_depth_or_in_focus_is_left_as_it_is():
     light, camera = torch.rand(4, 7, 5), ReferenceCamera(sensor(1e-4, 1e-8))
     assert not scene(light).sampled
     assert float(camera.blur_diameter(scene(light), 4.0).max()) == 0.0
@@ -140,7 +130,7 @@ def test_counts_are_poisson_and_read_noise_is_gaussian():
         assert inside == pytest.approx(math.erf(numbers / 16 / math.sqrt(2)), abs=0.008)
 
 
-def test_rounding_and_box_average_in_the_variance():
+def test_rounding_and_box_average_in_the_variance_and_without_noise():
     # sigma = 0.6 numbers: with 1/12 counted twice the variance would be 23 % too large.
     read = (0.6 / 16000) ** 2
     sample = record(ReferenceCamera(sensor(1e-5, read)), 0.0, 100.0)
@@ -162,9 +152,6 @@ def test_rounding_and_box_average_in_the_variance():
     assert average_planes(planes, 1) is planes
     expected = planes[:, :12, :15].reshape(4, 4, 3, 5, 3).mean(dim=(2, 4))
     torch.testing.assert_close(average_planes(planes, 3), expected)
-
-
-def test_no_noise_at_all_is_exact():
     camera = ReferenceCamera(sensor(0.0, 0.0, span=1000.0))
     signal = torch.tensor([-1.0, -0.2, -0.0012, 0.1234, 0.9996, 7.0]).expand(4, 1, 6)
     found = camera.record(signal, 100.0, torch.Generator()) * 1000
@@ -185,7 +172,7 @@ def test_clipped_flat_fields_are_white_or_a_full_well_under_the_base_iso():
         np.testing.assert_allclose(recorded, 0.5, rtol=0.005)
 
 
-def test_ratio_of_two_captures_is_the_bodys():
+def test_ratio_of_two_captures_and_black_offset_are_the_bodys():
     body = BodyError(shutter_delay=-20e-6, shutter_scale=0.01, transmission={12: 0.03, 21: -0.05})
     camera = ReferenceCamera(sensor(1e-6, 1e-9), body=body)
     first, second = CameraSettings(100, 1 / 4000, 4), CameraSettings(400, 1 / 125, 11)
@@ -199,9 +186,6 @@ def test_ratio_of_two_captures_is_the_bodys():
     # A stop without an entry has no error.
     plain = camera.capture(shot, replace(first, f_number=8), 3).mean.mean()
     assert float(captures[0].mean.mean() / plain) == pytest.approx(4 * 1.03, rel=1e-5)
-
-
-def test_black_offset_moves_the_numbers_but_not_the_noise_of_light():
     offset = (2 / 16000, -1.5 / 16000, 0.0, 1 / 16000)
     dark = ReferenceCamera(sensor(1e-4, 1e-6), body=BodyError(black_offset=offset))
     capture = dark.capture(scene(flat(0.0, 200)), BASE, 0)
@@ -223,17 +207,6 @@ def test_drawn_bodies():
     assert CameraSettings(100, 1, 22).aperture_stop in bodies[5].transmission
 
 
-def test_moving_image_is_smeared_over_the_true_exposure_time():
-    light = torch.zeros(4, 20, 80)
-    light[:, :, 40] = 1.0
-    camera = ReferenceCamera(sensor(1e-4, 1e-8), body=BodyError(shutter_scale=0.5))
-    settings = replace(BASE, exposure_time=1 / 16)
-    signal = camera.expose(light, settings, settings, image_speed=4.0)[0, 0].double().numpy()
-    extent = 4.0 * 1.5 / 16 * 20  # frame heights per second, seconds, pixels per frame height
-    assert signal.sum() == pytest.approx(1.5, rel=1e-5)
-    assert signal @ (np.arange(80) - 40) ** 2 / 1.5 == pytest.approx(extent**2 / 12, rel=1e-3)
-
-
 def test_same_seed_same_capture():
     camera, shot = ReferenceCamera(Z6), scene(flat(0.2, 16))
     first = camera.capture(shot, BASE, 4)
@@ -245,9 +218,8 @@ def test_same_seed_same_capture():
     # Captures of a sequence do not repeat each other's noise, whatever seed or setting differs.
     changes = [{}, {"iso": 200}, {"exposure_time": 1 / 128}, {"f_number": 8}, {}]
     dark, settings = scene(flat(0.0, 40)), [replace(BASE, **change) for change in changes]
-    drawn = [
-        camera.capture(dark, s, seed) for s, seed in zip(settings, (4, 4, 4, 4, 5), strict=True)
-    ]
+    seeds = zip(settings, (4, 4, 4, 4, 5), strict=True)
+    drawn = [camera.capture(dark, each, seed) for each, seed in seeds]
     correlation = torch.corrcoef(torch.stack([capture.sample.flatten() for capture in drawn]))
     assert float((correlation - torch.eye(5)).abs().max()) < 5 / math.sqrt(4 * 40 * 40)
 
@@ -257,7 +229,7 @@ def test_bad_input_is_refused():
     blind = ReferenceCamera(replace(plain, pixel_pitch_um=None))
     assert torch.equal(blind.blurred_light(scene(flat(0.1)), 4.0), flat(0.1))  # no depth, no need
     late = ReferenceCamera(plain, body=BodyError(shutter_delay=-0.001))
-    brief = replace(BASE, exposure_time=1 / 2000)
+    brief, drawing = replace(BASE, exposure_time=1 / 2000), np.random.default_rng(0)
     bad = [torch.where(torch.eye(8) > 0, z, depth) for z in (0.0, -1.0, 0.04, math.nan)]
     for call, arguments, message in (
         *((scene, (light,), "`light`") for light in (flat(-0.1), torch.zeros(3, 7, 8))),
@@ -266,12 +238,16 @@ def test_bad_input_is_refused():
         (ReferenceCamera, (replace(plain, nlf_by_iso={}),), "noise calibration"),
         (blind.blurred_light, (scene(flat(0.1), depth + 1), 4.0), "pixel pitch"),
         (late.capture, (scene(flat(0.1)), brief, 0), "`exposure_time`"),
+        # No exposure of the levels suits these.
+        *((sequences.draw_settings, (lux, drawing, Z6), "`illuminance`") for lux in (0.0, 1e-3)),
+        (Sequence, (lit_scene(), (CameraSettings(100, 1, 4),)), "`settings`"),
+        (select_pairs, ([], "noises", Z6), "`stage`"),
     ):
         with pytest.raises(ValueError, match=message):
             call(*arguments)
 
 
-def test_a_rolling_shutter_shows_bands_of_a_lamp():
+def test_lamps_show_bands_and_moving_images_are_smeared_over_the_true_exposure_time():
     camera = ReferenceCamera(sensor(1e-5, 1e-8, row_time=1e-3), box_factor=2)
     # On for 5 ms of every 10; exposed for 1 us, four sensor rows of 1 ms to a packed row.
     lit = PulsedLamp(frequency=100.0, duty=0.5)
@@ -288,6 +264,14 @@ def test_a_rolling_shutter_shows_bands_of_a_lamp():
     shot, whole = scene(flat(0.1, 10)), CameraSettings(100, 0.01, 4)
     even = camera.capture(shot, whole, seed=0, lamp=lit, start=0.0031).mean
     np.testing.assert_allclose(even, camera.capture(shot, whole, seed=0).mean)
+    light = torch.zeros(4, 20, 80)
+    light[:, :, 40] = 1.0
+    camera = ReferenceCamera(sensor(1e-4, 1e-8), body=BodyError(shutter_scale=0.5))
+    settings = replace(BASE, exposure_time=1 / 16)
+    signal = camera.expose(light, settings, settings, image_speed=4.0)[0, 0].double().numpy()
+    extent = 4.0 * 1.5 / 16 * 20  # frame heights per second, seconds, pixels per frame height
+    assert signal.sum() == pytest.approx(1.5, rel=1e-5)
+    assert signal @ (np.arange(80) - 40) ** 2 / 1.5 == pytest.approx(extent**2 / 12, rel=1e-3)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 0.5, 1.2])
@@ -307,8 +291,6 @@ def test_planes_are_sampled_by_their_colour_and_place(cfa: BayerPattern) -> None
     for plane, at in zip(planes, (red, red ^ 1, blue ^ 1, blue), strict=True):
         assert torch.equal(plane, light["RGB".index(cfa.name[at]), at // 2 : 6 : 2, at % 2 : 8 : 2])
 
-
-# -- sequences -------------------------------------------------------------------------------------
 
 #: What the marked f-numbers stand for: powers of sqrt(2).
 EXACT_F = {4.0: 4.0, 5.6: 2**2.5, 8.0: 8.0, 11.0: 2**3.5, 16.0: 16.0, 22.0: 2**4.5}
@@ -336,7 +318,7 @@ def targets(camera: CameraProfile, ev: int, *settings: CameraSettings) -> set[in
 
 def drawn(illuminance: float, count: int, camera: CameraProfile = Z6) -> list[CameraSettings]:
     rng = np.random.default_rng(7)
-    return [s for _ in range(count) for s in draw_settings(illuminance, rng, camera)]
+    return [s for _ in range(count) for s in sequences.draw_settings(illuminance, rng, camera)]
 
 
 def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
@@ -354,11 +336,12 @@ def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
 @pytest.mark.parametrize("illuminance", [10.0, 20_000.0])
 def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
     rng = np.random.default_rng(1)
-    sequences = [draw_settings(illuminance, rng, Z6) for _ in range(40)]
-    assert {20, 25} <= {len(settings) for settings in sequences} <= set(range(20, 26))
-    assert all(settings == sorted(set(settings)) for settings in sequences)
-    every = list(itertools.chain(*sequences))
-    assert all(s.iso in ISO_SPEEDS and s.exposure_time in EXPOSURE_TIMES for s in every)
+    drawn_settings = [sequences.draw_settings(illuminance, rng, Z6) for _ in range(40)]
+    assert {20, 25} <= {len(settings) for settings in drawn_settings} <= set(range(20, 26))
+    assert all(settings == sorted(set(settings)) for settings in drawn_settings)
+    every = list(itertools.chain(*drawn_settings))
+    assert {s.iso for s in every} <= {*sequences.ISO_SPEEDS}
+    assert {s.exposure_time for s in every} <= {*sequences.EXPOSURE_TIMES}
     # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
     states = [(s.iso, s.exposure_time, EXACT_F[s.f_number]) for s in every]
     iso, time, f_number = np.array(states).T
@@ -368,30 +351,20 @@ def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance
     assert np.percentile(errors, 5) < -2 < 2 < np.percentile(errors, 95)
 
 
-def test_bad_arguments_are_refused():
-    for light in (0.0, 1e-3):  # no exposure of the levels suits it
-        with pytest.raises(ValueError, match="`illuminance`"):
-            draw_settings(light, np.random.default_rng(0), Z6)
-    with pytest.raises(ValueError, match="`settings`"):
-        Sequence(lit_scene(), (CameraSettings(100, 1, 4),))
-    with pytest.raises(ValueError, match="`stage`"):
-        select_pairs([], "noises", Z6)
-
-
 def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
     # 320 lux is EV 7: ISO 100, 1/8 s, f/4 is right; the error is positive where it is too bright.
     for values, ev in (((100, 1 / 8, 4), 0), ((200, 1 / 4, 4), 2), ((100, 1 / 8, 5.6), -1)):
-        assert exposure_error(320.0, CameraSettings(*values)) == pytest.approx(ev)
+        assert sequences.exposure_error(320.0, CameraSettings(*values)) == pytest.approx(ev)
     # x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
     card, settings = 0.18 * 250 / (120 * math.pi), CameraSettings(100, 1 / 8, 4)
     assert card == pytest.approx(0.119, abs=5e-4)
-    assert grey_signal(lit_scene(320.0), settings) == pytest.approx(card)
-    assert grey_signal(lit_scene(640.0), settings) == pytest.approx(2 * card)
+    assert sequences.grey_signal(lit_scene(320.0), settings) == pytest.approx(card)
+    assert sequences.grey_signal(lit_scene(640.0), settings) == pytest.approx(2 * card)
     dark = lit_scene(None, CameraSettings(100, 1 / 4, 4), light=0.3)
-    assert grey_signal(dark, settings) == pytest.approx(0.15)
+    assert sequences.grey_signal(dark, settings) == pytest.approx(0.15)
 
 
-def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
+def test_noise_targets_collect_four_times_the_light_and_are_neither_black_nor_white():
     # With photon noise alone, variance at a common exposure goes as 1 / (light collected): at one
     # f-number the target's must be at most a quarter, so its exposure time at least fourfold.
     source = CameraSettings(6400, 1 / 128, 8)
@@ -404,9 +377,6 @@ def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
     )
     # Each target is within the range of exposures asked of it.
     assert targets(SHOT_ONLY, 9, source, *candidates) == {1, 3}
-
-
-def test_noise_targets_are_neither_black_nor_white_and_read_noise_counts():
     source = CameraSettings(6400, 1 / 8192, 8)  # an eighth of the light of any target
     # EV 12 is ISO 100, 1/64 s, f/8; 3 EV below and 2 EV above are the limits.
     times = (2.0**-9 * 0.98, 2.0**-9 * 1.02, 2.0**-4 * 0.98, 2.0**-4 * 1.02)

@@ -20,6 +20,7 @@ from simulator.optics.discs import DiscBank
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
+from simulator.training import losses
 from simulator.training.crops import (
     Batch,
     DetailCrops,
@@ -27,14 +28,6 @@ from simulator.training.crops import (
     NoiseBatch,
     ReferencePairs,
     draw_sequences,
-)
-from simulator.training.losses import (
-    ApertureLoss,
-    BaselineLoss,
-    ExposureLoss,
-    NoiseLoss,
-    away_from_clipping,
-    expose,
 )
 from tests.simulator.training.scenes import REFERENCE, scene
 
@@ -48,7 +41,7 @@ def pairs(*settings: CameraSettings, seed: int = 0, **scene_changes: object) -> 
     return ReferencePairs([sequence], ReferenceCamera(Z6), "exposure", seed=seed)
 
 
-def test_a_batch_is_that_of_its_step_process_and_seed_alone():
+def test_batches_and_sequences_are_those_of_their_seed_and_index():
     made = pairs()
     batches = [made.batch(0, 4, 16), made.batch(1, 4, 16), made.batch(0, 4, 16, process=1)]
     batches.append(pairs(seed=1).batch(0, 4, 16))
@@ -57,16 +50,6 @@ def test_a_batch_is_that_of_its_step_process_and_seed_alone():
         assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
     torch.manual_seed(77)
     assert all(map(torch.equal, batches[1], pairs().batch(1, 4, 16)))  # the first that it draws
-
-
-def test_the_target_is_clipped_as_the_camera_clips():
-    bright = CameraSettings(100, 1, 4)  # 16 x the light: most of it beyond white
-    batch = pairs(LIGHT, bright, depth=False).batch(0, 8, 32)
-    assert float(batch.target.max()) == float(batch.sample.max()) == 1.0
-    assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
-
-
-def test_sequences_are_drawn_by_seed_and_index():
     first, again, other = (draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1))
     assert [s.settings for s in first] == [s.settings for s in again]
     assert first[1].settings != first[0].settings != other[0].settings
@@ -75,7 +58,6 @@ def test_sequences_are_drawn_by_seed_and_index():
 
 
 def test_source_and_sample_have_the_noise_that_is_stated():
-    """Standardised by the noise level function, both have mean 0 and variance 1."""
     source, target = CameraSettings(1600, 1 / 512, 4), CameraSettings(400, 1 / 256, 4)
     made = pairs(source, target, size=64, depth=False)
     made.pairs = [p for p in made.pairs if p.source == 0]
@@ -134,6 +116,11 @@ def test_settings_of_a_pair_and_defocus_at_the_sources_aperture():
     np.testing.assert_allclose(batch.defocus.amax((1, 2)), expected, rtol=1e-4)
     assert not batch.defocus.amin((1, 2)).any()
     assert ((batch.defocus > 0).float().mean((1, 2)) == 0.5).all()
+    # The target is clipped as the camera clips.
+    bright = CameraSettings(100, 1, 4)  # 16 x the light: most of it beyond white
+    batch = pairs(LIGHT, bright, depth=False).batch(0, 8, 32)
+    assert float(batch.target.max()) == float(batch.sample.max()) == 1.0
+    assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
 
 
 def picture(*size: int, seed: int = 0, **named: object) -> DetailPicture:
@@ -158,6 +145,10 @@ def test_a_step_gives_the_same_batch_and_another_one_another() -> None:
     captures = crops.captures(2, 4, 24)
     assert all(torch.equal(part, part[:1].expand_as(part)) for part in captures[1:])
     assert not torch.equal(captures.noisy[0], captures.noisy[1])
+    # A tenth of the crops has coinciding planes; there alone the greens are equal.
+    clean = DetailCrops([picture(3, 128, 128)], [Z6]).batch(0, 200, 16).clean
+    equal = [torch.equal(each[1], each[2]) for each in clean]
+    assert np.mean(equal) == pytest.approx(0.1, abs=0.085)  # four standard errors
 
 
 def test_recorded_noise_has_the_variance_that_is_stated() -> None:
@@ -173,10 +164,7 @@ def test_recorded_noise_has_the_variance_that_is_stated() -> None:
             assert bool((error.mean(dim=1).abs() < 5 * (variance / error.shape[1]).sqrt()).all())
             seen += 1
     assert seen > 2
-
-
-def test_what_is_recorded_is_clipped_and_whole_numbers() -> None:
-    """A picture too small to be averaged: each sample is one of the camera's digital numbers."""
+    # A picture too small to be averaged: each sample is one of the camera's digital numbers.
     bright = DetailCrops([picture(3, 70, 70)], [CANON]).batch(0, 40, 32)
     numbers = bright.noisy.double() * torch.tensor(CANON.span)[:, None, None]
     assert float((numbers - numbers.round()).abs().max()) < 1e-2
@@ -185,13 +173,6 @@ def test_what_is_recorded_is_clipped_and_whole_numbers() -> None:
     levels = bright.clean.mean(dim=(1, 2, 3)).log2()
     assert -11.1 < float(levels.min()) < -7
     assert -3 < float(levels.max()) < -0.5
-
-
-def test_planes_are_sampled_at_their_own_places_but_for_some_crops() -> None:
-    """A tenth of the crops has coinciding planes; there alone the greens are equal."""
-    clean = DetailCrops([picture(3, 128, 128)], [Z6]).batch(0, 200, 16).clean
-    equal = [torch.equal(each[1], each[2]) for each in clean]
-    assert np.mean(equal) == pytest.approx(0.1, abs=0.085)  # four standard errors
 
 
 def test_a_mosaic_is_transposed_with_its_greens() -> None:
@@ -226,8 +207,6 @@ def test_a_recorded_mosaic_serves_only_where_it_is_quiet() -> None:
         crops.batch(0, 1, 49)
 
 
-# -- losses ----------------------------------------------------------------------------------------
-
 SHOT, READ = 4e-4, 1e-6
 
 
@@ -243,7 +222,6 @@ class Fixed(nn.Module):
 
 
 def batch(level: float = 0.2, ratio: float = 2.0, noise: bool = True) -> Batch:
-    """A flat field whose noise is drawn by NumPy, and its noise-free target."""
     deviation = math.sqrt(READ + SHOT * level) if noise else 0.0
     drawn = np.random.default_rng(0).normal(level, deviation, (2, 4, 32, 32))
     target = torch.full((2, 4, 32, 32), level * ratio)
@@ -273,18 +251,18 @@ def noise_batch(level: float = 0.2, noise: bool = True) -> NoiseBatch:
 
 
 def test_exposure_is_the_mean_error_of_what_is_not_over_exposed():
-    data, loss = batch(noise=False), ExposureLoss(ExposureModule())
+    data, loss = batch(noise=False), losses.ExposureLoss(ExposureModule())
     data.source[:, :, :16] = 0.995  # half the pixels; their error would be large
     assert loss(data)["loss"].item() == pytest.approx(0.01, rel=1e-4)
     data.source[:] = 1.0
     assert loss(data)["loss"].item() == 0.0  # not NaN
-    baseline = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
+    baseline = losses.BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
     values = baseline(batch(noise=False))  # source 0.2, compared with the sample, 0.41
     assert values["loss"].item() == pytest.approx(0.21, rel=1e-5)
     # The noise goes with the exposure.
     module, data = ExposureModule(), batch()
     module.load_state_dict({"w": torch.tensor(1.5), "b": torch.full((4,), 0.1)})
-    exposed, shot, read = expose(module, data)
+    exposed, shot, read = losses.expose(module, data)
     torch.testing.assert_close(exposed, (data.source + 0.1) * 3.0)
     torch.testing.assert_close(shot, torch.full((2, 4), 3 * SHOT))
     torch.testing.assert_close(read, torch.full((2, 4), 9 * READ))
@@ -299,14 +277,13 @@ def test_the_noise_loss_is_the_logarithm_of_what_is_left(level):
     data = noise_batch(level)
     for left, loss in ((1.0, 0.2), (0.5, math.log(0.25)), (0.0, math.log(3e-4))):
         halfway = partial(torch.lerp, data.clean, weight=left)
-        values = NoiseLoss(denoiser(lambda image, *_, to=halfway: to(image)))(data)
+        values = losses.NoiseLoss(denoiser(lambda image, *_, to=halfway: to(image)))(data)
         assert values["loss"].item() == pytest.approx(loss, abs=0.05)
         gain = 60.0 if left == 0.0 else -20 * math.log10(left)  # at most a million times
         assert float(values["gain_db"]) == pytest.approx(gain, abs=1e-4)
-    paper = NoiseLoss(denoiser(lambda both: torch.zeros_like(both[:, :4]), "paper"))
-    assert paper(data)["loss"].item() == pytest.approx(
-        math.sqrt(2 / math.pi * (SHOT * level + READ)), rel=0.03
-    )
+    paper = losses.NoiseLoss(denoiser(lambda both: torch.zeros_like(both[:, :4]), "paper"))
+    wanted = math.sqrt(2 / math.pi * (SHOT * level + READ))
+    assert paper(data)["loss"].item() == pytest.approx(wanted, rel=0.03)
 
 
 def test_the_noise_loss_counts_each_pixels_noise_and_that_of_the_whole_crop():
@@ -314,7 +291,7 @@ def test_the_noise_loss_counts_each_pixels_noise_and_that_of_the_whole_crop():
     data = noise_batch(0.0)
     data.shot.fill_(0.0)
     data.read[:, :2], data.read[:, 2:] = 4e-4, 25e-6
-    loss = NoiseLoss(denoiser(lambda *_: data.clean + 0.01))(data)["loss"].item()
+    loss = losses.NoiseLoss(denoiser(lambda *_: data.clean + 0.01))(data)["loss"].item()
     each, pooled = (0.25 + 4) / 2, 1e-4 / ((4e-4 + 25e-6) / 2)
     expected = sum(math.log(p + 3e-4) + 2 * max(p - 0.9, 0) for p in (each, pooled)) / 2
     assert loss == pytest.approx(expected, rel=1e-5)
@@ -330,7 +307,7 @@ def test_black_and_blown_out_batches_teach_finite_gradients(level, preset):
         data.shot.fill_(noise)
         data.read.fill_(noise / 100)
         module.zero_grad()
-        assert_finite(NoiseLoss(module)(data), module)
+        assert_finite(losses.NoiseLoss(module)(data), module)
 
 
 def assert_finite(values: dict[str, Tensor], module: nn.Module) -> None:
@@ -347,10 +324,10 @@ def opened(data: Batch) -> Batch:
     return data._replace(source=texture, target=target, ratio=torch.ones(2))
 
 
-def aperture_loss(log_blur: Callable[..., Tensor]) -> ApertureLoss:
+def aperture_loss(log_blur: Callable[..., Tensor]) -> losses.ApertureLoss:
     module = ApertureModule("compact")
     module.network.forward = Fixed(log_blur).forward
-    return ApertureLoss(ExposureModule(), denoiser(lambda image, *_: image), module)
+    return losses.ApertureLoss(ExposureModule(), denoiser(lambda image, *_: image), module)
 
 
 def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change():
@@ -368,7 +345,7 @@ def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change():
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
 def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble(preset):
-    loss = ApertureLoss(ExposureModule(), NoiseModule("nano"), ApertureModule(preset))
+    loss = losses.ApertureLoss(ExposureModule(), NoiseModule("nano"), ApertureModule(preset))
     same = opened(batch())._replace(f_target=torch.full((2,), 8.0))
     white = opened(batch())._replace(source=torch.ones(2, 4, 32, 32))
     for data in (same, white):
@@ -380,7 +357,7 @@ def test_seven_pixels_around_clipping_are_left_out():
     source, target = torch.zeros(1, 4, 40, 40), torch.zeros(1, 4, 40, 40)
     source[0, 2, 10, 10] = 0.995
     target[0, 0, 30, 39] = 1.0
-    used = away_from_clipping(source, target)
+    used = losses.away_from_clipping(source, target)
     left_out = torch.zeros(40, 40, dtype=torch.bool)
     left_out[3:18, 3:18] = left_out[23:38, 32:] = True
     assert torch.equal(used[0, 0], ~left_out)

@@ -4,6 +4,7 @@ import csv
 import math
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,8 @@ import torch
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import CameraSettings, RawImage, get_camera
 from simulator.networks.weights import load_modules
-from simulator.training.paper_dataset import (
-    CapturedPairs,
-    captured_pairs,
-    packed_camera,
-    read_dataset,
-    split_dataset,
-    train_on_captures,
-    write_packed_sequence,
-)
+from simulator.training import paper_dataset
+from simulator.training.paper_dataset import packed_camera, read_dataset, split_dataset
 from simulator.training.trainer import SimulatorConfig, StageConfig, first_modules
 from tests.simulator.training.scenes import SETTINGS, write_dataset
 
@@ -42,7 +36,7 @@ def captures(name: str) -> list[RawImage]:
 @pytest.mark.parametrize("camera", ["nikon_z6", "canon_70d"])
 def test_captures_come_back(tmp_path, camera):
     raws, folder = captures(camera), tmp_path / "scene_007"
-    write_packed_sequence(folder, raws)
+    paper_dataset.write_packed_sequence(folder, raws)
     (sequence,) = read_dataset(folder)
     assert sequence.name == "scene_007"
     for capture, raw in zip(sequence.captures, raws, strict=True):
@@ -90,7 +84,7 @@ def nikon(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
     return root, mosaics
 
 
-def test_the_authors_nikon_files(nikon):
+def test_the_authors_nikon_files_and_a_partial_copy_of_them(nikon, caplog):
     root, mosaics = nikon
     sequences = read_dataset(root)
     assert [(s.name, len(s.captures)) for s in sequences] == [("scene_001", 2), ("scene_002", 1)]
@@ -107,6 +101,12 @@ def test_the_authors_nikon_files(nikon):
     assert (raw.box_factor, raw.metadata["nlf_source"]) == (1, "camera_params.csv")
     mine = get_camera("canon_70d")
     assert read_dataset(root, camera=mine)[0].captures[0].read().camera is mine
+    (root / "scene_002" / "DSC_0001.npy").unlink()
+    assert [s.name for s in read_dataset(root)] == ["scene_001"]
+    assert "1 of 3 files are not there" in caplog.text
+    shutil.rmtree(root / "scene_001")
+    with pytest.raises(ValueError, match=r"camera_params\.csv"):
+        read_dataset(root)
 
 
 def test_the_authors_canon_files(tmp_path):
@@ -128,25 +128,12 @@ def test_the_authors_canon_files(tmp_path):
     assert raw.white_balance == pytest.approx((2.0, 1.0, 1.6))
 
 
-def test_a_partial_copy_is_read_with_a_warning(nikon, caplog):
-    root = nikon[0]
-    (root / "scene_002" / "DSC_0001.npy").unlink()
-    assert [s.name for s in read_dataset(root)] == ["scene_001"]
-    assert "1 of 3 files are not there" in caplog.text
-    shutil.rmtree(root / "scene_001")
-    with pytest.raises(ValueError, match=r"camera_params\.csv"):
-        read_dataset(root)
-
-
-def test_a_cell_that_is_no_value_is_named(tmp_path):
+def test_cells_that_are_no_value_and_files_that_are_no_raw_are_named(tmp_path):
     bad = {"iso": "auto", "time": "", "aperture": "0", "noiseprofile": "1e-5 1e-8 1e-5"}
     for name, value in bad.items():
         author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("s/a.jpg", **{name: value}))
         with pytest.raises(ValueError, match=f"row 2: `{name.replace('aperture', 'f_number')}`"):
             read_dataset(tmp_path)
-
-
-def test_files_that_are_no_packed_raw_are_refused(tmp_path):
     file, pickled = tmp_path / "a.npy", np.array([{}], dtype=object)  # nothing pickled is run
     author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("a.jpg"))
     for array in (np.zeros((4, 6)), np.full((4, 2, 2), math.nan), np.zeros((5, 2, 2)), pickled):
@@ -164,10 +151,10 @@ def test_what_cannot_be_written(tmp_path):
     (tmp_path / "a.txt").write_text("words")
     other_levels = [RawImage(canon[0].data, SETTINGS[0], get_camera("canon_70d"))]
     with pytest.raises(ValueError, match="`folder`"):
-        write_packed_sequence(tmp_path, nikon)
+        paper_dataset.write_packed_sequence(tmp_path, nikon)
     for raws in ([], [*nikon, canon[0]], other_levels):  # would come back as another camera's
         with pytest.raises(ValueError, match="`raws`"):
-            write_packed_sequence(tmp_path / "b", raws)
+            paper_dataset.write_packed_sequence(tmp_path / "b", raws)
     assert not (tmp_path / "b").exists()
 
 
@@ -183,15 +170,12 @@ def test_what_is_no_dataset_is_refused(tmp_path, read, name):
             read(tmp_path)
 
 
-# -- training -------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_dataset(tmp_path_factory.mktemp("Nikon"), sequences=4)
 
 
-def test_sequences_are_split_whole(folder: Path, tmp_path: Path) -> None:
+def test_sequences_are_split_whole_and_paired_for_each_stage(folder: Path, tmp_path: Path) -> None:
     train, test = split_dataset(folder, seed=0)
     assert (len(train), len(test)) == (3, 1)
     assert {s.name for s in (*train, *test)} == {f"scene_00{n}" for n in range(4)}
@@ -204,13 +188,11 @@ def test_sequences_are_split_whole(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path / "AutoModeNikon_Train")
     train, test = split_dataset(tmp_path)  # folders named test are held out
     assert (len(train), len(test)) == (4, 1)
-
-
-def test_pairs_of_each_stage(folder: Path) -> None:
     sequences = split_dataset(folder)[0][:1]
     settings = sequences[0].settings
+    pairs = paper_dataset.captured_pairs
     found = {
-        stage: [(settings[p.source], settings[p.target]) for p in captured_pairs(sequences, stage)]
+        stage: [(settings[p.source], settings[p.target]) for p in pairs(sequences, stage)]
         for stage in ("exposure", "noise", "aperture")
     }
     assert len(found["exposure"]) == 4 * 3
@@ -222,7 +204,7 @@ def test_pairs_of_each_stage(folder: Path) -> None:
 
 def test_batches_hold_what_the_files_and_the_table_say(folder: Path) -> None:
     sequences = split_dataset(folder)[0]
-    pairs, other = (CapturedPairs(sequences, "noise", seed=5) for _ in range(2))
+    pairs, other = (paper_dataset.CapturedPairs(sequences, "noise", seed=5) for _ in range(2))
     batch = pairs.batch(3, 4, 16)
     assert all(map(torch.equal, batch, other.batch(3, 4, 16)))
     assert batch.source.shape == (4, 4, 16, 16)
@@ -240,13 +222,14 @@ def test_a_training_changes_the_weights_and_a_second_run_resumes(tmp_path, folde
     train, _ = split_dataset(folder)
     path, once = tmp_path / "out" / "pc", StageConfig(steps=1, batch=1, crop=16)
     training = SimulatorConfig(preset="pc", baseline=once)
-    modules, card = load_modules(train_on_captures(training, train, path, command="test"))
+    run = partial(paper_dataset.train_on_captures, sequences=train, command="test")
+    modules, card = load_modules(run(training, path=path))
     assert card["stages"]["baseline"]["steps"] == 1
     assert (card["sequences"], card["training"]["preset"]) == (3, "pc")
     state, fresh = modules.state_dict(), first_modules(training)[0].state_dict()
     assert not all(torch.equal(fresh[name], value) for name, value in state.items())
-    again = load_modules(train_on_captures(training, train, path, command="test"))[0].state_dict()
+    again = load_modules(run(training, path=path))[0].state_dict()
     assert all(torch.equal(again[name], value) for name, value in state.items())
     compact = SimulatorConfig(preset="compact", exposure=once, noise=once, aperture=once)
     with pytest.raises(ValueError, match="`preset`"):
-        train_on_captures(compact, train, tmp_path / "a", command="test")
+        run(compact, path=tmp_path / "a")

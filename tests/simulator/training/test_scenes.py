@@ -9,20 +9,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from skimage.data import stereo_motorcycle
 
 from simulator import CameraSettings, get_camera
 from simulator.radiance.procedural import KINDS
 from simulator.reference.reference_camera import DRAPED, ReferenceScene
-from simulator.training import scenes as pictures
+from simulator.training import scenes as pictured
 from simulator.training.crops import DetailPicture
-from simulator.training.scenes import (
-    depth_photographs,
-    detail_pictures,
-    detail_split,
-    draped_scenes,
-    mosaic_scenes,
-    reference_scenes,
-)
+from simulator.training.scenes import reference_scenes
 from tests.ae_env.scene_files import write_exr, write_hdr
 
 CAMERA = get_camera("nikon_z6")
@@ -61,9 +55,6 @@ def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
     other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
     assert other.group != fewer[0].group
     assert not torch.equal(other.light, fewer[0].light)
-
-
-def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
     train = scenes["train"]
     kinds = [s.kind for s in train]
     assert kinds.count("depth") == 21
@@ -101,22 +92,10 @@ def test_panoramas_are_cut_and_coarse_pictures_left_out(tmp_path, caplog):
         reference_scenes("train", CAMERA, number=0, data=tmp_path / "none")
 
 
-@pytest.mark.real_data
-def test_real_pictures_become_scenes(data_dir: Path) -> None:
-    """Of the smallest split; that no two share a group, small files show below."""
-    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
-    assert {s.kind for s in made} == {"photograph", "radiance"}
-    mosaics = list(mosaic_scenes("test", CAMERA, data_dir, size=128))
-    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
-    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
-
-
 def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     """z = baseline * focal length / (disparity + offset), as scikit-image's documentation says."""
-    from skimage.data import stereo_motorcycle
-
     _, _, disparity = stereo_motorcycle()
-    front, middle = depth_photographs(CAMERA)
+    front, middle = pictured.depth_photographs(CAMERA)
     assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
     assert (front.light.shape, front.size) == ((3, 500, 740), (250, 370))
     assert torch.equal(front.depth, middle.depth)
@@ -127,10 +106,15 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
 
 
 @pytest.mark.real_data
-def test_real_cones(data_dir: Path) -> None:
-    for scene in depth_photographs(CAMERA, data=data_dir)[2:]:
+def test_real_pictures_become_scenes(data_dir: Path) -> None:
+    for scene in pictured.depth_photographs(CAMERA, data=data_dir)[2:]:
         assert (scene.group, scene.size) == ("cones", (187, 225))
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
+    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
+    assert {s.kind for s in made} == {"photograph", "radiance"}
+    mosaics = list(pictured.mosaic_scenes("test", CAMERA, data_dir, size=128))
+    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
+    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
 
 
 def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:
@@ -138,7 +122,7 @@ def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:
     reference = CameraSettings(100, 1 / 64, 4)
     scene = ReferenceScene("a", "the-group", "indoor", light, reference, illuminance=100.0)
     others = replace(scene, in_focus=False), replace(scene, light=light[[0, 1, 1, 2]])
-    drapes = list(draped_scenes([scene, *others], CAMERA, copies=4))
+    drapes = list(pictured.draped_scenes([scene, *others], CAMERA, copies=4))
     assert len({d.scene_id for d in drapes}) == len(drapes) == 4
     assert not torch.equal(drapes[0].depth, drapes[1].depth)
     for copy in drapes:
@@ -157,12 +141,12 @@ def test_softness_is_that_of_edges() -> None:
     edge = np.repeat(rng.uniform(1.0, 2.0, (256, 64)), 400, axis=1)  # 50 steps to a pixel
     rows = np.stack([np.roll(r, int(rng.integers(400))) for r in edge])
     pixels = rows.reshape(256, -1, 50).mean(axis=2)
-    assert pictures._edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
-    assert pictures._edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
+    assert pictured._edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
+    assert pictured._edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
 
 
 def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
-    return {s: detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}
+    return {s: pictured.detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}
 
 
 def the_only(folder: Path, name: str) -> DetailPicture:
@@ -171,7 +155,6 @@ def the_only(folder: Path, name: str) -> DetailPicture:
 
 
 def test_groups_of_files_stay_together(tmp_path: Path) -> None:
-    """Three photographs of each of 20 series, which a table names; and two known maps."""
     (tmp_path / "photo_pool").mkdir()
     rows = ["file,licence,group"]
     for i in range(60):
@@ -188,26 +171,13 @@ def test_groups_of_files_stay_together(tmp_path: Path) -> None:
     assert [p.name for p in pictures["train"] if p.kind == "radiance"] == ["bridge"]
     assert [p.name for p in pictures["test"] if p.kind == "radiance"] == ["venice"]
     # 62, 8 and 30 percent of 2,000 groups, within four standard errors.
-    drawn = [detail_split(f"group{i}") for i in range(2000)]
+    drawn = [pictured.detail_split(f"group{i}") for i in range(2000)]
     for split, share in zip(SPLITS, (0.62, 0.08, 0.30), strict=True):
         error = 4 * (share * (1 - share) / 2000) ** 0.5
         assert drawn.count(split) / 2000 == pytest.approx(share, abs=error)
 
 
-def test_a_map_has_a_median_of_one_and_no_lamp_outshines_it(tmp_path: Path) -> None:
-    cv2 = pytest.importorskip("cv2")
-    image = np.full((8, 16, 3), 4.0, np.float32)
-    image[0, 0] = 4000.0
-    (tmp_path / "hdri_pool").mkdir()
-    path = tmp_path / "hdri_pool" / "room.hdr"
-    path.write_bytes(cv2.imencode(".hdr", image)[1].tobytes())
-    light = the_only(tmp_path, "room").light
-    assert light.shape == (3, 8, 16)
-    assert light[:, 0, 0].tolist() == [64.0] * 3
-    torch.testing.assert_close(light[:, 1:], torch.ones(3, 7, 16), rtol=0.01, atol=0)
-
-
-def test_mosaics_and_linear_frames_by_hand(tmp_path: Path) -> None:
+def test_mosaics_linear_frames_and_maps_by_hand(tmp_path: Path) -> None:
     """Black 10 and white 110; the planes lie at (0, 0), (0, 1), (1, 0), (1, 1)."""
     cv2 = pytest.importorskip("cv2")
     for folder in ("gopro_raw", "intel_tau_small"):
@@ -225,10 +195,18 @@ def test_mosaics_and_linear_frames_by_hand(tmp_path: Path) -> None:
     assert (mosaic.nlf.shot, mosaic.nlf.read) == ((0.002,) * 4, (0.00003,) * 4)
     assert linear.light[:, 3, 0].tolist() == [1.0, 0.0, 0.0]
     assert linear.nlf.is_zero
+    # A map has a median of one, and no lamp outshines it.
+    image = np.full((8, 16, 3), 4.0)
+    image[0, 0] = 4000.0
+    write_hdr(tmp_path / "hdri_pool" / "room.hdr", image=image)
+    light = the_only(tmp_path, "room").light
+    assert light.shape == (3, 8, 16)
+    assert light[:, 0, 0].tolist() == [64.0] * 3
+    torch.testing.assert_close(light[:, 1:], torch.ones(3, 7, 16), rtol=0.01, atol=0)
 
 
 def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(pictures, "_SIZE", 64)
+    monkeypatch.setattr(pictured, "_SIZE", 64)
     drawn = by_split(None, drawn=8)
     assert "AE_ENV_DATA" in caplog.text
     assert_no_group_is_shared(drawn)
@@ -237,7 +215,7 @@ def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptu
         for each in own:
             assert (each.light.shape, each.light.dtype) == ((3, 64, 64), torch.float32)
             assert bool(((each.light >= 0) & each.light.isfinite()).all())
-    again, other = (detail_pictures("train", data=None, drawn=8, seed=s) for s in (0, 1))
+    again, other = (pictured.detail_pictures("train", data=None, drawn=8, seed=s) for s in (0, 1))
     for first, same, new in zip(drawn["train"], again, other, strict=True):
         assert torch.equal(first.light, same.light)
         assert not torch.equal(first.light, new.light)

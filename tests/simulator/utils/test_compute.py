@@ -117,9 +117,6 @@ def test_child_processes_make_threads_of_their_own():
     child.join(timeout=60)
 
 
-# -- tiles -----------------------------------------------------------------------------------------
-
-
 def frame(*size: int, seed: int = 0) -> Tensor:
     return torch.rand(1, 4, *size, generator=torch.Generator().manual_seed(seed))
 
@@ -132,7 +129,6 @@ def mean_of_neighbours(*images: Tensor) -> Tensor:
 
 
 def patches(height: int, width: int) -> Tensor:
-    """Two corners and a pixel in between."""
     needed = torch.zeros(height, width, dtype=torch.bool)
     needed[:9, :21] = needed[-5:, -30:] = True
     needed[height // 2, width // 3] = True
