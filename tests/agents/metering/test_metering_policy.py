@@ -59,6 +59,7 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
     policy = make_policy("average:tuned?shutter_cap=1/100", context, weights=weights)
     path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
     assert all(context.grid[s].exposure_time <= 1 / 100 for s in path)
+    make_policy("average:P", context).fit(None)  # it has nothing to learn
     with pytest.raises(ValueError, match="call fit"):
         _run(make_policy("average:tuned", context), photograph, 8.0)
     with pytest.raises(ValueError, match="nothing to save"):
