@@ -246,7 +246,7 @@ def test_frames_are_written_where_they_are_wanted() -> None:
     place = torch.full((3, 4, SIDE, SIDE), -7.0)
     frames = prepared().expose([LOW, HIGH], seed=3, out=place[1:])
     assert frames.data_ptr() == place[1:].data_ptr()
-    source = prepared(reference=LOW, gain=0.5)  # to which noise is added
+    source = prepared(reference=LOW, gain=1 / 64)  # to which noise is added
     for default in (source.capture(HIGH)[0], source.expose([HIGH])[0]):
         assert torch.equal(default, source.expose([HIGH], seed=0)[0])
         assert not torch.equal(default, source.expose([HIGH], seed=1)[0])
