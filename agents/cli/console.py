@@ -164,11 +164,14 @@ def scene_files(scenes: Any, on_error: str) -> Any:
     """The environment's `scenes` for the options `--scenes` and `--on-error`."""
     if on_error == "stop":
         return scenes
+    from ae_env.scenes.load import NAMED
     from ae_env.scenes.recorded import RecordedOptions
 
     rule = None
     if scenes is None:
         rule = "is about the files of --scenes: give that, too"
+    elif scenes in NAMED:
+        rule = f"is about the files of a folder: {scenes!r} has none that could be left out"
     elif RecordedOptions.of(scenes) is not None:
         rule = "must be 'stop' for recorded grids: take captures that cannot be read out of the "
         rule += "folder, and their states are forbidden"

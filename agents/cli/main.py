@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -165,6 +167,10 @@ def main() -> None:
             resumes = not _RESUMING.isdisjoint(sys.argv[1:])
             more = "; run the same command again to continue" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
+            # What is kept is written: a second Ctrl-C need not wait for the workers' end.
+            quit_at_once = partial(_quit, stop.code)
+            signal.signal(signal.SIGINT, quit_at_once)
+            signal.signal(signal.SIGTERM, quit_at_once)
         raise
 
 
@@ -182,6 +188,10 @@ def _first_time() -> Callable[[logging.LogRecord], bool]:
 def _terminate(*_: Any) -> None:
     """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
     raise SystemExit(_TERMINATED)
+
+
+def _quit(status: int, *_: Any) -> None:
+    os._exit(status)
 
 
 def _one_line(error: Exception) -> str:

@@ -106,7 +106,8 @@ def plot_convergence(
         _tidy(panel, labelsize=8)
     for panel in panels.flat[len(results) :]:
         panel.set_visible(False)
-    for panel in panels[-1]:
+    for panel in panels.flat[max(len(results) - columns, 0) : len(results)]:  # nothing is below
+        panel.tick_params(labelbottom=True)
         panel.set_xlabel("frame", fontsize=9)
     figure.supylabel("mean EV error [EV]", fontsize=9)
     labels, wide = [_text(policy) for policy in order], min(5, len(order))

@@ -119,6 +119,7 @@ print("loaded", *sys.modules)
         (("evaluate", *V1, "--append", "none/x.csv"), "there is no folder none"),
         (("evaluate", *V1, "--on-error", "skip"), "give that, too"),
         (("evaluate", "--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop'"),
+        (("evaluate", "--scenes", "polyhaven", "--on-error", "skip"), "files of a folder"),
         (("evaluate", *V1, "--append", "."), "must be a file, but it is a folder"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`aperture` (=8)"),
         ((*OPEN, "--depth", "small.png", "--png", "small.png"), "`png`"),
@@ -227,6 +228,16 @@ def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None
             assert re.findall(r"[\d,]+", line) == numbers
         assert str(folder) in out.replace("\n", "")
     assert [p.name for p in folder.rglob("*.safetensors")] == ["mine.safetensors"]
+
+
+def test_a_second_ctrl_c_while_workers_end_is_silent() -> None:
+    code = (
+        "import atexit, os, signal; from agents.cli import main as cli\n"
+        "def app(**_): raise SystemExit(130)\n"
+        "atexit.register(os.kill, os.getpid(), signal.SIGINT); cli.app = app; cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "\nstopped\n")
 
 
 _WARM_UP_AND_USE = """
