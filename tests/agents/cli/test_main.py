@@ -231,11 +231,9 @@ def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None
 
 
 def test_a_second_ctrl_c_while_workers_end_is_silent() -> None:
-    code = (
-        "import atexit, os, signal; from agents.cli import main as cli\n"
-        "def app(**_): raise SystemExit(130)\n"
-        "atexit.register(os.kill, os.getpid(), signal.SIGINT); cli.app = app; cli.main()"
-    )
+    code = "import atexit, os, signal, sys; from agents.cli import main as cli\n"
+    code += "cli.app = lambda **_: sys.exit(130)\n"
+    code += "atexit.register(os.kill, os.getpid(), signal.SIGINT); cli.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "\nstopped\n")
 
