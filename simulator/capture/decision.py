@@ -150,7 +150,7 @@ class Exposure:
     @property
     def left_out(self) -> float:
         """Error of the steps that are left out, in units of the target's noise."""
-        return math.hypot(*(step.error for step in self.steps if not step.runs))
+        return math.hypot(*(s.error for s in self.steps if s.estimate and not s.runs))
 
     @property
     def lens_blur(self) -> tuple[object, ...]:
