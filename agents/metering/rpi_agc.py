@@ -2,7 +2,7 @@
 
 `LibcameraAgc` works on continuous settings. It is written from libcamera's published behaviour
 ("Raspberry Pi Camera Algorithm and Tuning Guide", and its tuning of the imx477), and held to
-recordings of libcamera's own, frame by frame (``ae-env bench libcamera``). `RpiAgc` takes the
+recordings of libcamera's own, frame by frame (``tests/agents/metering``). `RpiAgc` takes the
 nearest states of a grid. The numbers of that tuning come first.
 """
 
