@@ -36,7 +36,7 @@ from simulator.radiance.maps import (
     read_radiance,
 )
 from simulator.raw.image import RawImage
-from simulator.raw.read import read_raw
+from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
@@ -66,6 +66,8 @@ class FolderOptions:
         hard: Whether they count as hard.
         median_speed: Median image speed of a moving episode [frame heights / s].
         ev100: EV100 of the radiance maps, in place of the assumed one.
+        settings: Of every raw, in place of the file's: any of ``iso``, ``exposure_time`` [s] and
+            ``f_number``, as an adapted lens or some telephones do not state them.
         on_error: What happens where a file cannot be read, or is black without `illuminance`:
             ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
             ``"skip"`` leaves it out, and a warning in the log says how many were and why; not
@@ -77,6 +79,7 @@ class FolderOptions:
     hard: bool | None = None
     median_speed: float | None = None
     ev100: float | None = None
+    settings: Mapping[str, float] | None = None
     on_error: OnError = "stop"
 
     def __post_init__(self) -> None:
@@ -91,6 +94,7 @@ class FolderOptions:
             check_number("median_speed", self.median_speed, 0.0, 1e6, more=" frame heights / s")
         if self.ev100 is not None:
             check_number("ev100", self.ev100, -20.0, 40.0)
+        check_settings(self.settings)
 
     def fields(self, path: Path) -> dict[str, Any]:
         """Keyword arguments for the scenes of `path`, a raw or a radiance map."""
@@ -291,7 +295,7 @@ def _read_file(
     """The scenes of a file; the `Shot` of a raw without a group goes into `shots`."""
     fields = options.fields(path)
     if _is_raw(path):
-        raw = read_raw(path)
+        raw = read_raw(path, settings=options.settings)
         source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
         scene = Scene.from_raw(raw, scene_id=name, group=group or name, source=source, **fields)
         scenes = [request.sized(scene)]

@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from simulator import CameraSimulator, RawImage, render_srgb
-from simulator.raw.develop import quarter_turns, srgb_from_camera
+from simulator.raw.develop import srgb_from_camera, upright
 from simulator.utils.checks import check_number
 from simulator.utils.files import write_atomically
 
@@ -122,7 +122,7 @@ def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
     rgb = np.stack([red, 0.5 * (green + green2), blue], axis=-1) * gains
     if raw.camera.colour_matrix is not None:
         rgb = rgb @ srgb_from_camera(raw.camera.colour_matrix).numpy().T
-    return np.maximum(np.rot90(rgb, quarter_turns(raw)), 0.0).astype(np.float32)
+    return np.maximum(upright(rgb, raw), 0.0).astype(np.float32)
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> Path:

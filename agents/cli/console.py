@@ -36,8 +36,8 @@ Folder = Annotated[Path, Option(help="Folder for the results.")]
 OutDng = Annotated[Path, Option("--out", "-o", help="DNG to write.")]
 Png = Annotated[Path | None, Option(help="Also write the developed picture here.")]
 SourceIso = Annotated[float | None, Option(help="ISO speed of RAW, instead of what the file says.")]
-SourceShutter = Annotated[str | None, Option(help="Exposure time of RAW [s].")]
-SourceAperture = Annotated[str | None, Option(help="F-number of RAW.")]
+SourceShutter = Annotated[str | None, Option(help="Exposure time of RAW [s], likewise.")]
+SourceAperture = Annotated[str | None, Option(help="F-number of RAW, likewise.")]
 Weights = Annotated[
     str,
     Option(

@@ -205,7 +205,7 @@ def refocus(
     import numpy as np
 
     from agents.applications import refocus as applied
-    from simulator.raw.develop import quarter_turns
+    from simulator.raw.develop import as_recorded
     from simulator.utils.checks import check_number
 
     f_number = console.parse_f_number(aperture)
@@ -226,7 +226,7 @@ def refocus(
         if pixel_pitch is not None:
             source = replace(source, camera=replace(source.camera, pixel_pitch_um=pixel_pitch))
         lens = _lens(source, metres, focus, focal_length)
-        metres = np.rot90(metres, -quarter_turns(source))  # as the sensor lies
+        metres = np.ascontiguousarray(as_recorded(metres, source))
     simulator = make_simulator(weights, device, cache)
     with console.option_names(f_number="aperture"):
         result = applied.refocus(
@@ -335,17 +335,16 @@ def make_simulator(weights: str, device: str, cache: bool, depth: str = "far") -
 
 def _read(path: Path, iso: float | None, shutter: str | None, aperture: str | None) -> RawImage:
     """The raw at `path`, with the settings that the options give instead of the file's."""
-    from simulator import CameraSettings, read_raw
+    from simulator import read_raw
 
-    if iso is None and shutter is None and aperture is None:
-        return read_raw(path)
-    if iso is None or shutter is None or aperture is None:
-        raise ValueError(
-            "give all of --source-iso, --source-shutter and --source-aperture, or none"
-        )
-    seconds = console.parse_seconds(shutter, "source-shutter")
-    f_number = console.parse_f_number(aperture, "source-aperture")
-    return read_raw(path, settings=CameraSettings(iso, seconds, f_number))
+    given: dict[str, float] = {}
+    if iso is not None:
+        given["iso"] = iso
+    if shutter is not None:
+        given["exposure_time"] = console.parse_seconds(shutter, "source-shutter")
+    if aperture is not None:
+        given["f_number"] = console.parse_f_number(aperture, "source-aperture")
+    return read_raw(path, settings=given)
 
 
 def _write(raw: RawImage, out: Path, png: Path | None) -> None:

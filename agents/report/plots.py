@@ -18,7 +18,7 @@ from agents.evaluation.result import EvaluationResult
 from agents.policy import Policy
 from agents.rollouts import errors_of
 from simulator import RawImage
-from simulator.raw.develop import quarter_turns
+from simulator.raw.develop import upright
 from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
@@ -260,8 +260,7 @@ def upright_picture(raw: RawImage, srgb: torch.Tensor) -> Image.Image:
     if aspect != 1.0:
         size = round(picture.width * max(aspect, 1)), round(picture.height / min(aspect, 1))
         picture = picture.resize(size, Image.Resampling.BICUBIC)
-    upright = np.rot90(np.asarray(picture), quarter_turns(raw))
-    return Image.fromarray(np.ascontiguousarray(upright))
+    return Image.fromarray(np.ascontiguousarray(upright(np.asarray(picture), raw)))
 
 
 #: Size of a picture, height of the chart below it and of the title above [pixel].

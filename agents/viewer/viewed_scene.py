@@ -37,7 +37,7 @@ from simulator import (
 from simulator.camera_simulator import Depth
 from simulator.capture.plan import SimulationPlan
 from simulator.radiance.maps import RADIANCE_SUFFIXES
-from simulator.raw.develop import quarter_turns, render_srgb
+from simulator.raw.develop import render_srgb, upright
 from simulator.utils.checks import did_you_mean
 from simulator.utils.files import RAW_SUFFIXES
 
@@ -228,7 +228,6 @@ class ViewedScene:
         scorer: str = "balanced",
     ) -> None:
         self.scene, self.photograph = opened.scene, opened.raw
-        self.turns = 0 if opened.raw is None else quarter_turns(opened.raw)
         self._simulator, self._depth, self._tolerance = simulator, depth, tolerance
         self._scorer = make_scorer(scorer)
         self._prepared: dict[tuple[int, int] | None, PreparedScene] = {}
@@ -339,8 +338,10 @@ class ViewedScene:
 
     def _window(self, centre: tuple[float, float]) -> tuple[slice, slice]:
         down, right = centre
-        for _ in range(self.turns % 4):  # from the upright picture to the frame
-            down, right = right, 1.0 - down
+        flip = 0 if self.photograph is None else self.photograph.metadata.get("flip", 0)
+        if flip & 4:  # from the upright picture to the frame, as `as_recorded`
+            down, right = right, down
+        down, right = 1.0 - down if flip & 2 else down, 1.0 - right if flip & 1 else right
 
         def part(share: float, side: int, size: int) -> slice:
             start = round(min(max(share * side - size / 2, 0), max(side - size, 0)))
@@ -364,7 +365,8 @@ class ViewedScene:
         return self._upright(image)
 
     def _upright(self, image: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.rot90(image, self.turns))
+        seen = image if self.photograph is None else upright(image, self.photograph)
+        return np.ascontiguousarray(seen)
 
 
 def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:

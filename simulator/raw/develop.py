@@ -144,12 +144,22 @@ def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
     return light.to(pictures.device)[pictures.long()][:, [0, 1, 1, 2]]
 
 
-def quarter_turns(raw: RawImage) -> int:
-    """Quarter turns to the left that turn a picture of `raw` upright, as `numpy.rot90` takes them.
+def upright(picture: np.ndarray, raw: RawImage) -> np.ndarray:
+    """A picture (H, W, ...) of `raw` as it was seen, turned or mirrored.
 
-    Files state how the camera was held in LibRaw's code, ``metadata["flip"]``.
+    Files state how the camera was held in LibRaw's code, ``metadata["flip"]``: 1 mirrors the
+    columns, 2 the rows, and 4 then exchanges both.
     """
-    return {3: 2, 5: 1, 6: -1}.get(raw.metadata.get("flip", 0), 0)
+    flip = raw.metadata.get("flip", 0)
+    seen = picture[:: -1 if flip & 2 else 1, :: -1 if flip & 1 else 1]
+    return seen.swapaxes(0, 1) if flip & 4 else seen
+
+
+def as_recorded(picture: np.ndarray, raw: RawImage) -> np.ndarray:
+    """An upright picture (H, W, ...) as the sensor of `raw` lies; inverts `upright`."""
+    flip = raw.metadata.get("flip", 0)
+    lying = picture.swapaxes(0, 1) if flip & 4 else picture
+    return lying[:: -1 if flip & 2 else 1, :: -1 if flip & 1 else 1]
 
 
 def _decoded(encoded: torch.Tensor) -> torch.Tensor:

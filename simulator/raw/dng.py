@@ -33,7 +33,9 @@ COMMENT_PREFIX = b"ASCII\0\0\0"
 #: EXIF's code for daylight of 6500 K.
 D65 = 21
 #: EXIF orientation for LibRaw's flip codes.
-ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}
+ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
+#: What a developer is to do with the pixels of a DNG, gain maps of the lens among it; passed on.
+OPCODES = ("OpcodeList1", "OpcodeList2", "OpcodeList3")
 #: Colour matrix of a raw whose camera has none: its R, G, B are taken as linear sRGB primaries
 #: (XYZ to sRGB, D65, IEC 61966-2-1).
 DEFAULT_COLOUR_MATRIX = (
@@ -75,7 +77,9 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
     The file carries the exposure in EXIF, the noise level function in NoiseProfile (greens
     averaged: the tag has one pair per colour), the white balance in AsShotNeutral and the camera's
     colour matrix; a camera without one is taken to see linear sRGB primaries
-    (`DEFAULT_COLOUR_MATRIX`). Values are clipped to the camera's 0 .. white level and rounded.
+    (`DEFAULT_COLOUR_MATRIX`). Of another DNG, its opcode lists (gain maps) go along while the frame
+    has its size, and its BaselineExposure. Values are clipped to the camera's 0 .. white level and
+    rounded.
 
     Args:
         path: Where to, ending in ``.dng``. The folder is made; an existing file is replaced once
@@ -137,11 +141,19 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
         "ColorMatrix1": (DATATYPE.SRATIONAL, [v for row in matrix for v in row]),
         "CalibrationIlluminant1": (DATATYPE.SHORT, [D65]),
         "AsShotNeutral": (DATATYPE.RATIONAL, neutral),
-        "BaselineExposure": (DATATYPE.SRATIONAL, [0.0]),
+        "BaselineExposure": (DATATYPE.SRATIONAL, [raw.metadata.get("baseline_exposure", 0.0)]),
         **_black_tags(raw),
         **({} if aspect == 1.0 else {"DefaultScale": (DATATYPE.RATIONAL, [aspect, 1])}),
         **_noise_tags(raw),
+        **_opcode_tags(raw),
     }
+
+
+def _opcode_tags(raw: RawImage) -> dict[str, Tag]:
+    """Opcode lists of the source; their positions are those of a frame of its size."""
+    size, lists = raw.metadata.get("opcodes", ((), {}))
+    fits = tuple(size) == tuple(raw.data.shape[1:]) and raw.box_factor == 1
+    return {name: (DATATYPE.UNDEFINED, lists[name]) for name in OPCODES if fits and name in lists}
 
 
 def _black_tags(raw: RawImage) -> dict[str, Tag]:

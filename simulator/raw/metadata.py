@@ -23,12 +23,25 @@ import tifffile
 
 from simulator.camera import BayerPattern
 from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction
-from simulator.raw.dng import COMMENT_PREFIX, D65, SOFTWARE_NAME, OwnRecord
+from simulator.raw.dng import COMMENT_PREFIX, D65, OPCODES, SOFTWARE_NAME, OwnRecord
 from simulator.settings import CameraSettings
 
-#: The tags of one TIFF directory: a tuple of values by name. Rationals are floats, ASCII is one
+#: The tags of one TIFF directory: a tuple of values by name. Rationals are `Ratio`, ASCII is one
 #: ``str``, UNDEFINED one ``bytes``.
 Directory = dict[str, tuple[Any, ...]]
+
+
+class Ratio(float):
+    """A rational of a file, which keeps the denominator that it was written with."""
+
+    denominator: int
+
+    def __new__(cls, numerator: int, denominator: int) -> Ratio:
+        """NaN over a denominator of 0."""
+        ratio = super().__new__(cls, numerator / denominator if denominator else math.nan)
+        ratio.denominator = denominator
+        return ratio
+
 
 # -- TIFF directories -----------------------------------------------------------------------------
 
@@ -43,7 +56,7 @@ _NAMES = (
     *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
     *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
-    "DefaultScale",
+    *("PhotographicSensitivity", "DefaultScale", "BaselineExposure", *OPCODES),
 )
 _NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
@@ -52,6 +65,7 @@ _WANTED = {*_NAME_OF_CODE, _SUB_DIRECTORIES, _EXIF}
 _MAGIC = (42, 0x4F52, 0x5352, 0x55)
 #: Beyond these a file is damaged, or made to take forever; camera files stay far below.
 _MAX_DIRECTORIES, _MAX_TAGS, _MAX_VALUES = 64, 4096, 2**18
+_NO_POSITION = 2**32 - 1
 
 
 def read_directories(stream: BinaryIO) -> list[Directory]:
@@ -131,7 +145,7 @@ def _values(tag: tifffile.TiffTag) -> tuple[Any, ...]:
     values = tuple(np.ravel(value).tolist())
     if kind in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
         pairs = zip(values[::2], values[1::2], strict=True)
-        return tuple(a / b if b else math.nan for a, b in pairs)
+        return tuple(Ratio(*pair) for pair in pairs)
     return values
 
 
@@ -152,12 +166,16 @@ def first_numbers(directories: Sequence[Directory], name: str) -> tuple[float, .
 
 
 def missing_bytes(directories: Sequence[Directory], size: int) -> int:
-    """How many bytes of pixels lie beyond the end of a file of `size` bytes; 0 if it is whole."""
+    """How many bytes of pixels lie beyond the end of a file of `size` bytes; 0 if it is whole.
+
+    An offset of 2^32 - 1 and a count of 0 are no position: Panasonic's RW2 have their own tag.
+    """
     end = size
     for tags in directories:
         for offsets, counts in (_POSITIONS[:2], _POSITIONS[2:]):
             pairs = zip(numbers(tags, offsets), numbers(tags, counts), strict=False)
-            end = max([end, *(int(a + b) for a, b in pairs)])
+            ends = (int(a + b) for a, b in pairs if b and a != _NO_POSITION)
+            end = max([end, *ends])
     return end - size
 
 
@@ -332,27 +350,47 @@ def read_noise_profile(directories: Sequence[Directory]) -> NoiseLevelFunction |
 
 
 def read_black_level(
-    directories: Sequence[Directory], cfa: BayerPattern, origin: tuple[int, int]
-) -> tuple[float, float, float, float] | None:
-    """Black level per plane R, G1, G2, B with its fraction; None for other forms of the tag.
+    tags: Directory, cfa: BayerPattern, origin: tuple[int, int], shape: tuple[int, int]
+) -> tuple[tuple[float, float, float, float], np.ndarray | None] | None:
+    """Black level per plane R, G1, G2, B with its fraction, and (H, W) what pixels differ from it.
 
-    `cfa` is the order at `origin`, the row and column of the file's array where the mosaic begins.
-    The tag's tile begins at the corner of the ActiveArea (DNG specification 1.4).
+    The pixels' own differences are None where there are none. The level of a pixel is that of the
+    tile, which begins at the corner of the ActiveArea, plus BlackLevelDeltaV of its row, plus
+    BlackLevelDeltaH of its column (DNG specification 1.4). Four values without a
+    BlackLevelRepeatDim are a tile of 2 x 2: several writers of DNGs leave it out.
+
+    Args:
+        tags: Of the directory that describes the mosaic.
+        cfa: The order at `origin`.
+        origin: Row and column of the file's array where the mosaic begins.
+        shape: Height and width of the mosaic.
+
+    Returns:
+        None where the file does not say, or says what cannot be.
     """
-    tags = next((tags for tags in directories if "BlackLevel" in tags), None)
-    if tags is None or "BlackLevelDeltaH" in tags or "BlackLevelDeltaV" in tags:
-        return None
-    repeat, values = tags.get("BlackLevelRepeatDim", (1, 1)), numbers(tags, "BlackLevel")
-    if any(v < 0 for v in values):
-        return None
-    if tuple(repeat) == (1, 1) and len(values) == 1:
-        values = tuple(values) * 4
-    elif tuple(repeat) != (2, 2) or len(values) != 4:
-        return None
+    values = numbers(tags, "BlackLevel")
+    rows, columns = tags.get("BlackLevelRepeatDim", (2, 2) if len(values) == 4 else (1, 1))[:2]
     corner = numbers(tags, "ActiveArea")[:2] or (0, 0)
-    if len(corner) != 2:
+    if len(values) != rows * columns or not values or min(values) < 0 or len(corner) != 2:
         return None
     down, right = (a - int(b) for a, b in zip(origin, corner, strict=True))
-    return tuple(  # type: ignore[return-value]
-        float(values[2 * ((row + down) % 2) + (column + right) % 2]) for row, column in cfa.offsets
-    )
+    height, width = shape
+    level = np.reshape(values, (rows, columns))
+    level = level[(np.arange(height) + down) % rows][:, (np.arange(width) + right) % columns]
+    for name, begin, count, axis in (
+        ("BlackLevelDeltaV", down, height, (slice(None), None)),
+        ("BlackLevelDeltaH", right, width, (None, slice(None))),
+    ):
+        if name in tags:
+            deltas = np.array(numbers(tags, name))[max(begin, 0) : begin + count]
+            if len(deltas) != count:
+                return None
+            level = level + deltas[axis]
+    planes = [level[row::2, column::2] for row, column in cfa.offsets]
+    means = [float(plane.mean()) for plane in planes]
+    if all(np.ptp(plane) == 0.0 for plane in planes):
+        return tuple(means), None  # type: ignore[return-value]
+    own = np.empty(shape, np.float32)
+    for (row, column), plane, mean in zip(cfa.offsets, planes, means, strict=True):
+        own[row::2, column::2] = plane - mean
+    return tuple(means), own  # type: ignore[return-value]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -16,7 +17,7 @@ import rawpy
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.raw.dng import ORIENTATIONS, OwnRecord
+from simulator.raw.dng import OPCODES, ORIENTATIONS, OwnRecord
 from simulator.raw.image import RawImage, pack_mosaic
 from simulator.raw.metadata import (
     LONG_ISO,
@@ -36,7 +37,7 @@ from simulator.raw.metadata import (
 )
 from simulator.raw.noise_estimation import estimate_nlf
 from simulator.settings import CameraSettings, snap_exposure_time
-from simulator.utils.checks import check_type
+from simulator.utils.checks import check_type, check_word
 from simulator.utils.files import as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
@@ -49,6 +50,17 @@ COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
 _COMPRESSIONS, _VC5 = (1, 7, 8), 9
 _LETTERS = {0: "R", 1: "G", 2: "B"}
 _SETTINGS = ("iso", "exposure_time", "f_number")
+_TAGS = {"iso": "PhotographicSensitivity", "exposure_time": "ExposureTime", "f_number": "FNumber"}
+#: Makers whose cameras record the stop that is marked, 1/60 s for 1/64 s, by the first word of
+#: their name; others (phones, computers, industrial cameras) record the time itself, and so does
+#: whoever gives it with this denominator or a larger one (Android: nanoseconds).
+_STOP_MARKING = {
+    *("asahi", "canon", "casio", "contax", "eastman", "epson", "fuji", "fujifilm", "hasselblad"),
+    *("kodak", "konica", "leaf", "leica", "mamiya", "minolta", "nikon", "olympus", "om"),
+    *("panasonic", "pentax", "phase", "ricoh", "samsung", "seiko", "sigma", "sony"),
+}
+_MEASURED = 10**6
+_LARGEST_BASELINE = 32.0  # [EV]; beyond it a file is damaged
 _DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
 #: What LibRaw raises; NotImplementedError is a RuntimeError.
 _LIBRAW_ERRORS = (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError)
@@ -72,7 +84,7 @@ def _errors_name(path: Path) -> Iterator[None]:
 def read_raw(
     path: str | os.PathLike[str],
     *,
-    settings: CameraSettings | None = None,
+    settings: CameraSettings | Mapping[str, float] | None = None,
     camera: CameraProfile | str | None = None,
     nlf: NoiseLevelFunction | None = None,
 ) -> RawImage:
@@ -86,9 +98,11 @@ def read_raw(
 
     Args:
         path: The file.
-        settings: Exposure settings to use in place of the file's, taken as they are. Without it
-            they come from the file's metadata, the shutter speed as the exact stop that the
-            recorded one stands for (1/60 is 1/64); a DNG of `write_dng` says exact values.
+        settings: Exposure settings to use in place of the file's, taken as they are: all of them,
+            or some by name (``{"f_number": 2.8}`` for an adapted lens). Others come from the file's
+            metadata, the shutter speed as the exact stop that the recorded one stands for (1/60 is
+            1/64) if the maker's cameras mark stops; a DNG of `write_dng`, a phone, a computer or an
+            industrial camera says exact values.
         camera: A `CameraProfile`, taken as it is (its CFA order must be the file's), or the name of
             a built-in camera, whose noise calibration is used with the file's own CFA order and
             levels. By default a built-in camera of the file's make and model is used in that way,
@@ -99,10 +113,11 @@ def read_raw(
 
     Returns:
         The raw, with ``metadata`` keys ``path`` (file name), ``make``, ``model``, ``flip``
-        (LibRaw's code of how to turn it upright: 0, 3, 5 or 6), ``nlf_source``,
-        ``white_balance_source`` and, where known, ``datetime`` (ISO 8601), ``focal_length`` [mm]
-        and, of pixels that are not square, ``pixel_aspect`` (width / height): the data have the
-        sensor's pixels.
+        (LibRaw's code of how to turn it upright, see `simulator.raw.develop.upright`),
+        ``nlf_source``, ``white_balance_source`` and, where known, ``datetime`` (ISO 8601),
+        ``focal_length`` [mm]; of a DNG ``baseline_exposure`` and ``opcodes`` (packed height and
+        width, and the lists by name), which `write_dng` passes on; and, of pixels that are not
+        square, ``pixel_aspect`` (width / height): the data have the sensor's pixels.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -113,12 +128,20 @@ def read_raw(
         ValueError: If settings are missing from the file and not given, or `camera` does not fit.
     """
     path = as_path(path)
+    check_settings(settings)
     if not path.is_file():
         missing = "is no ordinary file" if path.exists() else "does not exist"
         what = "is a folder" if path.is_dir() else missing
         raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
     with _errors_name(path):
         return _read(path, settings, camera, nlf)
+
+
+def check_settings(settings: object) -> None:
+    """A `ValueError` unless these are `CameraSettings`, some of them by name, or None."""
+    check_type("settings", settings, CameraSettings, Mapping, None)
+    for name in settings if isinstance(settings, Mapping) else ():
+        check_word("settings", name, _SETTINGS)
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
@@ -130,24 +153,20 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
     with _errors_name(path):
         with path.open("rb") as stream:
             directories = read_directories(stream)
+            make, _ = camera_identity(stream, directories)
         own = read_own_record(directories)
         if own is not None:
             return {name: getattr(own.settings, name) for name in _SETTINGS}
         try:
             with rawpy.imread(str(path)) as raw:
-                stated = _exposure(raw, directories)
+                return _exposure(raw, directories, make)
         except _LIBRAW_ERRORS as error:
             raise _unreadable(error, directories) from None
-    values = dict(zip(_SETTINGS, map(float, stated), strict=True))
-    known = {name: value for name, value in values.items() if np.isfinite(value) and value > 0}
-    if "exposure_time" in known:
-        known["exposure_time"] = snap_exposure_time(known["exposure_time"])
-    return known
 
 
 def _read(
     path: Path,
-    settings: CameraSettings | None,
+    settings: CameraSettings | Mapping[str, float] | None,
     camera: CameraProfile | str | None,
     nlf: NoiseLevelFunction | None,
 ) -> RawImage:
@@ -161,8 +180,11 @@ def _read(
     with ExitStack() as opened:
         decoded = None if own is None else _decode_own_dng(path, directories, own)
         if decoded is None:
-            decoded = _decode_with_libraw(path, directories, opened)
-        known = settings or _settings(path, decoded.exposure, own)
+            decoded = _decode_with_libraw(path, directories, make, opened)
+        stated = decoded.exposure
+        if own is not None:
+            stated = {name: getattr(own.settings, name) for name in _SETTINGS}
+        known = _settings(path, stated, settings)
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
     if float(packed.max()) > _WHITE_TOLERANCE:
@@ -189,8 +211,19 @@ def _read(
             "nlf_source": source,
             "white_balance_source": decoded.white_balance_source,
             **decoded.extra,
+            **_passed_on(directories, packed.shape[1:]),
         },
     )
+
+
+def _passed_on(directories: Sequence[Directory], size: Sequence[int]) -> dict[str, Any]:
+    """Metadata of a DNG for other developers, which `write_dng` passes on."""
+    tags, baseline = _mosaic_directory(directories), first_numbers(directories, "BaselineExposure")
+    lists = {name: tags[name][0] for name in OPCODES if isinstance(tags.get(name, (0,))[0], bytes)}
+    found: dict[str, Any] = {"opcodes": (tuple(size), lists)} if lists else {}
+    if baseline and 0.0 < abs(baseline[0]) < _LARGEST_BASELINE:
+        found["baseline_exposure"] = float(baseline[0])
+    return found
 
 
 def _check_structure(directories: Sequence[Directory], known_kind: bool, size: int) -> None:
@@ -216,24 +249,27 @@ def _check_structure(directories: Sequence[Directory], known_kind: bool, size: i
             raise RawFileError(f"must hold an image, but names {found}: it is damaged")
 
 
-def _settings(path: Path, exposure: Sequence[float], own: OwnRecord | None) -> CameraSettings:
-    """Settings from the file: exact from our own DNGs, else as a camera records them."""
-    if own is not None:
-        return own.settings
-    values = dict(zip(_SETTINGS, map(float, exposure), strict=True))
-    missing = [k for k, v in values.items() if not (np.isfinite(v) and v > 0)]
+def _settings(
+    path: Path, stated: Mapping[str, float], given: CameraSettings | Mapping[str, float] | None
+) -> CameraSettings:
+    """The settings that are given, the others as the file states them."""
+    if isinstance(given, CameraSettings):
+        return given
+    given = given or {}
+    values: Any = {**stated, **given}
+    missing = [name for name in _SETTINGS if name not in values]
     if missing:
         raise ValueError(
-            f"`settings` (=None) must be given: {path.name!r} does not say its "
-            f"{', '.join(missing)}; pass settings=CameraSettings(iso, exposure_time, f_number), or "
-            "--source-iso, --source-shutter and --source-aperture to `ae-env simulate` and `sweep`"
+            f"`settings` must be given: {path.name!r} does not say its {', '.join(missing)}; pass "
+            f"settings={dict.fromkeys(missing, '...')}, a folder's 'settings', or --source-iso, "
+            "--source-shutter, --source-aperture on the command line"
         )
-    # LibRaw hands on float32; 7 digits are what it holds.
-    rounded = {k: float(f"{v:.7g}") for k, v in values.items()}
     try:
-        return CameraSettings.from_exif(**rounded)
+        return CameraSettings(**values)
     except ValueError as error:
-        raise ValueError(f"`settings` (=None) must be given: {path.name!r} says {error}") from error
+        if set(given) == set(_SETTINGS):
+            raise
+        raise ValueError(f"`settings` must be given: {path.name!r} says {error}") from error
 
 
 def _profile(
@@ -333,7 +369,7 @@ class _Decoded:
     white_balance_source: str
     colour_matrix: tuple[tuple[float, float, float], ...] | None
     colour_matrix_source: str
-    exposure: tuple[float, float, float]  # ISO, seconds, f-number; 0 where the file does not say
+    exposure: dict[str, float]  # the settings that the file's tags state
     extra: dict[str, Any]
 
 
@@ -345,7 +381,7 @@ def _decode_own_dng(
     LibRaw refuses DNGs of less than about 22 pixels a side, and takes a frame of 32 x 32 that says
     Nikon Z 6 for another format.
     """
-    mosaic = _plain_mosaic(path, directories)
+    mosaic, tags = _plain_mosaic(path, directories), _mosaic_directory(directories)
     if mosaic is None:
         return None
     tile = first_numbers(directories, "CFAPattern")
@@ -353,9 +389,10 @@ def _decode_own_dng(
     if letters not in {p.value for p in BayerPattern}:
         rule = "must have a Bayer tile of 0 (R), 1 (G), 2 (B)"
         raise RawFileError(f"{rule}, but its CFAPattern is {tile}: damaged")
-    black = read_black_level(directories, BayerPattern(letters), (0, 0))
-    if black is None:
+    found = read_black_level(tags, BayerPattern(letters), (0, 0), mosaic.shape)
+    if found is None or found[1] is not None:
         return None
+    black = found[0]
     white = next(iter(first_numbers(directories, "WhiteLevel")), 0.0)
     neutral = first_numbers(directories, "AsShotNeutral")
     known = len(neutral) == 3 and min(neutral) > 0
@@ -378,7 +415,7 @@ def _decode_own_dng(
         white_balance_source="camera" if known else "none",
         colour_matrix=read_colour_matrix(directories),
         colour_matrix_source=_DNG_MATRIX,
-        exposure=(own.settings.iso, own.settings.exposure_time, own.settings.f_number),
+        exposure={},
         extra=_extra(flips.get(int(orientation), 0), moment, focal_length, aspect),
     )
 
@@ -404,7 +441,7 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
 
 
 def _decode_with_libraw(
-    path: Path, directories: Sequence[Directory], opened: ExitStack
+    path: Path, directories: Sequence[Directory], make: str, opened: ExitStack
 ) -> _Decoded:
     """A file as LibRaw reads it; `opened` closes its memory, in which the mosaic lies."""
     try:
@@ -413,12 +450,14 @@ def _decode_with_libraw(
         bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, path.stat().st_size)
         if bomb:
             raise RawFileError(bomb)
-        return _from_libraw(path, raw, directories)
+        return _from_libraw(path, raw, directories, make)
     except _LIBRAW_ERRORS as error:
         raise _unreadable(error, directories) from None
 
 
-def _from_libraw(path: Path, raw: rawpy.RawPy, directories: Sequence[Directory]) -> _Decoded:
+def _from_libraw(
+    path: Path, raw: rawpy.RawPy, directories: Sequence[Directory], make: str
+) -> _Decoded:
     sizes = raw.sizes
     if raw.raw_type != rawpy.RawType.Flat:
         raise RawFileError(
@@ -428,27 +467,31 @@ def _from_libraw(path: Path, raw: rawpy.RawPy, directories: Sequence[Directory])
     cfa = BayerPattern("".join(raw.color_desc.decode()[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
     black = [float(raw.black_level_per_channel[i]) for i in order]
-    exact = read_black_level(directories, cfa, (sizes.top_margin, sizes.left_margin))
-    if exact is not None and np.abs(np.sort(exact) - np.sort(black)).max() < 1.0:
-        # LibRaw drops the fraction, and the phase where it moves an odd margin to an even one.
-        black = list(exact)
-    white_balance, source = _white_balance(raw)
-    matrix, matrix_source = _colour_matrix(raw, directories)
-    mosaic = raw.raw_image_visible
+    mosaic, white = raw.raw_image_visible, float(raw.white_level)
     if min(mosaic.shape) < 2:
         raise RawFileError("must hold an image, but is empty")
+    # LibRaw drops the fraction, all but the mean of a pixel's own level, and the phase where it
+    # moves an odd margin to an even one.
+    margins = sizes.top_margin, sizes.left_margin
+    stated = read_black_level(_mosaic_directory(directories), cfa, margins, mosaic.shape)
+    if stated is not None:
+        black, own = list(stated[0]), stated[1]
+        if own is not None:  # what is white stays white
+            mosaic = np.where(mosaic < white, mosaic - own, mosaic)
+    white_balance, source = _white_balance(raw)
+    matrix, matrix_source = _colour_matrix(raw, directories)
     moment = raw.other.timestamp
     known = moment is not None and moment.timestamp() > 0
     return _Decoded(
         mosaic=mosaic,
         cfa=cfa,
         black_level=tuple(black),  # type: ignore[arg-type]
-        white_level=_white_level(path, float(raw.white_level), black, directories, mosaic),
+        white_level=_white_level(path, white, black, directories, mosaic),
         white_balance=white_balance,
         white_balance_source=source,
         colour_matrix=matrix,
         colour_matrix_source=matrix_source,
-        exposure=_exposure(raw, directories),
+        exposure=_exposure(raw, directories, make),
         extra=_extra(
             int(sizes.flip),
             moment.replace(tzinfo=None) if known else None,
@@ -506,12 +549,29 @@ def _colour_matrix(
     return rows, f"XYZ to camera RGB, as LibRaw {version} has it"  # type: ignore[return-value]
 
 
-def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory]) -> tuple[float, float, float]:
-    iso = raw.other.iso_speed
-    if iso == 65535:  # it does not fit EXIF's 16 bits
-        stated = (first_numbers(directories, name) for name in LONG_ISO)
-        iso = next((float(v[0]) for v in stated if v and v[0] > 0), iso)
-    return iso, raw.other.shutter_speed, raw.other.aperture
+def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> dict[str, float]:
+    """Settings that a file states, the shutter speed as the exact stop where a stop is recorded."""
+    other = raw.other
+    found = {
+        "iso": other.iso_speed,
+        "exposure_time": other.shutter_speed,
+        "f_number": other.aperture,
+    }
+    found = {name: float(f"{value:.7g}") for name, value in found.items()}  # it has float32
+    for setting, name in _TAGS.items():  # phones write no EXIF directory, where LibRaw looks
+        for stated in first_numbers(directories, name)[:1]:
+            if not found[setting] or math.isclose(found[setting], stated, rel_tol=1e-6):
+                found[setting] = float(stated)
+    if found["iso"] == 65535:  # it does not fit EXIF's 16 bits
+        more = (first_numbers(directories, name) for name in LONG_ISO)
+        found["iso"] = next((v[0] for v in more if v and v[0] > 0), found["iso"])
+    known = {k: float(v) for k, v in found.items() if math.isfinite(v) and v > 0}
+    marks_stops = bool(_STOP_MARKING.intersection(make.lower().split()[:1]))
+    for recorded in first_numbers(directories, "ExposureTime"):
+        marks_stops &= getattr(recorded, "denominator", 1) < _MEASURED
+    if marks_stops and "exposure_time" in known:
+        known["exposure_time"] = snap_exposure_time(known["exposure_time"])
+    return known
 
 
 def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileError:

@@ -40,7 +40,7 @@ def test_a_raw_at_other_settings(ae_env, raw: RawImage, dng: Path, tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("flip", "orientation"),
-    [(3, 3), (5, 8), (6, 6)],  # LibRaw's code and that of EXIF
+    [(1, 2), (2, 4), (3, 3), (4, 5), (5, 8), (6, 6), (7, 7)],  # LibRaw's code and that of EXIF
 )
 def test_a_picture_is_turned_as_exif_says_and_its_pixels_are_square(flip, orientation) -> None:
     metadata = {"flip": flip, "pixel_aspect": 2.0}

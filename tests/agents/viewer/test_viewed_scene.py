@@ -31,7 +31,7 @@ def image(picture):
     return np.asarray(Image.open(io.BytesIO(picture.jpeg))).astype(float)
 
 
-@pytest.mark.parametrize("flip", [0, 3, 5, 6])  # LibRaw's codes
+@pytest.mark.parametrize("flip", range(8))  # LibRaw's codes
 def test_the_window_lies_where_the_upright_picture_was_clicked(flip):
     light = torch.full((4, 700, 900), 0.02)
     light[:, 120:124, 700:704] = 0.9  # a spot

@@ -10,8 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rawpy
 import tifffile
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from skimage.io import imsave
 
 from simulator import CameraSettings, NoiseLevelFunction, RawFileError, RawImage, read_raw
@@ -19,6 +22,7 @@ from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.raw import read as read_module
 from simulator.raw.dng import write_dng
 from simulator.raw.metadata import camera_identity, is_raw_container, read_directories
+from simulator.raw.read import read_settings
 
 SETTINGS = CameraSettings(iso=100, exposure_time=1 / 60, f_number=4.0)
 NLF = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
@@ -101,6 +105,88 @@ def test_cfa_orders_black_levels_and_margins(tmp_path, order, corner):
     expected = [values[tile == i].reshape(len(rows) // 2, -1) for i in planes]
     np.testing.assert_allclose(raw.data, expected, atol=1e-7)
     assert raw.camera.black_level == tuple(BLACK[i] for i in planes)
+
+
+@given(
+    rows=st.integers(1, 5),
+    columns=st.integers(1, 5),
+    by_row=st.sampled_from([0.0, 3.0]),
+    by_column=st.sampled_from([0.0, -0.5]),
+    seed=st.integers(0, 99),
+)
+def test_black_levels_of_every_form(tmp_path, rows, columns, by_row, by_column, seed):
+    """Tile, rows and columns add up, at every pixel (DNG specification 1.4)."""
+    tile = np.random.default_rng(seed).integers(60, 120, (rows, columns))
+    tags = {"BlackLevelRepeatDim": ("H", (rows, columns)), "ActiveArea": ("I", (0, 0, 64, 96))}
+    if by_row:
+        tags["BlackLevelDeltaV"] = ("2i", fractions(by_row * np.arange(64)))
+    if by_column:
+        tags["BlackLevelDeltaH"] = ("2i", fractions(by_column * np.arange(96)))
+    path = write_sample_dng(tmp_path / "a.dng", black=tuple(tile.ravel().tolist()), **tags)
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    r, c = np.mgrid[:64, :96]
+    level = tile[r % rows, c % columns] + by_row * r + by_column * c
+    for plane, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        own, stored = level[row::2, column::2], MOSAIC[row::2, column::2]
+        assert raw.camera.black_level[plane] == pytest.approx(own.mean())
+        expected = (stored - own) / (4095 - own.mean())
+        np.testing.assert_allclose(raw.data[plane], expected, atol=1e-6)
+
+
+def test_black_levels_without_a_size_are_of_a_bayer_tile(tmp_path):
+    tags = {"BlackLevelRepeatDim": ("H", (1, 1))}  # hdr-plus leaves it out; LibRaw then says 0
+    content = write_sample_dng(tmp_path / "a.dng", black=BLACK, **tags).read_bytes()
+    entry = struct.pack("<HHI", CODE["BlackLevelRepeatDim"], 3, 2)
+    assert content.count(entry) == 1
+    (tmp_path / "a.dng").write_bytes(content.replace(entry, struct.pack("<HHI", 50703, 3, 2)))
+    assert read_raw(tmp_path / "a.dng", settings=SETTINGS, nlf=NLF).camera.black_level == BLACK
+
+
+@pytest.mark.parametrize(
+    ("make", "time", "seconds"),
+    [
+        *(("Canon", (1, 60), 1 / 64), ("NIKON CORPORATION", (10, 600), 1 / 64)),
+        *(("Google", (1, 60), 1 / 60), ("RaspberryPi", (1, 60), 1 / 60)),
+        ("samsung", (16666667, 10**9), 0.016666667),
+    ],
+)
+def test_settings_where_phones_write_them(tmp_path, make, time, seconds):
+    """In the first directory; only cameras that mark stops round them."""
+    tags = {"Make": ("s", make), "ExposureTime": ("2I", time)}
+    tags |= {"FNumber": ("2I", (18, 10)), "PhotographicSensitivity": ("H", (50,))}
+    path = write_sample_dng(tmp_path / "a.dng", **tags)
+    raw = read_raw(path, nlf=NLF)
+    wanted = {"iso": 50.0, "exposure_time": pytest.approx(seconds), "f_number": 1.8}
+    assert vars(raw.settings).items() >= wanted.items()
+    assert read_settings(path) == wanted
+    del tags["PhotographicSensitivity"]
+    path = write_sample_dng(tmp_path / "a.dng", **tags)
+    with pytest.raises(ValueError, match=r"`settings` .* iso;"):
+        read_raw(path, nlf=NLF)
+    raw = read_raw(path, nlf=NLF, settings={"iso": 64, "f_number": 2.8})
+    assert raw.settings == CameraSettings(64, seconds, 2.8)
+    with pytest.raises(ValueError, match="`settings`"):
+        read_raw(path, nlf=NLF, settings={"speed": 64})
+
+
+def test_gain_maps_and_baseline_go_along(tmp_path):
+    maps = {f"OpcodeList{i}": ("B", tuple(range(i, i + 40))) for i in (1, 2, 3)}
+    path = write_sample_dng(tmp_path / "a.dng", BaselineExposure=("2i", (3, 2)), **maps)
+    content = path.read_bytes()
+    for name in maps:  # of type UNDEFINED, which tifffile does not write
+        old, new = (struct.pack("<HHI", CODE[name], kind, 40) for kind in (1, 7))
+        content = content.replace(old, new)
+    path.write_bytes(content)
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    write_dng(tmp_path / "b.dng", raw)
+    write_dng(tmp_path / "c.dng", replace(raw, data=raw.data[:, 4:, 4:].contiguous()))
+    with tifffile.TiffFile(tmp_path / "b.dng") as file:
+        tags = file.pages[0].tags
+        assert tags["BaselineExposure"].value == (3, 2)
+        for name, (_, values) in maps.items():
+            assert bytes(tags[name].value) == bytes(values)
+    with tifffile.TiffFile(tmp_path / "c.dng") as file:  # positions would be wrong
+        assert not set(maps) & {tag.name for tag in file.pages[0].tags}
 
 
 def test_levels_colour_and_metadata(tmp_path):
@@ -363,6 +449,27 @@ def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
     head = struct.pack("<2sHIH", b"II", 42, 8, len(entries))
     body = b"".join(struct.pack("<HHII", *entry) for entry in entries)
     return head + body + struct.pack("<I", following)
+
+
+def test_a_panasonic_whose_strip_has_no_position(tmp_path):
+    """As the cameras write RW2 and RWL: the pixels' position is in a tag of their own, 0x118."""
+    width, height, data_at = 280, 120, 1024
+    short = {2: width, 3: height, 4: 0, 5: 0, 6: height, 7: width, 9: 1, 0x17: 200, 0x112: 1}
+    short |= {0x1C: 0, 0x1D: 0, 0x1E: 0, 0x24: 500, 0x25: 263, 0x26: 400}
+    long = {0x111: 2**32 - 1, 0x116: height, 0x117: 0, 0x118: data_at}
+    texts = {0x10F: b"Panasonic\0", 0x110: b"DMC-GF1\0"}
+    entries = [(1, 7, 4, int.from_bytes(b"0310", "little"))]
+    entries += [(code, 3, 1, value) for code, value in short.items()]
+    entries += [(code, 4, 1, value) for code, value in long.items()]
+    entries += [(c, 2, len(t), 512 + 16 * i) for i, (c, t) in enumerate(texts.items())]
+    content = tiff(sorted(entries)).replace(b"II*", b"IIU", 1).ljust(512, b"\0")
+    content += b"".join(text.ljust(16, b"\0") for text in texts.values())
+    path, packed = tmp_path / "a.rw2", bytes([85]) * (width * height * 8 // 7 + 0x4000)
+    path.write_bytes(content.ljust(data_at, b"\0") + packed)
+    raw = read_raw(path, settings={"exposure_time": 1 / 125, "f_number": 2.8}, nlf=NLF)
+    with rawpy.imread(str(path)) as decoded:
+        np.testing.assert_array_equal(raw.to_mosaic(), decoded.raw_image_visible.clip(0, 3986))
+    assert (raw.settings.iso, raw.camera.name) == (200, "panasonic_dmc-gf1")
 
 
 @pytest.mark.parametrize("byteorder", ["<", ">"])
