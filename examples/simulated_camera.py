@@ -20,17 +20,18 @@ class _Request:
     """A completed capture, as Picamera2 hands it out."""
 
     def __init__(self, mosaic: NDArray[np.uint16], metadata: dict[str, Any]) -> None:
-        self._mosaic, self._metadata = mosaic, metadata
+        self.mosaic, self._metadata = mosaic, metadata
 
     def get_metadata(self) -> dict[str, Any]:
-        """What the frame was taken with: ``ExposureTime`` [us] and ``AnalogueGain``."""
+        """``ExposureTime`` [us], ``AnalogueGain``, and ``SensorBlackLevels`` on 16 bits."""
         return dict(self._metadata)
 
-    def make_array(self, name: str) -> NDArray[np.uint16]:
-        """The mosaic (H, W) of digital numbers."""
+    def make_array(self, name: str) -> NDArray[np.uint8]:
+        """The mosaic as Picamera2 gives it: (H, stride) bytes, rows padded to 64."""
         if name != "raw":
             raise ValueError(f"`name` (={name!r}) must be 'raw'")
-        return self._mosaic
+        rows = np.ascontiguousarray(self.mosaic).view(np.uint8)
+        return np.pad(rows, ((0, 0), (0, -rows.shape[1] % 64)))
 
     def release(self) -> None:
         """Nothing to give back."""
@@ -52,6 +53,7 @@ class SimulatedCamera:
         line_time: Exposure times are whole multiples of it [s].
         gain_steps: Analogue gains are ``gain_steps / (gain_steps - n)``, as an imx477's.
         seed: Of the noise.
+        left_justified: Whether samples are moved up to 16 bits, as on a Raspberry Pi 5.
     """
 
     def __init__(
@@ -66,7 +68,9 @@ class SimulatedCamera:
         line_time: float = 1e-5,
         gain_steps: int = 1024,
         seed: int = 0,
+        left_justified: bool = False,
     ) -> None:
+        self.left_justified = left_justified
         self.camera, self.f_number, self.gains, self.seed = camera, f_number, gains, seed
         self.dropped, self.line_time, self.gain_steps = dropped, line_time, gain_steps
         self.frame = 0
@@ -77,6 +81,12 @@ class SimulatedCamera:
     def set_controls(self, controls: dict[str, float]) -> None:
         """Asks for ``ExposureTime`` [us] and ``AnalogueGain``; the newest request stays."""
         self._pending[-1] = {**self._pending[-1], **controls}
+
+    def camera_configuration(self) -> dict[str, dict[str, Any]]:
+        """Format and size of the raw stream."""
+        height, width = (2 * side for side in self._prepared.light.shape[1:])
+        bits = 16 if self.left_justified else self.camera.bit_depth
+        return {"raw": {"format": f"S{self.camera.cfa.value}{bits}", "size": (width, height)}}
 
     def capture_request(self) -> _Request:
         """The next frame that is not dropped."""
@@ -96,5 +106,8 @@ class SimulatedCamera:
         settings = CameraSettings(100.0 * gain, time, self.f_number)
         light = self.gains[min(frame, len(self.gains) - 1)]
         found = self._prepared.expose([settings], seed=self.seed + frame, gain=np.array([light]))
-        mosaic = unpack_mosaic(found[0], self.camera)
-        return _Request(mosaic, {"ExposureTime": round(time * 1e6), "AnalogueGain": gain})
+        mosaic, unused = unpack_mosaic(found[0], self.camera), 16 - self.camera.bit_depth
+        levels = [int(level * 2**unused) for level in self.camera.black_level]
+        metadata = {"ExposureTime": round(time * 1e6), "AnalogueGain": gain}
+        shown = mosaic << unused if self.left_justified else mosaic
+        return _Request(shown, metadata | {"SensorBlackLevels": levels})

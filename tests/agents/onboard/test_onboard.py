@@ -1,6 +1,7 @@
 """Exported agents against those in torch, and a camera that is driven by one."""
 
 import functools
+import json
 import runpy
 import subprocess
 import sys
@@ -76,7 +77,8 @@ def test_frames_and_settings_are_encoded_as_the_environment_does(exported: Any) 
     np.testing.assert_allclose(controller.encode_settings(state), expected, atol=1e-7)
 
 
-def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> None:
+@pytest.mark.parametrize("left_justified", [False, True])  # as on a Raspberry Pi 5
+def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any, left_justified) -> None:
     """After each jump of 5 EV it settles, at the aperture that it has, where little is clipped."""
     loop, simulated = (
         SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / f"{name}.py")))
@@ -86,19 +88,73 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> No
     scenes = load_scenes("bundled:small", "test", camera=body, resolution=64)
     scene = next(scene for scene in scenes if scene.kind == "indoor")
     gains = [2.0 ** (5 * (i >= 20) - 5 * (i >= 40)) for i in range(60)]
-    camera = simulated.SimulatedCamera(
-        scene, body, 4.0, delay=2, gains=gains, dropped=(5, 6, 21, 43)
-    )
-    levels = {"black": body.black_level[0], "white": body.white_level}
-    steps = list(loop.run(camera, Controller(exported[1]), 56, 4.0, **levels))
-    assert {wanted.f_number for _, wanted in steps} == {4.0}
+    options: Any = {"gains": gains, "dropped": (5, 6, 21, 43), "left_justified": left_justified}
+    camera = simulated.SimulatedCamera(scene, body, 4.0, delay=2, **options)
+    steps = list(loop.run(camera, Controller(exported[1]), 56, 4.0))
+    assert {(decision.state.f_number, decision.held) for _, decision in steps} == {(4.0, False)}
     for last, frame in ((17, 19), (36, 39), (55, 59)):  # the last that came through of each light
         (taken, _), (before, _) = steps[last], steps[last - 3]
         assert abs(np.log2(taken.exposure_time / before.exposure_time)) < 0.1
         controls = {"ExposureTime": 1e6 * taken.exposure_time, "AnalogueGain": taken.iso / 100}
-        numbers = camera.photograph(frame, controls).make_array("raw").astype(float)
+        numbers = camera.photograph(frame, controls).mosaic.astype(float)
+        numbers /= 2 ** (16 - body.bit_depth) if left_justified else 1
         signal = (numbers.mean() - body.black_level[0]) / (body.white_level - body.black_level[0])
         assert 0.02 < signal < 0.7
+
+
+def test_order_and_padding_of_a_raw_stream_are_those_of_its_configuration() -> None:
+    example = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "picamera2_ae.py")))
+    mosaic = np.array([[1, 2, 5, 6], [3, 4, 7, 8]], np.uint16) * 64  # rows of 8 bytes, padded to 12
+    array = np.pad(mosaic.view(np.uint8), ((0, 0), (0, 4)))
+    for order, planes in (("BGGR", (4, 3, 2, 1)), ("GBRG", (3, 4, 1, 2))):
+        raw = {"format": f"S{order}10", "size": (4, 2)}
+        found = example.planes_of(array, raw, [4096] * 4)  # 64 of 10 bits
+        wanted = [(64 * np.array([[v, v + 4]]) - 64) / (1023 - 64) for v in planes]
+        np.testing.assert_allclose(found, wanted)
+    with pytest.raises(ValueError, match="SRGGB12_CSI2P"):
+        example.planes_of(array, {"format": "SRGGB12_CSI2P", "size": (4, 2)}, [4096] * 4)
+
+
+def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported: Any) -> None:
+    """As if that frame had never been: of a frame, a gyro, a focus drive, one camera of two."""
+    planes, camera = np.full((4, 64, 64), 0.3, np.float32), Controller(exported[1])
+    state = camera.states[37]
+    bad, nan = planes.copy(), float("nan")
+    bad[2, 5, 5] = nan
+    first = camera.decide(None, state)
+    assert (first.state, first.held) == (state, True)  # its own state, before the first choice
+    good = camera.decide(planes, state)
+    for frame, readings in (
+        *((None, {}), (bad, {}), (planes, {"image_speed": nan})),
+        *((planes, {"defocus": np.inf}), (planes, {"image_speed": -np.nan})),
+    ):
+        held = camera.decide(frame, camera.states[5], **readings)
+        assert (held.state, held.held, bool(held.reason)) == (good.state, True, True)
+    fresh = Controller(exported[1])
+    assert fresh.decide(planes, state) == good
+    darker = 0.25 * planes
+    assert camera.decide(darker, state) == fresh.decide(darker, state)
+    two, codes = Controller(exported[1], 2), camera.encode_frame(planes)
+    shown = np.stack([codes] * 2), np.stack([camera.encode_settings(state)] * 2)
+    chosen = two.act(*shown, np.array([[0.1, 0.1], [nan, 0.1]], np.float32))
+    assert (chosen[1], [bool(reason) for reason in two.reasons]) == (37, [False, True])
+    again = two.act(*shown, np.full((2, 2), 0.1, np.float32))
+    assert again[0] == again[1] == chosen[0]
+
+
+def test_a_damaged_card_is_named(exported: Any, tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(str(exported[1]))
+    (entry,) = (entry for entry in model.metadata_props if entry.key == "ae_env")
+    whole = json.loads(entry.value)
+    for name, value in (
+        *(("states", [[100, 0, 4]]), ("states", whole["states"][1:]), ("format", 2)),
+        *(("frame_shape", [4, 32, 32]), ("kind", "dqn"), ("same_light_ev", "NaN"), ("more", 1)),
+    ):
+        entry.value = json.dumps({**whole, name: value})
+        onnx.save(model, str(tmp_path / "x.onnx"))
+        with pytest.raises(ValueError, match=r"`path` .* damaged"):
+            Controller(tmp_path / "x.onnx")
 
 
 def test_what_cannot_be_exported_or_loaded_is_named(exported, context, tmp_path):
@@ -115,11 +171,20 @@ def test_what_cannot_be_exported_or_loaded_is_named(exported, context, tmp_path)
         with pytest.raises(ValueError, match="`path`"):
             Controller(path)
     controller = Controller(exported[1])
-    frame = np.zeros((1, 4, 64, 64), np.uint8)
+    frame, signal = np.zeros((1, 4, 64, 64), np.uint8), np.zeros((4, 64, 64))
+    ready = frame, np.zeros((1, 3)), np.zeros((1, 2))
     for named, method, arguments in (
         ("sensors", controller.act, (frame, np.zeros((1, 3)))),
         ("raw", controller.act, (frame[[0, 0]], np.zeros((1, 3)), np.zeros((1, 2)))),
+        ("raw", controller.act, (frame.astype(np.int64), np.zeros((1, 3)), np.zeros((1, 2)))),
+        ("settings", controller.act, (frame, np.full((1, 3), np.nan), np.zeros((1, 2)))),
+        ("action_masks", controller.act, (*ready, np.zeros((1, 64), bool))),
+        ("action_masks", controller.act, (*ready, np.ones((1, 64)))),
         ("planes", controller.decide, (np.zeros((4, 8, 8)), controller.states[0])),
+        ("planes", controller.decide, (np.zeros((4, 64, 64), np.uint16), controller.states[0])),
+        ("planes", controller.decide, (np.full((4, 64, 64), 4095.0), controller.states[0])),
+        ("current.exposure_time", controller.decide, (signal, ExposureState(100, 0.0, 4))),
+        ("current.iso", controller.decide, (signal, ExposureState(np.inf, 1.0, 4))),
     ):
         with pytest.raises(ValueError, match=f"`{named}`"):
             method(*arguments)
