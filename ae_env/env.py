@@ -350,7 +350,7 @@ class AutoExposureBase(SpecProperty):
             return None
         if self._last is None:
             raise gym.error.ResetNeeded("call reset() before render()")
-        info, scores = self._last.info, self._last.info["rewards"]["score"]
+        info, scores = self._last.info, self._last.info["rewards.score"]
         return tuple(
             render_frame(
                 self._last.raw[i],
@@ -411,8 +411,8 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     ## Rewards
 
-    Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`:
-    clipping and noise are those of the recorded frame.
+    Score of the capture in [0, 1] minus the weighted costs. The terms are in the info, as `rewards.`
+    and their name: clipping and noise are those of the recorded frame.
 
     ## Info
 
@@ -427,7 +427,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `excess_noise` | noise variance beyond that of the camera at these settings |
     | `predicted_error` | the plan's error of this capture, in units of the noise that it should have: what was left out, and of a raw also what networks and saturated highlights are off by |
     | `modules` | steps of the simulator that this capture took |
-    | `rewards` | dictionary of the scorer's parts, `score` and the costs |
+    | `rewards.score`, `rewards.noise`, ... | the score, each part of the scorer, and the costs |
     | `oracle_state`, `regret` | best state, and its expected score minus that of `state`; only with `with_oracle` |
 
     ## Starting State
@@ -498,14 +498,18 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         chosen = check_options(options)
         super().reset(seed=check_seed(seed))
         self.core.begin(_FIRST, [self.np_random], [chosen])
+        self._ended = False
         return self._observe()
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
-        ended = self.core.transition(_FIRST, check_actions("action", action, ())[None])
+        chosen = check_actions("action", action, ())[None]
+        if self._ended:
+            raise gym.error.ResetNeeded("the episode has ended: call reset() before step()")
+        self._ended = bool(self.core.transition(_FIRST, chosen)[0])
         observation, info = self._observe()
         assert self._last is not None
-        return observation, float(self._last.reward[0]), bool(ended[0]), False, info
+        return observation, float(self._last.reward[0]), self._ended, False, info
 
     def _observe(self) -> tuple[Observation, dict[str, Any]]:
         self._last = self.core.observe(_FIRST)

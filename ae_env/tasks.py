@@ -423,7 +423,7 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
     | `frames` | frames kept |
     | `time_left` | time left [s] |
 
-    `rewards` has `score`, the reward.
+    `rewards.score` is the reward.
 
     ## Starting State
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import importlib
 import os
 import re
-import tempfile
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from filelock import FileLock, Timeout
 
 from agents.policy import Policy
 from agents.rollouts import checked_states, errors_of
@@ -65,15 +66,16 @@ def record_dataset(
 
     Raises:
         UserCodeError: If the policy raises, or chooses what is no allowed state.
+        ValueError: If there is a dataset of that name, or another process records one.
+        OSError: If Minari's folder cannot be written, or the disk is full.
     """
     check_dataset_id(dataset_id)
     minari, report = _minari(), progress or (lambda *_: None)
     root = Path(minari.storage.get_dataset_path(""))
-    root.mkdir(parents=True, exist_ok=True)
     oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
     with (
         closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
-        tempfile.TemporaryDirectory(dir=root, prefix=".unfinished-") as folder,
+        _reserved(root, dataset_id) as folder,
     ):
 
         def recorded() -> Iterator[Any]:
@@ -97,15 +99,49 @@ def record_dataset(
         namespace = dataset_id.rpartition("/")[0]
         if namespace and namespace not in minari.namespace.list_local_namespaces():
             minari.namespace.create_namespace(namespace)
-        Path(folder, dataset_id).rename(root / dataset_id)
+        (folder / dataset_id).rename(root / dataset_id)
     return minari.load_dataset(dataset_id)
 
 
 @contextmanager
-def _datasets_in(folder: str) -> Iterator[None]:
+def _reserved(root: Path, dataset_id: str) -> Iterator[Path]:
+    """An empty folder below `root` for a dataset that no other process may record meanwhile.
+
+    Folders that processes left which have died are removed.
+    """
+
+    @contextmanager
+    def emptied(folder: Path) -> Iterator[None]:
+        with FileLock(f"{folder}.lock", timeout=0):
+            try:
+                shutil.rmtree(folder, ignore_errors=True)
+                yield
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+                Path(f"{folder}.lock").unlink(missing_ok=True)
+
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        for left in filter(Path.is_dir, root.glob(".unfinished-*")):
+            with suppress(Timeout), emptied(left):
+                pass
+        folder = root / f".unfinished-{dataset_id.replace('/', '-')}"
+        with emptied(folder):
+            folder.mkdir()
+            yield folder
+    except Timeout:
+        rule = "is being recorded by another process: take another name, or wait"
+        raise ValueError(f"`out` (={dataset_id!r}) {rule}") from None
+    except OSError as error:
+        reason = f"`out` (={dataset_id!r}) cannot be written to {root}: {error.strerror or error}"
+        raise OSError(error.errno, reason) from error
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
     """Within, Minari writes to `folder`: a dataset is moved to its place when it is finished."""
     before = os.environ.get(_ROOT)
-    os.environ[_ROOT] = folder
+    os.environ[_ROOT] = str(folder)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that there is no author's address

@@ -51,7 +51,7 @@ class Frames:
 
     Args:
         observation: Arrays by name, n long; new ones every time.
-        info: Columns of numbers by name, n long; ``rewards`` is a dictionary of columns.
+        info: Columns of numbers by name, n long.
             ``scene_id`` and ``modules`` are indices into `EpisodeCore.scene_ids` and `MODULES`.
         reward: (n,) float64.
         raw: (n, 4, R, R) the whole frames, also where less of them is observed.
@@ -304,7 +304,7 @@ class EpisodeCore:
         observation |= self.task.observation(env_indices)
         info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
         info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
-        info |= columns | {"rewards": terms}
+        info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
         return Frames(observation, info, reward, raw)
 
     def _capture(self, env_indices: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
@@ -161,9 +162,9 @@ def append_rows(
     """Adds rows of `bench_rows` to a benchmark's table, and writes its page again: files by name.
 
     A row of the same task, policy, observation and author is replaced, which is logged; others
-    stay. The table is made where missing; one with rows of another hash is refused.
+    stay. The table is made where missing; one with rows of another hash is refused. Another process
+    that appends waits.
     """
-    known = _read_own(table, plan)
     found = rows.assign(
         task=plan.task,
         policy=rows.policy.map(row_name),
@@ -176,7 +177,14 @@ def append_rows(
     )
     # Through text, so that a table says the same whether its rows are new or read from the file.
     text = found.reindex(columns=COLUMNS).to_csv(index=False, float_format="%.4f")
-    both = pd.concat([known, _parse(text)])
+    table.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(table.with_name(f".{table.name}.lock")):
+        return _merged(table, plan, _parse(text))
+
+
+def _merged(table: Path, plan: EvaluationPlan, found: pd.DataFrame) -> dict[str, Path]:
+    known = _read_own(table, plan)
+    both = pd.concat([known, found])
     replaced = known.merge(found[_KEY].astype(str), on=_KEY)
     for row in replaced.itertuples():
         logger.warning("%s: replaced the row of %r by %r", table, row.policy, row.author)

@@ -314,7 +314,7 @@ def record(
         found.pictures.append(pictures[0])
         found.ev100.append(float(info["ev100"][0]))
         found.best.append(float(base.grid.ev100[info["oracle_state"][0]]))
-        found.scores.append(float(info["rewards"]["score"][0]))
+        found.scores.append(float(info["rewards.score"][0]))
         found.states.append(int(info["state"][0]))
         found.regrets.append(float(info["regret"][0]))
     return found

@@ -51,7 +51,7 @@ contact_sheet(scene, scorer=scorer, speed=0.5, seed=0).save("plug_in_a_scorer.we
 # ![all 64 states, framed in the colour of their score](plug_in_a_scorer.webp)
 #
 # The same scorer in an environment whose light falls by four stops in the third frame. Its terms are
-# in `info["rewards"]`.
+# in the info, as `rewards.` and their name.
 
 # %%
 env = gym.make(
@@ -64,7 +64,7 @@ env = gym.make(
 observation, info = env.reset(seed=0)
 for frame in range(5):
     observation, reward, _, _, info = env.step(int(info["oracle_state"]))  # the best one of before
-    terms = {name: round(float(value), 2) for name, value in info["rewards"].items()}
+    terms = {name: round(float(info[name]), 2) for name in info if name.startswith("rewards.")}
     print(frame + 1, env.unwrapped.grid[int(info["state"])], terms)
 
 # %% [markdown]

@@ -24,7 +24,7 @@ SCENES = "bundled"
 env = gym.make("ae_env/AutoExposure-v0", scenes=SCENES, split="train")
 observation, info = env.reset(seed=0)
 print({name: (value.shape, str(value.dtype)) for name, value in observation.items()})
-print(f"starts at {env.unwrapped.grid[info['state']]}, score {info['rewards']['score']:.2f}")
+print(f"starts at {env.unwrapped.grid[info['state']]}, score {info['rewards.score']:.2f}")
 observation, reward, terminated, truncated, info = env.step(20)
 print(f"then at {env.unwrapped.grid[info['state']]}, reward {reward:.2f}")
 

@@ -85,7 +85,8 @@ def write_atomically(
 ) -> Path:
     """Write bytes, text (as UTF-8), or pieces of bytes whole or not at all; returns `path`.
 
-    They are written under a temporary name beside `path`, whose folder is made, and then renamed.
+    They are written under a temporary name beside `path`, whose folder is made, and then renamed:
+    after they are on the disk, so that a loss of power leaves the old file or the new one.
     """
     path = as_path(path)
     content = content.encode() if isinstance(content, str) else content
@@ -96,6 +97,8 @@ def write_atomically(
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as stream:
             stream.writelines(pieces)
+            stream.flush()
+            os.fsync(stream.fileno())
         os.replace(temporary, path)
     except OSError as error:
         if error.errno is None:

@@ -140,9 +140,9 @@ def test_expected_rewards_are_those_of_the_running_episodes(arguments: dict[str,
             scene = core.scenes[episode.scene]
             wanted = core.task.tables.table(scene, **episode.moves)
             for name, scores in wanted.parts.items():
-                assert info["rewards"][name][i] == pytest.approx(scores[episode.state], abs=1e-12)
+                assert info[f"rewards.{name}"][i] == pytest.approx(scores[episode.state], abs=1e-12)
             score = wanted.mean[episode.state]
-            assert info["rewards"]["score"][i] == pytest.approx(score, abs=1e-12)
+            assert info["rewards.score"][i] == pytest.approx(score, abs=1e-12)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
@@ -295,7 +295,7 @@ def test_modes_have_the_names_and_values_of_gymnasiums_enum(mode: AutoresetMode)
     if mode is not AutoresetMode.SAME_STEP:  # Gymnasium's `final_obs` is an array of objects
         envs = NumpyToTorch(envs)  # everything else is a number
         assert envs.reset(seed=0)[1]["modules"].dtype == torch.int64
-        assert envs.step(torch.tensor([5, 6, 7]))[4]["rewards"]["score"].shape == (3,)
+        assert envs.step(torch.tensor([5, 6, 7]))[4]["rewards.score"].shape == (3,)
 
 
 def test_resets_that_are_needed_and_options_of_each_environment() -> None:

@@ -115,6 +115,11 @@ def test_rewards_add_up_to_the_quality_of_the_picture() -> None:
     assert ended
     assert after["quality"] == info["quality"]
     assert after["frames"] == 2
+    for action in (STOP, long):
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(action)
+    env.reset(seed=0)
+    env.step(long)
 
 
 def test_an_episode_ends_with_its_frames_or_its_time() -> None:

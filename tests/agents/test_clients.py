@@ -71,6 +71,8 @@ def test_torchrl(task: str) -> None:
     # An episode ends with its last step, and no earlier.
     done = rollout["next", "done"].flatten()
     assert not done[:-1].any()
+    many = GymWrapper(gym.make_vec(task, num_envs=2, autoreset_mode="SAME_STEP", **SMALL))
+    assert many.rollout(4, break_when_any_done=False)["next", "rewards.score"].isfinite().all()
     envs = SerialEnv(2, lambda: GymEnv(task, frame_skip=2, **SMALL))
     assert envs.rollout(1)["next", "reward"].shape == (2, 1, 1)
 

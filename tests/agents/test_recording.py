@@ -1,11 +1,15 @@
 """Recorded episodes, and what policies are fitted on where the scenes are too few to train on."""
 
+import errno
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from ae_env import UserCodeError
 from agents import Policy, PolicyContext, make_policy
@@ -53,12 +57,25 @@ class Stops(Policy):
         raise KeyError("lost")
 
 
-def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context):
+def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context, monkeypatch):
     with pytest.raises(UserCodeError, match=r"'stops'.*KeyError: 'lost'"):
         record_dataset(Stops(context), "stops", TASK, SMALL, "mine-v0", episodes=1)
     assert list(folder.iterdir()) == []
     policy = make_policy("random", context)
-    record_dataset(policy, "random", TASK, SMALL, "mine-v0", episodes=1)
+    for left in ("mine-v0", "other-v1", "x81nf"):  # of processes that have died
+        (folder / f".unfinished-{left}").mkdir()
+    with FileLock(folder / ".unfinished-ae-mine-v0.lock"):  # another process records it
+        (folder / ".unfinished-ae-mine-v0").mkdir()
+        with pytest.raises(ValueError, match=r"`out`.* another process"):
+            record_dataset(policy, "random", TASK, SMALL, "ae/mine-v0", episodes=1)
+        record_dataset(policy, "random", TASK, SMALL, "mine-v0", episodes=1)
+        left = {path.name for path in folder.iterdir() if path.is_dir()}
+        assert left == {".unfinished-ae-mine-v0", "mine-v0"}
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr("minari.data_collector.EpisodeBuffer", Mock(side_effect=full))
+    with pytest.raises(OSError, match=r"`out`.*No space left") as caught:
+        record_dataset(policy, "random", TASK, SMALL, "new-v0", episodes=1)
+    assert caught.value.errno == errno.ENOSPC
     for wrong in ("mine", "a/mine-v0", "mine-v0"):  # namespaces have two letters or more; is there
         with pytest.raises(ValueError, match=rf"`out` \(='{wrong}'\)"):
             record_dataset(policy, "random", TASK, SMALL, wrong, episodes=1)

@@ -275,14 +275,14 @@ def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
         fixed = {"motion": "none", "depth": "far", "simulator": None}
         env = make_env(scenes=[scene], resolution=40, **{**fixed, **arguments})
         _, info = env.reset(seed=0, options={"state": _state(100, 1 / 15, 8)})
-        return info["rewards"]["score"], info["rewards"]
+        return info["rewards.score"], info
 
     clean, terms = made(picture)
-    assert made(picture, noise=False)[1]["noise"] == pytest.approx(1.0)
-    assert terms["noise"] < 0.99
+    assert made(picture, noise=False)[1]["rewards.noise"] == pytest.approx(1.0)
+    assert terms["rewards.noise"] < 0.99
     left, its_terms = made(noisy)  # exposure and noise level function alone: the noise stays
     assert left < clean
-    assert its_terms["noise"] < terms["noise"]
+    assert its_terms["rewards.noise"] < terms["rewards.noise"]
     denoised, _ = made(noisy, simulator=weights)
     assert left < denoised <= clean + 0.01
     assert made(noisy, simulator=weights, tolerance=1e6)[0] == left  # no network is needed

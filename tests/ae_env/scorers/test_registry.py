@@ -313,7 +313,7 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
             for first in (mean_signal, blacken)
         )
         np.testing.assert_array_equal(plain["raw"], black["raw"])
-        np.testing.assert_array_equal(info["rewards"]["mean"], black_info["rewards"]["mean"])
+        np.testing.assert_array_equal(info["rewards.mean"], black_info["rewards.mean"])
     np.testing.assert_array_equal(step(Own(blacken))[0]["raw"], plain["raw"])
 
 

@@ -4,6 +4,7 @@ import base64
 import csv
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -396,6 +397,10 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     assert str(tmp_path) not in page
     with pytest.raises(ValueError, match="under the hash"):
         ae_bench.append_rows(table, plan.changed(hash="0"), found, author="x")
+    authors = [f"author {i}" for i in range(12)]
+    with ThreadPoolExecutor(6) as pool:  # each reads, adds and renames
+        list(pool.map(lambda name: ae_bench.append_rows(table, plan, again, author=name), authors))
+    assert set(authors) < set(ae_bench.read_table(table).author)
 
 
 def test_rows_of_brackets_by_hand(tmp_path):
