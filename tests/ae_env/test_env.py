@@ -22,7 +22,6 @@ from ae_env.observation import decode_observation
 from ae_env.options import EnvOptions
 from ae_env.rendering import _Sheet
 from ae_env.scenes import Scene
-from ae_env.scenes.polyhaven import list_assets
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from simulator import develop
@@ -59,14 +58,14 @@ def test_same_seed_same_rollout(kind: str) -> None:
 @pytest.mark.skipif(not STATM.is_file(), reason="the memory of a process is Linux's to tell")
 def test_a_long_run_takes_no_more_memory() -> None:
     env, rng, pages = make_env(max_episode_steps=None), np.random.default_rng(0), list[int]()
-    for episode in range(60):
+    for episode in range(30):
         env.reset(seed=episode)
         for _ in range(30):
             env.step(rng.integers(64))
-        if episode in (20, 59):
+        if episode in (10, 29):
             gc.collect()
             pages.append(int(STATM.read_text().split()[1]))
-    assert (pages[1] - pages[0]) * os.sysconf("SC_PAGE_SIZE") < 16 * 2**20
+    assert (pages[1] - pages[0]) * os.sysconf("SC_PAGE_SIZE") < 8 * 2**20
 
 
 def test_spaces_and_infos_are_as_documented() -> None:
@@ -168,20 +167,6 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
     assert np.median(episodes.defocus) == pytest.approx(1.0, rel=0.25)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("scenes", ["bundled", "polyhaven"])
-def test_oracle_is_spread_over_every_control(scenes: str) -> None:
-    if scenes == "polyhaven" and any(asset.path is None for asset in list_assets()):
-        pytest.skip("needs the maps of Poly Haven (AE_ENV_DATA)")
-    env = make_env(scenes=scenes, split="test", resolution=36).unwrapped
-    states = []
-    for i in range(len(env.scenes)):
-        env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
-        states.append(env.score_table().oracle)
-    for control in env.grid.controls(np.array(states)).T:
-        assert np.bincount(control).max() <= 0.5 * len(states)
-
-
 def test_cached_light_changes_nothing_and_random_states_are_left_alone(monkeypatch) -> None:
     cached = rollout(5, depth=3.0, motion=0.5)
     monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
@@ -226,11 +211,14 @@ def test_frame_is_the_developed_capture_enlarged(kind: str) -> None:
 
 
 def test_paths_are_drawn_in_their_own_colours() -> None:
-    plain = np.asarray(contact_sheet(_scene(), grid=FEW))
-    drawn = contact_sheet(_scene(), grid=FEW, path={"first": [0, 7], "second": [3, 3, 4]})
-    colours = {(0xD5, 0x5E, 0x00), (0x56, 0xB4, 0xE9)}
-    assert colours <= {tuple(c) for c in np.asarray(drawn).reshape(-1, 3).tolist()}
-    assert not colours & {tuple(c) for c in plain.reshape(-1, 3).tolist()}
+    paths = {"first": [0, 7], "second": [3, 3, 4]}
+    plain, drawn = (
+        np.asarray(contact_sheet(_scene(), grid=FEW, path=path)) @ [2**16, 2**8, 1]
+        for path in (None, paths)
+    )
+    colours = [0xD55E00, 0x56B4E9]
+    assert np.isin(colours, drawn).all()
+    assert not np.isin(colours, plain).any()
     for path in ([0, 64], [], {"mine": [1.5]}):
         with pytest.raises(ValueError, match=r"path|mine|states"):
             contact_sheet(_scene(), path=path)

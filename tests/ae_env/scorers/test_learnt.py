@@ -1,10 +1,10 @@
-"""NIMA against Keras: one network with the same random weights, from files that Keras wrote."""
+"""NIMA against Keras with the same random weights, and classifiers from files."""
 
 import hashlib
+import math
 import pickle
-import subprocess
 import sys
-import textwrap
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -18,81 +18,68 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.learnt import PUBLISHED, Classifier, NimaMobileNet, read_network
 from ae_env.utils.user_files import UserCodeError
 
-KERAS = """
-    import os, sys
-    os.environ["KERAS_BACKEND"] = "torch"
-    import h5py, keras, numpy as np, torch
-    from keras.src.legacy.saving import legacy_h5_format
-    torch.set_num_threads(1)
-    folder = sys.argv[1]
-    base = keras.applications.MobileNet(
-        (224, 224, 3), include_top=False, pooling="avg", weights=None
-    )
-    dropped = keras.layers.Dropout(0.75)(base.output)
-    head = keras.layers.Dense(10, activation="softmax", name="dense_1")
-    model = keras.Model(base.inputs, head(dropped))
-    rng = np.random.default_rng(0)
-    for weight in model.weights:
-        shape = tuple(weight.shape)
-        if weight.name in ("moving_variance", "gamma"):
-            weight.assign(rng.uniform(0.7, 1.6, shape))
-        elif weight.name in ("beta", "moving_mean", "bias"):
-            weight.assign(rng.normal(0.1, 0.3, shape))
-        else:  # He's scale, or the signal dies in the depth
-            fan = np.prod(shape[:2]) if "dw" in weight.path else np.prod(shape[:-1])
-            gain = 24.0 if "dense_1" in weight.path else 2.0
-            weight.assign(rng.normal(0.0, np.sqrt(gain / fan), shape))
-    assert model.count_params() == 3_239_114
-    with h5py.File(f"{folder}/weights.h5", "w") as file:  # of `save_weights` in Keras 2
-        legacy_h5_format.save_weights_to_hdf5_group(file, model)
-        for layer in model.layers:
-            group = file[layer.name]
-            if layer.name not in group:  # a layer without weights
-                continue
-            own = group[layer.name]
-            for array in list(own):
-                depthwise = layer.name.startswith("conv_dw") and array == "kernel"
-                own.move(array, "depthwise_kernel:0" if depthwise else f"{array}:0")
-            group.attrs["weight_names"] = [f"{layer.name}/{array}".encode() for array in own]
-    model.save(f"{folder}/whole.h5")
-    pictures = np.load(f"{folder}/pictures.npy")
-    np.save(f"{folder}/shares.npy", model.predict(pictures * 255.0 / 127.5 - 1.0, verbose=0))
-"""
+#: Mean ratings that Keras 3.15 gives to `pictures_of_keras` with `weights_of_keras`, by
+#: ``MobileNet((224, 224, 3), include_top=False, pooling="avg", weights=None)`` and a dense layer of
+#: ten with a softmax; ``predict(2 * pictures - 1) @ np.arange(1, 11)``.
+MEANS_OF_KERAS = np.array([8.475087, 8.796729, 8.662664])
+WIDTHS = [32, 64, 128, 128, 256, 256, *[512] * 6, 1024, 1024]
 
 
-@pytest.fixture(scope="module")
-def keras_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """weights.h5 and whole.h5 of one network, and its answers to pictures.npy (N, H, W, 3)."""
-    folder = tmp_path_factory.mktemp("keras")
+def pictures_of_keras() -> torch.Tensor:
     rng = np.random.default_rng(1)
     pictures = rng.random((3, 224, 224, 3)) * np.array([1.0, 0.2, 1.0])[:, None, None, None]
     pictures[2] = np.linspace(0.0, 1.0, 224)[None, :, None] ** np.array([0.5, 1.0, 2.0])
-    np.save(folder / "pictures.npy", pictures.astype(np.float32))
-    code = textwrap.dedent(KERAS)
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(folder)], check=True)
-    return folder
+    return torch.from_numpy(pictures.astype(np.float32)).permute(0, 3, 1, 2)
 
 
-def test_a_converted_file_scores_as_keras_does(keras_files, tmp_path, monkeypatch):
+def weights_of_keras() -> dict[tuple[str, str], np.ndarray]:
+    """Random ones by layer and array, in Keras' shapes."""
+    kernels: dict[str, tuple[int, ...]] = {"conv1": (3, 3, 3, 32)}
+    for i, (inputs, outputs) in enumerate(pairwise(WIDTHS), start=1):
+        kernels |= {f"conv_dw_{i}": (3, 3, inputs, 1), f"conv_pw_{i}": (1, 1, inputs, outputs)}
+    rng, weights = np.random.default_rng(0), {}
+    for layer, shape in [*kernels.items(), ("dense_1", (1024, 10))]:
+        # He's scale, or the signal dies in the depth.
+        fan = math.prod(shape[:2] if "dw" in layer else shape[:-1])
+        gain = 24.0 if layer == "dense_1" else 2.0
+        weights[layer, "kernel"] = rng.normal(0.0, math.sqrt(gain / fan), shape)
+        if layer == "dense_1":
+            weights[layer, "bias"] = rng.normal(0.1, 0.3, 10)
+            continue
+        channels = shape[2] if "dw" in layer else shape[3]
+        for array in ("gamma", "beta", "moving_mean", "moving_variance"):
+            positive = array in ("gamma", "moving_variance")
+            drawn = rng.uniform(0.7, 1.6, channels) if positive else rng.normal(0.1, 0.3, channels)
+            weights[f"{layer}_bn", array] = drawn
+    return weights
+
+
+def test_a_converted_file_scores_as_keras_does(tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
     for name in ("nima_aesthetic", "nima_technical"):
         with pytest.raises(ValueError, match=rf"AE_ENV_{name.upper()}.*{PUBLISHED[name]}"):
             make_scorer(name)
-    content = (keras_files / "weights.h5").read_bytes()
+    weights, old, whole = tmp_path / "weights.h5", "{0}/{0}/{1}:0", "model_weights/{0}/{0}/{1}"
+    # As `save_weights` of Keras 2 and `save` of Keras 3 name them.
+    with h5py.File(weights, "w") as first, h5py.File(tmp_path / "whole.h5", "w") as second:
+        for (layer, array), values in weights_of_keras().items():
+            depthwise = "_dw_" in layer and array == "kernel"
+            own = "depthwise_kernel" if depthwise else array
+            first[old.format(layer, own)] = values.astype(np.float32)
+            second[whole.format(layer, array)] = values.astype(np.float32)
+    content = weights.read_bytes()
     blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
     monkeypatch.setitem(convert_nima.PUBLISHED, "nima_technical", blob)
-    convert_nima.main(str(keras_files / "weights.h5"))  # as if published: into the cache folder
+    convert_nima.main(str(weights))  # as if published: into the cache folder
     with pytest.raises(SystemExit, match="name"):
-        convert_nima.main(str(keras_files / "whole.h5"))
-    convert_nima.main(str(keras_files / "whole.h5"), str(tmp_path / "new" / "mine.safetensors"))
+        convert_nima.main(str(tmp_path / "whole.h5"))
+    convert_nima.main(str(tmp_path / "whole.h5"), str(tmp_path / "new" / "mine.safetensors"))
     monkeypatch.setenv("AE_ENV_NIMA_AESTHETIC", str(tmp_path / "new" / "mine.safetensors"))
-    means = np.load(keras_files / "shares.npy") @ np.arange(1.0, 11.0)
-    assert np.ptp(means) > 0.3  # else this shows nothing
-    pictures = torch.from_numpy(np.load(keras_files / "pictures.npy")).permute(0, 3, 1, 2)
+    pictures = pictures_of_keras()
     for name in ("nima_aesthetic", "nima_technical"):
         scorer = make_scorer(name).parts[name]
         scores = scorer(pictures, None)
-        np.testing.assert_allclose(scores.numpy(), (means - 1.0) / 9.0, atol=2e-5)
+        np.testing.assert_allclose(scores.numpy(), (MEANS_OF_KERAS - 1.0) / 9.0, atol=2e-5)
     alone = torch.cat([scorer(p[None], None) for p in pictures])
     torch.testing.assert_close(alone, scores, rtol=0.0, atol=1e-6)
     for size in (1, 300):  # any picture is resized
