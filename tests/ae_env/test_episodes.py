@@ -23,14 +23,7 @@ from simulator.capture.sensor import clip_and_quantise, exposed_light, frame_nor
 from simulator.noise.noise_level_function import ReadNoise
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from tests.ae_env.environments import (
-    ID,
-    assert_equal,
-    assert_same,
-    check_parity,
-    make_env,
-    make_envs,
-)
+from tests.ae_env.environments import assert_equal, assert_same, check_parity, make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
 
@@ -355,7 +348,7 @@ def test_workers_that_are_forked_from_a_process_with_environments(tmp_path, monk
     torch.set_num_threads(2)
     make_env(**given).reset(seed=0)
     _LOADED.clear()
-    envs = gym.make_vec(f"ae_env:{ID}", 2, vectorization_mode="async", **given)
+    envs = make_envs(2, vectorization_mode="async", **given)
     try:
         envs.reset_async(seed=0)
         envs.reset_wait(timeout=120)
