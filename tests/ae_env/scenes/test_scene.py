@@ -265,29 +265,6 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
         make_env(scenes=[noisy_scene()], resolution=40, simulator=str(damaged))
 
 
-def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    light = 0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
-    picture = Scene.from_array(light, NOISY, CAMERA, scene_id="flat", illuminance=640.0)
-    noisy = replace(picture, nlf=CAMERA.nlf(NOISY.iso))
-
-    def made(scene: Scene, **arguments: Any) -> tuple[float, dict[str, float]]:
-        fixed = {"motion": "none", "depth": "far", "simulator": None}
-        env = make_env(scenes=[scene], resolution=40, **{**fixed, **arguments})
-        _, info = env.reset(seed=0, options={"state": _state(100, 1 / 15, 8)})
-        return info["rewards"]["score"], info["rewards"]
-
-    clean, terms = made(picture)
-    assert made(picture, noise=False)[1]["noise"] == pytest.approx(1.0)
-    assert terms["noise"] < 0.99
-    left, its_terms = made(noisy)  # exposure and noise level function alone: the noise stays
-    assert left < clean
-    assert its_terms["noise"] < terms["noise"]
-    denoised, _ = made(noisy, simulator=weights)
-    assert left < denoised <= clean + 0.01
-    assert made(noisy, simulator=weights, tolerance=1e6)[0] == left  # no network is needed
-
-
 def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
     """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
     light = torch.zeros(4, 80, 80)
