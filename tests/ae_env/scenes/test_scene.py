@@ -175,6 +175,7 @@ def my_scenes(split: str, camera: object) -> list[Scene]:
 
 
 MINE = my_scenes("all", None)
+NONE = {"path": "no/such/folder"}
 
 
 def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
@@ -206,7 +207,16 @@ def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
         ("math:pi", "float"),
         *(([1], r"`scenes\[0\]`"), ([], "at least one"), ([*MINE, *MINE], "`scene_id`")),
         *(({"lux": 3}, "'path'"), ({"path": "bundled", "kind": "snow"}, "existing file")),
-        ({"path": "x", "illuminace": 3}, "did you mean 'illuminance'"),
+        # Options of folders and of recorded scenes, before anything is read.
+        *(({**NONE, "illuminace": 3}, "'illuminance'"), ({**NONE, "on_error": "skp"}, "'skip'")),
+        *(({**NONE, "on_eror": "skip"}, "'on_error'"), ({**NONE, "kind": 3}, "`kind`")),
+        *(({**NONE, "illuminance": -1.0}, "`illuminance`"), ({**NONE, "hard": 1}, "`hard`")),
+        *(({**NONE, "ev100": "bright"}, "`ev100`"), ({**NONE, "sequence": "here"}, "`scenes`")),
+        ({"sequence": "here", "on_error": "skip"}, "`on_error`"),
+        *(({"path": "recorded:here"}, "`scenes`"), ("recorded:none", "existing folder")),
+        *((spec, r"`scenes\['recorded'\]`") for spec in ("recorded:", {"recorded": 3})),
+        *(("recorded:a?iso=-3", "`iso`"), ("recorded:a?iso=fast", "number")),
+        ({"recorded": "a", "isos": 3}, "did you mean 'iso'"),
     ],
 )
 def test_scenes_that_cannot_be_are_refused(spec: object, words: str) -> None:
