@@ -5,9 +5,7 @@ import logging
 import multiprocessing
 import multiprocessing.forkserver
 import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -82,18 +80,6 @@ def forkserver() -> Any:
 def quick_spawn(forkserver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes that the package spawns come from `forkserver`: importing torch takes seconds."""
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": forkserver}.__getitem__)
-
-
-@pytest.fixture
-def compiled_and_loaded(tmp_path: Path) -> Callable[[str], list[list[str]]]:
-    """Words that a program prints which compiles its kernels, and then one that loads them."""
-
-    def run(code: str) -> list[list[str]]:
-        command, given = [sys.executable, "-c", code], {"NUMBA_CACHE_DIR": str(tmp_path)}
-        outputs = (subprocess.check_output(command, env=os.environ | given) for _ in range(2))
-        return [output.decode().split() for output in outputs]
-
-    return run
 
 
 @pytest.fixture
