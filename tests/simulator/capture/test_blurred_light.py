@@ -107,22 +107,6 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(size, tile, monkeypa
         assert not torch.equal(result, image) or min(size) == 1
 
 
-def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
-    calls: list[int] = []
-
-    def estimate() -> Tensor:
-        calls.append(1)
-        return torch.full((24, 24), 2.0)
-
-    made = MapApertureBlur(light(), estimate, 8.0)
-    assert made.extent(8.0) == made.extent(16.0) == 0.0
-    assert not calls
-    assert made.extent(4.0) == pytest.approx(2 * math.sqrt(3))
-    made.opened(4.0, None)
-    made.remaining_variance(5.6)
-    assert calls == [1]
-
-
 # -- uniform blur in sweeps -------------------------------------------------------------------
 
 STILL = Exposure(2.0, ZERO, ZERO)
