@@ -31,8 +31,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("tests")
 
-# Each of pytest-xdist's workers has its share of the processors: OpenMP's threads spin while they
-# wait for one another, which takes several times as long on processors that others use.
+# A share of the processors for each worker of pytest-xdist: OpenMP's waiting threads block others.
 _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 torch.set_num_threads(max(1, min(2, torch.get_num_threads() // _WORKERS)))
 os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # of processes they start

@@ -104,31 +104,26 @@ def test_an_uncalibrated_camera_uses_the_raws_own_noise(simulator: CameraSimulat
         simulator.simulate(RawImage(picture(), BASE, unknown), BASE)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda s, raw: s.simulate(raw.data, BASE), "`source`"),
-        (lambda s, raw: s.simulate(raw, BASE, seed=-1), "`seed`"),
-        (lambda s, raw: s.prepare(raw, image_speed=True), "`image_speed`"),
-        (lambda s, raw: s.prepare(raw, defocus=math.nan), "`defocus`"),
-        (lambda s, raw: s.prepare(raw, depth="near"), "`depth`"),
-        (lambda s, raw: s.prepare(raw, depth="unknown"), "`depth`"),  # without networks
-        (lambda s, raw: s.prepare(raw, tolerance=None), "`tolerance`"),
-        (lambda s, raw: s.plan(raw, BASE, tolerance=None), "`tolerance`"),
-        (lambda s, raw: s.simulate(raw, 3), "`settings`"),
-        # A disc may be as wide as the frame.
-        (lambda s, raw: s.simulate(raw, CameraSettings(100, 1, 1), defocus=200.0), "`defocus`"),
-        (lambda s, raw: s.denoise(s.prepare(raw)), "there is no noise module"),
-        (lambda s, raw: s.estimate_defocus(s.prepare(raw)), "there is no aperture module"),
-        (lambda s, raw: s.stages(raw, BASE), "there is no noise module"),
-        (lambda s, raw: CameraSimulator(device="tpu9"), "`device`"),
-        (lambda s, raw: CameraSimulator(device="cpu", precision="float16"), "`precision`"),
-        (lambda s, raw: CameraSimulator("tiny", device="cpu"), "`preset`"),
-    ],
-)
-def test_bad_input_is_named(simulator: CameraSimulator, call, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call(simulator, RawImage(picture(), BASE, Z6))
+def test_bad_input_is_named(simulator: CameraSimulator) -> None:
+    raw, wide = RawImage(picture(), BASE, Z6), CameraSettings(100, 1, 1)
+    prepared, depths = simulator.prepare(raw), ("near", "unknown")  # the latter needs networks
+    bad = [("image_speed", True), ("defocus", math.nan), ("tolerance", None)]
+    calls = [(f"`{k}`", simulator.prepare, (raw,), {k: v}) for k, v in bad]
+    calls += [("`depth`", simulator.prepare, (raw,), {"depth": depth}) for depth in depths]
+    calls += [("`tolerance`", simulator.plan, (raw, BASE), {"tolerance": None})]
+    calls += [("`source`", simulator.simulate, (raw.data, BASE), {})]
+    calls += [("`seed`", simulator.simulate, (raw, BASE), {"seed": -1})]
+    calls += [("`settings`", simulator.simulate, (raw, 3), {})]
+    # A disc may be as wide as the frame.
+    calls += [("`defocus`", simulator.simulate, (raw, wide), {"defocus": 200.0})]
+    calls += [("no noise module", simulator.denoise, (prepared,), {})]
+    calls += [("no aperture module", simulator.estimate_defocus, (prepared,), {})]
+    calls += [("no noise module", simulator.stages, (raw, BASE), {})]
+    wrong = [("device", "tpu9"), ("precision", "float16"), ("preset", "tiny")]
+    calls += [(f"`{k}`", CameraSimulator, (), {"device": "cpu", k: v}) for k, v in wrong]
+    for message, call, arguments, options in calls:
+        with pytest.raises(ValueError, match=message):
+            call(*arguments, **options)
 
 
 @pytest.mark.gpu

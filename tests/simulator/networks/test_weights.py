@@ -112,8 +112,7 @@ def test_files_that_are_not_there_or_cannot_be_read(saved: Path, ending: str) ->
 
 
 def test_shipped_weights_load_by_name(saved, monkeypatch, tmp_path_factory):
-    """From a package that ships two sizes, in a folder without any; the second errs as its card
-    says."""
+    """From a package that ships two sizes, in a folder without any; one with its known errors."""
     root = tmp_path_factory.mktemp("package")
     (root / "pretrained").mkdir()
     for ending in (".json", ".safetensors"):
@@ -331,20 +330,17 @@ def test_networks_compute_what_the_released_ones_do(ncs: nn.ModuleDict, released
 @torch.no_grad()
 def test_the_full_run_is_that_of_the_released_demo(converted: Path, released) -> None:
     """Every stage by the formulas of their demo, of the sample of noise that ours draws."""
-    simulator = CameraSimulator.from_pretrained(
-        converted, device="cpu", body_correction=True, cache=None
-    )
+    options = {"device": "cpu", "body_correction": True, "cache": None}
+    simulator = CameraSimulator.from_pretrained(converted, **options)
     camera = get_camera("nikon_z6")
     data = 0.05 + 0.1 * torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0))
     raw = RawImage(data, CameraSettings(400, 1 / 64, 11.0), camera)
     target = CameraSettings(100, 1 / 64, 4.0)
     stages = simulator.stages(raw, target, seed=3)
     shown: list[Tensor] = []
-    handle = simulator.noise.network.register_forward_hook(
-        lambda _, inputs, __: shown.append(inputs[0])
-    )
-    simulator.stages(raw, target)
-    handle.remove()
+    network = simulator.noise.network
+    with network.register_forward_hook(lambda _, inputs, __: shown.append(inputs[0])):
+        simulator.stages(raw, target)
     ratio = 8.0 / 4.0  # three stops of aperture, two of ISO
     exp = released["exp_model"]
     scale = exp.linear.weight.item() * ratio
