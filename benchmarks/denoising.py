@@ -177,6 +177,7 @@ def non_local_means(stable: np.ndarray) -> np.ndarray:
 
 
 def bm3d_planes(stable: np.ndarray) -> np.ndarray:
+    """BM3D; its authors' package is free for non-commercial use only."""
     try:
         import bm3d
     except ImportError:
