@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, ImageOps
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, merge
@@ -38,7 +38,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.checks import check_number, check_word
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, open_picture
 
 logger = logging.getLogger(__name__)
 
@@ -273,15 +273,15 @@ def _merged(frames: Sequence[Scene]) -> Scene:
 
 def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
     """The capture of `file`; a picture is developed back and has the noise of `camera`."""
-    try:
-        if not file.is_picture:
+    if not file.is_picture:
+        try:
             return read_raw(file.path, settings=file.settings)
-        with Image.open(file.path) as picture:
-            if picture.mode.startswith(("I", "F")):
-                raise ValueError(f"must have 8 bits a sample, not mode {picture.mode!r}")
-            rgb = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
-        raise ValueError(f"recorded file {str(file.path)!r} cannot be read: {error}") from error
+        except (OSError, ValueError) as error:
+            raise ValueError(f"recorded file {str(file.path)!r} cannot be read: {error}") from error
+    with open_picture(file.path) as picture:
+        if picture.mode.startswith(("I", "F")):
+            raise ValueError(f"it must have 8 bits a sample, not mode {picture.mode!r}")
+        rgb = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
     assert camera is not None
     data = develop_inverse(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None])[0]
     return RawImage(data, file.settings, camera)
@@ -469,9 +469,11 @@ def _in_file(path: Path) -> dict[str, float]:
     if path.suffix.lower() in RAW_SUFFIXES:
         return read_settings(path)
     try:
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
             tags = picture.getexif().get_ifd(ExifTags.IFD.Exif)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+    except ValueError:
+        if not path.exists():  # a link that leads nowhere
+            raise
         return {}  # said where its pixels are read
     names = (ExifTags.Base.ISOSpeedRatings, ExifTags.Base.ExposureTime, ExifTags.Base.FNumber)
     values = {what: tags.get(tag) for what, tag in zip(_SETTINGS, names, strict=True)}

@@ -14,13 +14,13 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 
 from agents.applications.hdr import import_openexr
 from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage, defocus
 from simulator.optics.thin_lens import SHARP
 from simulator.training.scenes import fill_from_nearest
 from simulator.utils.checks import check_number, check_word
+from simulator.utils.files import open_picture
 
 #: The numbers of a depth map: distances, or inverse distances.
 DepthKind = Literal["distance", "disparity"]
@@ -173,7 +173,7 @@ def _read_map(path: Path) -> np.ndarray:
     try:
         match path.suffix.lower():
             case ".png":
-                with Image.open(path, formats=["PNG"]) as picture:
+                with open_picture(path, ["PNG"]) as picture:
                     # Indices into a palette would look like a map.
                     values = np.asarray(picture.convert() if picture.mode == "P" else picture)
             case ".npy":

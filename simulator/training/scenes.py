@@ -54,6 +54,7 @@ from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
 from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_integer, check_word
+from simulator.utils.files import open_picture
 
 logger = logging.getLogger(__name__)
 
@@ -168,7 +169,7 @@ def photograph_pictures(data: Path, split: Split) -> Iterator[DetailPicture]:
     """Photographs of a split, unprocessed to linear light, 1.0 at the photograph's white."""
     for path, group in _files(data, "photo_pool", (".jpg", ".png"), split):
         rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
             light = unprocess(np.asarray(picture.convert("RGB")), rng)
         yield DetailPicture(path.stem, group, "photograph", torch.from_numpy(light))
 
@@ -184,7 +185,7 @@ def recorded_mosaics(data: Path, split: Split) -> Iterator[DetailPicture]:
     described = json.loads(description.read_text(encoding="utf-8"))
     for path, group in _files(data, "gopro_raw", (".png",), split):
         meta = described[path.name]
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
             mosaic = np.asarray(picture).astype(np.float32)
         planes = np.stack([mosaic[i::2, j::2] for i in (0, 1) for j in (0, 1)])
         black = np.array(meta["black"], np.float32)[:, None, None]

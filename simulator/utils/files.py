@@ -14,12 +14,15 @@ import os
 import platform
 import secrets
 import subprocess
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simulator import __version__
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 #: Environment variable that names the folder of real files.
 DATA_VARIABLE = "AE_ENV_DATA"
@@ -40,6 +43,10 @@ MAX_PIXELS = 2**28
 MAX_PIXELS_PER_BYTE = 1024
 #: The same for a radiance map; a flat one in OpenEXR's DWAB compression has over 3000.
 MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
+
+#: Most pixels of a developed picture; a black one may have a thousand pixels a byte, so its length
+#: tells nothing.
+MAX_PICTURE_PIXELS = 2**26
 
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
@@ -78,6 +85,32 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
         claim = f"claims {height} x {width} pixels in {size} bytes"
         return f"{claim}, where at most {per_byte} a byte are read"
     return ""
+
+
+@contextmanager
+def open_picture(path: Path, formats: list[str] | None = None) -> Iterator[Image.Image]:
+    """A developed picture, of `formats` of Pillow only; pixels are decoded when they are asked for.
+
+    Raises:
+        ValueError: Here and within, naming the file, if it is missing (a link that leads nowhere),
+            no whole picture, larger than `MAX_PICTURE_PIXELS`, or has colours of more than 8 bits,
+            of which Pillow reads the upper 8.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=formats) as picture:
+            if picture.width * picture.height > MAX_PICTURE_PIXELS:
+                size = f"{picture.width} x {picture.height} pixels"
+                raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")
+            tiles = getattr(picture, "tile", ())
+            if len(picture.getbands()) > 1 and any(";16" in str(tile[3]) for tile in tiles):
+                raise ValueError("it has colours of 16 bits: save it with 8, or give raws")
+            yield picture
+    except (OSError, SyntaxError, EOFError, ValueError, Image.DecompressionBombError) as error:
+        dangling = path.is_symlink() and not path.exists()
+        reason = "the link leads nowhere" if dangling else error
+        raise ValueError(f"picture {str(path)!r} cannot be read: {reason}") from error
 
 
 def write_atomically(

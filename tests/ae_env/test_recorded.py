@@ -1,14 +1,15 @@
 """Real captures as scenes and environments: which file is which state, what is shown, bad input."""
 
-import functools
 import os
 import pickle
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -32,7 +33,7 @@ from tests.ae_env.scene_files import (
 from tests.simulator.training.scenes import scene as reference_scene
 
 CAMERA = get_camera("nikon_z6")
-load = functools.partial(load_scenes, split="all", camera=CAMERA, resolution=None)
+load = partial(load_scenes, split="all", camera=CAMERA, resolution=None)
 
 
 def test_raws_are_shown_as_they_are_and_pictures_developed_back(tmp_path: Path) -> None:
@@ -126,14 +127,33 @@ def only_16_bits(path: Path) -> None:
     Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
 
 
+def colours_of_16_bits(path: Path) -> None:
+    path.unlink()
+    tifffile.imwrite(path.with_suffix(".tif"), np.full((32, 40, 3), 30000, np.uint16))
+
+
+def bomb(side: int, path: Path) -> None:
+    Image.new("1", (side, side)).save(path.with_suffix(".png"))  # some kB
+    path.unlink()
+
+
+def link(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("nowhere.JPEG")
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda file: os.truncate(file, 300), r"file '.*param_3.*val_1.JPEG' cannot be read: "),
+        (lambda file: os.truncate(file, 300), r"'.*param_3.*val_1.JPEG' cannot be read: "),
         (lambda file: shutil.copy(file, file.with_suffix(".png")), "l1/n00000001/val_1' must have"),
         (lambda file: Image.new("RGB", (44, 40)).save(file), r"val_1.JPEG' \(\(40, 44\) packed"),
         (lambda file: (file.parents[3] / "grid-options-2x2x2.csv").unlink(), "val_0.JPEG"),
-        (only_16_bits, r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
+        (only_16_bits, r"val_1.png' cannot be read: it must have 8 bits a sample, not mode 'I;16'"),
+        (colours_of_16_bits, r"val_1.tif' cannot be read: it has colours of 16 bits"),
+        (partial(bomb, 8200), r"val_1.png' cannot be read: it has 8200 x 8200 pixels"),
+        (partial(bomb, 14000), r"val_1.png' cannot be read: Image size"),
+        (link, r"val_1.JPEG' cannot be read: the link leads nowhere"),
         (None, r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
         (only_one_state, "1 of 1 captures in the grid, .*param_3"),
     ],
