@@ -27,14 +27,8 @@ import torch
 
 from ae_env.scenes.scene import Scene, SceneRequest
 from simulator.radiance.light import camera_from_srgb, mean_anchor
-from simulator.radiance.maps import (
-    RADIANCE_SUFFIXES,
-    assumed_ev100,
-    hash_fraction,
-    map_views,
-    near_one,
-    read_radiance,
-)
+from simulator.radiance.maps import assumed_ev100, hash_fraction, map_views, near_one
+from simulator.radiance.reading import RADIANCE_SUFFIXES, read_radiance
 from simulator.raw.image import RawImage
 from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
@@ -66,6 +60,7 @@ class FolderOptions:
         hard: Whether they count as hard.
         median_speed: Median image speed of a moving episode [frame heights / s].
         ev100: EV100 of the radiance maps, in place of the assumed one.
+        layer: Part or layer of the OpenEXR files, where several have R, G and B.
         settings: Of every raw, in place of the file's: any of ``iso``, ``exposure_time`` [s] and
             ``f_number``, as an adapted lens or some telephones do not state them.
         on_error: What happens where a file cannot be read, or is black without `illuminance`:
@@ -79,6 +74,7 @@ class FolderOptions:
     hard: bool | None = None
     median_speed: float | None = None
     ev100: float | None = None
+    layer: str | None = None
     settings: Mapping[str, float] | None = None
     on_error: OnError = "stop"
 
@@ -89,6 +85,7 @@ class FolderOptions:
             if value is not None:
                 check_number("illuminance", value, 1e-6, 1e9, more=" lux")
         check_type("kind", self.kind, str, None)
+        check_type("layer", self.layer, str, None)
         check_type("hard", self.hard, bool, None)
         if self.median_speed is not None:
             check_number("median_speed", self.median_speed, 0.0, 1e6, more=" frame heights / s")
@@ -102,7 +99,9 @@ class FolderOptions:
         if isinstance(lux, Mapping):
             lux = lux.get(path.name)
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
-        given |= {"illuminance": lux, "ev100": None if _is_raw(path) else self.ev100}
+        given |= {"illuminance": lux}
+        if not _is_raw(path):
+            given |= {"ev100": self.ev100, "layer": self.layer if path.suffix == ".exr" else None}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -315,6 +314,7 @@ def radiance_scenes(
     name: str,
     group: str,
     ev100: float | None = None,
+    layer: str | None = None,
     **fields: Any,
 ) -> Iterator[Scene]:
     """The scenes of one radiance map, all in one source group; see `map_views`.
@@ -322,11 +322,11 @@ def radiance_scenes(
     A radiance map is linear but relative: nothing in it says how many lux it shows. Unless that is
     known, its views are put at `ev100` or the `assumed_ev100` of the source group, as each scene's
     `source` says: the mean of the views is 0.12 there, on average over the views, which keep their
-    relative brightness. `name` begins the scene ids; `fields` are further arguments of
-    `Scene.from_radiance`.
+    relative brightness. `name` begins the scene ids; `layer` is as of `read_radiance`,
+    `fields` are further arguments of `Scene.from_radiance`.
     """
     file = Path(path).name
-    image = read_radiance(path)
+    image = read_radiance(path, layer=layer)
     if "illuminance" not in fields:
         image = near_one(image)
         if ev100 is None:

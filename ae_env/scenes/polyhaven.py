@@ -27,7 +27,8 @@ from ae_env.scenes.bundled import add_layout, cached_scenes
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
 from ae_env.utils.user_files import find_preset
 from simulator.camera import CameraProfile
-from simulator.radiance.maps import native_size, perspective, read_radiance
+from simulator.radiance.maps import native_size, perspective
+from simulator.radiance.reading import read_radiance
 from simulator.utils.cache import cache_dir, cache_key
 from simulator.utils.config_file import Configuration, load_yaml
 from simulator.utils.files import data_folder

@@ -7,6 +7,7 @@ stays in focus, and has nothing blurred before it, keeps its pixels as they were
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -15,9 +16,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from agents.applications.hdr import import_openexr
 from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage, defocus
 from simulator.optics.thin_lens import SHARP
+from simulator.radiance.reading import read_exr
 from simulator.training.scenes import fill_from_nearest
 from simulator.utils.checks import check_number, check_word
 from simulator.utils.files import open_picture
@@ -131,17 +132,22 @@ def _known_blur(raw: RawImage, depth: np.ndarray | None, lens: Lens | None) -> t
 
 
 def read_depth(
-    path: str | Path, *, kind: DepthKind = "distance", scale: float | None = None
+    path: str | Path,
+    *,
+    kind: DepthKind = "distance",
+    scale: float | None = None,
+    layer: str | None = None,
 ) -> np.ndarray:
     """Distances from the lens, of a depth camera's, a stereo matcher's or a network's file.
 
     Args:
-        path: A PNG of one channel (8 or 16 bit), an EXR (channel Z, Y or R; an `ImportError` if
-            OpenEXR is not installed) or a ``.npy`` array (H, W).
+        path: A PNG of one channel (8 or 16 bit), an EXR (channel Z, Depth, V, Y, or R alone; an
+            `ImportError` if OpenEXR is not installed) or a ``.npy`` array (H, W).
         kind: ``"disparity"`` where larger numbers are nearer: 1 / metres, times a constant.
         scale: Metres for each unit, or 1 / metres for each unit of disparity. By default
             a PNG of distances is in millimetres, an EXR or ``.npy`` in metres; a disparity has
             no default.
+        layer: Part or layer of an EXR, such as ``"ViewLayer.Depth"``, where several have depth.
 
     Returns:
         (H, W) float64 [m], all > 0. Where the file has no number (0 in a PNG, NaN, infinite or
@@ -155,7 +161,7 @@ def read_depth(
     if scale is not None or kind == "disparity":
         unit = "1 / metres" if kind == "disparity" else "metres"
         check_number("scale", scale, 1e-12, 1e12, more=f": {unit} for each unit")
-    values = _read_map(path)
+    values = _read_map(path, layer)
     of_png = path.suffix.lower() == ".png"
     zero_counts = kind == "disparity" and not of_png  # infinitely far
     known = np.isfinite(values) & ((values > 0) | ((values == 0) & zero_counts))
@@ -168,7 +174,7 @@ def read_depth(
     return filled * (scale or (PNG_METRES if of_png else 1.0))
 
 
-def _read_map(path: Path) -> np.ndarray:
+def _read_map(path: Path, layer: str | None) -> np.ndarray:
     """The map (H, W) of numbers in a file, float64."""
     try:
         match path.suffix.lower():
@@ -179,10 +185,8 @@ def _read_map(path: Path) -> np.ndarray:
             case ".npy":
                 values = np.asarray(np.load(path, allow_pickle=False))
             case ".exr":
-                with import_openexr().File(str(path), separate_channels=True) as file:
-                    channels = {name: channel.pixels for name, channel in file.channels().items()}
-                found = [channels[name] for name in ("Z", "Y", "R") if name in channels]
-                values = found[0] if found else np.empty(0)
+                kinds = ("Z",), ("DEPTH",), ("V",), ("Y",), ("R",)
+                values = read_exr(path, kinds, layer, outside=math.nan)[0][0]
             case _:
                 raise ValueError("the file must end in .png, .exr or .npy")
         if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":

@@ -166,6 +166,9 @@ DepthScale = Annotated[
         "each unit of disparity."
     ),
 ]
+DepthLayer = Annotated[
+    str | None, Option(help="Part or layer of an EXR, where several have depth.")
+]
 Focus = Annotated[
     str | None,
     Option(
@@ -187,6 +190,7 @@ def refocus(
     depth: DepthMap = None,
     depth_kind: DepthKindName = None,
     depth_scale: DepthScale = None,
+    depth_layer: DepthLayer = None,
     focus: Focus = None,
     focal_length: FocalLength = None,
     pixel_pitch: PixelPitch = None,
@@ -209,7 +213,8 @@ def refocus(
     from simulator.utils.checks import check_number
 
     f_number = console.parse_f_number(aperture)
-    for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale, "focus": focus}
+    for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale}
+    for_depth |= {"depth-layer": depth_layer, "focus": focus}
     for_depth |= {"focal-length": focal_length, "pixel-pitch": pixel_pitch}
     for name, value in for_depth.items():
         if depth is None and value is not None:
@@ -222,7 +227,7 @@ def refocus(
     if depth is not None:
         with console.option_names(kind="depth-kind", scale="depth-scale"):
             kind: Any = depth_kind or "distance"
-            metres = applied.read_depth(depth, kind=kind, scale=depth_scale)
+            metres = applied.read_depth(depth, kind=kind, scale=depth_scale, layer=depth_layer)
         if pixel_pitch is not None:
             source = replace(source, camera=replace(source.camera, pixel_pitch_um=pixel_pitch))
         lens = _lens(source, metres, focus, focal_length)

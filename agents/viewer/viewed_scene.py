@@ -36,7 +36,7 @@ from simulator import (
 )
 from simulator.camera_simulator import Depth
 from simulator.capture.plan import SimulationPlan
-from simulator.radiance.maps import RADIANCE_SUFFIXES
+from simulator.radiance.reading import RADIANCE_SUFFIXES
 from simulator.raw.develop import render_srgb, upright
 from simulator.utils.checks import did_you_mean
 from simulator.utils.files import RAW_SUFFIXES

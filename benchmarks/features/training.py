@@ -22,7 +22,7 @@ from benchmarks.harness import RUNS, data_root
 from benchmarks.isolated import ROOT
 from simulator import develop
 from simulator.augment import ExposureAugmentation, sample_seeds
-from simulator.radiance.maps import read_radiance
+from simulator.radiance.reading import read_radiance
 from simulator.raw.develop import GREY_CARD_SIGNAL, srgb_encode
 from simulator.training.scenes import Split, photograph_pictures, radiance_files, recorded_mosaics
 

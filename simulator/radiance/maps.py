@@ -1,28 +1,18 @@
-"""Radiance maps (.hdr, .exr): reading them, views into panoramas, and their assumed light.
+"""Radiance maps: views into panoramas, and their assumed light.
 
 A radiance map is linear but relative: nothing in it says how many lux it shows.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import logging
 import math
-import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from simulator.radiance.procedural import NATIVE_SIZE
-from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
-logger = logging.getLogger(__name__)
-
-#: File endings read here.
-RADIANCE_SUFFIXES = (".hdr", ".exr")
 #: Directions of the views cut from a panorama [degrees], and their field of view.
 AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
 FIELD_OF_VIEW = 60.0
@@ -30,35 +20,6 @@ FIELD_OF_VIEW = 60.0
 EV100_RANGE = (3.0, 14.0)
 #: Maps whose median lies beyond 2 to this power, or below its inverse, are scaled first.
 _USUAL_EXPONENT = 20
-
-
-def read_radiance(path: str | Path) -> np.ndarray:
-    """Linear light of an .hdr or .exr file, (3, H, W) float32 of arbitrary scale.
-
-    Values that are not light are repaired, and the repair is logged: NaN and negative values
-    (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
-    Primaries are taken to be sRGB's, as those files usually have; alpha and further channels are
-    ignored; a file with luminance only is grey.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, holds no light, or claims more pixels than
-            `simulator.utils.files` allows for a file of its length.
-    """
-    path = as_path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"`path` (={str(path)!r}) must be an existing file")
-    suffix = path.suffix.lower()
-    if suffix not in RADIANCE_SUFFIXES:
-        raise ValueError(f"`path` (={path.name!r}) must end in one of {list(RADIANCE_SUFFIXES)}")
-    try:
-        image = _read_hdr(path) if suffix == ".hdr" else _read_exr(path)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise ValueError(f"radiance map {str(path)!r} cannot be read: {error}") from error
-    return _clean(image.astype(np.float32, copy=False), path)
 
 
 def near_one(image: np.ndarray) -> np.ndarray:
@@ -176,79 +137,3 @@ def _central_square(image: np.ndarray, size: int) -> np.ndarray:
     top, left = (height - k * size) // 2, (width - k * size) // 2
     square = image[:, top : top + k * size, left : left + k * size]
     return np.asarray(square.reshape(3, size, k, size, k).mean(axis=(2, 4)))
-
-
-def _read_hdr(path: Path) -> np.ndarray:
-    try:
-        import cv2
-    except ImportError:
-        raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
-    content = path.read_bytes()
-    claim = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
-    if claim:
-        _refuse_lies(path, int(claim[1]), int(claim[2]), len(content))
-    level = cv2.utils.logging.setLogLevel(0)  # the error below says it all
-    image = None
-    try:
-        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-        with contextlib.suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if image is None or image.dtype != np.float32:
-        raise ValueError(f"radiance map {str(path)!r} must be a complete Radiance RGBE file")
-    return image[:, :, ::-1].transpose(2, 0, 1)
-
-
-def _refuse_lies(path: Path, height: int, width: int, size: int) -> None:
-    bomb = refuse_bomb(height, width, size, per_byte=MAX_RADIANCE_PIXELS_PER_BYTE)
-    if bomb:
-        raise ValueError(f"radiance map {str(path)!r} {bomb}")
-
-
-def _exr_size(file: Any) -> tuple[int, int]:
-    """Rows and columns of all parts of an OpenEXR file, below one another; channels in threes."""
-    height = width = 0
-    for part in file.parts:
-        low, high = (np.asarray(corner, np.int64) for corner in part.header["dataWindow"])
-        columns, rows = (high - low + 1).tolist()
-        height += rows * -(-len(part.header["channels"]) // 3)
-        width = max(width, columns)
-    return height, width
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    try:
-        import OpenEXR
-    except ImportError:
-        raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            _refuse_lies(path, *_exr_size(file), path.stat().st_size)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: c.pixels for name, c in file.channels().items()}
-    except (RuntimeError, ValueError) as error:
-        if "radiance map" in str(error):
-            raise
-        rule = f"must be a complete OpenEXR file, but OpenEXR says: {error}"
-        raise ValueError(f"radiance map {str(path)!r} {rule}") from error
-    names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
-    planes = [np.asarray(channels[n], np.float32) for n in names if n in channels]
-    if len(planes) != 3 or len({p.shape for p in planes}) != 1:
-        rule = f"(channels {sorted(channels)}) must have R, G and B of the same size, or Y"
-        raise ValueError(f"radiance map {str(path)!r} {rule}")
-    return np.stack(planes)
-
-
-def _clean(image: np.ndarray, path: Path) -> np.ndarray:
-    undefined, infinite, negative = np.isnan(image), np.isposinf(image), image < 0
-    if undefined.any() or infinite.any() or negative.any():
-        finite = np.where(undefined | negative | infinite, 0.0, image)
-        image = np.where(infinite, finite.max(), finite)
-        logger.info(
-            "radiance map %s: %d NaN and %d negative values set to 0, %d infinite to the maximum",
-            *(path.name, undefined.sum(), negative.sum(), infinite.sum()),
-        )
-    if not image.any():
-        raise ValueError(f"radiance map {str(path)!r} must hold some light, but is 0 everywhere")
-    return np.ascontiguousarray(image, np.float32)

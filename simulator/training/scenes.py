@@ -31,14 +31,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.thin_lens import Lens
 from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
 from simulator.radiance.light import camera_light, mean_anchor, reference_settings, temperature_tint
-from simulator.radiance.maps import (
-    AZIMUTHS,
-    EV100_RANGE,
-    RADIANCE_SUFFIXES,
-    assumed_ev100,
-    hash_fraction,
-    read_radiance,
-)
+from simulator.radiance.maps import AZIMUTHS, EV100_RANGE, assumed_ev100, hash_fraction
 from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
 from simulator.radiance.procedural import (
     KINDS,
@@ -48,6 +41,7 @@ from simulator.radiance.procedural import (
     draw_lux,
     fractal_noise,
 )
+from simulator.radiance.reading import RADIANCE_SUFFIXES, read_radiance
 from simulator.raw.read import read_raw
 from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene, packed_pitch
 from simulator.reference.sequences import ILLUMINANCE

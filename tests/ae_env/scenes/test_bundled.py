@@ -23,9 +23,9 @@ from ae_env.scenes.polyhaven import Asset, incident_light, list_assets
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
 from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
-from simulator.radiance.maps import read_radiance
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
+from simulator.radiance.reading import read_radiance
 from simulator.utils.cache import disk_cache
 from tests.ae_env.environments import assert_equal, make_env, make_envs
 from tests.ae_env.scene_files import write_hdr

@@ -14,7 +14,8 @@ from ae_env.scenes import load_scenes
 from ae_env.scenes.folder import Shot, group_shots, radiance_scenes, sequence_bounds, split_groups
 from ae_env.scenes.scene import SceneRequest
 from simulator import CameraSettings, RawImage, get_camera, write_dng
-from simulator.radiance.maps import assumed_ev100, perspective, read_radiance
+from simulator.radiance.maps import assumed_ev100, perspective
+from simulator.radiance.reading import read_radiance
 from tests.ae_env.environments import check_parity, make_env
 from tests.ae_env.scene_files import load, write_exr, write_hdr
 

@@ -19,7 +19,7 @@ from skimage.io import imsave
 
 from simulator import CameraSettings, NoiseLevelFunction, RawFileError, RawImage, read_raw
 from simulator.camera import BayerPattern, CameraProfile, get_camera
-from simulator.radiance.maps import read_radiance
+from simulator.radiance.reading import read_radiance
 from simulator.raw import read as read_module
 from simulator.raw.dng import write_dng
 from simulator.raw.metadata import camera_identity, is_raw_container, read_directories
