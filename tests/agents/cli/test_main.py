@@ -1,20 +1,28 @@
 """The program as a whole: help, errors, exit statuses, and the two commands about itself."""
 
+import importlib
 import os
+import pkgutil
 import re
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
 from PIL import Image
 
+import ae_env
 import simulator
 from ae_env.scorers import list_scorers
 from agents.cli import console
 from agents.cli import main as cli
+from agents.viewer.viewed_scene import find_scenes
 from simulator import RawImage, write_dng
 from simulator.capture.decision import DEFAULT_TOLERANCE
 
@@ -238,53 +246,50 @@ def test_a_second_ctrl_c_while_workers_end_is_silent() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "\nstopped\n")
 
 
-_WARM_UP_AND_USE = """
-import importlib, pkgutil
-import gymnasium as gym
-from numba.core.dispatcher import Dispatcher
-from agents.cli.main import app
-import ae_env, simulator
+def _warm_up_and_use(folder: Path) -> list[str]:
+    """Kernels that commands do not find ready on disk after the warm-up."""
+    modules = [
+        importlib.import_module(found.name)
+        for package in (ae_env, simulator)
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    kernels = {k for module in modules for k in vars(module).values() if isinstance(k, Dispatcher)}
 
-def kernels():
-    for package in (ae_env, simulator):
-        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            values = vars(importlib.import_module(found.name)).values()
-            yield from (value for value in values if isinstance(value, Dispatcher))
+    def used(kernel: Dispatcher) -> set[Dispatcher]:
+        code, names = kernel.py_func, kernel.py_func.__code__.co_names
+        called = (code.__globals__.get(name) for name in names)
+        return {kernel}.union(*(used(each) for each in called if isinstance(each, Dispatcher)))
 
-def used(kernel):
-    code, names = kernel.py_func, kernel.py_func.__code__.co_names
-    called = (code.__globals__.get(name) for name in names)
-    return {kernel}.union(*(used(each) for each in called if isinstance(each, Dispatcher)))
+    make_vec, small = gym.make_vec, {"scenes": "bundled:small", "resolution": 36}
+    gym.make_vec = lambda name, **arguments: make_vec(name, **{**arguments, **small})
+    os.chdir(folder)
+    os.environ["AE_ENV_CACHE"] = "cache"
+    cli.app(["warm-up"], standalone_mode=False)
+    types = {kernel: kernel.signatures for kernel in kernels}
+    warm = set().union(*(used(kernel) for kernel, own in types.items() if own))
+    for words in (
+        "simulate IMG_1.dng --iso 800 --shutter 1/30 --aperture 2.8 --depth unknown -o out.dng",
+        "refocus out.dng --aperture 1.4 -o open.dng --weights compact",
+        "sweep IMG_1.dng --out sweep",
+    ):
+        cli.app(words.split(), standalone_mode=False)
+    ready = {k for k in warm if k.stats.cache_path and k.signatures == types[k]}
+    return [kernel.py_func.__name__ for kernel in kernels - ready]
 
-make_vec = gym.make_vec
-small = {"scenes": "bundled:small", "resolution": 36}
-gym.make_vec = lambda name, **arguments: make_vec(name, **{**arguments, **small})
-app(["warm-up"], standalone_mode=False)
-types = {kernel: kernel.signatures for kernel in kernels()}
-warm = set().union(*(used(kernel) for kernel, own in types.items() if own))
-for words in (
-    "simulate IMG_1.dng --iso 800 --shutter 1/30 --aperture 2.8 --depth unknown -o out.dng",
-    "refocus out.dng --aperture 1.4 -o open.dng --weights compact",
-    "sweep IMG_1.dng --out sweep",
-):
-    app(words.split(), standalone_mode=False)
-ready = {k for k in warm if k.stats.cache_path and k.signatures == types[k]}
-print("cold", *(kernel.py_func.__name__ for kernel in types if kernel not in ready))
-"""
+
+def _draw(folder: Path) -> None:
+    os.environ["AE_ENV_CACHE"] = str(folder / "cache")
+    find_scenes("bundled:small")
 
 
 @pytest.mark.slow
-def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, tmp_path: Path) -> None:
+def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, forkserver: Any) -> None:
     """Commands use the kernels of the warm-up, at its types, all of which are kept on disk.
 
     So the kernels may come from the cache of all tests: none has to be compiled for this."""
-    env = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
-    env["AE_ENV_CACHE"] = str(tmp_path / "cache")
-    draw = "from agents.viewer.viewed_scene import find_scenes; find_scenes('bundled:small')"
     drawn = []
-    for code, shown in ((_WARM_UP_AND_USE, "cold\n"), (draw, "")):
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, env=env, cwd=dng.parent, capture_output=True, text=True)
-        assert (done.returncode, done.stdout[-5:]) == (0, shown), done.stderr
-        drawn.append({path: path.stat().st_ino for path in tmp_path.glob("cache/scenes/*")})
+    for run in (_warm_up_and_use, _draw):
+        with ProcessPoolExecutor(1, mp_context=forkserver) as pool:
+            assert not pool.submit(run, dng.parent).result()
+        drawn.append({path: path.stat().st_ino for path in dng.parent.glob("cache/scenes/*")})
     assert drawn[0] == drawn[1] != {}
