@@ -2,12 +2,8 @@
 
 import copy
 import math
-import os
 import pickle
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +15,7 @@ from gymnasium.wrappers.vector import NumpyToTorch
 
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
+from ae_env.scenes.load import _LOADED
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures, prepare_scene
 from simulator.camera import get_camera
@@ -340,16 +337,22 @@ def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
             np.testing.assert_array_equal(shown[-1][name][others], values[others])
 
 
-@pytest.mark.slow
-def test_workers_that_are_forked_from_a_process_with_environments(tmp_path: Path) -> None:
-    # Gymnasium's default: torch's threads do not survive the fork, a worker must not need them,
-    # not even to draw the scenes, as nothing is cached yet.
-    code = (
-        "import gymnasium as gym; envs = gym.make_vec('ae_env:ae_env/AutoExposure-v0', num_envs=2,"
-        " vectorization_mode='async', scenes='bundled:snow', split='test', resolution=36);"
-        "envs.reset(seed=0); print(envs.step([3, 40])[1].shape); envs.close()"
-    )
-    variables = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
-    variables["AE_ENV_CACHE"] = str(tmp_path)
-    command = [sys.executable, "-c", code]
-    assert subprocess.check_output(command, env=variables, timeout=300) == b"(2,)\n"
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_workers_that_are_forked_from_a_process_with_environments(tmp_path, monkeypatch) -> None:
+    """Gymnasium's default: torch's threads do not survive the fork, a worker must not need them.
+
+    Not even to draw the scenes, as nothing is cached yet.
+    """
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    given = {"scenes": "bundled:snow", "split": "test", "resolution": 36}
+    torch.set_num_threads(2)
+    make_env(**given).reset(seed=0)
+    _LOADED.clear()
+    envs = make_envs(2, vectorization_mode="async", **given)
+    try:
+        envs.reset_async(seed=0)
+        envs.reset_wait(timeout=120)
+        envs.step_async(np.array([3, 40]))
+        assert envs.step_wait(timeout=120)[1].shape == (2,)
+    finally:
+        envs.close(terminate=True)

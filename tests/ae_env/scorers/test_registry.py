@@ -208,7 +208,7 @@ def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
         assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
 
 
-@settings(max_examples=6)  # each of all scorers
+@settings(max_examples=4)  # each of all scorers
 @given(lights(LIGHT.map(abs)), USUAL_SETTINGS, grids(), st.data())
 def test_scores_are_shares_and_the_oracle_has_the_highest(light, reference, grid, data):
     draws = [[None, 1e-3, 640.0, 1e6], [False, True], [0.0, 1e-3, 1.0, 100.0], [0.0, 1.0, 25.0]]

@@ -375,17 +375,18 @@ def test_tables_are_the_means_over_many_captures(make: Any, blurred: bool) -> No
     scene, made = make(), make_scorer("balanced")
     blur = {"speed": 0.3, "defocus": 2.0} if blurred else {}
     table = ScoreTables(GRID, CAMERA, made).table(scene, **blur)
-    prepared = prepare_scene(scene, CAMERA, **blur)
-    captures = make_captures([scene] * 64, list(GRID), **blur)
-    captures = replace(captures, source_noise=source_noises(prepared, GRID.states, np.ones(64)))
+    prepared, some = prepare_scene(scene, CAMERA, **blur), np.arange(0, 64, 3)
+    states = [GRID[i] for i in some]
+    captures = make_captures([scene] * len(some), states, **blur)
+    captures = replace(captures, source_noise=source_noises(prepared, states, np.ones(len(some))))
     drawn: dict[str, list[np.ndarray]] = {name: [] for name in [*made.parts, "score"]}
     for seed in range(40):
-        images = prepared.expose(GRID.states, seed=seed).clamp_(0.0, 1.0)
+        images = prepared.expose(states, seed=seed).clamp_(0.0, 1.0)
         scores = {n: s.numpy() for n, s in made.score_parts(images, captures).items()}
         for name, values in [*scores.items(), ("score", made.totals(scores))]:
             drawn[name].append(values)
     for name, values in drawn.items():
-        found = table.mean if name == "score" else table.parts[name]
+        found = (table.mean if name == "score" else table.parts[name])[some]
         error = np.std(values, axis=0, ddof=1) / np.sqrt(40)
         off = np.abs(np.mean(values, axis=0) - found) - 5.0 * error
         assert (off < (one_pixel if name == "highlights" else 1e-3)).all(), name
