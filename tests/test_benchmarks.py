@@ -21,17 +21,10 @@ from ae_env.scorers.score_table import ScoreTable
 from agents.cli.main import BENCHMARKS
 from agents.learning import training as learning
 from benchmarks import features, harness, paper, recorded, transfer
+from benchmarks import paper_baselines as baselines
 from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.features import training
 from benchmarks.harness import Part, Report, benchmark, pivot, rounded, table
-from benchmarks.paper_baselines import (
-    AdaptiveNorm,
-    DecoupledNet,
-    GeneratedConvolution,
-    ParameterConcatenation,
-    edge_map,
-    scaled_parameters,
-)
 from benchmarks.transfer import agents, tables
 from benchmarks.transfer.agents import TableSet, TransferPlan, World
 from benchmarks.work_precision import pareto_front
@@ -322,11 +315,11 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("make", [ParameterConcatenation, DecoupledNet])
+@pytest.mark.parametrize("make", [baselines.ParameterConcatenation, baselines.DecoupledNet])
 def test_batch_of_different_parameters_equals_single_runs(make):
     net = make(width=6).eval().double()
     for module in net.modules():  # running statistics that differ from a single image's
-        if isinstance(module, AdaptiveNorm):
+        if isinstance(module, baselines.AdaptiveNorm):
             nn.init.constant_(module.normalised, 0.5)
             module.norm.running_mean.normal_()
     images = normal(3, 4, 9, 7).double()
@@ -340,7 +333,9 @@ def test_scaled_parameters() -> None:
     """ISO 100, 1/8000 s is the origin; the paper's whole range is positive and of order one."""
     extremes = torch.tensor([[0.0, -12.97, 2.0, 7.33, 2.0, 4.46]])
     expected = [[0.0, 0.00375, 0.25, 0.91625, 1.875, 0.5575]]
-    torch.testing.assert_close(scaled_parameters(extremes, normal(1, 1)), torch.tensor(expected))
+    torch.testing.assert_close(
+        baselines.scaled_parameters(extremes, normal(1, 1)), torch.tensor(expected)
+    )
 
 
 def test_trained_baselines_come_back(tmp_path: Path) -> None:
@@ -355,7 +350,7 @@ def test_trained_baselines_come_back(tmp_path: Path) -> None:
 
 def test_adaptive_normalisation() -> None:
     """lambda * x + mu * BN(x): over the batch in training, with running statistics after it."""
-    norm = AdaptiveNorm(3).double()
+    norm = baselines.AdaptiveNorm(3).double()
     x = normal(2, 3, 4, 5).double() * 2 + 1
     assert torch.equal(norm(x), x)  # lambda = 1, mu = 0
     nn.init.constant_(norm.identity, 0.3)
@@ -371,7 +366,7 @@ def test_adaptive_normalisation() -> None:
 
 def test_receptive_field_of_the_published_table() -> None:
     """513 pixels (Chen et al. 2017, table 1)."""
-    net = ParameterConcatenation(width=1).eval()
+    net = baselines.ParameterConcatenation(width=1).eval()
     for parameter in net.parameters():
         nn.init.ones_(parameter)  # positive, lest contributions cancel
     image = torch.ones(1, 4, 1, 701, requires_grad=True)
@@ -384,9 +379,9 @@ def test_receptive_field_of_the_published_table() -> None:
 @pytest.mark.parametrize("options", [{}, {"stride": 2}, {"dilation": 4}, {"upsample": True}])
 def test_generated_convolution_is_each_sample_s_own(options: dict[str, int]) -> None:
     torch.manual_seed(0)
-    layer = GeneratedConvolution(5, 5, **options).double()  # type: ignore[arg-type]
+    layer = baselines.GeneratedConvolution(5, 5, **options).double()  # type: ignore[arg-type]
     x = normal(3, 5, 7, 6).double()
-    parameters = scaled_parameters(PARAMETERS, x)
+    parameters = baselines.scaled_parameters(PARAMETERS, x)
     result = layer(x, parameters)
     for i in range(3):
         flat = layer.generator.weight @ parameters[i] + layer.generator.bias
@@ -402,9 +397,9 @@ def test_generated_convolution_is_each_sample_s_own(options: dict[str, int]) -> 
 def test_edge_map() -> None:
     """A ramp of slope 1 along the rows: two differences of 1 inside, one at the ends, over 4."""
     ramp = torch.arange(4.0).expand(1, 4, 3, 4)
-    assert edge_map(ramp)[0, 0].tolist() == [[0.25, 0.5, 0.5, 0.25]] * 3
-    assert torch.equal(edge_map(ramp.mT), edge_map(ramp).mT)
-    assert edge_map(torch.ones(1, 4, 1, 1)).item() == 0.0
+    assert baselines.edge_map(ramp)[0, 0].tolist() == [[0.25, 0.5, 0.5, 0.25]] * 3
+    assert torch.equal(baselines.edge_map(ramp.mT), baselines.edge_map(ramp).mT)
+    assert baselines.edge_map(torch.ones(1, 4, 1, 1)).item() == 0.0
 
 
 # -- transfer -------------------------------------------------------------------------------------

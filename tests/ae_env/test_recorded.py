@@ -176,17 +176,7 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
         recorded.index_recorded(tmp_path, {})
 
 
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        *(("recorded:", r"`scenes\['recorded'\]`"), ({"recorded": 3}, r"`scenes\['recorded'\]`")),
-        *(("recorded:none", "existing folder"), ("recorded:a?iso=-3", "`iso`")),
-        *(({"recorded": "a", "isos": 3}, "did you mean 'iso'"), ("recorded:a?iso=fast", "number")),
-    ],
-)
-def test_options(tmp_path: Path, spec: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        load(spec)
+def test_options_and_how_many_states_a_grid_may_have(tmp_path: Path) -> None:
     options = recorded.RecordedOptions
     found = options.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
     assert found == options(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)

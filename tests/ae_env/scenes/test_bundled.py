@@ -146,6 +146,7 @@ def test_cached_scenes_equal_fresh_ones(tmp_path, monkeypatch, caplog):
         return load_scenes("bundled:photograph", "test", camera=CAMERA, resolution=36)
 
     fresh = load()
+    assert {scene.kind for scene in fresh} == {"photograph"}
     (file,) = (tmp_path / "scenes").glob("*.safetensors")
     content, cache, key = file.read_bytes(), disk_cache(), f"scenes/{file.stem}"
     stored = cache.get(key)

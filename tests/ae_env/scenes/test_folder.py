@@ -49,23 +49,6 @@ def test_bad_files_stop_or_are_skipped_with_a_reason(tmp_path, caplog):
     assert "skip" not in str(caught.value)  # which would not help with one file
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        *(({"on_error": "skp"}, "did you mean 'skip'"), ({"on_eror": "skip"}, "'on_error'")),
-        *(({"illuminance": -1.0}, "`illuminance`"), ({"hard": 1}, "`hard`")),
-        *(({"kind": 3}, "`kind`"), ({"ev100": "bright"}, "`ev100`")),
-        ({"sequence": "here"}, "`scenes`"),
-        ({"path": None, "sequence": "here", "on_error": "skip"}, "`on_error`"),
-        ({"path": "recorded:here"}, "`scenes`"),
-    ],
-)
-def test_options_are_refused_before_anything_is_read(options, words, tmp_path):
-    spec = {"path": tmp_path / "is not there", **options}
-    with pytest.raises(ValueError, match=words):
-        load({name: value for name, value in spec.items() if value is not None})
-
-
 def test_options_reach_the_scenes(tmp_path: Path) -> None:
     write_hdr(tmp_path / "a.hdr", 0)
     write_hdr(tmp_path / "b.hdr", 1)
