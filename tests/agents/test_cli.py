@@ -547,7 +547,7 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
 
 def check_files(out: Path) -> dict[str, Any]:
     names = {"scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png", "ev_error.png"}
-    names |= {"cost.png", "contact_sheet.webp"}
+    names |= {"cost.png", "contact_sheet.webp", "contact_sheet_2.webp"}
     assert {path.name for path in out.iterdir() if path.stat().st_size > 200} >= names
     content = json.loads((out / "results.json").read_text())
     rows = [row for row in content["rows"] if row["condition"] == "all"]
@@ -561,7 +561,7 @@ def check_files(out: Path) -> dict[str, Any]:
 @pytest.mark.usefixtures("quick_spawn")
 def test_quickstart_on_bundled_scenes_then_on_ones_own(ae_env, raw, tmp_path, monkeypatch):
     few = {"REGRESSION_FRAMES": 128, "PPO_FRAMES": 1024, "EPISODES": 1}
-    few |= {"BASELINES": ("best_fixed", "matrix:tuned", "oracle")}
+    few |= {"BASELINES": ("random", "best_fixed", "matrix:tuned", "oracle")}
     for name, value in few.items():
         monkeypatch.setattr(quickstart, name, value)
     monkeypatch.setattr("agents.metering.metering_policy.FIT_PER_SCENE", 1)
