@@ -84,7 +84,7 @@ def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(gym, "make_vec", with_few)
     program, weights = ROOT / "examples" / "recurrent_ppo.py", tmp_path / "recurrent.safetensors"
-    runpy.run_path(str(program))["train"](weights, frames=256)
+    runpy.run_path(str(program))["train"](weights, frames=128)
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")
     context = PolicyContext.from_envs(envs)
     policy = make_policy(f"{program}:RecurrentAgent?weights={weights}", context)
