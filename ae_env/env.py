@@ -246,7 +246,9 @@ class AutoExposure(Task):
     ) -> Captures:
         episodes, env_indices, rows = self.episodes, frames.env_indices[part], frames.rows
         scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
-        light = noises = None
+        light = noises = movements = None
+        if episodes.subject_speed[env_indices].any():  # else they do not matter
+            movements = [episodes[index].movement for index in env_indices.tolist()]
         if not self.in_chunks:
             light = torch.empty(1).expand(len(env_indices), *scenes[0].light.shape)
         if source_noise[part].any():
@@ -258,7 +260,7 @@ class AutoExposure(Task):
             episodes.camera,
             speed=episodes.speed[env_indices],
             defocus=episodes.defocus[env_indices],
-            movements=[episodes[index].movement for index in env_indices.tolist()],
+            movements=movements,
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],
             light=light,

@@ -129,7 +129,7 @@ def load_scenes(
     elif isinstance(spec, str):
         scenes = _by_name(spec, request)
     else:
-        scenes = _sized_list(spec, "scenes", request)
+        scenes = _sized_list(spec, spec, "scenes", request)
     if not scenes:
         raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
     name, count = Counter(scene.scene_id for scene in scenes).most_common(1)[0]
@@ -162,7 +162,7 @@ def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
                 names = inspect.signature(found).parameters
                 known = [n for n in ("split", "camera", "resolution") if n in names]
                 found = found(**{name: getattr(request, name) for name in known})
-            return _sized_list(found, spec, request)
+            return _sized_list(found, spec, spec, request)
         hint = did_you_mean(spec, NAMED, cutoff=0.7)
         if hint or ours:
             rule = "an existing file, folder or glob, or 'pkg.mod:attr'"
@@ -189,10 +189,10 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 
-def _sized_list(found: Any, name: str, request: SceneRequest) -> list[Scene]:
+def _sized_list(found: Any, spec: object, name: str, request: SceneRequest) -> list[Scene]:
     if isinstance(found, str | bytes) or not isinstance(found, Sequence):
         raise ValueError(
-            f"`scenes` (={name!r}) must give a list of Scene, not {type(found).__name__}; else it "
+            f"`scenes` (={spec!r}) must give a list of Scene, not {type(found).__name__}; else it "
             "is a name, a path or a mapping"
         )
     for i, scene in enumerate(found):

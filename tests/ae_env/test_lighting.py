@@ -167,7 +167,7 @@ def test_whole_periods_have_no_bands(frequency: float, times, duty: float | None
     assert lighting.rows(0, 1 / 90, 0.0, SHUTTER)[1] is not None
 
 
-PHASES = np.random.default_rng(0).random(60)
+PHASES = np.random.default_rng(0).random(40)
 #: Most stops away from where the light begins (sines begin anywhere), most stops between frames.
 BOUNDS = {"ramps": (6.0, 1.5), "sines": (3.5, np.pi), "tunnels": (7.0, 7.0 / 3.0)}
 BOUNDS |= {"steps": (3.0, 6.0), "drifts": (6.0, 1.5), "lamps": (0.0, 0.0), "shadows": (5.0, 5.0)}

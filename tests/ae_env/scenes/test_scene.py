@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.color import rgb2xyz
 
-from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, exposure_ratio
@@ -175,6 +174,7 @@ def my_scenes(split: str, camera: object) -> list[Scene]:
 
 
 MINE = my_scenes("all", None)
+NONE = {"path": "no/such/folder"}
 
 
 def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
@@ -206,7 +206,16 @@ def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
         ("math:pi", "float"),
         *(([1], r"`scenes\[0\]`"), ([], "at least one"), ([*MINE, *MINE], "`scene_id`")),
         *(({"lux": 3}, "'path'"), ({"path": "bundled", "kind": "snow"}, "existing file")),
-        ({"path": "x", "illuminace": 3}, "did you mean 'illuminance'"),
+        # Options of folders and of recorded scenes, before anything is read.
+        *(({**NONE, "illuminace": 3}, "'illuminance'"), ({**NONE, "on_error": "skp"}, "'skip'")),
+        *(({**NONE, "on_eror": "skip"}, "'on_error'"), ({**NONE, "kind": 3}, "`kind`")),
+        *(({**NONE, "illuminance": -1.0}, "`illuminance`"), ({**NONE, "hard": 1}, "`hard`")),
+        *(({**NONE, "ev100": "bright"}, "`ev100`"), ({**NONE, "sequence": "here"}, "`scenes`")),
+        ({"sequence": "here", "on_error": "skip"}, "`on_error`"),
+        *(({"path": "recorded:here"}, "`scenes`"), ("recorded:none", "existing folder")),
+        *((spec, r"`scenes\['recorded'\]`") for spec in ("recorded:", {"recorded": 3})),
+        *(("recorded:a?iso=-3", "`iso`"), ("recorded:a?iso=fast", "number")),
+        ({"recorded": "a", "isos": 3}, "did you mean 'iso'"),
     ],
 )
 def test_scenes_that_cannot_be_are_refused(spec: object, words: str) -> None:
@@ -248,10 +257,6 @@ def noisy_scene() -> Scene:
     return Scene.from_array(data, NOISY, CAMERA, scene_id="noisy", nlf=nlf)
 
 
-def _state(iso: float, time: float, f_number: float) -> int:
-    return ExposureGrid.default().states.index(CameraSettings(iso, time, f_number))
-
-
 def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
     """The weights named here cannot be read: whoever loads them fails."""
     damaged = tmp_path / "damaged.safetensors"
@@ -265,29 +270,6 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
         make_env(scenes=[noisy_scene()], resolution=40, simulator=str(damaged))
 
 
-def test_what_is_in_the_frame_moves_the_reward(weights: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    light = 0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
-    picture = Scene.from_array(light, NOISY, CAMERA, scene_id="flat", illuminance=640.0)
-    noisy = replace(picture, nlf=CAMERA.nlf(NOISY.iso))
-
-    def made(scene: Scene, **arguments: Any) -> tuple[float, dict[str, float]]:
-        fixed = {"motion": "none", "depth": "far", "simulator": None}
-        env = make_env(scenes=[scene], resolution=40, **{**fixed, **arguments})
-        _, info = env.reset(seed=0, options={"state": _state(100, 1 / 15, 8)})
-        return info["rewards"]["score"], info["rewards"]
-
-    clean, terms = made(picture)
-    assert made(picture, noise=False)[1]["noise"] == pytest.approx(1.0)
-    assert terms["noise"] < 0.99
-    left, its_terms = made(noisy)  # exposure and noise level function alone: the noise stays
-    assert left < clean
-    assert its_terms["noise"] < terms["noise"]
-    denoised, _ = made(noisy, simulator=weights)
-    assert left < denoised <= clean + 0.01
-    assert made(noisy, simulator=weights, tolerance=1e6)[0] == left  # no network is needed
-
-
 def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
     """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
     light = torch.zeros(4, 80, 80)
@@ -297,8 +279,8 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
     fixed = {"motion": "none", "noise": False, "observation": "linear", "depth": "unknown"}
     env = make_env(scenes=[scene], simulator=weights, resolution=40, **fixed)
     for f_number, growth in ((4, 4.0 - 1.0), (5.6, 2.0 - 1.0), (8, 0.0), (11, 0.0)):
-        options = {"state": _state(100, 1 / 125, f_number)}
-        observation, info = env.reset(seed=0, options=options)
+        state = env.unwrapped.grid.states.index(CameraSettings(100, 1 / 125, f_number))
+        observation, info = env.reset(seed=0, options={"state": state})
         raw = observation["raw"][0].astype(np.float64)
         assert info["modules"] == ("exposure+aperture" if growth else "exposure")
         if growth:
@@ -362,7 +344,8 @@ def test_its_noise_is_the_cameras_averaged(box_factor: int) -> None:
 
 
 def test_in_the_environment_everything_comes_from_the_raw():
-    given = {"scenes": "bundled:small", "motion": "none", "depth": "far"}
+    some = make_env().unwrapped.scenes[:4]
+    given = {"scenes": some, "motion": "none", "depth": "far"}
     sources = ({"source": "raw"}, {}, {"source": "raw", "simulator": None})
     env, *others = (make_env(**given, **source) for source in sources)
     scene = max(env.unwrapped.scenes, key=lambda s: s.reference.iso)

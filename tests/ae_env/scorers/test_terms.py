@@ -89,13 +89,6 @@ def test_scores_follow_the_formulas(illuminance, speed, defocus):
         np.testing.assert_allclose(scores.numpy(), wanted, rtol=2e-4, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("value", [1e-9, 1e4])
-def test_black_and_white_frames_score_below_a_twentieth(value: float) -> None:
-    captures = make_captures(make_scene(np.full((4, 40, 40), value)), list(GRID))
-    images = captures.light.clamp(0.0, 1.0)
-    assert make_scorer("balanced")(images, captures).sort().values[59] < 0.05  # of 64
-
-
 def test_noise_is_that_of_the_cameras_own_pixels() -> None:
     """Box-averaging does not make ISO free: only a frame's values are less noisy."""
     tables = ScoreTables(GRID, CAMERA, make_scorer("noise"))
@@ -307,9 +300,8 @@ def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
     # at 1/100 s and ISO 1600 at 1/400 s; times that are no powers of two round differently.
     grid = ExposureGrid((100, 400, 1600), (1 / 400, 1 / 100, 1 / 25), (4, 8))
     for ev100 in (5.7, 9.3, 12.1):
-        best = _tables("brightness", grid=grid).table(
-            replace(_scene(), illuminance=2.5 * 2.0**ev100)
-        )
+        lit = replace(_scene(), illuminance=2.5 * 2.0**ev100)
+        best = _tables("brightness", grid=grid).table(lit)
         assert best.oracle == np.flatnonzero(best.mean > best.mean.max() - 1e-7)[0]
 
 
@@ -375,17 +367,18 @@ def test_tables_are_the_means_over_many_captures(make: Any, blurred: bool) -> No
     scene, made = make(), make_scorer("balanced")
     blur = {"speed": 0.3, "defocus": 2.0} if blurred else {}
     table = ScoreTables(GRID, CAMERA, made).table(scene, **blur)
-    prepared = prepare_scene(scene, CAMERA, **blur)
-    captures = make_captures([scene] * 64, list(GRID), **blur)
-    captures = replace(captures, source_noise=source_noises(prepared, GRID.states, np.ones(64)))
+    prepared, some = prepare_scene(scene, CAMERA, **blur), np.arange(0, 64, 3)
+    states = [GRID[i] for i in some]
+    captures = make_captures([scene] * len(some), states, **blur)
+    captures = replace(captures, source_noise=source_noises(prepared, states, np.ones(len(some))))
     drawn: dict[str, list[np.ndarray]] = {name: [] for name in [*made.parts, "score"]}
     for seed in range(40):
-        images = prepared.expose(GRID.states, seed=seed).clamp_(0.0, 1.0)
+        images = prepared.expose(states, seed=seed).clamp_(0.0, 1.0)
         scores = {n: s.numpy() for n, s in made.score_parts(images, captures).items()}
         for name, values in [*scores.items(), ("score", made.totals(scores))]:
             drawn[name].append(values)
     for name, values in drawn.items():
-        found = table.mean if name == "score" else table.parts[name]
+        found = (table.mean if name == "score" else table.parts[name])[some]
         error = np.std(values, axis=0, ddof=1) / np.sqrt(40)
         off = np.abs(np.mean(values, axis=0) - found) - 5.0 * error
         assert (off < (one_pixel if name == "highlights" else 1e-3)).all(), name
