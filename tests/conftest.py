@@ -5,9 +5,7 @@ import logging
 import multiprocessing
 import multiprocessing.forkserver
 import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,10 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("tests")
 
-torch.set_num_threads(min(2, torch.get_num_threads()))
+# A share of the processors for each worker of pytest-xdist: OpenMP's waiting threads block others.
+_WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+torch.set_num_threads(max(1, min(2, torch.get_num_threads() // _WORKERS)))
+os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # of processes they start
 
 
 @pytest.fixture(scope="session")
@@ -78,18 +79,6 @@ def forkserver() -> Any:
 def quick_spawn(forkserver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes that the package spawns come from `forkserver`: importing torch takes seconds."""
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": forkserver}.__getitem__)
-
-
-@pytest.fixture
-def compiled_and_loaded(tmp_path: Path) -> Callable[[str], list[list[str]]]:
-    """Words that a program prints which compiles its kernels, and then one that loads them."""
-
-    def run(code: str) -> list[list[str]]:
-        command, given = [sys.executable, "-c", code], {"NUMBA_CACHE_DIR": str(tmp_path)}
-        outputs = (subprocess.check_output(command, env=os.environ | given) for _ in range(2))
-        return [output.decode().split() for output in outputs]
-
-    return run
 
 
 @pytest.fixture

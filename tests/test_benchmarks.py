@@ -306,9 +306,10 @@ def test_the_papers_table_in_one_command(
 
 # -- the paper's baselines, against their papers' tables and PyTorch's layers ----------------------
 
-SOURCES = torch.tensor([[0.0, -7.0, 3.5], [7.3, -13.0, 2.0], [2.0, -5.0, 2.5]])
-TARGETS = torch.tensor([[6.0, -10.0, 2.0], [0.0, 2.0, 4.5], [3.0, -6.0, 2.5]])
-PARAMETERS = torch.cat([SOURCES, TARGETS], dim=1)
+#: Log2 of ISO / 100, exposure time and f-number, of the source and then of the target.
+PARAMETERS = torch.tensor(
+    [[0, -7, 3.5, 6, -10, 2], [7.3, -13, 2, 0, 2, 4.5], [2, -5, 2.5, 3, -6, 2.5]]
+)
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:

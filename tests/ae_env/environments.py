@@ -5,7 +5,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 ID = "ae_env/AutoExposure-v0"
@@ -14,11 +13,6 @@ SMALL: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
 
 def make_env(task: str = ID, **arguments: Any) -> gym.Env:
     return gym.make(f"ae_env:{task}", **{**SMALL, **arguments})
-
-
-def make_worker_env(**arguments: Any) -> gym.Env:
-    torch.set_num_threads(1)  # a worker process of its own crawls with one thread per core
-    return make_env(**arguments)
 
 
 def make_envs(num_envs: int = 3, task: str = ID, **arguments: Any) -> gym.vector.VectorEnv:
@@ -77,7 +71,7 @@ def named(envs: Any, results: tuple[Any, ...]) -> tuple[Any, ...]:
 
 def check_parity(seed: int, steps: int, mode: str = "SAME_STEP", **arguments: Any) -> None:
     """The native vector environment shows what single ones show, out of step with each other."""
-    make = functools.partial(make_worker_env, **arguments)
+    make = functools.partial(make_env, **arguments)
     envs = make_envs(autoreset_mode=mode, **arguments)
     reference = SyncVectorEnv([make] * 3, autoreset_mode=AutoresetMode[mode], copy=True)
     assert envs.metadata["autoreset_mode"] == AutoresetMode[mode]

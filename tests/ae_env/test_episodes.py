@@ -225,10 +225,8 @@ def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any)
 
 @pytest.mark.parametrize("scorer", ["balanced", {"balanced": 0.7, "banding": 0.3}])
 def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> None:
-    env = _env(
-        lighting=LED, scorer=scorer, with_oracle=True, motion=0.05, depth=0.5, noise=False,
-        reward="expected",
-    )  # fmt: skip
+    given = {"with_oracle": True, "motion": 0.05, "depth": 0.5, "noise": False}
+    env = _env(lighting=LED, scorer=scorer, reward="expected", **given)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(18)
     lamp, scene = PulsedLamp(250.0, 0.3, env.episode().phase), _grey()

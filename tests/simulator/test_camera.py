@@ -138,9 +138,6 @@ def test_bad_values_are_named(name: str, value: object) -> None:
 )
 def test_ranges_include_their_ends(name: str, low: float, high: float) -> None:
     arguments = {"iso": 100.0, "exposure_time": 0.5, "f_number": 4.0}
-    assert repr(CameraSettings(**arguments)) == (
-        "CameraSettings(iso=100.0, exposure_time=0.5, f_number=4.0)"
-    )
     for value in (low, high):
         assert getattr(CameraSettings(**arguments | {name: value}), name) == value
     for value in (0.999 * low, 1.001 * high):
@@ -211,21 +208,19 @@ def test_z6_is_the_table_and_scales_where_it_has_no_neighbours(iso, base, stops)
 
 @pytest.mark.real_data
 @pytest.mark.parametrize(
-    ("name", "entry", "inferred"),
+    ("name", "entry"),
     [
-        ("canon_5d4", "CanonEOS5D4", {}),
-        ("canon_700d", "CanonEOS700D", {}),
-        ("canon_70d", "CanonEOS70D", {}),
-        # Its read noise falls at ISO 400, where its second profile is taken.
-        ("nikon_d850", "NikonD850", dict.fromkeys((400, 800, 1600, 3200, 6400), "Profile-2")),
-        ("sony_a7s2", "SonyA7S2", {}),
+        *[("canon_5d4", "CanonEOS5D4"), ("canon_700d", "CanonEOS700D")],
+        *[("canon_70d", "CanonEOS70D"), ("nikon_d850", "NikonD850"), ("sony_a7s2", "SonyA7S2")],
     ],
 )
-def test_elds_cameras_are_its_calibration(data_dir, name, entry, inferred):
+def test_elds_cameras_are_its_calibration(data_dir, name, entry):
     """K = Kmin ISO / 100 DN per electron; ln sigma = slope ln K + bias, in DN of 15583."""
     known = json.loads((data_dir / "noise_eld.json").read_text())["cameras"][entry]
     for stop, iso in enumerate((100, 200, 400, 800, 1600, 3200, 6400)):
-        gain, fits = known["Kmin"] * iso / 100, known[inferred.get(iso, "Profile-1")]
+        # The D850's read noise falls at ISO 400, where its second profile is taken.
+        profile = 1 + (name == "nikon_d850" and iso >= 400)
+        gain, fits = known["Kmin"] * iso / 100, known[f"Profile-{profile}"]
         sigma, row = (
             math.exp(fits[key]["slope"] * math.log(gain) + fits[key]["bias"])
             for key in ("g_scale", "R_scale")
@@ -298,14 +293,10 @@ def test_levels() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"cfa": "XTRANS"}, "`cfa`"),
-        ({"black_level": (1, 2, 3)}, "`black_level`"),
-        ({"black_level": -1}, "`white_level`"),
-        ({"black_level": (0, 0, 0, 1023)}, "`white_level`"),
-        ({"white_level": 70_000, "bit_depth": 16}, "`white_level`"),
-        ({"bit_depth": 0}, "`bit_depth`"),
-        ({"bit_depth": 10.5}, "`bit_depth`"),
-        ({"white_level": 1022.5}, "`white_level`"),
+        *[({"cfa": "XTRANS"}, "`cfa`"), ({"black_level": (1, 2, 3)}, "`black_level`")],
+        *[({"bit_depth": depth}, "`bit_depth`") for depth in (0, 10.5)],
+        *[({"black_level": black}, "`white_level`") for black in (-1, (0, 0, 0, 1023))],
+        *[({"white_level": white, "bit_depth": 16}, "`white_level`") for white in (70_000, 1022.5)],
     ],
 )
 def test_bad_profiles_are_refused(fields: dict[str, object], message: str) -> None:

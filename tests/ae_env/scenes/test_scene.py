@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.color import rgb2xyz
 
-from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, exposure_ratio
@@ -258,10 +257,6 @@ def noisy_scene() -> Scene:
     return Scene.from_array(data, NOISY, CAMERA, scene_id="noisy", nlf=nlf)
 
 
-def _state(iso: float, time: float, f_number: float) -> int:
-    return ExposureGrid.default().states.index(CameraSettings(iso, time, f_number))
-
-
 def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
     """The weights named here cannot be read: whoever loads them fails."""
     damaged = tmp_path / "damaged.safetensors"
@@ -284,8 +279,8 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
     fixed = {"motion": "none", "noise": False, "observation": "linear", "depth": "unknown"}
     env = make_env(scenes=[scene], simulator=weights, resolution=40, **fixed)
     for f_number, growth in ((4, 4.0 - 1.0), (5.6, 2.0 - 1.0), (8, 0.0), (11, 0.0)):
-        options = {"state": _state(100, 1 / 125, f_number)}
-        observation, info = env.reset(seed=0, options=options)
+        state = env.unwrapped.grid.states.index(CameraSettings(100, 1 / 125, f_number))
+        observation, info = env.reset(seed=0, options={"state": state})
         raw = observation["raw"][0].astype(np.float64)
         assert info["modules"] == ("exposure+aperture" if growth else "exposure")
         if growth:

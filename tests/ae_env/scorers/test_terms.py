@@ -300,9 +300,8 @@ def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
     # at 1/100 s and ISO 1600 at 1/400 s; times that are no powers of two round differently.
     grid = ExposureGrid((100, 400, 1600), (1 / 400, 1 / 100, 1 / 25), (4, 8))
     for ev100 in (5.7, 9.3, 12.1):
-        best = _tables("brightness", grid=grid).table(
-            replace(_scene(), illuminance=2.5 * 2.0**ev100)
-        )
+        lit = replace(_scene(), illuminance=2.5 * 2.0**ev100)
+        best = _tables("brightness", grid=grid).table(lit)
         assert best.oracle == np.flatnonzero(best.mean > best.mean.max() - 1e-7)[0]
 
 

@@ -31,7 +31,7 @@ def context() -> PolicyContext:
     return PolicyContext.from_envs(small_envs(1))
 
 
-@pytest.fixture(scope="module", params=["regression", "ppo"])
+@pytest.fixture(scope="module", params=["regression", pytest.param("ppo", marks=pytest.mark.slow)])
 def exported(request: pytest.FixtureRequest, context: PolicyContext, tmp_path_factory: Any) -> Any:
     policy = make_policy(request.param, context)
     return policy, export_agent(policy, tmp_path_factory.mktemp("onnx") / "agent.onnx")

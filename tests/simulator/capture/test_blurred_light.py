@@ -5,6 +5,7 @@ import math
 import pickle
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -107,22 +108,6 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(size, tile, monkeypa
         assert not torch.equal(result, image) or min(size) == 1
 
 
-def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
-    calls: list[int] = []
-
-    def estimate() -> Tensor:
-        calls.append(1)
-        return torch.full((24, 24), 2.0)
-
-    made = MapApertureBlur(light(), estimate, 8.0)
-    assert made.extent(8.0) == made.extent(16.0) == 0.0
-    assert not calls
-    assert made.extent(4.0) == pytest.approx(2 * math.sqrt(3))
-    made.opened(4.0, None)
-    made.remaining_variance(5.6)
-    assert calls == [1]
-
-
 # -- uniform blur in sweeps -------------------------------------------------------------------
 
 STILL = Exposure(2.0, ZERO, ZERO)
@@ -190,6 +175,10 @@ def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
     found = _prepared(layout=None, image_speed=0.3).expected(SLOW)
     wanted = path_blur(SCENE, path_taps(path, SIZE, SIZE)) * exposure.ratio
     torch.testing.assert_close(found, wanted)
+    along_rows = _prepared(layout=None, movement=Movement(subject_speed=2.0), image_speed=0.3)
+    plain = PreparedScene(SCENE, REFERENCE, Z6, ZERO, image_speed=0.3)
+    assert torch.equal(plain.expected(SLOW), along_rows.expected(SLOW))
+    assert along_rows.exposure(SLOW).is_uniform
 
 
 def test_the_largest_extent_decides() -> None:
@@ -200,13 +189,6 @@ def test_the_largest_extent_decides() -> None:
     light = still.expected(SLOW) / still.exposure(SLOW).ratio
     assert torch.equal(light[:, :, :4], SCENE[:, :, :4])  # far from it all stays as it is
     assert not torch.allclose(light[:, 12:18, 14:22], SCENE[:, 12:18, 14:22], atol=0.05)
-
-
-def test_a_movement_along_the_rows_changes_nothing() -> None:
-    plain = PreparedScene(SCENE, REFERENCE, Z6, ZERO, image_speed=0.3)
-    same = _prepared(layout=None, movement=Movement(subject_speed=2.0), image_speed=0.3)
-    assert torch.equal(plain.expected(SLOW), same.expected(SLOW))
-    assert same.exposure(SLOW).is_uniform
 
 
 @pytest.mark.parametrize("defocus", [0.0, 5.0])
@@ -294,17 +276,6 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
 
-class Counted:
-    """Scenes of a batch, and which of them were asked for."""
-
-    def __init__(self) -> None:
-        self.calls: list[int] = []
-
-    def __call__(self, index: int) -> PreparedScene:
-        self.calls.append(index)
-        return prepared(index)
-
-
 def made(noise="bank", *, cache_light=True, scenes=prepared):
     return CaptureBatch(scenes, 7, STATES, Z6, noise=noise, cache_light=cache_light)
 
@@ -328,7 +299,7 @@ def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
 @pytest.mark.parametrize("cache_light", [True, False])
 def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: bool) -> None:
-    scenes, rng, seen = Counted(), np.random.default_rng(0), set()
+    scenes, rng, seen = Mock(side_effect=prepared), np.random.default_rng(0), set()
     batch = made(noise, cache_light=cache_light, scenes=scenes)
     for _ in range(12):
         states, gains = rng.integers(len(STATES), size=7), rng.choice([1e-6, 0.25, 1.0, 3.0], 7)
@@ -350,7 +321,7 @@ def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: 
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
     assert seen >= {"aperture", "defocus", "motion_blur"}
-    assert sorted(scenes.calls) == list(range(7))
+    assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(7))
     assert noise is None or seen >= {"noise", "excess"}
 
 
@@ -365,8 +336,8 @@ def test_rows_have_the_light_that_is_given() -> None:
 
 
 def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -> None:
-    scenes = Counted()
-    batch, calls = made(scenes=scenes), scenes.calls
+    calls: list[int] = []
+    batch = made(scenes=lambda index: calls.append(index) or prepared(index))
     first, again, _ = photographed(batch, 1)[0], photographed(batch, 1)[0], photographed(batch, 4)
     assert sorted(calls) == list(range(7))
     # The pool is private: memory that is not used again would show as a slow environment only.

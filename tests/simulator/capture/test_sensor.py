@@ -32,12 +32,8 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise
 
-STATES = [
-    CameraSettings(iso, exposure_time, f_number)
-    for iso, exposure_time, f_number in itertools.product(
-        (100, 400, 1600, 6400), (1 / 1000, 1 / 125, 1 / 15, 1 / 2), (4, 5.6, 8, 11)
-    )
-]
+ISOS, TIMES = (100, 400, 1600, 6400), (1 / 1000, 1 / 125, 1 / 15, 1 / 2)
+STATES = list(itertools.starmap(CameraSettings, itertools.product(ISOS, TIMES, (4, 5.6, 8, 11))))
 AREA = {4: 1 / 16, 5.6: 1 / 32, 8: 1 / 64, 11: 1 / 128}  # exact stops of the marked f-numbers
 Z6 = get_camera("nikon_z6")
 BLACK, WHITE, SPAN = 1008.0, 15520.0, 14512.0
@@ -118,11 +114,8 @@ def test_noise_free_source_over_all_states() -> None:
         samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
         shot, read = z6_noise(state.iso)[..., None]
         variance = read + shot * levels - 1.0 / (12.0 * Z6.span[0] ** 2)  # what rounding adds
-        expected += [
-            recorded_moments(level, v)
-            for row in variance
-            for level, v in zip(levels, row, strict=True)
-        ]
+        for row in variance:
+            expected += map(recorded_moments, levels, row)
     assert_moments(np.concatenate(samples), expected)
 
 
@@ -325,26 +318,17 @@ def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
     assert torch.equal(light, before)
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        *map(get_camera, list_cameras()),
-        *(
-            CameraProfile("x", "RGGB", black, white, 16)
-            for black in ((0.0,) * 4, (64.5,) * 4, (3.0, 7.5, 0.0, 60.0))
-            for white in (255.0, 65535.0)
-        ),
-    ],
-    ids=str,
-)
+LEVELS = itertools.product(((0.0,) * 4, (64.5,) * 4, (3.0, 7.5, 0.0, 60.0)), (255.0, 65535.0))
+BODIES = [CameraProfile("x", "RGGB", black, white, 16) for black, white in LEVELS]
+
+
+@pytest.mark.parametrize("body", [*map(get_camera, list_cameras()), *BODIES], ids=str)
 def test_every_digital_number_is_written_exactly(body: CameraProfile) -> None:
     numbers = np.arange(int(body.white_level) + 1)
     black, span = np.array(body.black_level)[:, None], np.array(body.span)[:, None]
     light = torch.from_numpy(((numbers - black) / span).astype(np.float32)).contiguous()
-    outputs = {
-        "codes": np.empty((1, 4, len(numbers)), np.uint8),
-        "numbers": np.empty((1, 4, len(numbers)), np.uint16),
-    }
+    kinds = {"codes": np.uint8, "numbers": np.uint16}
+    outputs = {name: np.empty((1, 4, len(numbers)), kind) for name, kind in kinds.items()}
     signals = torch.empty(1, 4, len(numbers))
     table = exposure_table([Exposure(1.0, ZERO, ZERO)])
     transition = Transitions([light[:, None]], table)

@@ -119,13 +119,11 @@ def test_levels_in_units_of_the_noise() -> None:
     light = LIGHTS["natural"]
     statistics = LightStatistics(tensor(light))
     zero = np.zeros_like(light)
-    assert statistics.relative_level(3.0, Z6.nlf(400)) == pytest.approx(
-        exact(light, 3.0, 3.0 * light, zero, 400), rel=0.01
-    )
-    deviation = 3.0 * np.sqrt(variance(light, 1600))
-    assert statistics.relative_noise(3.0, Z6.nlf(1600), Z6.nlf(400)) == pytest.approx(
-        exact(light, 3.0, zero, deviation, 400), rel=0.01
-    )
+    expected = exact(light, 3.0, 3.0 * light, zero, 400)
+    assert statistics.relative_level(3.0, Z6.nlf(400)) == pytest.approx(expected, rel=0.01)
+    expected = exact(light, 3.0, zero, 3.0 * np.sqrt(variance(light, 1600)), 400)
+    found = statistics.relative_noise(3.0, Z6.nlf(1600), Z6.nlf(400))
+    assert found == pytest.approx(expected, rel=0.01)
     for ratio in (0.5, 3.0):  # of a source that is on the target's scale
         excess = variance(ratio * light, 1600) / variance(ratio * light, 400) - 1.0
         stated = statistics.relative_excess_variance(ratio, Z6.nlf(1600), Z6.nlf(400))

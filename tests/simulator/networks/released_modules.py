@@ -1,8 +1,4 @@
-"""Networks of the released layout in plain torch layers.
-
-What they compute is written down again from the layers, without our code, so that it can be
-compared with what our networks make of the same weights.
-"""
+"""Networks of the released layout in plain torch layers, written down without our code."""
 
 from typing import Any
 

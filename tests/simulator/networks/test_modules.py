@@ -106,8 +106,7 @@ def test_only_the_images_that_open_change(preset: aperture_module.AperturePreset
 
 def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
     """3 px at f/8, less the dead zone z: 9 - z^2 squared, times a factor squared; f/4 adds 2^2 - 1
-        times that. A point
-    becomes a spot of second moment d^2 / 16 per axis."""
+    times that. A point becomes a spot of second moment d^2 / 16 per axis."""
     image = torch.zeros(2, 4, 41, 41)
     image[..., 20, 20] = 1.0
     output = with_map(3.0)(image, torch.zeros_like(image), F8, F4).double().numpy()
@@ -193,20 +192,14 @@ def test_the_noise_of_four_planes_averages() -> None:
     assert float(noise_plane[..., 20:-20, 20:-20].mean()) == pytest.approx(expected, abs=0.01)
 
 
-# -- flat, tiny, black and blinding images ---------------------------------------------------------
-
-IMAGE_SIZES = ((1, 1), (17, 2))
-#: Black, negative, saturated, blinding.
-LEVELS = (0.0, -0.07, 1.0, 1e4)
-
-
 @pytest.mark.parametrize("preset", [*BUILDERS])
 @torch.inference_mode()
 def test_flat_tiny_and_blinding_images_stay_finite(preset: str) -> None:
     torch.manual_seed(0)
     modules = build_modules(preset).eval()
-    for size in IMAGE_SIZES:
-        flat = torch.stack([torch.full((4, *size), level) for level in LEVELS])
+    levels = torch.tensor([0.0, -0.07, 1.0, 1e4])  # black, negative, saturated, blinding
+    for size in ((1, 1), (17, 2)):
+        flat = levels[:, None, None, None].expand(-1, 4, *size)
         for images in (flat, flat + 0.05 * torch.randn(flat.shape)):
             if "baseline" in modules:
                 parameters = torch.tensor([0.0, -6.0, 2.0, 3.0, -9.0, 1.0]).expand(len(images), -1)
@@ -252,7 +245,6 @@ def test_operations_by_hand() -> None:
     expected = sum(2 * taps * wide * out / places for places, taps, wide, out in convolutions)
     assert NoiseModule("nano").operations == round(expected) == 41_472
     assert not NoiseModule("paper").commutes
-    assert NoiseModule("paper").operations > 100_000
 
 
 @pytest.mark.parametrize("preset", ["nano", "paper"])

@@ -103,13 +103,6 @@ def test_any_light_is_developed_within_the_range(light, white_balance, tone):
         assert shown.shape == (3, 2 * light.shape[1], 2 * light.shape[2])
 
 
-def test_each_image_of_a_large_batch_is_as_alone():
-    images, gains = torch.rand(40, 4, 40, 48) * 1.2 - 0.1, 1 + torch.rand(40, 3)
-    together = develop(images, gains, Z6.colour_matrix)
-    alone = develop(images[33:34], tuple(gains[33].tolist()), Z6.colour_matrix)
-    assert torch.equal(alone[0], together[33])
-
-
 @pytest.mark.parametrize("size", [(1, 5), (2, 2), (3, 7)])
 def test_render_sizes(size):
     camera = CameraProfile("c", "GBRG", 0, 1023, 10)

@@ -16,6 +16,7 @@ from skimage.io import imsave
 
 from simulator import CameraSettings, NoiseLevelFunction, RawFileError, RawImage, read_raw
 from simulator.camera import BayerPattern, CameraProfile, get_camera
+from simulator.radiance.maps import read_radiance
 from simulator.raw import read as read_module
 from simulator.raw.dng import write_dng
 from simulator.raw.metadata import camera_identity, is_raw_container, read_directories
@@ -317,22 +318,49 @@ def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, for
         assert changed != LARGEST or f"white level (={values[0]})" in caplog.text
 
 
+def damaged(content: bytes, rng: np.random.Generator) -> bytes:
+    """Cut off, or with up to four pieces lost or overwritten, most of them near the beginning."""
+    data = bytearray(content)
+    for _ in range(rng.integers(1, 5)):
+        at = int(rng.integers(1 + len(data) if rng.random() < 0.3 else 1024))
+        lost, new = rng.integers(65, size=2) // rng.choice([1, 64])  # a piece, or a byte
+        data[at : at + lost] = rng.bytes(new)
+    return bytes(data if rng.random() < 0.8 else data[: rng.integers(1 + len(data))])
+
+
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
 def test_damaged_files_are_read_or_refused(path, own_dng, name):
-    content, rng = path.with_name(name).read_bytes(), np.random.default_rng(5)
-    refused = 0
-    for _ in range(150):
-        damaged = bytearray(content)
-        for at in rng.integers(0, 900, rng.integers(1, 5)):
-            damaged[at] = rng.choice([0, 1, 127, 255])
-        path.write_bytes(damaged)
+    content, rng, refused = path.with_name(name).read_bytes(), np.random.default_rng(5), 0
+    for _ in range(120):
+        path.write_bytes(damaged(content, rng))
         try:
-            raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+            assert bool(torch.isfinite(read_raw(path, settings=SETTINGS, nlf=NLF).data).all())
         except RawFileError:
             refused += 1
-        else:
-            assert bool(torch.isfinite(raw.data).all())
-    assert 15 < refused < 150
+    assert 15 < refused < 120
+
+
+@pytest.mark.filterwarnings("ignore")  # libraries may warn of a file; the program must not stop
+def test_damaged_radiance_maps_are_read_or_refused(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    rng, refused = np.random.default_rng(0), 0
+    pixels = rng.integers(100, 140, (16, 32, 4), dtype=np.uint8)
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n"
+    (tmp_path / "map.hdr").write_bytes(head + pixels.tobytes())
+    channels = {name: rng.random((16, 32), np.float32) for name in "RGB"}
+    for kind in (openexr.NO_COMPRESSION, openexr.ZIP_COMPRESSION, openexr.PIZ_COMPRESSION):
+        header = {"compression": kind, "type": openexr.scanlineimage}
+        openexr.File(header, channels).write(str(tmp_path / f"{kind}.exr"))
+    originals = sorted(tmp_path.iterdir())
+    for number in range(120):
+        original = originals[number % len(originals)]
+        path = original.with_stem("damaged")
+        path.write_bytes(damaged(original.read_bytes(), np.random.default_rng([7, number])))
+        try:
+            assert np.isfinite(read_radiance(path)).all()
+        except ValueError:
+            refused += 1
+    assert 30 < refused < 120
 
 
 def test_white_levels_that_are_wrong_or_beyond_the_bits_of_a_sample(tmp_path, caplog):

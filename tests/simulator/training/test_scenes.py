@@ -26,7 +26,8 @@ WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-l
 
 @pytest.fixture(scope="module")
 def scenes() -> dict[str, list[ReferenceScene]]:
-    return {split: reference_scenes(split, CAMERA, number=28, size=48) for split in SPLITS}
+    numbers = zip(SPLITS, (28, 4, 4), strict=True)
+    return {split: reference_scenes(split, CAMERA, number=n, size=48) for split, n in numbers}
 
 
 def blur(scene: ReferenceScene) -> np.ndarray:
@@ -45,14 +46,14 @@ def assert_no_group_is_shared(made: dict[str, list]) -> None:
 
 def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
     assert_no_group_is_shared(scenes)
-    fewer = reference_scenes("test", CAMERA, number=5, size=48)[:5]
-    for scene, again in zip(scenes["test"], fewer, strict=False):
+    fewer = reference_scenes("validation", CAMERA, number=2, size=48)[:2]
+    for scene, again in zip(scenes["validation"], fewer, strict=False):
         assert (scene.scene_id, scene.lens) == (again.scene_id, again.lens)
         for field in ("light", "depth"):
             torch.testing.assert_close(getattr(again, field), getattr(scene, field), rtol=0, atol=0)
     with pytest.raises(ValueError, match="`split`"):
         reference_scenes("trian", CAMERA)
-    other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
+    other = reference_scenes("validation", CAMERA, number=1, size=48, seed=1)[0]
     assert other.group != fewer[0].group
     assert not torch.equal(other.light, fewer[0].light)
     train = scenes["train"]
@@ -106,15 +107,20 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
 
 
 @pytest.mark.real_data
-def test_real_pictures_become_scenes(data_dir: Path) -> None:
-    for scene in pictured.depth_photographs(CAMERA, data=data_dir)[2:]:
+def test_real_pictures_become_scenes(data_dir: Path, tmp_path: Path) -> None:
+    """One file of each kind."""
+    files = "photo_pool/galliumos_galliumos-3_0-architectural.jpg", "hdri_pool/Flowers.exr"
+    for name in ("depth_cones", "MANIFEST_POOL.csv", *files, "canon_crw_cc0/CRW_0117.CRW"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).symlink_to(data_dir / name)
+    for scene in pictured.depth_photographs(CAMERA, data=tmp_path)[2:]:
         assert (scene.group, scene.size) == ("cones", (187, 225))
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
-    made = reference_scenes("validation", CAMERA, number=0, size=128, data=data_dir)
-    assert {s.kind for s in made} == {"photograph", "radiance"}
-    mosaics = list(pictured.mosaic_scenes("test", CAMERA, data_dir, size=128))
-    assert {"CRW_0117", "CRW_0119"} <= {s.scene_id for s in mosaics}
-    assert all(s.sampled and s.size == (128, 128) for s in (*made, *mosaics))
+    made = reference_scenes("validation", CAMERA, number=0, size=128, data=tmp_path)
+    assert [s.scene_id for s in made] == ["coffee", "Flowers", Path(files[0]).stem]
+    made += pictured.mosaic_scenes("test", CAMERA, tmp_path, size=128)
+    assert [(s.scene_id, s.group) for s in made[3:]] == [("CRW_0117", "camera_box")]
+    assert all(s.sampled and s.size == (128, 128) for s in made)
 
 
 def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:

@@ -60,9 +60,8 @@ def quick_calibration():
 def save(folder, *given, progress=lambda *_: None, scenes=scenes, **changes):
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
-    return trainer.train_and_save(
-        made, file, make_scenes=scenes, make_pictures=pictures, tensorboard=True, **options
-    )
+    options |= {"make_scenes": scenes, "make_pictures": pictures, "tensorboard": True}
+    return trainer.train_and_save(made, file, **options)
 
 
 @pytest.fixture(scope="module")
@@ -332,9 +331,8 @@ def calibrated(left: float, shift: Any) -> Residual:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("simulator.training.trainer._SIDE", 32)
         patch.setattr("simulator.training.trainer._CROPS", 64)
-        return trainer.calibrate(
-            Known(left, shift), DetailCrops([picture], [get_camera("nikon_z6")])
-        )
+        crops = DetailCrops([picture], [get_camera("nikon_z6")])
+        return trainer.calibrate(Known(left, shift), crops)
 
 
 @pytest.mark.parametrize(("left", "shift"), [(0.0, 0.3), (0.8, -0.2)])
