@@ -169,6 +169,7 @@ def _forecasts(networks: list[LightForecaster], reading: Reading, exposed_at: np
     return expected, spread
 
 
+@pytest.mark.slow
 def test_it_learns_to_foresee_swinging_light():
     """After a short training nearer than the latest reading."""
     sizes = {"steps": 70, "batch_size": 10, "width": 32, "traces": 60}
