@@ -41,7 +41,7 @@ def test_a_loop_as_cleanrl_writes_it(task: str) -> None:
     network = nn.Linear(size, envs.single_action_space.n)
     observation, _ = envs.reset(seed=1)
     lengths: list[int] = []
-    for _ in range(100):
+    for _ in range(100 if "Video" in task else 20):
         raw = torch.from_numpy(observation["raw"]).flatten(1).float() / 255.0
         inputs = torch.cat([raw, torch.from_numpy(observation["settings"])], dim=1)
         chosen = torch.distributions.Categorical(logits=network(inputs))
@@ -77,6 +77,7 @@ def test_torchrl(task: str) -> None:
     assert envs.rollout(1)["next", "reward"].shape == (2, 1, 1)
 
 
+@pytest.mark.slow
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It trains, its weights come back, and a reset forgets the episode."""
     make_vec = gym.make_vec
@@ -86,7 +87,7 @@ def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(gym, "make_vec", with_few)
     program, weights = ROOT / "examples" / "recurrent_ppo.py", tmp_path / "recurrent.safetensors"
-    runpy.run_path(str(program))["train"](weights, frames=256)
+    runpy.run_path(str(program))["train"](weights, frames=128)
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")
     context = PolicyContext.from_envs(envs)
     policy = make_policy(f"{program}:RecurrentAgent?weights={weights}", context)

@@ -165,7 +165,7 @@ def test_the_agent_that_ships_is_ahead_of_the_schedule_on_unseen_scenes() -> Non
     context = PolicyContext.from_envs(envs)
     schedule = make_policy("bracket:hasinoff?headroom=6&longest=1/15", context)
     policies = make_policy("bracket", context), schedule
-    ours, theirs = (run_brackets(p, envs, count=2)["quality"].mean() for p in policies)
+    ours, theirs = (run_brackets(p, envs, count=1)["quality"].mean() for p in policies)
     assert ours > theirs
 
 

@@ -106,10 +106,10 @@ def test_wrong_actions_name_the_policy_and_arguments_are_checked(small, few):
 
 
 @pytest.fixture(scope="module")
-def fitted(small) -> dict:
+def fitted(small, few) -> dict:
     names = ("best_fixed", "average:tuned", "average:tuned_blind", "random", "average:P")
     policies = {n: make_policy(n, small) for n in names}
-    fit_policies(policies, OPTIONS, seed=1, batch=20)
+    fit_policies(policies, few, seed=1, batch=20)
     return policies
 
 
@@ -155,15 +155,15 @@ def test_delay_scores_the_frame_that_was_exposed(small, few):
     assert found["regret"].mean() > 0.01
 
 
-def test_fit_makes_tuned_and_fixed_policies_better_than_random(small, fitted):
-    result = evaluate(fitted, {**OPTIONS, "split": "train"}, frames=3, batch=20, seed=77)
+def test_fit_makes_tuned_and_fixed_policies_better_than_random(small, few, fitted):
+    result = evaluate(fitted, few, frames=3, batch=20, seed=77)
     score = {n: float(result.episode_metrics(n)["score"].mean()) for n in fitted}
     assert score["average:tuned"] > score["average:P"] > score["random"]
     assert score["best_fixed"] > score["random"]
     assert fitted["average:tuned"].regression.features.shape[1] == 3
     assert fitted["average:tuned_blind"].regression.features.shape[1] == 1
     again = make_policy("average:tuned", small)
-    fit_policies({"again": again}, OPTIONS, seed=1, batch=7)
+    fit_policies({"again": again}, few, seed=1, batch=7)
     first = fitted["average:tuned"].regression.scores
     np.testing.assert_array_equal(again.regression.scores, first)
 
@@ -274,7 +274,7 @@ def test_episodes_of_another_start_share_everything_but_the_start(scenes):
 
 STEP = {"lighting": {"kind": "step", "stops": 4, "at": 3}}
 CONDITIONS = {"static": {}, "step+4": STEP, "step+4/late": {**STEP, "delay": 1}}
-JOBS = PLAN.changed(conditions=CONDITIONS, frames=8, starts=("dark", "bright"))
+JOBS = PLAN.changed(max_scenes=3, conditions=CONDITIONS, frames=8, starts=("dark", "bright"))
 JOBS = JOBS.changed(policies=("matrix:P", "random", "oracle"))
 
 
@@ -345,6 +345,7 @@ def test_a_stopped_run_continues_with_what_it_lacks(results, folder, tmp_path, m
     assert _arrays(tmp_path) == _arrays(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_spawn")
 def test_two_processes_give_what_one_does(results, folder, tmp_path):
     run_plan(JOBS, tmp_path, workers=2)

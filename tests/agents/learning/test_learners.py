@@ -33,7 +33,7 @@ TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, 
 def test_it_learns(make_tiny_envs) -> None:
     rewards: list[float] = []
     session = Session(progress=lambda d, t, values: rewards.append(values["reward"]))
-    sizes = {"total_timesteps": 1024, "n_steps": 8, "batch_size": 64, "n_epochs": 6, "width": 32}
+    sizes = {"total_timesteps": 1024, "n_steps": 8, "batch_size": 64, "n_epochs": 4, "width": 16}
     # Always sharp: short times and small apertures gain nothing, low ISO does.
     envs = make_tiny_envs(num_envs=16, motion="none", depth="far")
     train_ppo(envs, PPOTraining(**sizes, learning_rate=3e-3), session)
@@ -66,12 +66,12 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path, observati
             make_policy(f"ppo:{tmp_path / 'ppo'}", PolicyContext.from_envs(make_tiny_envs()))
 
 
-REGRESSION = RegressionTraining(frames=160, width=16, seed=5)
+REGRESSION = RegressionTraining(frames=48, width=16, seed=5)
 
 
 @pytest.mark.parametrize(
     ("train", "training", "stopped_at", "done"),
-    [(train_ppo, TRAINING, 56, 48), (train_regression, REGRESSION, 100, 100)],
+    [(train_ppo, TRAINING, 56, 48), (train_regression, REGRESSION, 28, 28)],
 )
 def test_a_stopped_training_goes_on(train, training, stopped_at, done, make_tiny_envs, tmp_path):
     """PPO from its last complete update of 4 x 4 frames."""
@@ -85,9 +85,9 @@ def test_a_stopped_training_goes_on(train, training, stopped_at, done, make_tiny
         train(make_tiny_envs(), training, Session(checkpoint=path, progress=stop))
     session = Session(checkpoint=path, progress=lambda *a: seen.append(a[0]))
     network = train(make_tiny_envs(), training, session)
-    assert seen == list(range(done + 4, 97 if train is train_ppo else 161, 4))
+    assert seen == list(range(done + 4, 97 if train is train_ppo else 49, 4))
     end = torch.load(path, weights_only=True)["state"]
-    name, steps = ("policy", 24) if train is train_ppo else ("network", 40)
+    name, steps = ("policy", 24) if train is train_ppo else ("network", 12)
     assert all(torch.equal(v, end[name][key]) for key, v in network.state_dict().items())
     # Adam goes on counting, so its moments were restored.
     assert {float(s["step"]) for s in end["optimizer"]["state"].values()} == {steps}
@@ -152,15 +152,15 @@ def test_episodes_do_not_mix_and_frames_of_other_light_are_forgotten(context, ph
 def test_training_lowers_the_loss(make_tiny_envs) -> None:
     losses: list[float] = []
     session = Session(progress=lambda done, total, values: losses.append(values["mse"]))
-    train_regression(make_tiny_envs(num_envs=8), RegressionTraining(frames=320, width=32), session)
-    assert np.mean(losses[-15:]) < 0.6 * np.mean(losses[:8])
+    train_regression(make_tiny_envs(num_envs=8), RegressionTraining(frames=160, width=32), session)
+    assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:4])
 
 
 @pytest.mark.parametrize(
     ("train", "training"),
     [
-        (train_regression, RegressionTraining(frames=32, width=16)),
-        (train_ppo, TRAINING.model_copy(update={"total_timesteps": 32})),
+        (train_regression, RegressionTraining(frames=16, width=8)),
+        (train_ppo, TRAINING.model_copy(update={"total_timesteps": 16})),
     ],
 )
 def test_the_seed_alone_decides_and_progress_is_complete(train, training, make_tiny_envs):
@@ -180,7 +180,7 @@ def test_the_seed_alone_decides_and_progress_is_complete(train, training, make_t
     other = weights(2)
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert any(not torch.equal(first[name], other[name]) for name in first)
-    assert [(done, total) for done, total, _ in seen] == [(n, 32) for n in range(4, 33, 4)] * 3
+    assert [(done, total) for done, total, _ in seen] == [(n, 16) for n in range(4, 17, 4)] * 3
     assert all(0.0 <= values.get("reward", 0.0) <= 1.0 for _, _, values in seen)
 
 

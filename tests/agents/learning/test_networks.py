@@ -169,11 +169,11 @@ def _forecasts(networks: list[LightForecaster], reading: Reading, exposed_at: np
     return expected, spread
 
 
+@pytest.mark.slow
 def test_it_learns_to_foresee_swinging_light():
     """After a short training nearer than the latest reading."""
-    training = ForecasterTraining(
-        steps=110, batch_size=24, width=48, traces=100, mixed=0.0, bent=0.0, learning_rate=2e-2
-    )
+    sizes = {"steps": 70, "batch_size": 10, "width": 32, "traces": 60}
+    training = ForecasterTraining(**sizes, mixed=0.0, bent=0.0, learning_rate=5e-2)
     light = _light("sines", 40)
     reading, exposed_at = metered(light, np.random.default_rng(1))
     expected, _ = _forecasts([train_forecaster(training)], reading, exposed_at)

@@ -16,8 +16,8 @@ from agents.rollouts import make_envs
 
 CONTROLLERS = (*METERS, "rpi_agc")
 SMALL = {"scenes": "bundled:small", "split": "all", "resolution": 36}
-#: Scenes of the loops: each third of the small ones, so some of every kind.
-COUNT = 14
+#: Scenes of the loops: each sixth of the small ones.
+COUNT = 7
 GREY = np.ones((64, 64))
 
 
@@ -131,7 +131,7 @@ def _loop(name: str, frames: int, start: int | None = None, step: float | None =
         options |= {"lighting": lighting, "delay": 2}
     with closing(make_envs(options, num_envs=COUNT, frames=frames)) as envs:
         base: Any = envs.unwrapped
-        scenes = range(0, len(base.scenes), 3)
+        scenes = range(0, len(base.scenes), 6)
         policy = make_policy(name, PolicyContext.from_envs(envs))
         policy.reset(COUNT, seed=0)
         where = {"scene": list(scenes)} | ({} if start is None else {"state": start})
