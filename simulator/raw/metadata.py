@@ -49,7 +49,7 @@ _POSITIONS = ("StripOffsets", "StripByteCounts", "TileOffsets", "TileByteCounts"
 #: The tags that are read, by name. Others (maker notes, previews, XMP) are passed over.
 _NAMES = (
     *("ImageWidth", "ImageLength", "BitsPerSample", "Compression", "PhotometricInterpretation"),
-    *("Make", "Model", "Orientation", "Software", *_POSITIONS),
+    *("Make", "Model", "Orientation", "SamplesPerPixel", "Software", *_POSITIONS),
     *("CFAPattern", "CFAPlaneColor", "LinearizationTable", "WhiteLevel", "ActiveArea"),
     *("BlackLevelRepeatDim", "BlackLevel", "BlackLevelDeltaH", "BlackLevelDeltaV"),
     *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),

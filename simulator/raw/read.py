@@ -238,7 +238,9 @@ def _check_structure(directories: Sequence[Directory], known_kind: bool, size: i
         raise RawFileError(f"must be whole, but names {lost} bytes beyond its end: truncated")
     kinds = [tags.get("PhotometricInterpretation") for tags in directories]
     if (LINEAR_RAW,) in kinds and (COLOUR_FILTER_ARRAY,) not in kinds:
-        raise RawFileError("must be a Bayer raw, but is a linear DNG: demosaicked already")
+        single = directories[kinds.index((LINEAR_RAW,))].get("SamplesPerPixel") == (1,)
+        found = "of a monochrome sensor" if single else "a linear DNG: demosaicked already"
+        raise RawFileError(f"must be a Bayer raw, but is {found}")
     for tags, kind in zip(directories, kinds, strict=True):
         if kind != (COLOUR_FILTER_ARRAY,):
             continue
