@@ -318,10 +318,13 @@ def test_files_that_are_no_raw_are_named(tmp_path, content):
 
 def test_arrays_that_are_not_bayer_are_refused(tmp_path):
     path = tmp_path / "a.dng"
-    for pixels, kind in ((np.stack([MOSAIC] * 3, axis=-1), "linear DNG"), (MOSAIC, "monochrome")):
-        write_sample_dng(path, pixels, photometric=34892)
-        with pytest.raises(RawFileError, match=kind):
-            read_raw(path)
+    write_sample_dng(path, np.stack([MOSAIC] * 3, axis=-1), photometric=34892)
+    with pytest.raises(RawFileError, match="linear DNG"):
+        read_raw(path)
+    bayer, linear = (struct.pack("<HHII", 262, 3, 1, kind) for kind in (32803, 34892))
+    path.write_bytes(write_sample_dng(path).read_bytes().replace(bayer, linear))
+    with pytest.raises(RawFileError, match="monochrome"):
+        read_raw(path)
     colours = tuple("RGB".index(c) for c in "GBGGRGRGBRGBGBGGRGGRGGBGBGBRGRGRGGBG")
     write_sample_dng(path, CFAPattern=("B", colours), CFARepeatPatternDim=("H", (6, 6)))
     with pytest.raises(RawFileError, match="X-Trans"):
