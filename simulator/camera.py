@@ -58,6 +58,8 @@ class CameraProfile:
         black_level: Digital number of no light, per plane R, G1, G2, B.
         white_level: Digital number at which the sensor saturates, whole.
         bit_depth: Bits per sample of its raw files.
+        full_level: Share of white from which a photosite is full where another one of its pixel is
+            at white: photosites of some compact cameras differ by some percent.
         nlf_by_iso: Calibrated noise level function by ISO; empty if unknown.
         read_noise_by_iso: Rows and tails of the read noise by ISO, for ``noise="sensor"``; empty if
             unknown.
@@ -74,6 +76,7 @@ class CameraProfile:
     black_level: tuple[float, float, float, float]
     white_level: float
     bit_depth: int
+    full_level: float = field(default=1.0, kw_only=True)
     make: str = "unknown"
     model: str = "unknown"
     nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict, hash=False)
@@ -94,6 +97,7 @@ class CameraProfile:
             raise ValueError(f"`black_level` (={black}) must be one number or 4 (R, G1, G2, B)")
         object.__setattr__(self, "black_level", black)
         check_integer("bit_depth", self.bit_depth, 1, 16)
+        check_number("full_level", self.full_level, 0.5, 1.0)
         white, largest = self.white_level, 2**16 - 1
         if not (all(0 <= b < white for b in black) and white <= largest and white == round(white)):
             raise ValueError(

@@ -60,6 +60,8 @@ _STOP_MARKING = {
     *("panasonic", "pentax", "phase", "ricoh", "samsung", "seiko", "sigma", "sony"),
 }
 _MEASURED = 10**6
+#: `CameraProfile.full_level` of cameras that are not built in, seen in their own files.
+_FULL_LEVELS = {"canonpowershots40": 0.92}
 _LARGEST_BASELINE = 32.0  # [EV]; beyond it a file is damaged
 _DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
 #: What LibRaw raises; NotImplementedError is a RuntimeError.
@@ -315,6 +317,7 @@ def _profile(
         black_level=decoded.black_level,
         white_level=decoded.white_level,
         bit_depth=depth,
+        full_level=_FULL_LEVELS.get(normalised_model(make, model), 1.0),
         **colours,
     )
 

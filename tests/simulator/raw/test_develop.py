@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ae_env.scenes import Scene
-from simulator import CameraSettings, CameraSimulator, RawImage, develop, read_raw, render_srgb
+from simulator import (
+    CameraSettings,
+    CameraSimulator,
+    NoiseLevelFunction,
+    RawImage,
+    develop,
+    read_raw,
+    render_srgb,
+)
 from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.raw.develop import (
     apply_tone,
@@ -208,9 +217,29 @@ def test_clipped_planes_become_as_bright_as_white(recorded, expected) -> None:
     assert light[2].equal(light[1])
 
 
+@pytest.mark.parametrize("light", [0.92, 0.97, 1.0, 1.02])
+def test_what_noise_alone_clips_stays_near_white(light: float) -> None:
+    """A flat patch at ISO 6400: nothing measured is replaced, and the rest is off by the noise."""
+    deviation = 0.03
+    nlf = NoiseLevelFunction((deviation**2,) * 4, (0.0,) * 4)
+    noise = deviation * torch.randn(4, 48, 48, generator=torch.Generator().manual_seed(0))
+    recorded = (light + noise).clamp(max=1.0)
+    raw = RawImage(recorded, BASE, Z6, nlf, white_balance=(2.0, 1.0, 1.5))
+    found = neutral_highlights(raw, raw.saturated)
+    measured = recorded < 1.0 - 1e-4
+    assert found[measured].equal(recorded[measured])
+    assert (found >= recorded).all()
+    inner = found[:, 3:-3, 3:-3]
+    assert (inner - light).square().mean().sqrt() < 1.1 * deviation
+
+
 def test_a_full_photosite_below_white_and_an_absurd_balance() -> None:
+    """Some compact cameras' photosites are full below white; of others such a value is measured."""
     raw = clipped((1.0, 1.0, 1.0))
     raw.data[1] = 0.94  # a smaller full well than the other green's
+    found = neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist()
+    assert found == pytest.approx([1.0, 0.94, 1.0, 1.0])  # the level 0.94 is below white
+    raw = replace(raw, camera=replace(Z6, full_level=0.92))
     assert neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist() == pytest.approx([2, 4, 4, 3.2])
     raw = clipped((1.0, 1.0, 1.0), balance=(1e30, 1.0, 1.0))
     assert neutral_highlights(raw, raw.saturated).max() == 16.0
