@@ -91,11 +91,10 @@ def _xyz_from_rgb(chromaticities: Sequence[float]) -> np.ndarray:
     """(3, 3) XYZ of R, G, B whose white, at (1, 1, 1), has the luminance 1."""
     x, y = np.reshape(chromaticities, (4, 2)).T.astype(np.float64)
     columns = np.stack([x, y, 1.0 - x - y])
-    white = columns[:, 3] / columns[1, 3]
-    matrix = columns[:, :3]
-    if not np.isfinite(white).all() or abs(np.linalg.det(matrix)) < 1e-9:
+    matrix, white = columns[:, :3], columns[:, 3]
+    if not np.isfinite(columns).all() or not white[1] or abs(np.linalg.det(matrix)) < 1e-9:
         raise RadianceError(f"states primaries that are none: {tuple(chromaticities)}")
-    return np.asarray(matrix * np.linalg.solve(matrix, white))
+    return np.asarray(matrix * np.linalg.solve(matrix, white / white[1]))
 
 
 def _refuse_lies(path: Path, height: int, width: int) -> None:
@@ -132,8 +131,10 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     primaries: Sequence[float] = _RADIANCE_FORMATS[kind]
     if "PRIMARIES" in entries:
         try:
-            primaries = [float(number) for number in entries["PRIMARIES"].split()]
-            _xyz_from_rgb(primaries)
+            stated = [float(number) for number in entries["PRIMARIES"].split()]
+            if any(stated):  # some programs write zeros
+                primaries = stated
+                _xyz_from_rgb(primaries)
         except ValueError:
             raise RadianceError(f"states PRIMARIES that are none: {entries['PRIMARIES']}") from None
     lines, samples, data = int(shown[3]), int(shown[6]), content[found.end() :]

@@ -103,7 +103,9 @@ def test_radiance_files_of_every_orientation_and_header(tmp_path):
         head = f"#?RADIANCE\n# by hand\nEXPOSURE=2\nFORMAT=32-bit_rle_rgbe\n\n{size}\n"
         path.write_bytes(head.encode() + rgbe(stored))
         assert_image(read_radiance(path), atol=0.02)
-    for head in ("#?RGBE\n\n-Y 6 +X 10\n", "#?RADIANCE\r\n\r\n-Y 6 +X 10\r\n"):  # no FORMAT; CRLF
+    # No FORMAT; CRLF; primaries that some programs write.
+    zeros = f"#?RADIANCE\nPRIMARIES={' 0' * 8}\n\n-Y 6 +X 10\n"
+    for head in ("#?RGBE\n\n-Y 6 +X 10\n", "#?RADIANCE\r\n\r\n-Y 6 +X 10\r\n", zeros):
         path.write_bytes(head.encode() + rgbe(IMAGE))
         assert_image(read_radiance(path), atol=0.02)
     for head, words in (
