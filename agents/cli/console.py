@@ -6,6 +6,7 @@ Help must come at once: no module of a command imports anything heavy, see `main
 from __future__ import annotations
 
 import io
+import os
 import shlex
 import sys
 import tempfile
@@ -28,6 +29,9 @@ OwnSeed = Annotated[
 ]
 OnError = Annotated[
     str, Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
+]
+Trust = Annotated[
+    bool, Option("--trust", help="Let the YAML file name Python code, which then runs.")
 ]
 Device = Annotated[str, Option(help="Torch device: auto, cpu, cuda.")]
 Policies = Annotated[list[str] | None, Option(help="A policy; give the option several times.")]
@@ -146,6 +150,14 @@ def parse_f_number(text: str, name: str = "aperture") -> float:
         return float(text.lower().removeprefix("f").removeprefix("/"))
     except ValueError:
         raise ValueError(f"`{name}` (={text!r}) must be an f-number, such as 4 or f/4") from None
+
+
+def trust_configuration(trust: bool) -> None:
+    """With `trust`, the YAML files of this process, and of its workers, may name Python code."""
+    from simulator.utils.config_file import TRUST_VARIABLE
+
+    if trust:
+        os.environ[TRUST_VARIABLE] = "all"
 
 
 @contextmanager

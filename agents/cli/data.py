@@ -72,6 +72,7 @@ def record(
     split: Annotated[str | None, Option(help="train (default), test or all.")] = None,
     episodes: Annotated[int, Option(help="How many.", min=1, max=1_000_000)] = 200,
     seed: console.Seed = 0,
+    trust: console.Trust = False,
 ) -> None:
     """Record episodes of a policy as a Minari dataset.
 
@@ -89,6 +90,7 @@ def record(
     from agents.rollouts import fitting_arguments
     from simulator.utils.checks import check_word
 
+    console.trust_configuration(trust)
     check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))
     check_dataset_id(out)
     options: dict[str, Any] = {"split": "train"} | ({} if env is None else load_preset(env))

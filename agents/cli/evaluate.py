@@ -91,6 +91,7 @@ def evaluate(
     seed: FirstSeed = None,
     workers: Workers = None,
     device: console.Device = "cpu",
+    trust: console.Trust = False,
 ) -> None:
     """Compare policies on the same episodes; a second run resumes the first.
 
@@ -103,6 +104,7 @@ def evaluate(
     given = {name: context.params[name] for name in options if context.params[name] is not None}
     found = console.scene_files(scenes, on_error)
     given |= {} if found is None else {"scenes": found}
+    console.trust_configuration(trust)
     device = console.torch_device(device)
     plan = make_plan(preset, env, policy or [], given)
     if append is not None:

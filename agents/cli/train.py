@@ -24,6 +24,7 @@ def train(
     seed: console.OwnSeed = None,
     device: console.Device = "cpu",
     tensorboard: Annotated[Path | None, Option(help="Folder for a TensorBoard log.")] = None,
+    trust: console.Trust = False,
 ) -> None:
     """Train an agent; a second run resumes the first.
 
@@ -34,6 +35,7 @@ def train(
     from agents.report.plots import plot_learning
     from simulator.utils.files import sibling
 
+    console.trust_configuration(trust)
     device = console.torch_device(device)
     agent = load_config(find_config(config))
     file = sibling(out, ".json")

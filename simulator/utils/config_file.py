@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import re
 import reprlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -13,6 +17,10 @@ from simulator.utils.checks import did_you_mean
 
 #: Most bytes of a YAML file.
 MAX_BYTES = 2**20
+#: Environment variable: folders whose YAML files may name Python code, or ``all``.
+TRUST_VARIABLE = "AE_ENV_TRUST"
+#: A class or function of a file or module, with options behind it or not.
+_CODE = re.compile(r"(?P<head>.+\.py|[A-Za-z_]\w*(\.[A-Za-z_]\w*)*):[A-Za-z_][\w.]*(\?.*)?|.+\.py")
 
 #: Words for pydantic's errors that name Python types.
 _PLAIN = {
@@ -56,11 +64,12 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
 def read_yaml(path: str | Path, *, name: str = "config") -> Any:
     """The values in a YAML file from anybody; None for an empty file.
 
-    No tag runs code; `name` is the argument that gave the path, for error messages.
+    No tag runs code, and no value may name code to run, unless `TRUST_VARIABLE` has the file's
+    folder; `name` is the argument that gave the path, for error messages.
 
     Raises:
-        ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or not YAML, or
-            gives an entry twice.
+        ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or not YAML, gives
+            an entry twice, or names Python code.
     """
     file = Path(path).expanduser()
     cause: Exception | None = None
@@ -70,7 +79,12 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
         elif file.stat().st_size > MAX_BYTES:
             fault = f"must not be larger than {MAX_BYTES} bytes"
         else:
-            return yaml.load(file.read_text(encoding="utf-8"), _Loader)
+            content = yaml.load(file.read_text(encoding="utf-8"), _Loader)
+            code = None if _is_trusted(file) else next(filter(_names_code, _texts(content)), None)
+            if code is None:
+                return content
+            fault = f"it names Python code ({code!r}), which would run: read both, then give "
+            fault += f"--trust, or name the folder in {TRUST_VARIABLE}"
     except OSError as error:
         fault, cause = f"cannot be read: {error.strerror}", error
     except RecursionError:
@@ -78,6 +92,36 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
     except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
         fault, cause = f"is not YAML: {' '.join(str(error).split())}", error
     raise ValueError(f"`{name}` (={str(path)!r}): {fault}") from cause
+
+
+def _is_trusted(file: Path) -> bool:
+    named = os.environ.get(TRUST_VARIABLE, "")
+    folders = [Path(folder).expanduser().resolve() for folder in named.split(os.pathsep) if folder]
+    return named == "all" or any(file.resolve().is_relative_to(folder) for folder in folders)
+
+
+def _texts(content: Any) -> Iterator[str]:
+    """All texts of a YAML file, keys among them."""
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, dict):
+        for pair in content.items():
+            yield from _texts(list(pair))
+    elif isinstance(content, list):
+        for value in content:
+            yield from _texts(value)
+
+
+def _names_code(text: str) -> bool:
+    """Whether a text names a Python file, or a class or function of a module that there is."""
+    found = _CODE.fullmatch(text)
+    if found is None:
+        return False
+    head = found["head"] or text
+    try:
+        return head.endswith(".py") or "." in head or importlib.util.find_spec(head) is not None
+    except ValueError:  # such as `__main__`
+        return True
 
 
 class _Loader(yaml.SafeLoader):

@@ -155,6 +155,28 @@ def test_a_good_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        *("scorer: their/evil.py:X", "scorer: {noise: 0.5, '~/evil.py:X': 0.5}", "a: evil.py"),
+        *("scenes: pkg.mod:attr", "policies: [matrix:P, 'evil.py:Mine?gain=2']", "scenes: json:x"),
+    ],
+)
+def test_code_in_a_file_needs_trust(tmp_path, monkeypatch, text):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"`config` .*a\.yaml.* --trust"):
+        read_yaml(tmp_path / "a.yaml")
+    for trusted in (str(tmp_path), f"/nowhere:{tmp_path.parent}", "all"):
+        monkeypatch.setenv("AE_ENV_TRUST", trusted)
+        assert read_yaml(tmp_path / "a.yaml")
+
+
+def test_names_of_our_own_are_no_code(tmp_path):
+    text = "[bundled:snow, matrix:P, 'recorded:my_grid?iso=100', ppo:video, a.dng, 'x.yaml', '1:2']"
+    (tmp_path / "a.yaml").write_text(text)
+    assert len(read_yaml(tmp_path / "a.yaml")) == 7
+
+
+@pytest.mark.parametrize(
     ("text", "parts"),
     [
         ("name: x\npart: {steps: 0}", ["part.steps (=0)", "greater than or equal to 1"]),
