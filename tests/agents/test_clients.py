@@ -12,12 +12,12 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from torch import nn
 
-from ae_env.registration import ENV_IDS
+from ae_env.registration import TASKS
 from agents import PolicyContext, make_policy
 from tests.ae_env.environments import SMALL
 
 ROOT = Path(__file__).parents[2]
-every_task = pytest.mark.parametrize("task", ENV_IDS)
+every_task = pytest.mark.parametrize("task", TASKS)
 
 
 @every_task
