@@ -160,10 +160,7 @@ print("loaded", *sys.modules)
         (("bench", "transfer", "--part", "table"), "`part` (='table')"),
         (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
         (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
-        (
-            ("evaluate", "--policy", "random", "--seed", 2**32),
-            "`seeds` (=4294967296) must",
-        ),
+        (("evaluate", "--policy", "random", "--seed", 2**32), "`seeds` (=4294967296) must"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
         (("evaluate", "--preset", "standrad"), "did you mean 'standard'"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
