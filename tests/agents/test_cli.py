@@ -641,6 +641,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
 
 
+@pytest.mark.slow
 def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(
         "agent: regression\nnum_envs: 4\nenvironment: {scenes: 'bundled:small', resolution: 36}\n"
