@@ -192,6 +192,7 @@ def test_delays_multiply_the_conditions_that_have_none_of_their_own():
     [
         ({"starts": ["drak"]}, r"`starts` \(='drak'\)"),
         ({"seeds": [0, 0]}, "seeds\n"),
+        ({"seeds": [0, 2**32]}, r"`seeds` \(=4294967296\)"),
         ({"conditions": {"hard": {}}}, "`conditions`"),
         ({"conditions": {"a": {"budget": 1.0}}}, "`conditions`"),
         ({"conditions": {"a": {"lighting": "disco"}}}, "condition 'a': `lighting`"),

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -163,12 +164,17 @@ def test_brackets_by_hand(tmp_path):
     assert set(files) == {p.name for p in tmp_path.iterdir()} == {"results.json", "report.md"}
     text = files["report.md"].read_text()
     assert "```\nae-env x\n```" in text
+    assert "-0.050 (-0.050 to -0.050)" in text
+    assert "0.000" not in text  # the best is not compared with itself
     places = [text.index(shown) for shown in ("## 0.1 s", "0.6500", "## 0.2 s", "0.7500")]
     assert places == sorted(places)
     content = json.loads(files["results.json"].read_text())
     assert content["meta"]["plan"]["budgets"] == [0.1, 0.2]
     shown = {(r["budget"], r["policy"]): r["quality"] for r in content["rows"]}
     assert (shown[0.1, "low"], shown[0.2, "low"]) == pytest.approx((0.65, 0.75))
+    few = made_brackets(low=quality[:, :2], high=quality[:, :2] + 0.05)
+    files = write_report({"0.1 s": few, "0.2 s": few}, tmp_path, command="x")
+    assert files["report.md"].read_text().count(" -0.050 |") == 2  # too few for an interval
 
 
 NAMES = {
@@ -225,6 +231,10 @@ def test_the_terminal_shows_scores_or_every_group(tmp_path):
     assert [len(own.columns) for _, own in groups] == [5, 3]  # four of the six groups, then two
     ((_, frame),) = summary({"0.1 s": made_brackets(a=np.full((1, 16), 0.5))})
     assert frame.to_numpy().tolist() == [["a", "0.5000", "0.5000 to 0.5000", "0.5000"]]
+    told = {"oracle": replace(made_result().tracks["ppo"], privileged=True)}
+    told = replace(made_result(), tracks=told)
+    ((_, frame),) = summary({"static": told, "sine": told})
+    assert [*frame] == ["tier", "policy", "all conditions", "95 % interval", "static"]
 
 
 #: Names that mean something to Markdown or HTML.
@@ -274,7 +284,8 @@ def test_a_film_shows_the_episode_of_each_policy(tmp_path):
     # Settings are in effect two frames after the next: frame 3 has what was best for frame 0.
     assert found.ev100[3] == found.best[0]
     done = []
-    other = record("average:P", make_policy("average:P", context), envs, 5, 3)
+    meter = make_policy("average:P", context)
+    other = record("average:P", SimpleNamespace(reset=meter.reset, act=meter.act), envs, 5, 3)
     assert other.best == found.best  # the same episode
     path = tmp_path / "film.gif"
     write_film(path, [other, found], lambda n, total: done.append((n, total)))
