@@ -251,9 +251,10 @@ class Episodes:
         for name, value in found.items():
             rule = ""
             if name == "scene":
+                if isinstance(value, str) and value in self._index:
+                    value = self._index[value]
                 hint = did_you_mean(value, self._ids) if isinstance(value, str) else ""
                 rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
-                value = self._index.get(value, value) if isinstance(value, str) else value
             most = limits[name] - 1
             found[name] = check_integer(f"options[{name!r}]", value, 0, most, more=rule)
         return found

@@ -23,7 +23,6 @@ import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.signal import fftconvolve
 from torch import Tensor
 
 from simulator.optics.motion import (
@@ -469,6 +468,8 @@ def _kernel_products() -> np.ndarray:
 @functools.cache
 def _correlations() -> np.ndarray:
     """(K, 2, R, R) correlations of a disc with itself and its successor; the middle is no shift."""
+    from scipy.signal import fftconvolve  # not above: it takes a second
+
     kernels = [disc_kernel(d) for d in DIAMETERS]
     size = 2 * kernels[-1].shape[0] - 1
     found = np.zeros((len(kernels), 2, size, size))

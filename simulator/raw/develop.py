@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ import torch.nn.functional as F
 from simulator.camera import BayerPattern
 from simulator.raw.image import RawImage, check_packed
 from simulator.utils.checks import check_number, check_type, check_word
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 #: Linear sRGB (D65) to CIE XYZ, IEC 61966-2-1:1999.
 XYZ_FROM_SRGB = (
@@ -150,6 +154,22 @@ def quarter_turns(raw: RawImage) -> int:
     Files state how the camera was held in LibRaw's code, ``metadata["flip"]``.
     """
     return {3: 2, 5: 1, 6: -1}.get(raw.metadata.get("flip", 0), 0)
+
+
+def upright_picture(raw: RawImage, srgb: torch.Tensor) -> Image.Image:
+    """`srgb` (3, H, W) uint8, a picture of `raw`, turned as its camera was held.
+
+    Where the sensor's pixels are not square, it grows along their longer side: none is left out.
+    """
+    from PIL import Image
+
+    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
+    aspect = raw.metadata.get("pixel_aspect", 1.0)
+    if aspect != 1.0:
+        size = round(picture.width * max(aspect, 1)), round(picture.height / min(aspect, 1))
+        picture = picture.resize(size, Image.Resampling.BICUBIC)
+    upright = np.rot90(np.asarray(picture), quarter_turns(raw))
+    return Image.fromarray(np.ascontiguousarray(upright))
 
 
 def _decoded(encoded: torch.Tensor) -> torch.Tensor:

@@ -21,6 +21,7 @@ from simulator.camera import get_camera
 from tests.ae_env.environments import make_envs
 
 ROOT = Path(__file__).parents[3]
+pytestmark = pytest.mark.slow  # an export takes seconds
 
 
 small_envs = functools.partial(make_envs, split="test", max_episode_steps=None, resolution=64)
@@ -31,7 +32,7 @@ def context() -> PolicyContext:
     return PolicyContext.from_envs(small_envs(1))
 
 
-@pytest.fixture(scope="module", params=["regression", pytest.param("ppo", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["regression", "ppo"])
 def exported(request: pytest.FixtureRequest, context: PolicyContext, tmp_path_factory: Any) -> Any:
     policy = make_policy(request.param, context)
     return policy, export_agent(policy, tmp_path_factory.mktemp("onnx") / "agent.onnx")

@@ -271,6 +271,7 @@ def slider(page, name):
     return page.locator(f"[aria-label='{name}'] [tabindex='0']")
 
 
+@pytest.mark.slow
 def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect, capsys):
     """From the key to the frame of the screen after the picture has loaded: see docs/viewer.md."""
     expect(page.locator(".state", has_text=re.compile(r"\d"))).to_have_count(64)
@@ -321,6 +322,7 @@ def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect
     expect(over).to_have_css("clip-path", "inset(0px 0px 0px 0%)")
 
 
+@pytest.mark.slow
 def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     page.get_by_label(re.compile("Mark where policies")).click()
     page.get_by_role("option", name="average", exact=True).click()
@@ -357,6 +359,7 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     expect(page.locator(".title").first).not_to_have_text(name)
 
 
+@pytest.mark.slow
 def test_takes_a_raw_and_gives_files_back(page, expect, tmp_path):
     openexr = pytest.importorskip("OpenEXR")
     (bad := tmp_path / "holiday.dng").write_bytes(b"not a raw at all" * 100)
