@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 _EXPORTS = {
-    "EvaluationPlan": "evaluation.plan",
+    "EvaluationPlan": "evaluation.evaluation_plan",
     "EvaluationResult": "evaluation.result",
     "MeteringPolicy": "metering.metering_policy",
     "Policy": "policy",
@@ -14,7 +14,7 @@ _EXPORTS = {
     "evaluate": "evaluation.engine",
     "fit_policies": "evaluation.engine",
     "list_policies": "policy_names",
-    "load_plan": "evaluation.plan",
+    "load_plan": "evaluation.evaluation_plan",
     "make_policy": "policy_names",
     "result_rows": "evaluation.result",
     "run_plan": "evaluation.jobs",

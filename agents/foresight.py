@@ -26,7 +26,7 @@ from agents.policy import Floats, Ints, Observations, PolicyContext
 #: Hermite for a normal distribution, whose standard deviation is 1.25 of its mean absolute error.
 POINTS = (1.2533 * 3.0**0.5 * np.array([-1.0, 0.0, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0)
 #: Shares of a surprise that correct the level and the rate, and the share of the rate that is left
-#: after a frame. Chosen on the training kinds of moving light (`ae-env bench foresight`).
+#: after a frame. Chosen on the training kinds of moving light.
 ALPHA, BETA, DAMPING = 0.85, 0.7, 0.8
 #: A surprise beyond this is another light, whose rate is not known yet [EV].
 JUMP_EV = 2.5

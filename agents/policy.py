@@ -38,7 +38,6 @@ class PolicyContext:
         camera: The camera body.
         observation_space: Observation of a single environment (a `Dict` with ``raw``,
             ``settings`` and, where the camera has them, ``sensors``).
-        frame_rate: Frames per second.
         delays: Frames after the next until a decision's ISO, exposure time and aperture are in
             effect.
         bracket: Limits of a bracket; None for tasks without one.
@@ -47,7 +46,6 @@ class PolicyContext:
     grid: ExposureGrid
     camera: CameraProfile
     observation_space: gym.spaces.Dict
-    frame_rate: float = 30.0
     delays: tuple[int, int, int] = (0, 0, 0)
     bracket: BracketLimits | None = None
 

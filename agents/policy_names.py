@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -97,8 +96,8 @@ def training_seeds(name: str) -> list[str]:
     """
     base, _ = split_options(name)
     head, _, tail = base.partition(":")
-    if base in _SHIPPED:
-        files = [f"{_SHIPPED[base]}-{seed}" for seed in PRETRAINED_SEEDS]
+    if (agent := base.removesuffix(":")) in _SHIPPED:
+        files = [f"{_SHIPPED[agent]}-{seed}" for seed in PRETRAINED_SEEDS]
     elif head in ("ppo", "regression") and "*" in tail:
         files = weight_files(tail)
         if not files:
@@ -162,8 +161,9 @@ def _scalar(name: str, key: str, text: str) -> Any:
     except (yaml.YAMLError, ValueError, RecursionError):
         value = {}
     if isinstance(value, str):
+        numerator, slash, denominator = value.partition("/")
         try:  # YAML 1.1 takes 1/60 and 1e-3 for texts
-            return float(Fraction(value))
+            return float(numerator) / (float(denominator) if slash else 1.0)
         except (ValueError, ZeroDivisionError):
             return value
     if not (value is None or isinstance(value, bool | int | float)):
@@ -195,6 +195,7 @@ def make_policy(
             the class found is not a policy or does not take an option.
     """
     base, named = split_options(name)
+    base = base.removesuffix(":")
     for key in set(options) & set(named):
         raise _refusal(name, f": option {key!r} is given twice")
     cls, fixed = _find(name, base)
@@ -212,7 +213,7 @@ def make_policy(
         if not isinstance(error, ValueError | FileNotFoundError):
             raise
         kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
-        raise kind(f"`policy` (={name!r}): {error}") from error
+        raise kind(f"`policy` (={_shown(name)!r}): {error}") from error
     if named:
         policy.name = name
     return policy
@@ -285,5 +286,12 @@ def _known(base: str) -> str:
     )
 
 
+def _shown(name: object) -> object:
+    """`name` for a message: agents that come with the package are known by no path."""
+    for agent, file in _SHIPPED.items() if isinstance(name, str) else ():
+        name = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, name)
+    return name
+
+
 def _refusal(policy: object, text: str) -> ValueError:
-    return ValueError(f"`policy` (={policy!r}){text}")
+    return ValueError(f"`policy` (={_shown(policy)!r}){text}")

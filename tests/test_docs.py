@@ -158,6 +158,7 @@ def test_commands_parse(page: Path) -> None:
             assert {word for word in rest if word.startswith("-")} <= {*known, "--help"}
 
 
+@pytest.mark.slow
 def test_the_scorer_computes_what_it_says_and_is_used_as_printed(ae_env, tmp_path, capsys):
     """In Python, in a configuration, on the command line and in a package."""
     (tmp_path / "my_scorer.py").write_text(_blocks(SCORER_PAGE, "python")[0])

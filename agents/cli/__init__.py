@@ -1,1 +1,1 @@
-"""The command line: one module a command."""
+"""The command line: one module for the commands about one thing."""

@@ -22,10 +22,10 @@ terminal = Console()
 
 # -- options of several commands ------------------------------------------------------------------
 
-MAX_SEED = 2**63 - 1
-Seed = Annotated[int, Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
+_INT64_MAX = 2**63 - 1
+Seed = Annotated[int, Option(help="Seed of everything random.", min=0, max=_INT64_MAX)]
 OwnSeed = Annotated[
-    int | None, Option(help="Seed instead of the one in the YAML.", min=0, max=MAX_SEED)
+    int | None, Option(help="Seed instead of the one in the YAML.", min=0, max=_INT64_MAX)
 ]
 OnError = Annotated[
     str, Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
@@ -68,7 +68,7 @@ Noise = Annotated[
         "the row noise and the tails of a calibrated camera's read noise."
     ),
 ]
-#: `simulator.capture.plan.DEFAULT_TOLERANCE`, which a test compares: help imports no torch.
+#: `simulator.capture.decision.DEFAULT_TOLERANCE`, which a test compares: help imports no torch.
 TOLERANCE = 0.1
 
 

@@ -60,9 +60,7 @@ EpisodeCount = Annotated[
 Frames = Annotated[int | None, Option(help="Frames per episode.", min=1)]
 Append = Annotated[Path | None, Option(help="Benchmark table (CSV) to add the results to.")]
 Author = Annotated[str, Option(help="For --append: who made the policy.")]
-FirstSeed = Annotated[
-    int | None, Option(help="Seed of everything random.", min=0, max=console.MAX_SEED)
-]
+FirstSeed = Annotated[int | None, Option(help="Seed of everything random.", min=0)]
 Workers = Annotated[
     int | None, Option(help="Processes; by default one per core if it pays.", min=1)
 ]
@@ -121,7 +119,12 @@ def evaluate(
 
 
 def _run(
-    plan: EvaluationPlan, out: Path, append: Path | None, author: str, workers: Any, device: str
+    plan: EvaluationPlan,
+    out: Path,
+    append: Path | None,
+    author: str,
+    workers: int | None,
+    device: str,
 ) -> None:
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.jobs import Jobs

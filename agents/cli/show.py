@@ -97,7 +97,7 @@ def film(
     from agents.policy_names import make_policy
     from agents.report.plots import record, write_film
     from agents.rollouts import scenes_of
-    from simulator.utils.checks import check_word
+    from simulator.utils.checks import check_word, did_you_mean
 
     console.check_outputs(out=(out, ".gif"))
     check_word("light", light, (*MOVES, *KIND_SETS))
@@ -107,7 +107,10 @@ def film(
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", num_envs=1, **options)
     with closing(envs), progress_bars() as progress:
         if scene is not None:
-            check_word("scene", scene, tuple(one.scene_id for one in scenes_of(envs)))
+            known = [one.scene_id for one in scenes_of(envs)]
+            if scene not in known:
+                rule = f"must be an id of {scenes!r}, such as {known[0]!r}"
+                raise ValueError(f"`scene` (={scene!r}) {rule}{did_you_mean(scene, known)}")
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in policy or POLICIES}
         with progress("fitting") as task:

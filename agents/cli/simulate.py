@@ -365,7 +365,7 @@ def _write(raw: RawImage, out: Path, png: Path | None) -> None:
 
 def _write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
     """Writes `srgb` (3, 2H, 2W) uint8, a picture of `raw`, upright and with square pixels."""
-    from agents.report.plots import upright_picture
+    from simulator.raw.develop import upright_picture
 
     aspect = raw.metadata.get("pixel_aspect", 1.0)
     if aspect != 1.0:

@@ -118,9 +118,10 @@ def export(
     ],
     out: Annotated[Path, Option("--out", "-o", help="The .onnx file.")] = Path("policy.onnx"),
 ) -> None:
-    """Export a trained agent to ONNX, to run it without torch (`agents.onboard.Controller`).
+    """Export a trained agent to ONNX, to run it without torch.
 
-    Its states, and what it keeps in mind between frames, are in the same file.
+    `agents.onboard.controller.Controller` runs it. Its states, and what it keeps in mind between
+    frames, are in the same file.
 
     Example: `ae-env export regression -o policy.onnx`
     """

@@ -111,7 +111,7 @@ class EvaluationPlan(Configuration):
         default=None, min_length=1
     )
     max_frames: int = Field(default=3, ge=1, le=4)
-    seeds: tuple[Annotated[int, Field(ge=0, le=MAX_SEED)], ...] = Field(default=(0,), min_length=1)
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     policies: tuple[str, ...] = ()
     other_scorers: tuple[str, ...] = ()
     other_scorer_scenes: int = Field(default=8, ge=1, le=MAX_SCENES)
@@ -137,6 +137,8 @@ class EvaluationPlan(Configuration):
                 raise ValueError(f"`{entry}` must not be given in a plan that has {also}")
         for start in self.starts:
             check_word("starts", start, STARTS)
+        for seed in self.seeds:
+            check_integer("seeds", seed, 0, MAX_SEED)
         for name, condition in self.conditions.items():
             if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:
                 raise ValueError(
@@ -145,7 +147,9 @@ class EvaluationPlan(Configuration):
                 )
         for name in (*CONDITION_ARGUMENTS, *_SET_BY_EVALUATION):
             if name in self.environment:
-                raise ValueError(f"`environment` must not have `{name}`: give it as a condition's")
+                known = name in CONDITION_ARGUMENTS
+                rule = "give it as a condition's" if known else "the evaluation sets it"
+                raise ValueError(f"`environment` must not have `{name}`: {rule}")
         for name, condition in self.all_conditions.items():
             try:
                 options = self.options(condition)

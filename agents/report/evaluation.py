@@ -235,7 +235,9 @@ def write_report(
         assert result.plan is not None
         meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
         scenes = repr(result.plan.environment.get("scenes", "bundled"))
-        text = fill("brackets.md", plan=result.plan, rows=rows, meta=meta, scenes=scenes)
+        apart = pd.Series(map(_difference, rows.to_best, rows.to_best_ci95))
+        shown = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
+        text = fill("brackets.md", plan=result.plan, rows=shown, meta=meta, scenes=scenes)
         return {
             "results.json": write_results(folder / "results.json", _records(rows), meta),
             "report.md": write_atomically(folder / "report.md", text),
@@ -408,8 +410,12 @@ def _change(change: Mapping[str, Any] | None) -> str | None:
     if change is None:
         return None
     mark = " \\*" if change["significant"] else ""
-    interval = "" if change["simultaneous_ci95"] is None else " ({simultaneous_ci95:+.3f})"
-    return cell(change, "{difference:+.3f}" + interval) + mark
+    return _difference(change["difference"], change["simultaneous_ci95"]) + mark
+
+
+def _difference(value: float, pair: Sequence[float] | None) -> str:
+    """A paired difference with its interval, if it has one."""
+    return f"{value:+.3f}" + cell({"pair": pair}, " ({pair:+.3f})", "")
 
 
 def _histogram_rows(histogram: Mapping[str, Mapping[str, float]]) -> list[dict[str, str]]:
@@ -480,17 +486,15 @@ def summary(
         table = table.reset_index()
         title = "normalised score: 0 is random, 1 the best state of every frame"
     else:
-        lines = [
+        table = pd.DataFrame(
             {
-                "tier": "-" if one["tier"] is None else str(one["tier"]),
-                "policy": one["policy"],
-                "all conditions": f"{one['normalised_score']:.3f}",
-                "95 % interval": _interval(one["ci95"]),
-                static: f"{result.normalised(one['policy']):.3f}",
+                "tier": ["-" if tier is None else str(tier) for tier in ranking.tier],
+                "policy": ranking.policy,
+                "all conditions": ranking.normalised_score.map("{:.3f}".format),
+                "95 % interval": ranking.ci95.map(_interval),
+                static: [f"{result.normalised(policy):.3f}" for policy in ranking.policy],
             }
-            for one in ranking.to_dict("records")
-        ]
-        table = pd.DataFrame(lines)
+        )
         title = f"normalised score over {len(results)} conditions, and in {static!r}"
     tables = [(title, table)]
     groups = group_rows(result)

@@ -10,15 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
 from agents.policy import Policy
 from agents.rollouts import errors_of
-from simulator import RawImage
-from simulator.raw.develop import upright
 from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
@@ -250,19 +247,6 @@ def write_palette_png(path: Path, picture: Image.Image) -> Path:
     return write_atomically(path, stream.getvalue())
 
 
-def upright_picture(raw: RawImage, srgb: torch.Tensor) -> Image.Image:
-    """`srgb` (3, H, W) uint8, a picture of `raw`, turned as its camera was held.
-
-    Where the sensor's pixels are not square, it grows along their longer side: none is left out.
-    """
-    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
-    aspect = raw.metadata.get("pixel_aspect", 1.0)
-    if aspect != 1.0:
-        size = round(picture.width * max(aspect, 1)), round(picture.height / min(aspect, 1))
-        picture = picture.resize(size, Image.Resampling.BICUBIC)
-    return Image.fromarray(np.ascontiguousarray(upright(np.asarray(picture), raw)))
-
-
 #: Size of a picture, height of the chart below it and of the title above [pixel].
 PICTURE, CHART, TITLE, GAP = 192, 64, 34, 8
 #: Pictures per second; half of the camera's, so that one can follow.
@@ -307,7 +291,7 @@ def record(
     for frame in range(frames + 1):
         if frame:
             with errors_of(name, "act"):
-                extra = {"info": info} if policy.privileged else {}
+                extra = {"info": info} if getattr(policy, "privileged", False) else {}
                 actions = policy.act(observations, base.action_masks(), **extra)
             observations, _, _, _, info = envs.step(actions)
         pictures: Any = envs.render()

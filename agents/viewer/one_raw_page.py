@@ -17,10 +17,10 @@ from PIL import Image
 
 from agents.applications.hdr import hdr_picture, linear_rgb, write_exr
 from agents.applications.refocus import NOTHING_FOUND, refocus
-from agents.report.plots import upright_picture
 from agents.viewer.tab import Stage, Tab, complain
 from agents.viewer.viewed_scene import ViewedScene, encoded
 from simulator import CameraSimulator, RawImage, render_srgb, write_dng
+from simulator.raw.develop import upright_picture
 from simulator.utils.files import write_atomically
 
 #: F-numbers as cameras mark them, in third stops.

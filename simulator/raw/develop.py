@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ import torch.nn.functional as F
 from simulator.camera import BayerPattern
 from simulator.raw.image import RawImage, check_packed
 from simulator.utils.checks import check_number, check_type, check_word
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 #: Linear sRGB (D65) to CIE XYZ, IEC 61966-2-1:1999.
 XYZ_FROM_SRGB = (
@@ -161,6 +165,21 @@ def as_recorded(picture: np.ndarray, raw: RawImage) -> np.ndarray:
     flip = raw.metadata.get("flip", 0)
     lying = picture.swapaxes(0, 1) if flip & 4 else picture
     return lying[:: -1 if flip & 2 else 1, :: -1 if flip & 1 else 1]
+
+
+def upright_picture(raw: RawImage, srgb: torch.Tensor) -> Image.Image:
+    """`srgb` (3, H, W) uint8, a picture of `raw`, turned as its camera was held.
+
+    Where the sensor's pixels are not square, it grows along their longer side: none is left out.
+    """
+    from PIL import Image
+
+    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
+    aspect = raw.metadata.get("pixel_aspect", 1.0)
+    if aspect != 1.0:
+        size = round(picture.width * max(aspect, 1)), round(picture.height / min(aspect, 1))
+        picture = picture.resize(size, Image.Resampling.BICUBIC)
+    return Image.fromarray(np.ascontiguousarray(upright(np.asarray(picture), raw)))
 
 
 def _decoded(encoded: torch.Tensor) -> torch.Tensor:

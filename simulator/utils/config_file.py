@@ -87,6 +87,8 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
             fault += f"--trust, or name the folder in {TRUST_VARIABLE}"
     except OSError as error:
         fault, cause = f"cannot be read: {error.strerror}", error
+    except _GivenTwice as error:
+        fault = str(error)
     except RecursionError:
         fault = "is not YAML: it is nested too deeply"
     except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
@@ -124,6 +126,10 @@ def _names_code(text: str) -> bool:
         return True
 
 
+class _GivenTwice(Exception):
+    """Two entries of one name."""
+
+
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, which by itself takes the last of two entries of one name."""
 
@@ -132,7 +138,7 @@ class _Loader(yaml.SafeLoader):
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if (key.tag, key.value) in seen:
                 line = key.start_mark.line + 1
-                raise ValueError(f"the entry {key.value!r} is given twice, again in line {line}")
+                raise _GivenTwice(f"the entry {key.value!r} is given twice, again in line {line}")
             seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 

@@ -27,11 +27,11 @@ from agents.cli import console, quickstart
 from agents.cli import main as cli
 from agents.cli.evaluate import make_plan
 from agents.learning.policy_file import load_agent
-from agents.report.plots import upright_picture
 from agents.viewer.viewed_scene import find_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.capture.decision import DEFAULT_TOLERANCE
 from simulator.networks.weights import build_modules, load_modules, save_modules
+from simulator.raw.develop import upright_picture
 from simulator.training import scenes as pictures
 from simulator.training import trainer
 from simulator.training.crops import ReferencePairs
@@ -159,7 +159,8 @@ print("loaded", *sys.modules)
         (("bench", "throughput", "--part", "agents"), "`part` (='agents') is for transfer only"),
         (("bench", "transfer", "--part", "table"), "`part` (='table')"),
         (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
-        (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "`scene` (='nowhere')"),
+        (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
+        (("evaluate", "--policy", "random", "--seed", 2**32), "`seeds` (=4294967296) must"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
         (("evaluate", "--preset", "standrad"), "did you mean 'standard'"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
@@ -640,6 +641,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
 
 
+@pytest.mark.slow
 def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(
         "agent: regression\nnum_envs: 4\nenvironment: {scenes: 'bundled:small', resolution: 36}\n"
