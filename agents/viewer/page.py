@@ -6,11 +6,13 @@ import asyncio
 import shutil
 import tempfile
 import uuid
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakMethod
 
 from fastapi import Response
 from nicegui import app, run, ui
@@ -25,6 +27,8 @@ from simulator.camera_simulator import Depth
 
 #: Largest file that is taken [byte].
 _LARGEST_UPLOAD = 300_000_000
+#: Files of all tabs together, from which on no other is taken [byte].
+_MOST_STORED = 4_000_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
 _TABS = ("Exposure", "Episode", "Refocus, HDR")
@@ -76,12 +80,26 @@ class Options:
         return ViewedScene(library.open(name), self.simulator, **how)  # type: ignore[arg-type]
 
 
+def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+    """`method`, whose object may go: FastAPI's caches hold the handlers of uploads for ever."""
+    known = WeakMethod(method)
+
+    async def call(event: Any) -> None:
+        found = known()
+        if found is not None:
+            await found(event)
+
+    return call
+
+
 async def show_page(options: Options) -> None:
     """Puts the page together, for one tab of the browser, and opens the first scene."""
     ui.add_css(_STYLE.read_text())
     page = Page(options)
-    await ui.context.client.connected()
-    await page.open(options.library.first)
+    client = ui.context.client
+    await client.connected()
+    if not client.is_deleted:  # of a page that nobody ever looked at
+        await page.open(options.library.first)
 
 
 class Page:
@@ -104,7 +122,7 @@ class Page:
             upload = ui.upload(
                 auto_upload=True,
                 max_file_size=_LARGEST_UPLOAD,
-                on_upload=self._take_upload,
+                on_upload=_weakly(self._take_upload),
                 on_rejected=lambda: ui.notify(most, type="negative"),
             ).classes("hidden")
             pick = partial(upload.run_method, "pickFiles")
@@ -179,9 +197,17 @@ class Page:
     async def _take_upload(self, event: Any) -> None:
         event.sender.reset()
         name = Path(event.file.name).name
+        folder = Path(self._options.folder or self._folder)
+        stored = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        if name in ("", ".."):
+            complain("A file without a name cannot be opened.")
+            return
+        if stored > _MOST_STORED:
+            complain(f"More than {_MOST_STORED // 10**9} GB are open: close other tabs first.")
+            return
         path = Path(tempfile.mkdtemp(dir=self._folder), name)
-        await event.file.save(path)
         try:
+            await event.file.save(path)
             own = await run.io_bound(self._library.add, path, name)
         except (ValueError, OSError) as error:
             path.unlink(missing_ok=True)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import os
 import secrets
 import socket
 import tempfile
+import webbrowser
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,6 +23,8 @@ from starlette.websockets import WebSocketClose
 from agents.viewer.page import Options, show_page
 
 HOST = "127.0.0.1"
+#: Largest file that is taken, with what a browser sends around it [byte].
+LARGEST_UPLOAD = 301_000_000
 _COOKIE = "ae-env-view"
 
 
@@ -34,7 +39,8 @@ class TokenGuard:
     def __init__(self, app: Any, token: str, port: int) -> None:
         self._app, self._token = app, token
         self._cookie = f"{_COOKIE}-{port}"  # cookies are shared between ports
-        self._hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+        names = (HOST, "localhost")
+        self._hosts = {f"{name}:{port}" for name in names} | (set(names) if port == 80 else set())
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Passes a request on, or refuses it."""
@@ -42,17 +48,26 @@ class TokenGuard:
             await self._app(scope, receive, send)
             return
         asked = HTTPConnection(scope)
-        origin = asked.headers.get("origin")
-        own = asked.headers.get("host") in self._hosts
-        own = own and (origin is None or urlsplit(origin).netloc in self._hosts)
+        own = asked.headers.get("host") in self._hosts and self._is_own(asked.headers.get("origin"))
         by_query = own and self._is_token(asked.query_params.get("token", ""))
-        if not by_query and not (own and self._is_token(asked.cookies.get(self._cookie, ""))):
+        if not by_query and not (own and any(map(self._is_token, self._cookies(asked)))):
             text = "Open the address that `ae-env view` printed: it contains the token."
             refusal: Any = PlainTextResponse(text, 403)
             if scope["type"] == "websocket":
                 refusal = WebSocketClose(1008)
             await refusal(scope, receive, send)
             return
+
+        if int(asked.headers.get("content-length", "0")) > LARGEST_UPLOAD:
+            await PlainTextResponse("The file is too large.", 413)(scope, receive, send)
+            return
+        taken = 0
+
+        async def limited() -> Any:  # a body may come without its length
+            nonlocal taken
+            message = await receive()
+            taken += len(message.get("body", b""))
+            return message if taken <= LARGEST_UPLOAD else {"type": "http.disconnect"}
 
         async def with_cookie(message: Any) -> None:
             if message["type"] == "http.response.start":
@@ -63,7 +78,19 @@ class TokenGuard:
                     headers.append("set-cookie", value)
             await send(message)
 
-        await self._app(scope, receive, with_cookie)
+        await self._app(scope, limited if scope["type"] == "http" else receive, with_cookie)
+
+    def _is_own(self, origin: str | None) -> bool:
+        try:
+            return origin is None or urlsplit(origin).netloc in self._hosts
+        except ValueError:
+            return False
+
+    def _cookies(self, asked: HTTPConnection) -> list[str]:
+        """Values of the cookie; other servers of this machine may set one of the same name."""
+        header = ";".join(asked.headers.getlist("cookie"))
+        pairs = (pair.strip().partition("=") for pair in header.split(";"))
+        return [value for name, _, value in pairs if name == self._cookie]
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode(), self._token.encode())
@@ -87,17 +114,31 @@ def serve(options: Options, port: int, open_browser: bool, announce: Callable[[s
     path = f"/?token={token}"
     app.add_middleware(TokenGuard, token=token, port=port)
     address = f"http://{HOST}:{port}{path}"
-    app.on_startup(lambda: background_tasks.create(_announce_when_served(announce, address, port)))
     ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
     # Uploads and downloads are gone with the program, however its pages were left.
     with tempfile.TemporaryDirectory(prefix="ae-env-view-") as options.folder:
-        how: dict[str, Any] = {"host": HOST, "port": port, "show": path if open_browser else False}
+
+        def served() -> None:
+            announce(address)
+            if open_browser:
+                webbrowser.open(_page_that_leads_to(address, Path(options.folder or "")))
+
+        app.on_startup(lambda: background_tasks.create(_call_when_served(served, port)))
+        how: dict[str, Any] = {"host": HOST, "port": port, "show": False}
         how |= {"show_welcome_message": False, "uvicorn_logging_level": "error"}
         ui.run(reload=False, reconnect_timeout=10.0, **how)
 
 
-async def _announce_when_served(announce: Callable[[str], None], address: str, port: int) -> None:
-    """Calls `announce` as soon as the port answers: the program starts before it listens."""
+def _page_that_leads_to(address: str, folder: Path) -> str:
+    """Address of a file that only this user may read; all may read a browser's arguments."""
+    page = folder / "open.html"
+    with open(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(f'<meta http-equiv="refresh" content="0;url={address}">')
+    return page.as_uri()
+
+
+async def _call_when_served(served: Callable[[], None], port: int) -> None:
+    """Calls `served` as soon as the port answers: the program starts before it listens."""
     while True:
         try:
             _, writer = await asyncio.open_connection(HOST, port)
@@ -105,5 +146,5 @@ async def _announce_when_served(announce: Callable[[str], None], address: str, p
             await asyncio.sleep(0.05)
             continue
         writer.close()
-        announce(address)
+        served()
         return

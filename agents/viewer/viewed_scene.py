@@ -119,6 +119,7 @@ def find_scenes(what: str) -> Library:
             else:
                 own = path != base and path.is_relative_to(base)
                 name = str(path.relative_to(base)) if own else path.name
+                name = name.encode(errors="surrogateescape").decode(errors="replace")  # to be shown
                 readers[name] = partial(_read_raw, path, name)
         return Library(readers, _first_readable(what, readers))
     try:

@@ -411,15 +411,20 @@ def test_whoever_lacks_the_token_or_has_another_name_is_refused():
     def client():
         return TestClient(guard, base_url="http://127.0.0.1:8000")
 
-    foreign = {"Origin": "http://evil.test"}
+    foreign, ours = {"Origin": "http://evil.test"}, "ae-env-view-8000"
+    others = {"Cookie": f'x; =; {ours}=stale; y="; {ours}=secret'}  # of a server beside this one
     for query, headers, status in (
         ("", {}, 403),
         ("?token=wrong", {}, 403),
         ("?token=secret", {"Host": "evil.test:8000"}, 403),
         ("?token=secret", foreign, 403),
+        ("?token=secret", {"Origin": "http://[evil"}, 403),
         ("?token=secret", {"Host": "localhost:8000"}, 200),
+        *(("", others, 200), ("", {"Cookie": f"{ours}=stale"}, 403)),
     ):
         assert client().get(f"/{query}", headers=headers).status_code == status
+    usual = TokenGuard(PlainTextResponse("page"), token="secret", port=80)  # browsers leave it out
+    assert TestClient(usual, base_url="http://127.0.0.1").get("/?token=secret").text == "page"
     known = client()
     known.get("/?token=secret")
     assert known.get("/").text == "page"  # by its cookie
