@@ -345,17 +345,18 @@ def test_each_decision_says_what_it_costs() -> None:
     )
     tiny, strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.09, 0.2, 0.3))
     assert "leaving it out would be an error of 0.25" in strict.steps[1].reason
-    network_bound, loose_bound = 0.1 * 1.5 * _BOUND["network"], 0.25 * _BOUND["left out"]
-    cases = (tiny, 0.1, network_bound), (strict, 0.1, network_bound), (loose, 0.25, loose_bound)
-    for plan, found, bound in cases:
+    by_network, left_out = 1.5 * _BOUND["network"], _BOUND["left out"]
+    cases = (tiny, 0.1, by_network), (strict, 0.1, by_network), (loose, 0.25, left_out)
+    for plan, found, factor in cases:
         assert plan.predicted_error == pytest.approx(found, rel=1e-3)
-        assert plan.error_bound == pytest.approx(math.hypot(bound, _LEAST_BOUND), rel=1e-3)
+        bound = factor * math.hypot(found, _LEAST_BOUND)
+        assert plan.error_bound == pytest.approx(bound, rel=1e-3)
         assert plan.network == ("nano" if found == 0.1 else None)
         assert ("out of reach" in plan.explain()) is (plan is tiny)
         assert ("kept)" in plan.explain()) is (plan is not tiny)
-    # Rounding has no factor of its own.
+    # Never below what is predicted.
     rounded = replace(loose, errors={**loose.errors, "left out": 0.0, "rounding": 0.4})
-    assert rounded.error_bound == pytest.approx(math.hypot(0.4, _LEAST_BOUND))
+    assert rounded.error_bound == pytest.approx(0.4)
     assert "kept, except for errors" in rounded.explain()
     alone = replace(made, denoised_lights=()).plan(settings)
     assert alone.errors["left out"] == pytest.approx(0.25)
@@ -378,8 +379,10 @@ def test_what_clipped_highlights_hide_by_quadrature(ratio: float) -> None:
         square = quad(lambda u: (min(ratio / u, 1.0) - shown) ** 2, 0, 1, points=[ratio])[0]
     error = HIDDEN_LIGHT * math.sqrt(0.1 * square / noise)
     assert plan.errors["clipped highlights"] == pytest.approx(error, rel=1e-6)
-    bound = math.hypot(_BOUND["clipped highlights"] * error, plan.errors["rounding"], _LEAST_BOUND)
-    assert plan.error_bound == pytest.approx(bound)
+    leading = max(plan.errors, key=plan.errors.get)
+    assert leading == ("clipped highlights" if ratio < 1.0 else "rounding")
+    bound = _BOUND[leading] * math.hypot(error, plan.errors["rounding"], _LEAST_BOUND)
+    assert plan.error_bound == pytest.approx(max(bound, plan.predicted_error))
     assert plan.clipped_source == pytest.approx(0.1)
     clear = replace(made, saturated=None).plan(CameraSettings(100, ratio / 64, 8))
     assert clear.clipped_source == clear.errors["clipped highlights"] == 0.0
