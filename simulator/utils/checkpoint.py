@@ -1,16 +1,19 @@
-"""Training states on disk, so that a training that is killed goes on from its last checkpoint."""
+"""Training states on disk, so that a training that is killed goes on from its last checkpoint.
+
+A file is safetensors, whose metadata hold the plain values as JSON, and its SHA-256 after it.
+"""
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import time
-import zipfile
 from collections.abc import Callable, Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 
 from simulator import __version__
@@ -19,6 +22,7 @@ from simulator.utils.files import write_atomically
 _LOGGER = logging.getLogger(__name__)
 #: Least time between two checkpoints of a training [s].
 INTERVAL = 20.0
+_CHECKSUM_BYTES = 32
 
 
 class Checkpoint:
@@ -53,18 +57,20 @@ class Checkpoint:
     def load(self) -> dict[str, Any] | None:
         """The state to resume from, tensors on the CPU; None if there is no file that fits.
 
-        Nothing but tensors and plain values is unpickled: a checkpoint of others runs no code.
+        Nothing is unpickled: a checkpoint of others runs no code.
         """
         if self.path is None or not self.path.is_file():
             return None
         try:
-            with zipfile.ZipFile(self.path) as archive:  # torch does not look at the checksums
-                damaged = archive.testzip()
-            if damaged is not None:
-                raise ValueError(f"wrong checksum of {damaged}")
-            stored = torch.load(self.path, map_location="cpu", weights_only=True)
-            identity, state = stored["identity"], dict(stored["state"])
-        except Exception as error:  # zipfile, pickle and torch raise whatever damage leads to
+            content = self.path.read_bytes()
+            stored, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
+            if sha256(stored).digest() != checksum:
+                raise ValueError("its checksum is wrong")
+            size = int.from_bytes(stored[:8], "little")
+            described = json.loads(stored[8 : 8 + size])["__metadata__"]
+            identity = described["identity"]
+            state = _unpacked(json.loads(described["state"]), safetensors.torch.load(stored))
+        except (OSError, ValueError, KeyError, safetensors.SafetensorError) as error:
             reason = str(error).strip().partition("\n")[0]
             _LOGGER.warning("checkpoint %s is damaged, training restarts: %s", self.path, reason)
             return None
@@ -77,10 +83,12 @@ class Checkpoint:
     def save(self) -> None:
         """Writes the state; on a full disk the previous one stays, with a warning in the log."""
         if self.path is not None and self.writes:
-            content = io.BytesIO()
-            torch.save({"identity": self.identity, "state": dict(self.state())}, content)
+            tensors: dict[str, torch.Tensor] = {}
+            described = json.dumps(_packed(dict(self.state()), tensors))
+            metadata = {"identity": self.identity, "state": described}
+            content = safetensors.torch.save(tensors, metadata)
             try:
-                write_atomically(self.path, content.getvalue())
+                write_atomically(self.path, [content, sha256(content).digest()])
             except OSError as error:
                 _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
         self._saved = time.monotonic()
@@ -96,3 +104,30 @@ class Checkpoint:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None or issubclass(kind, KeyboardInterrupt | SystemExit):
             self.save()
+
+
+def _packed(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """`value` for JSON: each tensor goes to `tensors`, what is no JSON value says what it is."""
+    if isinstance(value, torch.Tensor):
+        name = str(len(tensors))
+        tensors[name] = value.detach().cpu().contiguous().clone()
+        return {"tensor": name}
+    if isinstance(value, Mapping):  # keys may be numbers
+        return {"items": [[key, _packed(own, tensors)] for key, own in value.items()]}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__: [_packed(own, tensors) for own in value]}
+    if value is None or isinstance(value, str | int | float):
+        return value
+    raise TypeError(f"a checkpoint holds tensors and plain values, not {type(value).__name__}")
+
+
+def _unpacked(value: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
+    if not isinstance(value, dict):
+        return value
+    ((kind, own),) = value.items()
+    if kind == "tensor":
+        return tensors[own]
+    if kind == "items":
+        return {key: _unpacked(part, tensors) for key, part in own}
+    parts = [_unpacked(part, tensors) for part in own]
+    return tuple(parts) if kind == "tuple" else parts
