@@ -355,7 +355,7 @@ def _report(
             row | {"best": _change(row["to_best"]), "next": _change(row["to_next"])}
             for row in meta["ranking"]
         ],
-        parts={part: ordered[ordered.condition == part] for part in result.conditions},
+        parts={part: ordered[ordered.condition == part] for part in result.parts},
         min_groups=MIN_GROUPS,
         groups=group_rows(result),
         conditions=_condition_tables(results, by, order) if len(results) > 1 else [],
@@ -480,7 +480,7 @@ def summary(
     if len(results) == 1:
         rows = result_rows(result, resamples=2000)
         table = rows.pivot(index="policy", columns="condition", values="normalised_score")
-        table = table.loc[list(result.tracks), list(result.conditions)].map("{:.3f}".format)
+        table = table.loc[list(result.tracks), list(result.parts)].map("{:.3f}".format)
         pairs = rows[rows.condition == "all"].set_index("policy").ci95
         table["95 % interval (all)"] = [_interval(pair) for pair in pairs[table.index]]
         table = table.reset_index()

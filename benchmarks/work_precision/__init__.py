@@ -28,7 +28,7 @@ from benchmarks.work_precision.methods import Method, all_methods
 from benchmarks.work_precision.plans import GRID, SIZES, Trial, trials
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage
 from simulator.noise.noise_level_function import noise_variance
-from simulator.utils.files import data_folder as data_root
+from simulator.utils.files import data_folder
 
 #: Processes among which the scenes of the plan's predictions are shared out: of the validation
 #: split, which the plan's constants were calibrated on, and of the test split.
@@ -233,7 +233,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "left-out": table(kinds, _LEFT_OUT),
     }
     figures: dict[Any, Figure] = {QUICK if meta["quick"] else HEADLINE: _headline(precise)}
-    more = {"threads": CORES, "real_files": data_root() is not None}
+    more = {"threads": CORES, "real_files": data_folder() is not None}
     return Report(rows, tables, meta=more, figures=figures)
 
 

@@ -29,7 +29,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ae_env import ExposureGrid
-from benchmarks.harness import Row, cropped, data_root
+from benchmarks.harness import Row, cropped
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, incident_ev100
@@ -39,6 +39,7 @@ from simulator.capture.sensor import exposed_light, exposure_table, missing_vari
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import Split, reference_scenes
+from simulator.utils.files import data_folder
 
 #: Height and width [packed pixel].
 Size = tuple[int, int]
@@ -144,7 +145,7 @@ def _scenes(
 ) -> dict[str, list[ReferenceScene]]:
     """Scenes of exactly `size` by kind."""
     profile = get_camera(CAMERA)
-    found = reference_scenes(split, profile, number=groups, size=drawn, data=data_root())
+    found = reference_scenes(split, profile, number=groups, size=drawn, data=data_folder())
     names = ("depth", "flat", "photograph", "radiance")
     kinds: dict[str, list[ReferenceScene]] = {kind: [] for kind in names}
     for scene in found:
