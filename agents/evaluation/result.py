@@ -487,16 +487,15 @@ def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataF
     return rank(gains, np.mean(spans, axis=0), resamples=resamples)
 
 
-def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
+def training_seed_rows(result: EvaluationResult) -> pd.DataFrame:
     """Normalised score per policy, training seed and part, for those with several seeds."""
-    rows: list[dict[str, Any]] = []
+    rows = []
     for part in result.parts:
         for policy in (name for name, track in result.tracks.items() if track.num_seeds > 1):
             gains, span = result.group_gains(policy, part)
-            for k, value in enumerate((gains.sum(axis=1) / span.sum()).tolist()):
-                run = {"policy": policy, "condition": part, "training_run": k}
-                rows.append({**run, "normalised_score": value})
-    return rows
+            for k, value in enumerate(gains.sum(axis=1) / span.sum()):
+                rows.append((policy, part, k, value))
+    return pd.DataFrame(rows, columns=["policy", "condition", "training_run", "normalised_score"])
 
 
 def oracle_histogram(result: EvaluationResult) -> dict[str, dict[str, float]]:

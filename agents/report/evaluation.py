@@ -319,7 +319,7 @@ def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int)
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
         "differences_to_best_meter": differences,
-        "training_seeds": training_seed_rows(result),
+        "training_seeds": _records(training_seed_rows(result)),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
     }

@@ -82,8 +82,8 @@ def trained_noise_modules() -> dict[str, NoiseModule]:
 @torch.no_grad()
 def baseline(network: nn.Module, raw: RawImage, target: CameraSettings) -> Tensor:
     """What one of the paper's baselines makes of a raw, (4, H, W): it is told both settings."""
-    told = [v for settings in (raw.settings, target) for v in settings_parameters(settings)]
-    image: Tensor = network(raw.data[None], torch.tensor([told]))[0].float()
+    stated = [v for settings in (raw.settings, target) for v in settings_parameters(settings)]
+    image: Tensor = network(raw.data[None], torch.tensor([stated]))[0].float()
     return image
 
 

@@ -73,7 +73,7 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         row |= {"noise_variance_error": float(np.median(own["noise"] or np.nan))}
         rows.append(row | {"scenes": len(chosen), "states_per_scene": count})
     points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
-    for row, best in zip(rows, pareto_front(points), strict=True):
+    for row, best in zip(rows, undominated(points), strict=True):
         row["pareto"] = best
     return rows
 
@@ -157,7 +157,7 @@ def noise_ratios(
     return [float(found[at].mean() / wanted[at].mean()) for at in levels if len(at) >= _FEWEST]
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+def undominated(points: Sequence[tuple[float, float]]) -> list[bool]:
     """Which of (milliseconds, PSNR [dB]) no other beats in both.
 
     One that is faster and, to a hundredth of a decibel, as good beats another.

@@ -7,17 +7,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
-from torch import nn
 
-from ae_env.registration import ENV_IDS
+from ae_env.registration import TASKS
 from agents import PolicyContext, make_policy
 from tests.ae_env.environments import SMALL
 
 ROOT = Path(__file__).parents[2]
-every_task = pytest.mark.parametrize("task", ENV_IDS)
+every_task = pytest.mark.parametrize("task", TASKS)
 
 
 @every_task
@@ -34,20 +32,15 @@ def test_stable_baselines(task: str, algorithm: Any, policy: str) -> None:
 
 @every_task
 def test_a_loop_as_cleanrl_writes_it(task: str) -> None:
-    """`ppo.py`: a vector environment in SAME_STEP mode, statistics of episodes, a flat network."""
+    """`ppo.py`: a vector environment in SAME_STEP mode, and statistics of its episodes."""
     envs = gym.make_vec(task, num_envs=4, autoreset_mode="SAME_STEP", **SMALL)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
-    size = int(np.prod(envs.single_observation_space["raw"].shape)) + 3
-    network = nn.Linear(size, envs.single_action_space.n)
-    observation, _ = envs.reset(seed=1)
+    envs.action_space.seed(1)
+    envs.reset(seed=1)
     lengths: list[int] = []
     for _ in range(100 if "Video" in task else 20):
-        raw = torch.from_numpy(observation["raw"]).flatten(1).float() / 255.0
-        inputs = torch.cat([raw, torch.from_numpy(observation["settings"])], dim=1)
-        chosen = torch.distributions.Categorical(logits=network(inputs))
-        actions = chosen.sample()
-        observation, rewards, terminated, truncated, info = envs.step(actions.numpy())
-        assert (chosen.log_prob(actions) * torch.from_numpy(rewards)).mean().isfinite()
+        _, rewards, terminated, truncated, info = envs.step(envs.action_space.sample())
+        assert np.isfinite(rewards).all()
         done = terminated | truncated
         if done.any():
             assert set(np.flatnonzero(done)) == {i for i, o in enumerate(info["final_obs"]) if o}
@@ -68,9 +61,7 @@ def test_torchrl(task: str) -> None:
     check_env_specs(env)
     rollout = env.rollout(8)
     assert rollout["next", "reward"].isfinite().all()
-    # An episode ends with its last step, and no earlier.
-    done = rollout["next", "done"].flatten()
-    assert not done[:-1].any()
+    assert not rollout["next", "done"].flatten()[:-1].any()  # it ends with its last step
     envs = SerialEnv(2, lambda: GymEnv(task, frame_skip=2, **SMALL))
     assert envs.rollout(1)["next", "reward"].shape == (2, 1, 1)
 

@@ -54,11 +54,9 @@ def test_every_state_of_every_scene_is_in_the_tables(done: Path) -> None:
     assert table["state"] == [*range(64), *range(64)]
     assert (table["iso"][20], table["f_number"][20]) == (400, 4.0)  # (1 * 4 + 1) * 4 + 0
     assert sum(table["best"]) == 2
-    score = np.reshape(table["score"], (2, 64))
-    best = np.reshape(table["best"], (2, 64))
+    score, best, ev100 = (np.reshape(table[n], (2, 64)) for n in ("score", "best", "ev100"))
     assert (score[best] == score.max(axis=1)).all()
-    ev100 = np.reshape(table["ev100"], (2, 64))[best]
-    assert ev100[1] >= ev100[0]  # more light, less exposure
+    assert np.diff(ev100[best]) >= 0.0  # more light, less exposure
     # Captures are the digital numbers of the states.
     frames = load_file(done / "captures-00002.safetensors")
     name = next(name for name in frames if name.startswith("night-4.dng"))
@@ -85,8 +83,7 @@ def test_a_run_continues_with_the_shards_that_are_missing(folder: Path, done: Pa
     plan.table(1).unlink()
     seen: list[tuple[int, int]] = []
     made = run(plan, "local", lambda done, total: seen.append((done, total)))
-    assert [one["shard"] for one in made] == [1]
-    assert seen == [(2, 3), (3, 3)]
+    assert ([one["shard"] for one in made], seen) == ([1], [(2, 3), (3, 3)])
     assert contents(done) == whole
     assert run(plan, "local", lambda *_: None) == []
     with pytest.raises(ValueError, match="`out`"):
@@ -96,10 +93,7 @@ def test_a_run_continues_with_the_shards_that_are_missing(folder: Path, done: Pa
 def test_what_cannot_run_leaves_no_folder(ae_env, folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     out = tmp_path / "tables"
-    for on, status, message in (
-        ("ray://head:10001", 1, "pip install 'ae-env[ray]'"),
-        ("cluster", 2, "`on` (='cluster') must be local"),
-    ):
+    for on, status, message in (("ray://head:10001", 1, "ae-env[ray]"), ("cluster", 2, "`on`")):
         code, _, error = ae_env("score-tables", folder, "--on", on, "-o", out)
         assert (code, error.count("\n"), message in error) == (status, 1, True)
     assert not out.exists()

@@ -38,14 +38,6 @@ def simulator() -> CameraSimulator:
     return CameraSimulator(device="cpu")
 
 
-def disc_area(f_number: float, depth: float) -> float:
-    """Packed pixels in the disc that the larger aperture adds to the blur at f/5.6, in theory."""
-    # c = f^2 / N (1/s - 1/z) / (1 - f/s); marked 5.6 stands for 4 sqrt 2, 1.4 for sqrt 2.
-    exact = {5.6: 2**2.5, 1.4: 2**0.5}
-    disc = 0.05**2 * abs(1 / 2 - 1 / depth) / (1 - 0.05 / 2) / 10e-6  # at f/1
-    return np.pi / 4 * disc**2 * (exact[f_number] ** -2 - exact[5.6] ** -2)
-
-
 def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator) -> None:
     dark = 160.0 / CAMERA.span[0]  # whole digital numbers: rounding errors would add up
     light = torch.full((4, 161, 161), dark)
@@ -56,7 +48,10 @@ def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator
     assert out.settings.f_number == 1.4
     assert out.settings.exposure_time == pytest.approx(1 / 64 / 16)
     np.testing.assert_allclose(float(disc.sum()), 0.89, rtol=0.01)
-    area = disc_area(1.4, 2.2)
+    # c = f^2 / N (1/s - 1/z) / (1 - f/s) in packed pixels, less what f/5.6 has blurred already;
+    # marked 5.6 stands for 4 sqrt 2, 1.4 for sqrt 2.
+    disc_at_1 = 0.05**2 * (1 / 2 - 1 / 2.2) / (1 - 0.05 / 2) / 10e-6
+    area = np.pi / 4 * disc_at_1**2 * (1 / 2 - 1 / 32)
     offset = torch.arange(25).double() - 12
     # A disc of area A has the second moment A / (4 pi) along each axis.
     for profile in (disc.sum(dim=0), disc.sum(dim=1)):
@@ -157,7 +152,7 @@ def test_bad_maps(tmp_path) -> None:
         with pytest.raises(ValueError, match=rf"`depth` \(='.*{name}'"):
             read_depth(tmp_path / name)
     for wrong in ({"kind": "metres"}, {"kind": "disparity"}, {"scale": 0.0}):
-        with pytest.raises(ValueError, match=r"`kind` \(='metres'|`scale` \(=(None|0\.0)\)"):
+        with pytest.raises(ValueError, match=r"`(kind|scale)`"):
             read_depth(tmp_path / "photo.jpg", **wrong)
 
 

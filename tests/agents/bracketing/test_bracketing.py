@@ -13,26 +13,19 @@ from ae_env import ExposureGrid
 from ae_env.merging import log_error, merge
 from ae_env.observation import encode_sensors
 from ae_env.utils.user_files import UserCodeError
-from agents.bracketing.policies import (
-    BINS,
-    FixedBracket,
-    Schedules,
-    blur_error,
-    light_shares,
-    run_brackets,
-)
+from agents.bracketing import policies as brackets
+from agents.bracketing.policies import BINS, FixedBracket, Schedules, run_brackets
 from agents.policy import BracketLimits, Policy, PolicyContext
 from agents.policy_names import make_policy
 from simulator.camera import get_camera
 from tests.ae_env import environments
 
-ID = "ae_env/ExposureBracket-v0"
 CAMERA = get_camera("nikon_z6")
 GRID = ExposureGrid((100, 1600), (1 / 1000, 1 / 60, 1 / 4), (4,))
 LIMITS = BracketLimits(budget=0.3, max_frames=2, box_factor=4)
 
-
-make_envs = functools.partial(environments.make_envs, task=ID, autoreset_mode="DISABLED")
+TASK = {"task": "ae_env/ExposureBracket-v0", "autoreset_mode": "DISABLED"}
+make_envs = functools.partial(environments.make_envs, **TASK)
 
 
 @pytest.fixture(scope="module")
@@ -133,14 +126,14 @@ def test_hasinoff_takes_the_largest_ratio_in_the_worst_light() -> None:
 def test_what_frames_show_is_counted_by_hand() -> None:
     light = np.array([1.0, 4.0, 4.0, 0.0, 0.01])
     precision = np.array([100.0, 100.0, 100.0, 0.0, 1.0])  # white where 0; the last is noise
-    found = light_shares(light, precision, limit=6.0, reference=2.0)
+    found = brackets.light_shares(light, precision, limit=6.0, reference=2.0)
     # Clear, and noisy at its standard deviation, 1; clear twice; white.
     assert dict(zip(BINS[found > 0], found[found > 0], strict=True)) == {-2: 0.4, 0: 0.4, 4: 0.2}
 
 
 def test_blur_costs_what_was_measured() -> None:
     """A blur of a quarter pixel of a 64-pixel frame costs nothing, one of 4 pixels 0.17 EV."""
-    costs = blur_error(np.array([0.0, 0.25, 4.0, 8.0, 4.0 * 2**0.5, 1000.0]))
+    costs = brackets.blur_error(np.array([0.0, 0.25, 4.0, 8.0, 4.0 * 2**0.5, 1000.0]))
     expected = [0.0, 0.0, 0.17012548, 0.31782454, (0.17012548 + 0.31782454) / 2, 0.43819642]
     np.testing.assert_allclose(costs, expected, rtol=1e-6)
 

@@ -15,15 +15,8 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from agents import Policy, evaluate, fit_policies, make_policy
 from agents.evaluation import engine
-from agents.evaluation.evaluation_plan import (
-    Condition,
-    EvaluationPlan,
-    digest,
-    load_plan,
-    plan_episodes,
-    plan_scenes,
-    start_state,
-)
+from agents.evaluation import evaluation_plan as plans
+from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
 from agents.evaluation.jobs import named_content, run_plan
 from agents.policy import PolicyContext
 from agents.rollouts import make_envs
@@ -58,9 +51,7 @@ def test_shapes_and_oracle(result):
     assert result.scores.shape == result.allowed.shape == (episodes, 3, 64)
     assert result.tracks["random*3"].states.shape == (3, episodes, 3)
     assert len(set(result.scene_ids.tolist())) == episodes // 2
-    np.testing.assert_array_equal(
-        result.tracks["oracle"].states[0], np.repeat(result.oracle_states[:, None], 3, axis=1)
-    )
+    assert (result.tracks["oracle"].states[0] == result.oracle_states[:, None]).all()
     assert result.tracks["oracle"].privileged
     assert result.tracks["matrix:P"].ms_alone > 0
     oracle = result.episode_metrics("oracle")
@@ -169,9 +160,9 @@ def test_fit_makes_tuned_and_fixed_policies_better_than_random(small, few, fitte
 
 
 def test_other_scorers_rate_chosen_states_over_frames_then_groups(tmp_path):
-    plan = EvaluationPlan(environment=OPTIONS, max_scenes=3, frames=3, starts=("dark",))
+    given = {"max_scenes": 3, "frames": 3, "starts": ("dark",), "policies": ("matrix:P", "random")}
     scorers = {"other_scorers": ("brightness", "sharpness"), "other_scorer_scenes": 2}
-    plan = plan.changed(policies=("matrix:P", "random"), **scorers)
+    plan = EvaluationPlan(environment=OPTIONS, **given, **scorers)
     result = run_plan(plan, tmp_path)["static"]
     table = result.other_scores
     assert list(table) == ["brightness", "sharpness"]
@@ -186,14 +177,13 @@ PLAN = EvaluationPlan(environment=OPTIONS, max_scenes=5)
 
 
 def test_delays_multiply_the_conditions_that_have_none_of_their_own():
-    plan = EvaluationPlan(
-        conditions={"late": Condition(delay=3), "static": Condition()}, delays=(0, 2)
-    )
+    conditions = {"late": {"delay": 3}, "static": {}}
+    plan = EvaluationPlan(conditions=conditions, delays=(0, 2))
     found = {name: c.delay for name, c in plan.all_conditions.items()}
     assert found == {"late": 3, "static": 0, "static/delay2": 2}
     assert [name for name, c in plan.all_conditions.items() if c.at_rest] == ["static"]
     assert plan.static_condition == "static"
-    changing = EvaluationPlan(conditions={"sine": Condition(lighting="sine")})
+    changing = EvaluationPlan(conditions={"sine": {"lighting": "sine"}})
     assert changing.static_condition == "sine"  # there is no other
 
 
@@ -246,17 +236,17 @@ def scenes():
 
 def test_starts_are_the_ends_of_the_grid_and_the_right_exposure(scenes):
     scene, grid = scenes[0], PLAN.options().make_grid()
-    dark, middle, bright = (start_state(s, scene, grid) for s in ("dark", "middle", "bright"))
+    dark, middle, bright = (plans.start_state(s, scene, grid) for s in ("dark", "middle", "bright"))
     # f/11 (11.3), 1/1000 s, ISO 100 and f/4, 1/2 s, ISO 6400.
     assert grid.ev100[dark] == pytest.approx(np.log2(128 * 1000), abs=0.01)
     assert grid.ev100[bright] == pytest.approx(np.log2(16 * 2 / 64), abs=0.01)
     assert abs(grid.ev100[middle] - scene.ev100) == np.abs(grid.ev100 - scene.ev100).min()
-    assert start_state("random", scene, grid) is None
+    assert plans.start_state("random", scene, grid) is None
     allowed = np.ones(64, bool)
     allowed[[dark, middle]] = False
     holes = dataclasses.replace(scene, allowed=allowed)
-    assert grid.ev100[start_state("dark", holes, grid)] == pytest.approx(16, abs=0.1)
-    assert start_state("middle", holes, grid) != middle
+    assert grid.ev100[plans.start_state("dark", holes, grid)] == pytest.approx(16, abs=0.1)
+    assert plans.start_state("middle", holes, grid) != middle
 
 
 def test_episodes_of_another_start_share_everything_but_the_start(scenes):
@@ -265,7 +255,7 @@ def test_episodes_of_another_start_share_everything_but_the_start(scenes):
     with pytest.raises(ValueError, match="JSON value"):  # objects are described, but no protocol
         given.protocol()
     plan = PLAN.changed(seeds=(0, 7), starts=("dark", "bright"))
-    episodes = plan_episodes(plan, scenes, PLAN.options().make_grid())
+    episodes = plans.plan_episodes(plan, scenes, PLAN.options().make_grid())
     assert episodes.seeds[:10] == episodes.seeds[10:]
     assert len(set(episodes.seeds)) == 10
     assert episodes.seeds[5] == 7 * 2**20

@@ -8,20 +8,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import nn
 
 from ae_env.grid import ExposureGrid
+from agents.learning import regression
 from agents.learning.networks import Session
 from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.ppo import PPOTraining, train_ppo
-from agents.learning.regression import (
-    RegressionPolicy,
-    RegressionTraining,
-    Replay,
-    ScoreRegressor,
-    train_regression,
-)
+from agents.learning.regression import RegressionPolicy, RegressionTraining, train_regression
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from simulator.utils.files import sibling
@@ -48,10 +42,6 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path, observati
     network = train_ppo(envs, training)
     save_agent(tmp_path / "ppo", "ppo", network, network.width, context, {})
     loaded = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
-    # The three extractors of SB3's policy are stored once, and are one again.
-    names = load_file(tmp_path / "ppo.safetensors")
-    assert len({name.split(".")[0] for name in names if "extractor" in name}) == 2  # and the MLP
-    assert loaded.network.pi_features_extractor is loaded.network.features_extractor
     observations, _ = envs.reset(seed=9)
     loaded.reset(6)
     for _ in range(3):
@@ -186,7 +176,7 @@ def test_the_seed_alone_decides_and_progress_is_complete(train, training, make_t
 
 @pytest.mark.parametrize("memory", [1, 4, 10])
 def test_replay_memory_is_bounded(memory: int) -> None:
-    replay = Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
+    replay = regression.Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
     for step in range(12):
         new = {"raw": np.full((4, 4, 2, 2), step, np.uint8), "settings": np.zeros((4, 3))}
         batch, target = replay.batch(new, np.full((4, 64), float(step)))
@@ -195,21 +185,21 @@ def test_replay_memory_is_bounded(memory: int) -> None:
     assert len(replay.memory) == max(1, memory // 4)
 
 
-def make_network(context: PolicyContext) -> ScoreRegressor:
-    return ScoreRegressor(context.observation_space, context.grid, width=8)
+@pytest.fixture
+def network(context: PolicyContext) -> nn.Module:
+    return regression.ScoreRegressor(context.observation_space, context.grid, width=8)
 
 
 @pytest.fixture
-def agent(context: PolicyContext, tmp_path: Path) -> Path:
+def agent(context: PolicyContext, network: nn.Module, tmp_path: Path) -> Path:
     path, training = tmp_path / "regression-0.5", {"agent": "regression"}
-    save_agent(path, "regression", make_network(context), 8, context, training)
+    save_agent(path, "regression", network, 8, context, training)
     return path
 
 
-def test_weights_that_are_not_finite_replace_none(agent: Path, context: PolicyContext) -> None:
+def test_weights_that_are_not_finite_replace_none(agent: Path, context, network) -> None:
     _, card = load_agent(agent, "regression")
     assert (card["width"], card["training"]) == (8, {"agent": "regression"})
-    network = make_network(context)
     next(network.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="finite"):
         save_agent(agent, "regression", network, 8, context, {})

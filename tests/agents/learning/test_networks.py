@@ -1,5 +1,7 @@
 """Networks and forecasts, and the environments in the shape of SB3 that they are trained on."""
 
+import functools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,25 +12,9 @@ from torch import nn
 from ae_env.grid import ExposureGrid
 from ae_env.lighting.moving import MOVES
 from ae_env.observation import encode_sensors
-from agents.learning.forecaster import (
-    HORIZON,
-    KINDS,
-    ForecasterTraining,
-    LearntTracker,
-    LightForecaster,
-    metered,
-    sample,
-    train_forecaster,
-)
-from agents.learning.networks import (
-    LIGHT_NUMBERS,
-    NUMBERS,
-    ExposureFeatures,
-    MeterHistory,
-    StateHead,
-    random_shift,
-    with_history,
-)
+from agents.learning import forecaster, networks
+from agents.learning.forecaster import ForecasterTraining, LightForecaster, metered
+from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, MeterHistory, StateHead
 from agents.learning.regression import observation_tensors
 from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
 from agents.metering.reading import Reading
@@ -150,7 +136,7 @@ def test_frames_are_shifted_by_up_to_an_eighth_and_mirrored() -> None:
     padded = np.pad(raw, ((0, 0), (0, 0), (2, 2), (2, 2)), mode="edge")
     cuts = [padded[:, :, r : r + 16, c : c + 16] for r in range(5) for c in range(5)]
     known = {frames.tobytes() for cut in cuts for frames in (cut, cut[..., ::-1])}
-    assert {random_shift(raw, rng).tobytes() for _ in range(600)} == known
+    assert {networks.random_shift(raw, rng).tobytes() for _ in range(600)} == known
 
 
 def _light(kind: str, count: int, seed: int = 9) -> np.ndarray:
@@ -158,9 +144,9 @@ def _light(kind: str, count: int, seed: int = 9) -> np.ndarray:
     return np.stack([10.0 + MOVES[kind](rng)[:70] for _ in range(count)])
 
 
-def _forecasts(networks: list[LightForecaster], reading: Reading, exposed_at: np.ndarray):
+def _forecasts(trained: list[LightForecaster], reading: Reading, exposed_at: np.ndarray):
     """EV100 expected three frames ahead, and how sure that is, both (B, 60)."""
-    tracker, found = LearntTracker(len(exposed_at), networks), []
+    tracker, found = forecaster.LearntTracker(len(exposed_at), trained), []
     for t in range(60):
         one = Reading(reading.ev100[:, t], reading.saturated[:, t], reading.black[:, t])
         tracker.update(one, exposed_at[:, t])
@@ -176,7 +162,7 @@ def test_it_learns_to_foresee_swinging_light():
     training = ForecasterTraining(**sizes, mixed=0.0, bent=0.0, learning_rate=5e-2)
     light = _light("sines", 40)
     reading, exposed_at = metered(light, np.random.default_rng(1))
-    expected, _ = _forecasts([train_forecaster(training)], reading, exposed_at)
+    expected, _ = _forecasts([forecaster.train_forecaster(training)], reading, exposed_at)
     ahead = light[:, 23:63]
     forecast, latest = (np.abs(x[:, 20:60] - ahead).mean() for x in (expected, reading.ev100))
     assert forecast < 0.85 * latest
@@ -185,9 +171,9 @@ def test_it_learns_to_foresee_swinging_light():
 def test_samples_are_what_a_meter_reads_and_where_the_light_goes():
     training = ForecasterTraining(batch_size=50, mixed=0.5, bent=0.5)
     rng = np.random.default_rng(0)
-    traces = np.stack([MOVES[kind](rng) for kind in KINDS for _ in range(4)])
-    described, changes = sample(traces, training, rng)
-    assert (described.shape, changes.shape) == ((50, 128, 4), (50, 128, HORIZON + 1))
+    traces = np.stack([MOVES[kind](rng) for kind in forecaster.KINDS for _ in range(4)])
+    described, changes = forecaster.sample(traces, training, rng)
+    assert (described.shape, changes.shape) == ((50, 128, 4), (50, 128, forecaster.HORIZON + 1))
     assert np.isfinite(described).all()
     clear = described[:, :, 2] == 0.0  # nothing clipped: the reading is the light itself
     assert np.abs(changes[:, :, 0][clear]).mean() < 0.1
@@ -199,21 +185,14 @@ def test_samples_are_what_a_meter_reads_and_where_the_light_goes():
 
 def test_cameras_do_not_see_each_other_and_trainings_are_averaged():
     """Where they differ, the forecast is less sure."""
-    networks = [LightForecaster(8).eval() for _ in range(2)]
+    trained = [LightForecaster(8).eval() for _ in range(2)]
     reading, exposed_at = metered(_light("ramps", 3), np.random.default_rng(1))
-    (a, s), (b, t) = (_forecasts([network], reading, exposed_at) for network in networks)
+    (a, s), (b, t) = (_forecasts([network], reading, exposed_at) for network in trained)
     second = Reading(reading.ev100[1:2], reading.saturated[1:2], reading.black[1:2])
-    mean, spread = _forecasts(networks, second, exposed_at[1:2])
+    mean, spread = _forecasts(trained, second, exposed_at[1:2])
     np.testing.assert_allclose(mean, (a + b)[1:2] / 2, atol=1e-4)
     squared = (s**2 + t**2) / 2 + ((a - b) / 2) ** 2
     np.testing.assert_allclose(spread**2, squared[1:2], rtol=1e-3)
-
-
-STEPS = 3  # of an episode
-
-
-def single() -> gym.Env:
-    return make_env(max_episode_steps=STEPS)
 
 
 def assert_same_rollout(ours: VecEnv, theirs: VecEnv, steps: int) -> None:
@@ -222,22 +201,17 @@ def assert_same_rollout(ours: VecEnv, theirs: VecEnv, steps: int) -> None:
     assert_equal(ours.reset_infos[1], theirs.reset_infos[1], "reset info")
     for step in range(steps):
         actions = rng.integers(64, size=ours.num_envs)
-        mine, other = ours.step(actions), theirs.step(actions)
-        assert_equal(dict(mine[0]), dict(other[0]), f"{step}: observation")
-        assert mine[1].dtype == other[1].dtype == np.float32
-        np.testing.assert_array_equal(mine[1], other[1])
-        np.testing.assert_array_equal(mine[2], other[2])
-        for i in range(ours.num_envs):
-            assert_equal(mine[3][i], other[3][i], f"{step}: info {i}")
-            ended = bool(other[2][i])
-            assert ("terminal_observation" in mine[3][i]) == ended
-            assert mine[3][i]["TimeLimit.truncated"] == ended
-            assert_equal(ours.reset_infos[i], theirs.reset_infos[i], f"{step}: reset info {i}")
+        (mine, *answers), (other, *wanted) = ours.step(actions), theirs.step(actions)
+        assert_equal(dict(mine), dict(other), f"{step}: observation")
+        assert_equal(answers, wanted, f"{step}: reward, done, info")
+        assert_equal(ours.reset_infos, theirs.reset_infos, f"{step}: reset info")
+        for ended, info in zip(*wanted[1:], strict=True):
+            assert ("terminal_observation" in info) == info["TimeLimit.truncated"] == ended
 
 
 def test_rollouts_equal_those_of_single_environments(make_tiny_envs) -> None:
-    ours = SB3VectorAdapter(make_tiny_envs(num_envs=3, max_episode_steps=STEPS))
-    theirs = DummyVecEnv([single] * 3)
+    ours = SB3VectorAdapter(make_tiny_envs(num_envs=3, max_episode_steps=3))
+    theirs = DummyVecEnv([functools.partial(make_env, max_episode_steps=3)] * 3)
     for envs in (ours, theirs):
         envs.seed(11)
     assert_same_rollout(ours, theirs, 7)
@@ -263,7 +237,7 @@ def test_attributes_methods_and_pictures_of_a_wrapped_batch(make_tiny_envs) -> N
     assert envs.has_attr("action_masks")  # as MaskablePPO asks
     assert [bool(mask[3]) for mask in envs.env_method("action_masks")] == [False] * 3
     scores = inner.unwrapped.expected_scores()
-    for indices in ([1], 1, np.int64(1), np.array([1])):
+    for indices in ([1], 1, np.array([1])):
         (row,) = envs.env_method("expected_scores", indices=indices)
         np.testing.assert_array_equal(row, scores[1])
     assert envs.env_is_wrapped(gym.Wrapper) == [False] * 3
@@ -299,12 +273,12 @@ def test_it_holds_readings_exposures_and_what_was_asked_for(context, photograph)
     history, grey, grid = MeterHistory(context, 1, 3), np.ones((64, 64)), context.grid
     state = grid.nearest(9.0)
     frame = photograph(grey, 9.0, state)
-    first = history.observe(frame).reshape(3, NUMBERS)
+    first = history.observe(frame).reshape(3, networks.NUMBERS)
     # Before the first frame there was the same.
     row = [0.0, (9.0 - grid.ev100[state]) / 4.0, 0.0, *frame["settings"][0]]
     np.testing.assert_allclose(first, [row] * 3, atol=0.02)
     history.record_action(np.array([40]))
-    second = history.observe(photograph(grey, 8.0, state)).reshape(3, NUMBERS)
+    second = history.observe(photograph(grey, 8.0, state)).reshape(3, networks.NUMBERS)
     np.testing.assert_allclose(second[0, 3:], photograph(grey, 8.0, 40)["settings"][0])
     np.testing.assert_allclose(second[:, 0], [0.0, 0.5, 0.5], atol=0.02)  # one stop brighter before
     history.forget(np.array([True]))
@@ -315,7 +289,7 @@ def test_wrapped_episodes_end_with_their_own_history(make_tiny_envs):
     envs = make_tiny_envs(num_envs=3, max_episode_steps=2)
     context = PolicyContext.from_envs(envs)
     seen = WithHistory(SB3VectorAdapter(envs), context, 4)
-    assert seen.observation_space == with_history(envs.single_observation_space, 4)
+    assert seen.observation_space == networks.with_history(envs.single_observation_space, 4)
     seen.seed(3)
     observations = seen.reset()
     alone = MeterHistory(context, 3, 4)
@@ -325,9 +299,8 @@ def test_wrapped_episodes_end_with_their_own_history(make_tiny_envs):
         observations, _, dones, infos = seen.step(np.full(3, action))
         assert dones.all() == (step == 1)
         if dones.all():
-            last = {
-                k: np.stack([i["terminal_observation"][k] for i in infos]) for k in observations
-            }
+            ends = [info["terminal_observation"] for info in infos]
+            last = {key: np.stack([end[key] for end in ends]) for key in observations}
             np.testing.assert_array_equal(last.pop("history"), alone.observe(last))
             alone.forget(dones)
         np.testing.assert_array_equal(observations["history"], alone.observe(observations))

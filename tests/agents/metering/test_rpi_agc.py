@@ -1,3 +1,5 @@
+"""The Raspberry Pi's AGC: against libcamera's recordings, and on a grid."""
+
 import dataclasses
 import json
 import math
@@ -7,50 +9,19 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from agents.metering.rpi_agc import (
-    LADDERS,
-    ZONE_WEIGHTS,
-    ExposureFilter,
-    LibcameraAgc,
-    inter_quantile_mean,
-    signal_histogram,
-    zone_map,
-)
+from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
 from agents.policy_names import make_policy
 
 GREY = np.ones((64, 64))
-
-
-@pytest.mark.parametrize(("stops", "frames"), [(-4.0, 11), (4.0, 24), (6.0, 30)])
-def test_filter_needs_the_published_frames(stops, frames):
-    """Light that changes by `stops`: frames until the exposure is within 2 % of its target."""
-    follow = ExposureFilter(1)
-    for _ in range(12):
-        follow.update(np.array([1.0]))
-    target = 2.0**-stops
-    errors = [abs(follow.update(np.array([target]))[0] / target - 1.0) for _ in range(60)]
-    assert next(i for i, error in enumerate(errors, 1) if error < 0.02) == frames
-
-
-def test_filter_goes_all_of_the_way_at_the_start_and_keeps_what_is_near():
-    follow = ExposureFilter(2, startup_frames=3)
-    for target in (1.0, 16.0, 0.25):
-        assert follow.update(np.array([target, target])).tolist() == [target, target]
-    assert follow.update(np.array([0.254, 0.246])).tolist() == [0.25, 0.25]  # within 2 %
-    near, far = follow.update(np.array([0.275, 1.25]))
-    assert near == pytest.approx(0.25 + math.sqrt(0.2) * 0.025)  # within 20 %
-    assert far == pytest.approx(0.25 + 0.2 * 1.0)
 
 
 def test_zones_cover_the_frame_with_the_first_in_the_middle():
     zones = zone_map(60, 90)
     assert np.unique(zones).tolist() == list(range(15))
     assert zones[30, 45] == 0
-    assert (zones == zones[::-1, ::-1]).mean() < 1.0  # sides have names of their own
     counts = np.bincount(zones.ravel())
     assert counts[11:].tolist() == [10 * 15] * 4  # a sixth by a sixth
     assert {int(zones[30, x]) for x in range(90)} == {9, 5, 1, 0, 2, 6, 10}
-    assert {len(w) for w in ZONE_WEIGHTS.values()} == {15}
 
 
 def _wanted_ev(policy, frame):
@@ -125,10 +96,9 @@ OURS = Path(__file__).with_name("libcamera_traces.json")
 
 
 def _played(recording, zone_factors):
-    """Exposure times [s] and gains of ours on the sensor and in the light of a recording.
+    """Exposure times [s] and gains of ours in the light of a recording, which it does not see.
 
-    Its own settings are fed back, as late as the sensor's: an exposure time reaches the third frame
-    after its decision, a gain the second. Nothing of the recording is shown to it.
+    Its settings take effect as the sensor's do: a time three frames after its decision, a gain two.
     """
     agc = LibcameraAgc(
         1,
@@ -176,15 +146,3 @@ def test_every_frame_is_libcameras(every: bool, request: pytest.FixtureRequest) 
             for own in ((times, gains), wanted)
         )
         assert ours == theirs
-
-
-def test_the_histogram_counts_every_pixel_and_its_mean_between_quantiles_is_theirs():
-    signals = np.random.default_rng(0).random((3, 4000)) ** 2
-    ordered = np.sort(signals, axis=1)
-    found = inter_quantile_mean(signal_histogram(signals), 0.5, 0.9)
-    np.testing.assert_allclose(found, ordered[:, 2000:3600].mean(axis=1), atol=0.5 / 128)
-    # The last bin holds white.
-    found = signal_histogram(np.array([[0.0, 1.0, 0.5, -0.01], [1 / 128, 0.999, 2.0, 0.0]]))
-    assert found.sum(axis=1).tolist() == [4, 4]
-    assert [found[0, 0], found[0, 64], found[0, 127]] == [2, 1, 1]
-    assert [found[1, 0], found[1, 1], found[1, 127]] == [1, 1, 2]

@@ -23,7 +23,7 @@ from agents.evaluation.jobs import run_plan
 from agents.evaluation.result import BRACKET_METRICS, Track, overall_ranking
 from agents.report import ae_bench
 from agents.report.evaluation import code, code_block, escape, summary, to_markdown
-from agents.report.plots import CHART, GAP, PICTURE, TITLE, Recording, record, write_film
+from agents.report.film import CHART, GAP, PICTURE, TITLE, record, write_film
 from simulator.capture.prepared_scene import Layout
 from tests.ae_env.environments import make_envs
 
@@ -52,10 +52,8 @@ def made_result(groups: int = 20) -> EvaluationResult:
     ids, groups = (np.array([f"{kind}-{i:02d}" for i in pairs]) for kind in ("scene", "group"))
     kinds, starts = np.where(hard, "snow", "photograph"), np.zeros(episodes, np.int64)
     named = {"scene_ids": ids, "groups": groups, "kinds": kinds, "hard": hard, "tracks": tracks}
-    allowed = np.ones(scores.shape, bool)
-    return EvaluationResult(
-        grid, **named, start_states=starts, scores=scores, allowed=allowed, seed=11
-    )
+    named |= {"scores": scores, "allowed": np.ones(scores.shape, bool)}
+    return EvaluationResult(grid, **named, start_states=starts, seed=11)
 
 
 def made_brackets(groups: list[str] | None = None, **quality: np.ndarray) -> EvaluationResult:
@@ -132,9 +130,9 @@ def test_best_meter_differences_and_histogram():
     scores = result_rows(result, resamples=10).query("condition == 'all'").set_index("policy")
     scores = scores.normalised_score
     assert ppo.difference.iloc[0] == pytest.approx(scores["ppo"] - scores["spot:P"])
-    seeds = [r for r in made.training_seed_rows(result) if r["condition"] == "all"]
-    assert [r["training_run"] for r in seeds] == [0, 1, 2]
-    assert np.mean([r["normalised_score"] for r in seeds]) == pytest.approx(scores["ppo"])
+    seeds = made.training_seed_rows(result).query("condition == 'all'")
+    assert seeds.training_run.tolist() == [0, 1, 2]
+    assert seeds.normalised_score.mean() == pytest.approx(scores["ppo"])
     histogram = made.oracle_histogram(result)
     assert [len(v) for v in histogram.values()] == [4, 4, 4]
     assert sum(histogram["f_number"].values()) == pytest.approx(1.0)
@@ -194,23 +192,19 @@ def test_files_of_a_report(tmp_path):
     assert (meta["command"], meta["best_meter"]) == (names["command"], "spot:P")
     assert [row["policy"] for row in meta["ranking"]] == ["spot:P", "matrix:P", "ppo"]
     text = files["report.md"].read_text()
-    for shown in (*following, "best meter, `spot:P`", "ISO 6400", "1/125 s", "snow (10)"):
-        assert shown in text
-    assert "\n\n\n" not in text
+    assert all(shown in text for shown in (*following, "ISO 6400", "1/125 s", "snow (10)"))
     for name in ("scores.png", "ev_error.png"):
         data = base64.b64encode(files[name].read_bytes()).decode()
         assert data in files["report.html"].read_text()
-    # Several conditions, no meter, one part.
-    result = made_result()
+    result = made_result()  # several conditions, no meter, one part
     result = replace(result, hard=np.zeros_like(result.hard), tracks={"ppo": result.tracks["ppo"]})
     files = write_report({"static": result, "sine": result}, tmp_path, command="x")
     results = json.loads(files["results.json"].read_text())
     assert {row["condition"] for row in results["rows"]} == {"all", "sine"}
     assert results["meta"]["best_meter"] is None
-    assert "## Conditions" in files["report.md"].read_text()
 
 
-def test_names_from_outside_show_no_file_and_few_groups_every_value(tmp_path):
+def test_names_from_outside_show_no_file(tmp_path):
     """Scenes, policies and folders may be called anything, a picture in Markdown included."""
     hostile = "![x](secret.png)<b>|`$x^$"
     (tmp_path / "secret.png").write_bytes(b"\x89PNG secret")
@@ -225,11 +219,7 @@ def test_names_from_outside_show_no_file_and_few_groups_every_value(tmp_path):
     assert page.count("<img") == page.count('<img src="data:') == 2
     assert not re.search("<b>|<script|http", page)  # it needs no other file
     assert page.count("![x](secret.png)&lt;b&gt;|`$x^$") >= 8
-    # Four groups are too few for intervals: every value is printed.
-    results = json.loads(files["results.json"].read_text())
-    assert {row["ci95"] for row in results["rows"]} == {None}
-    assert "no intervals, but every value" in page
-    assert all(f"group-{i:02d}<" in page for i in range(4))
+    assert all(f"group-{i:02d}<" in page for i in range(4))  # too few for intervals
 
 
 def test_the_terminal_shows_scores_or_every_group(tmp_path):
@@ -277,22 +267,19 @@ def test_cells_of_a_table_and_a_block_of_code():
     cells = [[text.strip() for text in line.strip("|").split("|")] for line in lines]
     assert cells[0] == list(columns)
     assert cells[2:] == [["x", "+0.5 to +0.2", "2.0 %", "0.002"], ["y", "-", "-", "0.002"]]
-    gaps = to_markdown(rows, {"a": "{a}", "none": "{b[3]}", "pair": "{b:.1f}"}, missing="")
-    assert "none" not in gaps
-    assert "-:|" in gaps  # numbers to the right
+    assert "none" not in to_markdown(rows, {"a": "{a}", "none": "{b[3]}"}, missing="")
     assert to_markdown([], {"a": "{a}", "b": "{b}"}).count("\n") == 1
     page = _rendered(code_block("ae-env --scenes '```'", "<b>\nmore"))
     assert page == "<pre><code>ae-env --scenes '```'\n&lt;b&gt; more\n</code></pre>\n"
 
 
-def test_a_film_shows_the_episode_of_each_policy_and_its_chart_up_to_now(tmp_path):
+def test_a_film_shows_the_episode_of_each_policy(tmp_path):
     options = {"render_mode": "rgb_array", "with_oracle": True, "max_episode_steps": 9}
     envs = make_envs(1, "ae_env/AutoExposureVideo-v0", **options)
     context = PolicyContext.from_envs(envs)
     found = record("oracle", make_policy("oracle", context), envs, 5, 3)
     envs.reset(seed=3)
-    best = [envs.unwrapped.grid.ev100[envs.unwrapped.score_table(0).oracle]]
-    assert found.best[:1] == best
+    assert found.best[0] == envs.unwrapped.grid.ev100[envs.unwrapped.score_table(0).oracle]
     assert [len(v) for v in (found.pictures, found.ev100, found.best, found.scores)] == [6] * 4
     # Settings are in effect two frames after the next: frame 3 has what was best for frame 0.
     assert found.ev100[3] == found.best[0]
@@ -306,17 +293,6 @@ def test_a_film_shows_the_episode_of_each_policy_and_its_chart_up_to_now(tmp_pat
         assert (image.format, image.n_frames) == ("GIF", 6)
         assert image.size == (2 * PICTURE + GAP, TITLE + PICTURE + CHART)
     assert done == [(n, 6) for n in range(1, 7)]
-    picture = np.full((16, 16, 3), 200, np.uint8)
-    flat = Recording("flat", [picture] * 3, [5.0] * 3, [9.0] * 3, [0.5] * 3)
-    with Image.open(write_film(tmp_path / "f.gif", [flat])) as image:
-        red = []
-        for frame in range(3):
-            image.seek(frame)
-            pixels = np.asarray(image.convert("RGB")).astype(int)
-            reddish = (pixels[..., 0] - pixels[..., 1] > 80).any(axis=0)
-            red.append(int(reddish.sum()))
-    assert red[0] == 0
-    assert 0.4 * PICTURE < red[1] < 0.6 * PICTURE < red[2]
 
 
 ENVIRONMENT = {"scenes": "bundled:small", "split": "test", "resolution": 36}
@@ -361,9 +337,9 @@ def test_plans_of_a_suite_have_one_hash_whatever_a_policy_sees(scenes, tmp_path)
     still, bracket = (load_plan(file) for file in files)
     assert (still.measure, bracket.measure) == ("score", "quality")
     found = ae_bench.bench_hash(still, scenes)
-    assert found == ae_bench.bench_hash(bracket, scenes)
     statistics = still.changed(environment={**still.environment, "observation": "statistics"})
-    assert found == ae_bench.bench_hash(statistics, scenes)
+    for other in (bracket, statistics):
+        assert found == ae_bench.bench_hash(other, scenes)
     (tmp_path / "bracket.yaml").write_text(text.format(files, "budgets: [0.2]\n"))
     assert found != ae_bench.bench_hash(still, scenes)
     # The published ones are one.
@@ -385,7 +361,6 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     assert sorted(files) == ["ae-bench.md", "v2.csv"]
     again = found[found.policy == "random"]
     statistics = plan.changed(environment={**plan.environment, "observation": "statistics"})
-    assert "replaced" not in caplog.text
     ae_bench.append_rows(table, plan, again, author="second")
     ae_bench.append_rows(table, statistics, again, author="first")
     assert "replaced" not in caplog.text
@@ -401,8 +376,6 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     assert rows[0]["real"] == rows[0]["unseen"] == ""  # no real places, no brackets
     assert float(rows[0]["procedural"]) == pytest.approx(float(rows[0]["score"]), abs=2e-4)
     page = (tmp_path / "docs" / "ae-bench.md").read_text()
-    assert "## Still" in page
-    assert "## Bracket" not in page
     assert page.index("| matrix:P ") < page.index("| random ")
     assert str(tmp_path) not in page
     with pytest.raises(ValueError, match="under the hash"):
@@ -439,7 +412,6 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
     check(table, plan, ["u/my.py:Mine"], author="me")
     check(table, plan, ["random"], author="")
     (broken := tmp_path / "broken.csv").write_bytes(b"\xff\xfe")
-    (columns := tmp_path / "columns.csv").write_text("policy,score\n")
     (tmp_path / "notes.md").write_text("mine")
     with pytest.raises(ValueError, match="`append`"):
         check(tmp_path / "new.csv", plan.changed(task=""), ["random"], author="me")
@@ -452,7 +424,6 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         (_table(tmp_path / "b.csv", plan, hash="0"), ["random"], "me", r"b\.csv .*hash"),
         (_table(tmp_path / "d.csv", plan, score="x"), ["random"], "me", r"d\.csv, line 2: `score`"),
         (broken, ["random"], "me", "broken.csv"),
-        (columns, ["random"], "me", "columns.csv: its columns"),
     ):
         with pytest.raises(ValueError, match=message):
             check(file, plan, policies, author=author)

@@ -25,11 +25,8 @@ def add(a: int, b: int) -> int:
     return a + b
 
 
-def test_kernels_run_without_the_lock_and_are_cached_where_they_can(monkeypatch, caplog):
-    compiled = kernel(fastmath=True)(add)
-    assert compiled(1, 2) == 3
-    assert {"nogil": True, "fastmath": True}.items() <= compiled.targetoptions.items()
-    assert compiled.stats.cache_path is not None
+def test_kernels_run_without_the_lock_and_where_they_cannot_be_cached(monkeypatch, caplog):
+    assert kernel()(add).targetoptions["nogil"]
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     with caplog.at_level(logging.INFO, "simulator.utils.compute"):
         assert kernel()(add)(1, 2) == 3
@@ -48,21 +45,18 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
     for name, text in texts.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-
-    checksum = partial(jit._checksum.__wrapped__, tmp_path / "ae_env/kernels.py")
-    before = checksum()
-    (tmp_path / "simulator/a/others.py").write_text("FACTOR = 3.0")
-    assert checksum() == before
-    for name in list(texts)[:3]:
+    checksums = [jit._checksum.__wrapped__(tmp_path / "ae_env/kernels.py")]
+    for name in reversed(texts):  # first the one that no kernel depends on
         (tmp_path / name).write_text(texts[name] + " # changed")
-        assert checksum() != before
-        (tmp_path / name).write_text(texts[name])
+        checksums.append(jit._checksum.__wrapped__(tmp_path / "ae_env/kernels.py"))
+    assert checksums[0] == checksums[1]
+    assert len(set(checksums)) == 4
     monkeypatch.undo()
     stamp = kernel()(add)._cache._cache_file._source_stamp
     assert stamp[1] == jit._checksum(Path(__file__))
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3, 8])
+@pytest.mark.parametrize("threads", [1, 3, 8])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_every_item_is_done_once(count, threads):
     done = np.zeros(count, int)

@@ -88,12 +88,11 @@ def test_the_folders_of_real_files_and_of_the_cache(tmp_path, monkeypatch):
 
 
 def test_meta_says_where_a_number_comes_from():
-    meta = result_meta("ae-env bench throughput", seed=3)
-    assert set(meta) == {"command", "commit", "seed", "date", "machine", "versions"}
+    meta = json.loads(json.dumps(result_meta("ae-env bench throughput", seed=3)))
     assert (meta["command"], meta["seed"]) == ("ae-env bench throughput", 3)
     assert meta["machine"]["threads"] == torch.get_num_threads()
     assert meta["versions"]["torch"] == version("torch")
-    json.dumps(meta)
+    assert meta["date"]
     git = "git", "-C", Path(__file__).parent
     head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True)
     changed = subprocess.run([*git, "diff", "--quiet", "HEAD"], capture_output=True).returncode
@@ -162,7 +161,7 @@ def test_a_good_file(tmp_path, monkeypatch):
         ("name: x\npart: {stesp: 2}", ["part.stesp (=2): unknown", "did you mean `steps`?"]),
         ("", ["is empty: it must map entries to values; known entries: name, part, parts"]),
         ("- a\n- b", ["holds ['a', 'b']: it must map entries"]),
-        ("name: x\npart: {steps: 2}\nname: y", ["'name' is given twice, again in line 3"]),
+        ("name: x\npart: {steps: 2}\nname: y", ["): the entry 'name' is given twice, again in"]),
         ("name: " + "[" * 700, ["nested too deeply"]),
         ("name: 2001-13-45", ["is not YAML"]),
         ("name: x" + " " * 2**20, ["must not be larger than"]),
@@ -255,7 +254,7 @@ def test_what_is_read_is_what_was_written(tmp_path):
 
 
 def test_damaged_files_are_as_if_not_there(tmp_path, caplog):
-    store, rng = Store(tmp_path), np.random.default_rng(0)
+    store = Store(tmp_path)
     path = store.path(KEYS[0])
     store.put(KEYS[0], VALUES)
     good = path.read_bytes()
@@ -266,12 +265,9 @@ def test_damaged_files_are_as_if_not_there(tmp_path, caplog):
         caplog.clear()
         assert store.get(KEYS[0]) is None
         assert f"{path} is damaged" in caplog.text
-    for _ in range(300):
-        changed = bytearray(good)
-        for position in rng.integers(len(good), size=rng.integers(1, 4)):
-            changed[position] ^= int(rng.integers(1, 256))
-        path.write_bytes(changed)
-        found = store.get(KEYS[0])  # some bytes decide nothing, such as a space
+    for place in range(0, len(good), 30):  # some bytes decide nothing, such as a space
+        path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
+        found = store.get(KEYS[0])
         assert found is None or bits(found) == bits(VALUES)
     path.unlink()
     path.mkdir()
@@ -396,14 +392,14 @@ def test_a_state_that_is_damaged_foreign_or_of_another_version(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "run"
     made(path, weight=torch.ones(1000)).save()
-    good, files = path.read_bytes(), []
+    good = path.read_bytes()
     middle = len(good) // 2  # the weights are by far the largest part
-    flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+    files = [good[:-50], b"", save({"weight": torch.zeros(2)})]
+    files.append(good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :])
     for content in ([1, 2], {"identity": Harm()}):
         torch.save(content, path)
         files.append(path.read_bytes())
-    foreign = save({"weight": torch.zeros(2)})
-    for damaged in (good[:-50], b"not a checkpoint at all", b"", foreign, flipped, *files):
+    for damaged in files:
         path.write_bytes(damaged)
         caplog.clear()
         assert made(path).load() is None
