@@ -288,7 +288,7 @@ def _known(base: str) -> str:
     )
 
 
-def _shown(name: object) -> object:
+def _shown(name: Any) -> Any:
     """`name` for a message: agents that come with the package are known by no path."""
     for agent, file in _SHIPPED.items() if isinstance(name, str) else ():
         name = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, name)

@@ -236,8 +236,8 @@ def write_report(
         meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
         scenes = repr(result.plan.environment.get("scenes", "bundled"))
         apart = pd.Series(map(_difference, rows.to_best, rows.to_best_ci95))
-        shown = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
-        text = fill("brackets.md", plan=result.plan, rows=shown, meta=meta, scenes=scenes)
+        compared = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
+        text = fill("brackets.md", plan=result.plan, rows=compared, meta=meta, scenes=scenes)
         return {
             "results.json": write_results(folder / "results.json", _records(rows), meta),
             "report.md": write_atomically(folder / "report.md", text),
