@@ -101,7 +101,7 @@ def load_scenes(
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
             made them has split them.
-        camera: In whose colours scenes are made. A raw brings its own camera.
+        camera: In whose colours scenes are made. A raw has its own camera.
         resolution: Packed pixels a side; None keeps each scene's own size.
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
         resize: Called with each scene at its finest resolution, `resolution` and `crop`.
