@@ -115,8 +115,7 @@ def load_scenes(
             or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
-    hint = "; `simulator.get_camera` gives one by name"
-    check_type("camera", camera, CameraProfile, more=hint)
+    check_type("camera", camera, CameraProfile, more="; `simulator.get_camera` gives one by name")
     request = SceneRequest(split, camera, resolution, crop, resize)
     scenes: Sequence[Scene]
     recorded = RecordedOptions.of(spec)
