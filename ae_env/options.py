@@ -251,8 +251,8 @@ def takes_env_arguments(
         for each in fields(EnvOptions):
             if each.name not in without:
                 default = None if each.default is MISSING else each.default
-                keyword = inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY)
-                taken = keyword.replace(default=default, annotation=each.type)
+                kind, hint = inspect.Parameter.KEYWORD_ONLY, EnvArguments.__annotations__[each.name]
+                taken = inspect.Parameter(each.name, kind, default=default, annotation=hint)
                 parameters.setdefault(each.name, taken)
         for name, default in defaults.items():
             parameters[name] = parameters[name].replace(default=default)
@@ -262,10 +262,9 @@ def takes_env_arguments(
         def checked(*args: P.args, **kwargs: P.kwargs) -> None:
             for name in kwargs:
                 if name not in known:
-                    raise TypeError(
-                        f"{init.__qualname__}() got an unexpected keyword argument {name!r}"
-                        f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
-                    )
+                    hint = f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
+                    call = f"{type(args[0]).__name__}.__init__()"
+                    raise TypeError(f"{call} got an unexpected keyword argument {name!r}{hint}")
             init(*args, **{**defaults, **kwargs})
 
         shown = signature.replace(parameters=list(parameters.values()))

@@ -16,7 +16,6 @@ TASKS: dict[str, tuple[str, int | None]] = {
     "ae_env/AutoExposureVideo-v0": ("AutoExposureVideo", 96),
     "ae_env/ExposureBracket-v0": ("ExposureBracket", None),
 }
-ENV_IDS = tuple(TASKS)
 
 
 def register_envs() -> None:

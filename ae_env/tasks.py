@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import gymnasium as gym
 import numpy as np
@@ -321,14 +321,14 @@ class ExposureBracket(Task):
         rows, columns = self._offsets(np.array([env_index]))[0].tolist()
         if not rows and not columns:
             return None
-        return displaced(self.episodes.scenes[self.episodes.scene[env_index]], rows, columns)
+        return move_subject(self.episodes.scenes[self.episodes.scene[env_index]], rows, columns)
 
     def score_table(self, env_index: int) -> ScoreTable:
         """Raises a `ValueError`: what a frame is worth depends on those before and after it."""
         raise ValueError("a bracket has no score table: the frames are rated together")
 
 
-def displaced(scene: Scene, rows: int, columns: int) -> Scene:
+def move_subject(scene: Scene, rows: int, columns: int) -> Scene:
     """`scene` with its subject `rows` further down and `columns` further right.
 
     What it uncovers shows the background nearest to it, as in a blur.
@@ -355,15 +355,20 @@ def displaced(scene: Scene, rows: int, columns: int) -> Scene:
 class _Bracket(AutoExposureBase):
     """The limits that both environments of the bracket task add."""
 
-    budget: float
-    max_frames: int
+    @property
+    def budget(self) -> float:
+        """Time that all frames of an episode may take together [s]."""
+        return cast(ExposureBracket, self.core.task).budget
+
+    @property
+    def max_frames(self) -> int:
+        """Frames of an episode at most."""
+        return cast(ExposureBracket, self.core.task).max_frames
 
     def _set_limits(self, budget: float, max_frames: int) -> None:
-        self.budget = check_number("budget", budget, 1e-5, _MOST_SECONDS, more=" seconds")
-        self.max_frames = check_integer("max_frames", max_frames, 1, _MOST_FRAMES)
-        self._make_task = functools.partial(
-            ExposureBracket, budget=self.budget, max_frames=self.max_frames
-        )
+        budget = check_number("budget", budget, 1e-5, _MOST_SECONDS, more=" seconds")
+        max_frames = check_integer("max_frames", max_frames, 1, _MOST_FRAMES)
+        self._make_task = functools.partial(ExposureBracket, budget=budget, max_frames=max_frames)
 
 
 class ExposureBracketEnv(_Bracket, AutoExposureEnv):

@@ -90,8 +90,8 @@ class _GridActions(RecordConstructorArgs):
 
 class _One(_GridActions, gym.ActionWrapper[Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._set_up(env)  # first: its error is plainer than Gymnasium's
         gym.ActionWrapper.__init__(self, env)
-        self._set_up(env)
         self.action_space = self._space()
 
     def action(self, action: Any) -> np.int64:
@@ -103,8 +103,8 @@ class _Many(_GridActions, gym.vector.VectorActionWrapper):
     _states_name = "states"
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        gym.vector.VectorActionWrapper.__init__(self, env)
         self._set_up(env)
+        gym.vector.VectorActionWrapper.__init__(self, env)
         self._shape = (env.num_envs, 3)
         self.single_action_space = self._space()
         self.action_space = batch_space(self.single_action_space, env.num_envs)
@@ -148,6 +148,10 @@ class _Steps(_GridActions):
 
 
 class _Apex(_GridActions):
+    def _set_up(self, env: Any) -> None:
+        super()._set_up(env)
+        self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self._grid])
+
     def _space(self) -> gym.Space[Any]:
         return gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
@@ -161,10 +165,9 @@ class _Apex(_GridActions):
             raise ValueError(
                 f"`action` (={actions!r}) must be finite numbers of shape {self._shape}"
             )
-        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self._grid])
-        low, high = apex.min(axis=0), apex.max(axis=0)
+        low, high = self._apex.min(axis=0), self._apex.max(axis=0)
         wanted = low + 0.5 * (np.clip(values.astype(np.float64), -1.0, 1.0) + 1.0) * (high - low)
-        distance = ((wanted[..., None, :] - apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
+        distance = ((wanted[..., None, :] - self._apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
         distance = np.where(self._inner.action_masks(), distance, np.inf)
         return np.argmin(distance, axis=-1).astype(np.int64)
 

@@ -41,6 +41,7 @@ from simulator.networks.noise_module import (
     variance_map,
 )
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.discs import DISC_REACH
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
@@ -57,8 +58,6 @@ Source = RawImage | PreparedScene | HasPrepared
 _NOISE_HALO, _MAP_HALO = 80, 56
 #: Size of the raw that a network's time is measured on [packed pixel].
 _TIMED = 128
-#: How far the largest disc of `simulator.optics.discs` reaches [pixel].
-_DISC_REACH = 16
 
 
 class SceneArguments(TypedDict, total=False):
@@ -346,7 +345,7 @@ class CameraSimulator:
                 return aperture.estimate_defocus(part, deviation)
 
         # No disc changes a pixel that sees a constant neighbourhood.
-        needed = varying(prepared.light, _DISC_REACH) if prepared.tolerance > 0 else None
+        needed = varying(prepared.light, DISC_REACH) if prepared.tolerance > 0 else None
         sharp = light.new_zeros(light[:, 0].shape)
         diameter = in_tiles(network, image, light, halo=_MAP_HALO, needed=needed, fallback=sharp)
         return usable_defocus(diameter, image)[0]
@@ -442,7 +441,9 @@ class CameraSimulator:
         settings: CameraSettings,
         *,
         seed: int = 0,
-        **scene: Unpack[SceneArguments],
+        image_speed: float | None = None,
+        defocus: float | None = None,
+        depth: Depth = "unknown",
     ) -> Stages:
         """Runs the whole pipeline on one source, every module for this very transition.
 
@@ -450,7 +451,7 @@ class CameraSimulator:
         presets ``"paper"`` and ``"ncs"`` clip to [0, 1] after the exposure, as the paper does.
 
         Args:
-            source, scene: See `prepare`; by default the depth is unknown.
+            source, image_speed, defocus, depth: See `prepare`.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
@@ -459,10 +460,9 @@ class CameraSimulator:
             ValueError: If this simulator has no networks, or an argument is out of range.
         """
         noise, aperture = _required("noise", self.noise), _required("aperture", self.aperture)
-        depth = scene.get("depth", "unknown")
         check_word("depth", depth, get_args(Depth))
         keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
-        prepared = self._seen(source, scene.get("image_speed"), scene.get("defocus"))
+        prepared = self._seen(source, image_speed, defocus)
         # A prepared scene may be corrected already; a scene is no recording of this body.
         module = self.exposure if isinstance(source, RawImage) else ExposureModule().to(self.device)
         # What networks found out about the scene is not used.
@@ -517,8 +517,8 @@ class CameraSimulator:
         """
         check_noise(noise)
         if tolerance is None and self.noise is not None:
-            if noise == "sensor":
-                raise ValueError("`noise` (='sensor') needs a `tolerance`: not in the full run")
+            if noise != "exact":
+                raise ValueError(f"`noise` (={noise!r}) needs a `tolerance`: not in the full run")
             scene.setdefault("depth", "far")
             stages = self.stages(source, settings, seed=seed, **scene)
             data, excess_noise = stages.capture, 0.0

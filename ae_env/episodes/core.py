@@ -52,7 +52,8 @@ class Frames:
     Args:
         observation: Arrays by name, n long; new ones every time.
         info: Columns of numbers by name, n long; ``rewards`` is a dictionary of columns.
-            ``scene_id`` and ``modules`` are indices into `EpisodeCore.scene_ids` and `MODULES`.
+            ``scene_id`` and ``modules`` are indices into `EpisodeCore.scene_ids` and
+            `AutoExposureBase.module_names`.
         reward: (n,) float64.
         raw: (n, 4, R, R) the whole frames, also where less of them is observed.
     """

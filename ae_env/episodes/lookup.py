@@ -11,15 +11,13 @@ import torch
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
-from simulator.camera import CameraProfile
+from simulator.camera import LOW_CLIP, CameraProfile
 from simulator.capture.batch import MODULES, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
 RECORDED, _MODULE = "recorded", len(MODULES)
-#: Signal up to which a sample counts as clipped low.
-_LOW = 2.0**-10
 
 
 class LookupBatch:
@@ -69,7 +67,7 @@ class LookupBatch:
                 outputs[name][:] = values
         count, nothing = len(shown), np.zeros(len(shown))
         return FrameStatistics(
-            clipped_low=(shown <= _LOW).reshape(count, -1).mean(axis=1),
+            clipped_low=(shown <= LOW_CLIP).reshape(count, -1).mean(axis=1),
             clipped_high=(digital >= self._white).reshape(count, -1).mean(axis=1),
             excess_variance=nothing,
             predicted_error=nothing,

@@ -18,7 +18,7 @@ from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
 from simulator.optics.motion import Movement
-from simulator.utils.checks import check_integer, check_word, did_you_mean
+from simulator.utils.checks import check_integer, check_key, did_you_mean
 
 #: Share of the episodes in which nothing moves.
 STATIC_SHARE = 1.0 / 3.0
@@ -136,7 +136,7 @@ class Episodes:
         self.pending = np.zeros((count, max(options.delays) + 1), np.int64)
         self.image_mean = np.full(count, np.nan)
         self._learn_about_scenes()
-        # Only recorded scenes forbid states. Those that one allows come first in its row, in order.
+        # The states that a scene allows come first in its row, in order.
         self._starts = np.argsort(~self.allowed, axis=1, kind="stable")
         self._num_starts = self.allowed.sum(axis=1)
         # (scenes, S) state that is shown where another is asked for; None where each can be.
@@ -363,7 +363,7 @@ def check_options(options: Any, *more: str) -> dict[str, Any]:
     if not isinstance(options, Mapping | None):
         raise ValueError(f"`options` (={options!r}) must be None or a dictionary with {known}")
     for name in options or {}:
-        check_word("options", name, known)
+        check_key("options", name, known)
     return dict(options or {})
 
 

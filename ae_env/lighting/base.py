@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
-from simulator.utils.checks import check_integer, check_number, check_type, check_word
+from simulator.utils.checks import check_integer, check_key, check_number, check_type, check_word
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
@@ -151,7 +151,7 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     check_word("lighting", name, tuple(sorted(KINDS)))
     kind = KINDS[name]
     for option in options:
-        check_word("lighting", option, tuple(f.name for f in fields(kind)))
+        check_key("lighting", option, tuple(f.name for f in fields(kind)))
     return kind(**options)
 
 

@@ -93,7 +93,8 @@ def clouds(rng: Generator) -> np.ndarray:
 def read_pans() -> dict[str, tuple[float, ...]]:
     """Mean light that a camera sees as it turns in a place [EV], in 72 directions 5 degrees apart.
 
-    Of each public panorama (CC0) of the test split of `ae_env.scenes.polyhaven`, `light_around`.
+    Of each public panorama (CC0) of the test split of `ae_env.scenes.polyhaven`: its luminance in a
+    view of 60 degrees, clipped at 6 times the geometric mean of all, relative to the first view's.
     """
     text = (files("ae_env.lighting") / "pans.csv").read_text(encoding="utf-8")
     return {line[0]: tuple(map(float, line[1:])) for line in csv.reader(text.splitlines())}

@@ -422,13 +422,14 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
         table = folder / "groups.csv"
         if not table.is_file():
             continue
-        for number, row in enumerate(read_table(table)[0], start=2):
+        rows, columns = read_table(table)
+        if not {"file", "group"} <= set(columns):
+            raise ValueError(f"{str(table)!r} (columns {columns}) must have `file` and `group`")
+        for number, row in enumerate(rows, start=2):
             name, group = ((row.get(column) or "").strip() for column in ("file", "group"))
             if not group or not name or not (folder / name).is_file():
-                raise ValueError(
-                    f"{str(table)!r}, line {number} (={name!r}, {group!r}): the column `file` must "
-                    "name a file beside it, and the column `group` its group"
-                )
+                given = f"{str(table)!r}, line {number} (={name!r}, {group!r})"
+                raise ValueError(f"{given} must name a file beside it, and its group")
             groups[(folder / name).resolve()] = group
     return groups
 

@@ -54,7 +54,7 @@ from simulator.raw.image import RawImage
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.checks import check_type, check_word, did_you_mean
+from simulator.utils.checks import check_key, check_type, check_word, did_you_mean
 from simulator.utils.files import sibling
 
 logger = logging.getLogger(__name__)
@@ -115,7 +115,8 @@ def load_scenes(
             or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
-    check_type("camera", camera, CameraProfile)
+    hint = "; `simulator.get_camera` gives one by name"
+    check_type("camera", camera, CameraProfile, more=hint)
     request = SceneRequest(split, camera, resolution, crop, resize)
     scenes: Sequence[Scene]
     recorded = RecordedOptions.of(spec)
@@ -185,7 +186,7 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
         rule = f"must have a 'path' or a 'sequence'; the other fields are {known}"
         raise ValueError(f"`scenes` (={dict(spec)!r}) {rule}")
     for name in spec:
-        check_word("scenes", name, (where, *known))
+        check_key("scenes", name, (where, *known))
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 

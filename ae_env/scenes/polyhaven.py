@@ -225,22 +225,6 @@ def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
     return float((luminance * weight).sum(dtype=np.float64) * 2.0 * math.pi**2 / (height * width))
 
 
-def light_around(panorama: np.ndarray, views: int = 72, field_of_view: float = 60.0) -> np.ndarray:
-    """Mean light that a camera sees as it turns in a panorama, clipped at white [EV], (views,).
-
-    Clipped as the light meter of a camera is that exposes the whole turn: white is 6 times the mean
-    of all directions. Relative to the direction in which the map begins.
-    """
-    means = []
-    for azimuth in np.arange(views) * 360.0 / views - 180.0:
-        view = perspective(panorama, float(azimuth), 48, field_of_view, 0.0)
-        means.append(np.tensordot(_LUMINANCE, view, axes=1))
-    luminance = np.stack(means)
-    white = 6.0 * np.exp(np.log(np.maximum(luminance, 1e-6)).mean())
-    ev = np.log2(np.minimum(luminance, white).mean(axis=(1, 2)))
-    return np.asarray(ev - ev[0])
-
-
 def cut_values(panorama: np.ndarray) -> list[str]:
     """What a panorama (3, H, W) does not show: ``"highlights are cut"``, ``"shadows are cut"``."""
     brightest = panorama.max(axis=0)
@@ -250,9 +234,7 @@ def cut_values(panorama: np.ndarray) -> list[str]:
     return [name for name, is_cut in cut.items() if is_cut]
 
 
-def download(
-    *, url: str = URL, timeout: float = _TIMEOUT, progress: Callable[[int, int, str], None] | None
-) -> list[Path]:
+def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None) -> list[Path]:
     """Fetches the maps that are missing or damaged into the cache, and returns their files.
 
     A file is put in place when it is complete and its hash is the list's. The environment's proxy
@@ -260,7 +242,6 @@ def download(
 
     Args:
         url: Folder that serves ``NAME_1k.hdr``.
-        timeout: Seconds in which the server must answer, and go on answering.
         progress: Called with the bytes that are there, all bytes, and the name of the next map.
 
     Raises:
@@ -284,7 +265,7 @@ def download(
         registry={asset.file_name: f"sha256:{asset.sha256}" for asset in assets},
         retry_if_failed=_RETRIES,
     )
-    fetch = pooch.HTTPDownloader(timeout=timeout)
+    fetch = pooch.HTTPDownloader(timeout=_TIMEOUT)
     total = sum(asset.bytes for asset in assets)
     done, fetched = 0, []
     for asset in assets:

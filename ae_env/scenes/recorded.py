@@ -37,7 +37,7 @@ from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.utils.checks import check_number, check_word
+from simulator.utils.checks import check_key, check_number
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 
 logger = logging.getLogger(__name__)
@@ -108,7 +108,7 @@ class RecordedOptions:
         if not isinstance(spec, Mapping) or KEY not in spec:
             return None
         for name in spec:
-            check_word("scenes", name, (KEY, *_SETTINGS))
+            check_key("scenes", name, (KEY, *_SETTINGS))
         if not isinstance(spec[KEY], str | Path) or not str(spec[KEY]):
             raise ValueError(f"`scenes[{KEY!r}]` (={spec[KEY]!r}) must be the path of a folder")
         settings = {name: spec[name] for name in _SETTINGS if name in spec}

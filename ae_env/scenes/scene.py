@@ -383,16 +383,18 @@ def _checked(scene: Scene) -> Scene:
     if denoised is not None:
         denoised = check_packed("denoised", denoised)
     layout = None if scene.layout is None else scene.layout.defocus
-    maps = {"saturated": mask, "defocus_map": blur, "layout": layout, "denoised": denoised}
+    plane = None if denoised is None else denoised[0]
+    maps = {"saturated": mask, "defocus_map": blur, "layout": layout, "denoised": plane}
     for name, found in maps.items():
-        if found is not None and found.shape[-2:] != size:
-            shapes = f"{tuple(found.shape)} must be that of `light`, {tuple(size)}"
-            raise ValueError(f"`{name}`: height and width {shapes}")
+        if found is not None and found.shape != size:
+            shape = tuple(found.shape)
+            raise ValueError(f"`{name}` (shape {shape}) must be as large as `light`, {tuple(size)}")
     if mask is not None and mask.dtype != torch.bool:
         raise ValueError(f"`saturated` (dtype {mask.dtype}) must be bool")
     if blur is not None and not bool((torch.isfinite(blur) & (blur >= 0)).all()):
         raise ValueError("`defocus_map` must be finite and >= 0 everywhere")
-    allowed, frames = scene.allowed, scene.recorded
+    allowed = None if scene.allowed is None else np.asarray(scene.allowed)
+    frames = scene.recorded
     if allowed is not None and (allowed.dtype != np.bool_ or allowed.ndim != 1 or not any(allowed)):
         raise ValueError("`allowed` must be bool, (S,), and allow a state")
     if frames is not None and (allowed is None or frames.shape != (len(allowed), 4, *size)):
@@ -403,6 +405,7 @@ def _checked(scene: Scene) -> Scene:
         denoised=denoised,
         saturated=mask if mask is not None and bool(mask.any()) else None,
         defocus_map=None if blur is None else blur.float(),
+        allowed=allowed,
     )
 
 

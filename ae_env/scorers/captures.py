@@ -15,11 +15,13 @@ import torch
 
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
-from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.decision import MAX_DISC_PX
+from simulator.capture.prepared_scene import MAX_IMAGE_SPEED, PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DIAMETERS
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.utils.checks import check_number, check_type
 
 ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
@@ -88,7 +90,7 @@ class Captures:
         row_gain: (B, H) float64, light of each row relative to the frame's mean, which is in
             `ratio` and `proper_ev`: the bands of flickering light. None where every row of every
             capture has the same.
-        source_noise: Noise that the source of each capture brings, of a native pixel, B long; None
+        source_noise: Noise that the source of each capture has, of a native pixel, B long; None
             where all come from light without noise.
         noisy: Whether the captures have noise.
         pixel_blur: How many pixels have which extent of blur; None where all have `blur_px`.
@@ -122,7 +124,7 @@ class Captures:
     def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
         """Variance of a native pixel's noise in the captures, at the recorded `signal`.
 
-        The camera's own at the settings, or the source's where it brought more. `signal` is
+        The camera's own at the settings, or the source's where it has more. `signal` is
         (B, 4, ...), at least 0, white is 1.
         """
         variance = torch.zeros_like(signal)
@@ -155,7 +157,7 @@ def prepare_scene(
     defocus: float = 0.0,
     movement: Movement = ALONG_ROWS,
 ) -> PreparedScene:
-    """`scene` as `camera` sees it in an episode.
+    """`scene` as `camera` sees it in an episode; a `ValueError` if a number is out of range.
 
     Args:
         scene: The scene.
@@ -164,6 +166,10 @@ def prepare_scene(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
         movement: Directions of the image's motion, and the subject's own.
     """
+    widest = 64.0 * max(1.0, MAX_DISC_PX / scene.light.shape[-2])
+    check_number("speed", speed, 0.0, MAX_IMAGE_SPEED, more=" frame heights per second")
+    check_number("defocus", defocus, 0.0, widest, more=" pixels of a 64-pixel frame")
+    check_type("movement", movement, Movement)
     prepared = scene.prepared.changed(camera=camera)
     return in_episode(prepared, speed=speed, defocus=defocus, movement=movement)
 
@@ -254,7 +260,7 @@ def layout_blur(
     """Blur of S captures of a scene with a layout; None where all pixels have the same.
 
     `movement` and `speed` are those of `prepare_scene`; `numbers` (3, S) exposure times [s],
-    diameters of the largest disc of defocus [pixel], and blur that the scene brings itself [pixel].
+    diameters of the largest disc of defocus [pixel], and the scene's own blur [pixel].
     """
     layout, height, (times, discs, own) = scene.layout, scene.light.shape[-2], numbers
     if layout is None or not (discs.any() or movement.subject_speed):
@@ -324,7 +330,7 @@ class SceneCaptures:
             pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
             blur = blur.rms_px
         gains = np.broadcast_to(gain, len(self.states))[part]
-        ratios = [2.0 ** (s.log2_exposure - scene.reference.log2_exposure) for s in states]
+        ratios = [exposure_ratio(scene.reference, s) for s in states]
         light = scene.clean_light.clone() if self.copies else scene.clean_light
         return Captures(
             settings=states,

@@ -96,7 +96,7 @@ class TermScores:
         self._which = np.array([isos.index(state.iso) for state in states])
         self._shot_read = np.array([[n.shot, n.read] for n in noises])[self._which]  # (S, 2, 4)
         self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
-        self._dark = Shadows.shares(_SIGNALS).numpy()
+        self._dark = Shadows().shares(_SIGNALS).numpy()
         self._edges = _code_edges(camera)
         # Up to light beyond white that even the most noise does not bring back.
         shot, read = (max(max(getattr(n, name)) for n in noises) for name in ("shot", "read"))
@@ -157,7 +157,7 @@ class TermScores:
             if source_noise is not None:
                 other = source_noise[:, 0, :, None] * light + source_noise[:, 1, :, None]
                 variance = np.maximum(variance, other)
-        shares: np.ndarray = Noise.shares(_SIGNALS, torch.from_numpy(variance).float()).numpy()
+        shares: np.ndarray = Noise().shares(_SIGNALS, torch.from_numpy(variance).float()).numpy()
         return shares
 
     def score(self, means: np.ndarray, captures: Captures | None) -> dict[str, np.ndarray]:

@@ -321,11 +321,10 @@ class Shadows:
         dark = self.shares(recorded_signal(images))
         return torch.exp(-dark.mean(dim=(1, 2, 3), dtype=torch.float64) / self.scale)
 
-    @classmethod
-    def shares(cls, signal: torch.Tensor) -> torch.Tensor:
+    def shares(self, signal: torch.Tensor) -> torch.Tensor:
         """How far samples of a recorded `signal` are blocked, 0 to 1."""
         stops = signal.clamp(min=2.0**-40).log2_()
-        return torch.sigmoid((stops + cls.depth).mul_(-1.0 / cls.width))
+        return torch.sigmoid((stops + self.depth).mul_(-1.0 / self.width))
 
 
 class Noise:
@@ -346,11 +345,10 @@ class Noise:
         shares = self.shares(signal, captures.noise_variance(signal))
         return shares.mean(dim=(1, 2, 3), dtype=torch.float64)
 
-    @classmethod
-    def shares(cls, signal: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    def shares(self, signal: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
         """``s / (s + 18^1.5)`` of samples of a recorded `signal`, >= 0, with this noise."""
         power = (signal.square() / variance.clamp(min=1e-30)).pow_(0.75)  # SNR**1.5
-        return power / (power + cls.half_snr**1.5)
+        return power / (power + self.half_snr**1.5)
 
 
 class Sharpness:
@@ -398,8 +396,8 @@ class Balanced(CompositeScorer):
         """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
         # The logarithm of arrays by NumPy: torch's threads do not survive a fork.
         log: Any = torch.log if torch.is_tensor(scores["highlights"]) else np.log
-        blown = -Highlights.scale * log(scores["highlights"])
-        blocked = -Shadows.scale * log(scores["shadows"])
+        blown = -self.parts["highlights"].scale * log(scores["highlights"])
+        blocked = -self.parts["shadows"].scale * log(scores["shadows"])
         # Rounding may leave a share above 1.
         score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
         for name, weight in self.weights.items():

@@ -179,7 +179,9 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
     total = functools.reduce(torch.add, (weight for _, weight in weighted()))
     fused: list[Tensor] = []
     for picture, weight in weighted():
-        weights = _gaussian_pyramid(_smoothed(weight / total)[None])
+        share = (weight / total).cpu().numpy()
+        share = gaussian_filter(share, SMOOTHING, mode="nearest", truncate=3.0)
+        weights = _gaussian_pyramid(torch.from_numpy(share).to(picture.device)[None])
         details = _laplacian_pyramid(picture)
         blended = [w * d for w, d in zip(weights, details, strict=True)]
         fused = blended if not fused else [f.add_(b) for f, b in zip(fused, blended, strict=True)]
@@ -197,12 +199,6 @@ def _weight(luma: Tensor, mean: float, width: float) -> Tensor:
     counts = torch.bincount(codes.flatten(), minlength=_BINS).double() / codes.numel()
     rarity = (1.0 / counts.clamp(min=1.0 / codes.numel())).float()[codes]
     return well_placed * rarity + _LEAST
-
-
-def _smoothed(weight: Tensor) -> Tensor:
-    """`weight` (H, W) after a Gaussian of `SMOOTHING`, borders repeated."""
-    values = gaussian_filter(weight.cpu().numpy(), SMOOTHING, mode="nearest", truncate=3.0)
-    return torch.from_numpy(values).to(weight.device)
 
 
 def _luma(picture: Tensor) -> Tensor:

@@ -159,7 +159,7 @@ def measure_in_focus(seed: int, quick: bool) -> list[Row]:
     camera, data, rows = get_camera("nikon_z6"), data_root(), []
     scenes = list(reference_scenes("test", camera, number=0, data=data))
     if data is not None:
-        scenes += mosaic_scenes("test", camera, data)
+        scenes += mosaic_scenes("test", data)
     sharp = (scene for scene in scenes if scene.depth is None and scene.in_focus)
     chosen = [scene for scene in sharp if scene.scene_id != _OUT_OF_FOCUS]
     for number, scene in enumerate(chosen[:: 8 if quick else 1]):

@@ -53,7 +53,8 @@ class FrameStatistics:
             to it; in flickering light, that of the frame's mean light.
         predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
             light without noise only what is left out.
-        modules: (B,) int64 index into `MODULES`: the steps that ran.
+        modules: (B,) int64 index into `MODULES`: the steps that ran; of a recorded frame, their
+            number.
         source_noise: (B, 2, 4) shot and read noise of the source in the frame.
         keys: Keys of the noise, uint64.
     """

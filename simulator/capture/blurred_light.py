@@ -203,7 +203,7 @@ class Pool:
         self.keeps, self.free = keeps, list[Tensor]()
 
     def take(self, like: Tensor) -> Tensor:
-        """Memory of the shape of `like`."""
+        """Memory of the shape of `like`, which all of a batch have."""
         return self.free.pop() if self.free else torch.empty(like.shape)
 
 

@@ -49,7 +49,8 @@ _STREAK_TO_DISC = 4.0 / 3.0
 
 def check_tolerance(tolerance: float) -> float:
     """`tolerance` as a float; a `ValueError` unless it is a finite number >= 0."""
-    return check_number("tolerance", tolerance, 0.0, sys.float_info.max)
+    more = "; ask `simulate` for the full run" if tolerance is None else ""
+    return check_number("tolerance", tolerance, 0.0, sys.float_info.max, more=more)
 
 
 @functools.lru_cache(maxsize=4096)

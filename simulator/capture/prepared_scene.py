@@ -197,7 +197,7 @@ class PreparedScene:
         tolerance: Error that a capture may have, in units of the target's noise: the cheapest
             steps that keep it are taken, or else, as at 0, those with the least error.
         blurred_light: Blurs the light and caches what it has blurred. It is made here, and copies
-            with the same light (`dataclasses.replace`) share it.
+            (`dataclasses.replace`) with the same light, `nlf` and `aperture_blur` share it.
 
     Raises:
         ValueError: If a value has the wrong shape or lies outside its range.
@@ -239,7 +239,7 @@ class PreparedScene:
                 )
         unit = " frame heights per second"
         check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
-        check_number("defocus", self.defocus, 0.0, math.inf)
+        check_number("defocus", self.defocus, 0.0, sys.float_info.max)
         disc_px(self, 4.0)
         check_number("gain", self.gain, 0.0, sys.float_info.max)
         if self.layout is not None and self.layout.defocus.shape != self.light.shape[-2:]:
@@ -250,10 +250,12 @@ class PreparedScene:
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
 
     def changed(self, **values: Any) -> PreparedScene:
-        """A copy of the same light with other values that are known to be right: not checked.
+        """A copy with other values that are known to be right: not checked.
 
-        An environment makes one an episode.
+        An environment makes one an episode. `light`, `nlf` and `aperture_blur` stay: what blurs the
+        light has them.
         """
+        assert values.keys().isdisjoint(("light", "nlf", "aperture_blur"))
         copied = copy.copy(self)
         vars(copied).update(values)
         return copied
@@ -286,11 +288,9 @@ class PreparedScene:
         check_type("settings", settings, CameraSettings)
         return decide(self, settings, noise=noise, gain=gain)
 
-    def plan(
-        self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
-    ) -> SimulationPlan:
+    def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
         """Steps, reasons, error and cost of a capture, or of `expected`; see `exposure`."""
-        exposure = self.exposure(settings, noise=noise, gain=gain)
+        exposure = self.exposure(settings, noise=noise)
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
         excess_noise, lacks_noise = noise_balance(light, exposure)

@@ -47,9 +47,8 @@ from simulator.utils.compute import addresses, as_pointer, kernel, parallel_rang
 #: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
 #: and tails of the camera's read noise (`simulator.noise.noise_level_function`).
 Noise = Literal["exact", "bank", "sensor"]
-#: Samples of a plane that one thread works on at a time, and at least, in units of blocks.
-_UNIT_BLOCKS = 256
-_WORTH_A_THREAD = 4 * 64 * 64 * 4
+#: Blocks of a plane that one thread works on at a time, and samples that are worth a thread.
+_UNIT_BLOCKS, _WORTH_A_THREAD = 256, 4 * 64 * 64 * 4
 _FAST = {"nnan", "nsz", "contract"}
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
 #: Bit from which samples clipped high are counted: no unit has as many that are clipped low.
@@ -389,16 +388,16 @@ def record_stepwise(
     read_noise: Sequence[ReadNoise] | None = None,
 ) -> None:
     """`record` on any device: the reference of the fused kernel. Fills `signals`."""
-    for i, (light, table) in enumerate(zip(transitions.light, transitions.table, strict=True)):
+    frames = zip(transitions.light, transitions.table, transitions.shares(), strict=True)
+    for i, (light, table, share) in enumerate(frames):
         signal = (light * table[0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
         if keys is not None:
-            missing = missing_variance(signal, table[1:], transitions.shares()[i])
+            missing = missing_variance(signal, table[1:], share)
             normals = frame_normals(int(keys[i]), tuple(light.shape), noise)
             drawn = torch.from_numpy(normals).to(signal.device)
             missing.clamp_(min=0.0)
             if read_noise is not None:
-                share, own = transitions.shares()[i], read_noise[i]
-                signal = signal + _read_part(missing, table, share, int(keys[i]), own)
+                signal = signal + _read_part(missing, table, share, int(keys[i]), read_noise[i])
             signal = missing.sqrt_().mul_(drawn).add_(signal)
         signals[i] = clip_and_quantise(signal, camera)
 

@@ -39,7 +39,8 @@ _FLOOR = 1e-30  # variance below which a target counts as noise-free: every chan
 #: Side of a block, over which light is averaged, and of a window, over which detail is [packed
 #: pixel]; blocks that are sampled, at most about this many.
 BLOCK, _WINDOW, _BLOCKS = 8, 32, 16384
-#: Relative variance of its square: twice the squared autocorrelation, over as many samples.
+#: Relative variance of the Laplacian's square: twice the squared autocorrelation, over as many
+#: samples.
 _CHANCE = 2.0 * (20.0**2 + 4 * 8.0**2 + 4 * 2.0**2 + 4 * 1.0**2) / 20.0**2
 #: Shares of white noise in octaves of detail, from the finest: 3/4, 3/16, ..., and what is coarser.
 _OCTAVES = (0.75, 0.1875, 0.046875, 0.015625)

@@ -17,7 +17,7 @@ from simulator.utils.checks import check_word
 AperturePreset = Literal["compact", "paper", "ncs"]
 #: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
 DEAD_ZONE = 1.0
-#: Factor on estimated diameters, as too little blur errs more than too much: of 1, 1.1 ... 1.4
+#: Factor on estimated diameters, as too little blur is worse than too much: of 1, 1.1 ... 1.4
 #: that with the least error on validation scenes where these are blurred by 1.5 pixels and more.
 BLUR_FACTOR = 1.3
 #: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
@@ -146,12 +146,11 @@ def _quantile(values: Tensor, weight: Tensor, low: float, high: float) -> Tensor
     return chosen[index] if index < len(chosen) else values.new_tensor(high)
 
 
-def dead_zone(diameter: Tensor, size: float = DEAD_ZONE) -> Tensor:
-    """``sqrt(max(c^2 - size^2, 0))``: keeps regions in focus unchanged."""
-    remainder = diameter.square() - size**2
-    return torch.where(
-        remainder > 0, remainder.clamp(min=1e-12).sqrt(), 0.0
-    )  # no infinite gradient
+def dead_zone(diameter: Tensor) -> Tensor:
+    """``sqrt(max(c^2 - DEAD_ZONE^2, 0))``: keeps regions in focus unchanged."""
+    remainder = diameter.square() - DEAD_ZONE**2
+    # Without an infinite gradient.
+    return torch.where(remainder > 0, remainder.clamp(min=1e-12).sqrt(), 0.0)
 
 
 class DefocusMap(nn.Module):

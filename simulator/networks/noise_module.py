@@ -5,12 +5,11 @@ from __future__ import annotations
 import copy
 import functools
 import itertools
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.flop_counter import FlopCounterMode
 
 from simulator.capture.sensor import frame_normals, noise_keys
 from simulator.capture.statistics import Residual
@@ -244,13 +243,19 @@ class NoiseModule(nn.Module):
 
     @functools.cached_property
     def operations(self) -> int:
-        """Arithmetic operations per packed pixel, counted as torch counts them."""
-        twin, side = copy.deepcopy(self.network).to("meta"), 64
+        """Arithmetic operations of its convolutions per packed pixel, a sum and a product each."""
+        twin, side, counted = copy.deepcopy(self.network).to("meta"), 64, []
+
+        def count(layer: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+            samples = inputs[0] if isinstance(layer, nn.ConvTranspose2d) else output
+            counted.append(2 * samples.numel() * layer.weight[0].numel())
+
+        for layer in twin.modules():
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+                layer.register_forward_hook(count)
         image, noise = (torch.empty(1, 4, *size, device="meta") for size in ((side, side), ()))
-        inputs = (image, noise, noise) if self.commutes else (torch.cat([image, image], dim=1),)
-        with FlopCounterMode(display=False) as counter:
-            twin(*inputs)
-        return round(counter.get_total_flops() / side**2)
+        twin(*(image, noise, noise) if self.commutes else (torch.cat([image, image], dim=1),))
+        return round(sum(counted) / side**2)
 
     def forward(self, exposed: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """The raw with little noise, float32; one without noise (shot = read = 0) as it is.

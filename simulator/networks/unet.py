@@ -62,11 +62,11 @@ def convolution(inputs: int, outputs: int, *, bias: bool = True) -> nn.Conv2d:
     return layer
 
 
-def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) -> Tensor:
-    """``scale * (x - mean(x)) / sqrt(var(x) + eps) + shift``, over the pixels of each map.
+def instance_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    """``scale * (x - mean(x)) / sqrt(var(x) + 1e-5) + shift``, over the pixels of each map.
 
     A flat map, and so every 1 x 1 map, becomes exactly `shift`. Convolutions leave deviations of
-    1e-7 in a flat image; each normalisation would multiply them by up to ``1 / sqrt(eps)`` = 300,
+    1e-7 in a flat image; each normalisation would multiply them by up to 300,
     and after three layers they would be the image. Deviations below `FLAT` are that rounding.
     `x` is (B, C, H, W), `scale` and `shift` are (B, C); statistics are at least float32.
 
@@ -79,7 +79,7 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
     centred = x - mean
     variance = centred.square().mean(dim=(2, 3), keepdim=True)
     varies = variance > FLAT**2 * (1.0 + mean.square())
-    gain = scale.to(wide)[:, :, None, None] * torch.rsqrt(variance + eps) * varies
+    gain = scale.to(wide)[:, :, None, None] * torch.rsqrt(variance + 1e-5) * varies
     return torch.addcmul(shift.to(wide)[:, :, None, None], centred, gain).to(x.dtype)
 
 

@@ -43,6 +43,8 @@ FORMAT_VERSION = 2
 
 def build_modules(preset: str) -> nn.ModuleDict:
     """The untrained modules of a preset, by stage."""
+    if preset in ("pc", "dl") and preset not in BUILDERS:
+        raise ValueError(f"`preset` (={preset!r}) is made in a clone only{_hint(preset, [])}")
     check_word("preset", preset, tuple(BUILDERS))
     return BUILDERS[preset]()
 
@@ -167,8 +169,9 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
 def _hint(name: str, known: list[str]) -> str:
     if name == "ncs":
         return "; docs/networks.md says how to convert the authors' files"
-    if name in BUILDERS:
-        return f"; train it: ae-env train-simulator configs/simulator/{name}.yaml"
+    if name in BUILDERS or name in ("pc", "dl"):
+        program = "ae-env" if name in BUILDERS else "python -m benchmarks.paper_baselines"
+        return f"; train it: {program} train-simulator configs/simulator/{name}.yaml"
     return did_you_mean(name, known)
 
 

@@ -54,8 +54,8 @@ _WIDE_PX = 40.0
 #: discs is within 2 % of the disc between them.
 DIAMETERS = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6, 32.0)
 _KNOTS = np.array(DIAMETERS) ** 2
-#: How far the largest disc reaches, as a multiple of 4 [pixel].
-HALO = 20
+#: How far the largest disc reaches, and by how much tiles overlap for it [pixel].
+DISC_REACH, HALO = 16, 20
 #: Pixels from which another thread is worth waking for a blend, and pixels blended together.
 _WORTH_A_THREAD, _BLENDED = 2**12, 128
 _ONE = np.float32(1)

@@ -87,14 +87,6 @@ class Pair:
     target: int
 
 
-def exposure_error(illuminance: float, settings: CameraSettings) -> float:
-    """Exposure error of `settings` against an incident-light meter [EV], > 0 if too bright.
-
-    The light on the scene is `illuminance` [lux].
-    """
-    return incident_ev100(illuminance) + settings.log2_exposure
-
-
 def draw_settings(
     illuminance: float, rng: np.random.Generator, camera: CameraProfile
 ) -> list[CameraSettings]:

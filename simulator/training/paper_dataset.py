@@ -10,10 +10,10 @@ aperture on the output of the stages before. The target is the capture itself, w
 
 from __future__ import annotations
 
-import functools
 import io
 import logging
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -31,11 +31,10 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import LOW_ISO, Pair, any_pairs, is_cleaner, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.crops import Batch, no_progress, stacked, stated_fields
+from simulator.training.crops import Batch, stacked, stated_fields
 from simulator.training.losses import expose
 from simulator.training.trainer import (
     SimulatorConfig,
-    TrainingProgress,
     first_modules,
     make_accelerator,
     save_trained,
@@ -193,10 +192,14 @@ def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[
 
 def _cells(table: Path) -> pd.DataFrame:
     """The cells of a table as text; no rows and no columns for an empty file."""
+    how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
     try:
-        frame = pd.read_csv(table, dtype=str, keep_default_na=False, encoding="utf-8-sig")
+        with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
+            frame = pd.read_csv(table, index_col=False, **how)  # without cells beyond the columns
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
+    except (pd.errors.ParserError, UnicodeError) as error:
+        raise ValueError(f"`{table}` must be a CSV file in UTF-8: {error}") from error
     return frame.rename(columns=str.strip)
 
 
@@ -427,7 +430,6 @@ def train_on_captures(
     *,
     command: str,
     device: str = "cpu",
-    progress: TrainingProgress = no_progress,
 ) -> Path:
     """Trains the stages of `config` on real captures, as `train_and_save` does on simulated ones.
 
@@ -452,7 +454,6 @@ def train_on_captures(
             accelerator,
             checkpoint=path.parent / f"{name}.checkpoint",
             identity=[{entry: values[entry] for entry in entries}, start, known],
-            progress=functools.partial(progress, name),
         )
     done = {"start": start, "sequences": len(sequences), "stages": stages}
     save_trained(path, modules, config, command, **done)

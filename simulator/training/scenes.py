@@ -125,8 +125,8 @@ def detail_split(group: str) -> Split:
     for split, names in _FIXED.items():
         if group in names:
             return split
-    draw = hash_fraction(group)
-    return "train" if draw < _TRAIN else "validation" if draw < _VALIDATION else "test"
+    drawn = hash_fraction(group)
+    return "train" if drawn < _TRAIN else "validation" if drawn < _VALIDATION else "test"
 
 
 def detail_pictures(
@@ -267,12 +267,12 @@ def _chart(rng: np.random.Generator) -> np.ndarray:
 
 def _text(rng: np.random.Generator) -> np.ndarray:
     page = Image.new("L", (_SIZE, _SIZE))
-    draw, top = ImageDraw.Draw(page), 0
+    pen, top = ImageDraw.Draw(page), 0
     while top < _SIZE:
         size = int(rng.integers(7, 40))
         letters = "".join(chr(c) for c in rng.integers(33, 127, 90))
         words = letters.replace("~", " ").replace("|", " ")
-        draw.text((int(rng.integers(-20, 5)), top), words, 255, ImageFont.load_default(size))
+        pen.text((int(rng.integers(-20, 5)), top), words, 255, ImageFont.load_default(size))
         top += size + int(rng.integers(1, 8))
     return np.asarray(page, np.float32) / 255.0
 
@@ -488,9 +488,7 @@ def _middle(image: Any, side: int) -> Any:
     return image[:, top : top + side, left : left + side]
 
 
-def mosaic_scenes(
-    split: Split, camera: CameraProfile, data: Path, *, size: int = 256
-) -> Iterator[ReferenceScene]:
+def mosaic_scenes(split: Split, data: Path, *, size: int = 256) -> Iterator[ReferenceScene]:
     """The middle of real raws at low ISO: flat art and far views, in focus throughout.
 
     For the aperture: their noise is small, but it is there, so they are no truth to denoise. They

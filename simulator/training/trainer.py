@@ -203,7 +203,7 @@ def scenes_of(config: SimulatorConfig, split: Split) -> list[ReferenceScene]:
     number = config.scenes.procedural if split == "train" else _VALIDATION_SCENES
     scenes = reference_scenes(split, camera, number=number, size=size, data=data, seed=config.seed)
     if data is not None:
-        scenes += mosaic_scenes(split, camera, data, size=size)
+        scenes += mosaic_scenes(split, data, size=size)
     return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import math
+import reprlib
+import sys
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
@@ -30,12 +32,20 @@ def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -
     raise ValueError(f"`{name}` (={value!r}) must be one of {rule}{hint}")
 
 
-def check_type(name: str, value: Any, *kinds: type | None) -> None:
-    """Raises a `ValueError` unless `value` is of one of the types `kinds`, which None may be."""
+def check_key(name: str, key: Any, known: tuple[str, ...]) -> None:
+    """Raises a `ValueError` unless `key` is one of those that the mapping `name` may have."""
+    if key not in known:
+        rule = f"its keys are {', '.join(map(repr, known))}" if known else "it has none"
+        raise ValueError(f"`{name}` must not have {key!r}: {rule}{did_you_mean(key, known)}")
+
+
+def check_type(name: str, value: Any, *kinds: type | None, more: str = "") -> None:
+    """Raises a `ValueError`, which `more` ends, unless `value` is of a type in `kinds`, or None."""
     known = tuple(type(None) if kind is None else kind for kind in kinds)
     if not isinstance(value, known):
         rule = " or ".join("None" if kind is None else kind.__name__ for kind in kinds)
-        raise ValueError(f"`{name}` (of type {type(value).__name__}) must be of type {rule}")
+        found = f"={' '.join(reprlib.repr(value).split())}, of type {type(value).__name__}"
+        raise ValueError(f"`{name}` ({found}) must be of type {rule}{more}")
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -61,7 +71,10 @@ def check_number(name: str, value: Any, low: float, high: float, *, more: str = 
     number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if low <= number <= high:
         return float(number)
-    raise ValueError(f"`{name}` (={value!r}) must be a number in [{low:g}, {high:g}]{more}")
+    rule = f"number in [{low:g}, {high:g}]"
+    if high == sys.float_info.max:
+        rule = "finite number > 0" if low == sys.float_info.min else f"finite number >= {low:g}"
+    raise ValueError(f"`{name}` (={value!r}) must be a {rule}{more}")
 
 
 def check_seed(seed: Any, name: str = "seed") -> int | None:

@@ -73,11 +73,17 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
             return yaml.load(file.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         fault, cause = f"cannot be read: {error.strerror}", error
+    except _GivenTwice as error:
+        fault = str(error)
     except RecursionError:
         fault = "is not YAML: it is nested too deeply"
     except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
         fault, cause = f"is not YAML: {' '.join(str(error).split())}", error
     raise ValueError(f"`{name}` (={str(path)!r}): {fault}") from cause
+
+
+class _GivenTwice(Exception):
+    """Two entries of one name."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -88,7 +94,7 @@ class _Loader(yaml.SafeLoader):
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if (key.tag, key.value) in seen:
                 line = key.start_mark.line + 1
-                raise ValueError(f"the entry {key.value!r} is given twice, again in line {line}")
+                raise _GivenTwice(f"the entry {key.value!r} is given twice, again in line {line}")
             seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 

@@ -156,7 +156,8 @@ def write_results(
         lines = ",\n".join(encode(dict(row)) for row in rows)  # a row a line: differences are short
         text = f'{{"meta": {encode(dict(meta))},\n"rows": [\n{lines}\n]}}'
     except (AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"`rows` and `meta` must hold finite JSON values: {error}") from None
+        found = f"{error.obj!r} is none" if isinstance(error, AttributeError) else error
+        raise ValueError(f"`rows` and `meta` must hold finite JSON values: {found}") from None
     return write_atomically(path, text + "\n")
 
 

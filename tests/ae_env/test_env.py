@@ -233,6 +233,9 @@ def test_paths_are_drawn_in_their_own_colours() -> None:
             contact_sheet(_scene(), path=path)
     with pytest.raises(ValueError, match="at most 256"):
         contact_sheet(_scene(), grid=ExposureGrid.third_stop())
+    for name, value in (("speed", -1), ("speed", 1e9), ("defocus", math.nan), ("movement", 5)):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            contact_sheet(_scene(), **{name: value})
 
 
 def test_caption_and_size_of_a_frame(caplog: pytest.LogCaptureFixture) -> None:

@@ -217,6 +217,7 @@ def test_odd_actions_and_other_environments_are_refused(single: type, vector: ty
     for make, message in (
         (lambda: single(gym.make("CartPole-v1")), "`env`"),
         (lambda: single(one), "wrapped already"),
+        (lambda: vector(gym.make("CartPole-v1")), "`env`"),
         (lambda: vector(gym.make_vec("CartPole-v1", vectorization_mode="sync")), "make_vec"),
     ):
         with pytest.raises(ValueError, match=message):

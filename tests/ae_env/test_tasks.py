@@ -13,7 +13,7 @@ import ae_env
 from ae_env import ExposureGrid, Scene
 from ae_env.lighting.moving import KIND_SETS
 from ae_env.merging import log_error, merge
-from ae_env.tasks import displaced
+from ae_env.tasks import move_subject
 from simulator.camera import get_camera
 from simulator.capture.prepared_scene import Layout
 from simulator.radiance.light import WHITE_SIGNAL
@@ -162,12 +162,12 @@ def test_a_subject_moves_between_frames_and_leaves_ghosts() -> None:
     mask[10:20, 4:12] = True
     light = torch.where(mask, 0.4, 0.1).expand(4, -1, -1)
     scene = make_scene(light.numpy(), 2560.0, layout=Layout(torch.zeros(36, 36), mask))
-    there = displaced(scene, 3, -6)  # two columns of it leave the frame
+    there = move_subject(scene, 3, -6)  # two columns of it leave the frame
     expected = torch.full((4, 36, 36), 0.1)
     expected[:, 13:23, 0:6] = 0.4
     np.testing.assert_allclose(there.light, expected, rtol=1e-6)
     assert there.layout.subject.sum() == 60
-    assert displaced(scene, 0, 40).layout.subject is None
+    assert move_subject(scene, 0, 40).layout.subject is None
     # Two frames of a subject that crosses the frame in a second are worse than one, as it is
     # elsewhere in the second; of one that stays, they are better.
     core = (env := bracket(scenes=[scene], split="all", motion="random")).unwrapped.core
@@ -191,6 +191,8 @@ def test_bad_arguments_are_refused() -> None:
         with pytest.raises(TypeError, match=name):
             bracket(**{name: "balanced"})
     env = bracket()
+    with pytest.raises(AttributeError, match="budget"):  # it would have no effect
+        env.unwrapped.budget = 1e-3
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"`action` \(=25\)"):
         env.unwrapped.step(np.int64(25))

@@ -12,7 +12,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from ae_env import UserCodeError
-from ae_env.registration import ENV_IDS
+from ae_env.registration import TASKS
 from agents import Policy, PolicyContext, make_policy
 from agents.recording import record_dataset
 from agents.rollouts import fitting_arguments, training_arguments
@@ -20,7 +20,7 @@ from tests.ae_env.environments import SMALL, make_envs
 from tests.ae_env.scene_files import GRID, write_raws
 
 ROOT = Path(__file__).parents[2]
-every_task = pytest.mark.parametrize("task", ENV_IDS)
+every_task = pytest.mark.parametrize("task", TASKS)
 
 
 @every_task
@@ -74,12 +74,8 @@ def test_torchrl(task: str) -> None:
 @pytest.mark.slow
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It trains, its weights come back, and a reset forgets the episode."""
-    make_vec = gym.make_vec
-
-    def with_few(task: str, **arguments: Any) -> gym.vector.VectorEnv:
-        return make_vec(task, **{**arguments, **SMALL, "num_envs": 8})
-
-    monkeypatch.setattr(gym, "make_vec", with_few)
+    make_vec, few = gym.make_vec, {**SMALL, "num_envs": 8}
+    monkeypatch.setattr(gym, "make_vec", lambda task, **given: make_vec(task, **given | few))
     program, weights = ROOT / "examples" / "recurrent_ppo.py", tmp_path / "recurrent.safetensors"
     runpy.run_path(str(program))["train"](weights, frames=128)
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")

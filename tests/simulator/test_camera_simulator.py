@@ -111,6 +111,7 @@ def test_bad_input_is_named(simulator: CameraSimulator) -> None:
     calls = [(f"`{k}`", simulator.prepare, (raw,), {k: v}) for k, v in bad]
     calls += [("`depth`", simulator.prepare, (raw,), {"depth": depth}) for depth in depths]
     calls += [("`tolerance`", simulator.plan, (raw, BASE), {"tolerance": None})]
+    calls += [(r"\(=0\) must be a finite number > 0", Z6.nlf, (0,), {})]
     calls += [("`source`", simulator.simulate, (raw.data, BASE), {})]
     calls += [("`seed`", simulator.simulate, (raw, BASE), {"seed": -1})]
     calls += [("`settings`", simulator.simulate, (raw, 3), {})]
@@ -319,6 +320,10 @@ def test_tolerance_nought_forgets_what_another_one_left_out(compact, depth):
     shared = compact.simulate(prepared, CLEANER, tolerance=0.0)
     full = compact.simulate(source, CLEANER, tolerance=None, depth=depth)
     torch.testing.assert_close(shared.data, full.data, rtol=0, atol=1.01 / 14512)
+    with pytest.raises(ValueError, match="`noise`"):
+        compact.simulate(source, CLEANER, tolerance=None, noise="bank")
+    with pytest.raises(TypeError, match="defocs"):
+        compact.simulate(source, CLEANER, tolerance=None, defocs=5)
 
 
 @given(mosaics(cameras()), settings_within(), SEEDS, st.sampled_from(["exact", "bank"]))

@@ -196,9 +196,10 @@ def test_groups_file_names_the_groups(tmp_path: Path) -> None:
     (tmp_path / "groups.csv").write_text("file,group\na.hdr,first\nb.hdr,first\n")
     assert [s.group for s in load(tmp_path)] == ["first", "first", "c"]
     for content, words in (
-        (b"name,group\na.hdr,x\n", "line 2"),
+        (b"name,group\na.hdr,x\n", r"columns \['name', 'group'\]"),
         (b"file,group\nz.hdr,x\n", "line 2"),
         (b"file,group\na.hdr,\n", "line 2"),
+        (b"file,grop\n", "`group`"),  # without rows, too
         (b"\xff\xfe\0", r"groups\.csv' must be a CSV file in UTF-8"),
         (b'file,group\n"' + b"x" * 200_000, r"groups\.csv' must be a CSV file in UTF-8"),
     ):

@@ -115,7 +115,7 @@ def test_resized_averages_what_the_networks_found() -> None:
                 *(("denoised", torch.zeros(4, 2, 3)), ("layout", Layout(torch.zeros(2, 3)))),
                 *(("defocus_map", torch.full((8, 4), v)) for v in (-1.0, math.inf)),
                 *(("defocus_map", torch.zeros(2, 3)), ("recorded", torch.zeros(3, 4, 2, 2))),
-                ("nlf", "nikon_z6"),
+                *(("nlf", "nikon_z6"), ("saturated", ONES.bool()), ("defocus_map", ONES[:1])),
             )
         ),
         *((lambda n=n: array_scene(ONES).resized(n), rf"`resolution` \(={n}\)") for n in (0, 5)),
@@ -139,6 +139,7 @@ def test_content_is_that_of_the_tensors() -> None:
     others = [array_scene(light), array_scene(ONES, denoised=light)]
     others.append(array_scene(ONES, defocus_map=light[0]))
     assert len({s.content for s in [scene, *others]}) == 4
+    assert array_scene(ONES, allowed=[True, False]).allowed.dtype == bool
 
 
 @given(lights(st.floats(-1.0, 100.0, width=32)), st.data(), SEEDS)

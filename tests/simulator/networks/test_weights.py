@@ -141,6 +141,8 @@ def test_shipped_weights_load_by_name(saved, monkeypatch, tmp_path_factory):
     assert "did you mean" not in str(caught.value)
     with pytest.raises(ValueError, match=r"`preset` \(='compcat'\)"):
         build_modules("compcat")
+    with pytest.raises(ValueError, match=r"train it: .*pc\.yaml"):
+        load_modules("pc")
 
 
 # -- results that are found again ------------------------------------------------------------------

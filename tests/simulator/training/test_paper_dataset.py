@@ -134,8 +134,12 @@ def test_cells_that_are_no_value_and_files_that_are_no_raw_are_named(tmp_path):
         author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("s/a.jpg", **{name: value}))
         with pytest.raises(ValueError, match=f"row 2: `{name.replace('aperture', 'f_number')}`"):
             read_dataset(tmp_path)
+    table = tmp_path / "camera_params.csv"
+    table.write_text(table.read_text() + '"s/a.jpg,1\n')  # a quotation that does not end
+    with pytest.raises(ValueError, match=r"camera_params\.csv` must be a CSV"):
+        read_dataset(tmp_path)
     file, pickled = tmp_path / "a.npy", np.array([{}], dtype=object)  # nothing pickled is run
-    author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("a.jpg"))
+    author_table(table, NIKON, [*nikon_row("a.jpg"), ""])  # a comma at the end
     for array in (np.zeros((4, 6)), np.full((4, 2, 2), math.nan), np.zeros((5, 2, 2)), pickled):
         np.save(file, array)
         (capture,) = read_dataset(tmp_path)[0].captures

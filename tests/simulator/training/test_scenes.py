@@ -118,7 +118,7 @@ def test_real_pictures_become_scenes(data_dir: Path, tmp_path: Path) -> None:
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
     made = reference_scenes("validation", CAMERA, number=0, size=128, data=tmp_path)
     assert [s.scene_id for s in made] == ["coffee", "Flowers", Path(files[0]).stem]
-    made += pictured.mosaic_scenes("test", CAMERA, tmp_path, size=128)
+    made += pictured.mosaic_scenes("test", tmp_path, size=128)
     assert [(s.scene_id, s.group) for s in made[3:]] == [("CRW_0117", "camera_box")]
     assert all(s.sampled and s.size == (128, 128) for s in made)
 
