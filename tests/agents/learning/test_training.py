@@ -45,8 +45,6 @@ def test_shipped_configs(path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is empty"),
-        ("agent: ppo\nnum_env: 3", r"num_env \(=3\).*`num_envs`"),
         ("agent: dqn", r"agent \(='dqn'\)"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\).*`n_steps`"),
         ("agent: ppo\ntraining: {batch_size: 100}", r"`batch_size` \(=100\)"),

@@ -105,17 +105,13 @@ def test_every_kind_of_observation_reads_the_same(context, photograph, name):
     np.testing.assert_allclose(found, found[0], atol=0.03)
 
 
-def _srgb(x):
-    return 12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055
-
-
 def _linear(z):
     return z / 12.92 if z <= 0.04045 else ((z + 0.055) / 1.055) ** 2.4
 
 
 def test_skewness_balances_two_levels_about_mid_grey(context, photograph):
     """Half of the pixels 0.2 of the code below mid-grey, half as much above."""
-    middle = _srgb(0.18)
+    middle = 1.055 * 0.18 ** (1 / 2.4) - 0.055  # in sRGB
     levels = [_linear(middle - 0.2) / 0.18, _linear(middle + 0.2) / 0.18]
     light = np.where(np.arange(64)[:, None] < 32, *levels) * np.ones((64, 64))
     for ev in (9.0, 10.0, 11.0):
