@@ -28,8 +28,10 @@ PRETRAINED_SEEDS = (0, 1, 2)
 #: Forecasters of light that come with the package, and the word that asks for them.
 FORECASTERS, LEARNT = str(PRETRAINED / "forecaster-*"), "learnt"
 
-#: Classes whose names take a file after the colon, and the argument that it is.
-_WITH_FILE = {
+#: The learnt agents, and classes whose names take a file after the colon, with the
+#: argument that it is.
+LEARNT_AGENTS = ("ppo", "regression")
+WITH_FILE = {
     "ppo": ("agents.learning.ppo:PPOPolicy", "weights"),
     "regression": ("agents.learning.regression:RegressionPolicy", "weights"),
     "recorded": ("agents.baselines:Recorded", "path"),
@@ -38,7 +40,7 @@ _WITH_FILE = {
 _SHIPPED = {
     f"{agent}{task}": f"{PRETRAINED}/{prefix}{agent}"
     for task, prefix in (("", ""), (":video", "video-"))
-    for agent in ("ppo", "regression")
+    for agent in LEARNT_AGENTS
 }
 #: The built-in policies: class, imported when a policy is made, and arguments that the name gives.
 _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -53,7 +55,7 @@ _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
         for p in PROGRAMS
     },
     **{
-        name: (_WITH_FILE[name.partition(":")[0]][0], {"weights": f"{file}-{PRETRAINED_SEEDS[0]}"})
+        name: (WITH_FILE[name.partition(":")[0]][0], {"weights": f"{file}-{PRETRAINED_SEEDS[0]}"})
         for name, file in _SHIPPED.items()
     },
 }
@@ -98,7 +100,7 @@ def training_seeds(name: str) -> list[str]:
     head, _, tail = base.partition(":")
     if (agent := base.removesuffix(":")) in _SHIPPED:
         files = [f"{_SHIPPED[agent]}-{seed}" for seed in PRETRAINED_SEEDS]
-    elif head in ("ppo", "regression") and "*" in tail:
+    elif head in LEARNT_AGENTS and "*" in tail:
         files = weight_files(tail)
         if not files:
             raise _refusal(name, f": no .safetensors file fits {tail!r}")
@@ -213,7 +215,7 @@ def make_policy(
         if not isinstance(error, ValueError | FileNotFoundError):
             raise
         kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
-        raise kind(f"`policy` (={_shown(name)!r}): {error}") from error
+        raise kind(*_refusal(name, f": {error}").args) from error
     if named:
         policy.name = name
     return policy
@@ -223,8 +225,8 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     """The class of a policy, and the arguments that `base`, the `name` without options, gives."""
     found = (_POLICIES | _BRACKETS).get(_SHORT.get(base, base))
     head, tail = split_class(base)
-    if found is None and head in _WITH_FILE:
-        path, argument = _WITH_FILE[head]
+    if found is None and head in WITH_FILE:
+        path, argument = WITH_FILE[head]
         if "*" in tail and argument == "weights":
             raise _refusal(name, " is a pattern, so several agents: `training_seeds` lists them")
         found = path, {argument: tail}
@@ -276,7 +278,7 @@ def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str
 
 def _known(base: str) -> str:
     """What a name may be, for an error about the unknown `base`."""
-    files = [f"{head}:{argument.upper()}" for head, (_, argument) in _WITH_FILE.items()]
+    files = [f"{head}:{argument.upper()}" for head, (_, argument) in WITH_FILE.items()]
     names = [*_POLICIES, *files, *_BRACKETS]
     single = [name for name in names if name.partition(":")[0] not in METERS]
     hint = did_you_mean(base, [*_SHORT, *names], cutoff=0.5)
@@ -286,12 +288,7 @@ def _known(base: str) -> str:
     )
 
 
-def _shown(name: object) -> object:
-    """`name` for a message: agents that come with the package are known by no path."""
-    for agent, file in _SHIPPED.items() if isinstance(name, str) else ():
-        name = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, name)
-    return name
-
-
-def _refusal(policy: object, text: str) -> ValueError:
-    return ValueError(f"`policy` (={_shown(policy)!r}){text}")
+def _refusal(policy: Any, text: str) -> ValueError:
+    for agent, file in _SHIPPED.items() if isinstance(policy, str) else ():
+        policy = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, policy)  # without the path
+    return ValueError(f"`policy` (={policy!r}){text}")

@@ -187,8 +187,8 @@ def run(
     local = on == _LOCAL
     shards = map(ShardWriter(plan).write, todo) if local else _on_ray(plan, todo, on, workers)
     made = []
-    for told in shards:
-        made.append(told)
+    for shard in shards:
+        made.append(shard)
         progress(total - len(todo) + len(made), total)
     return made
 
@@ -214,8 +214,8 @@ class _RayWorker:
         import ray
 
         node = ray.get_runtime_context().get_node_id()
-        told = [self._writer.write(int(shard)) | {"node": node} for shard in batch["shard"]]
-        return {name: np.array([one[name] for one in told]) for name in told[0]}
+        made = [self._writer.write(int(shard)) | {"node": node} for shard in batch["shard"]]
+        return {name: np.array([one[name] for one in made]) for name in made[0]}
 
 
 def _on_ray(

@@ -9,7 +9,7 @@ by side and show their own progress, so this one is no `benchmarks.harness.bench
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +56,8 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     meta["training"] = {name: own[0].config.card() for name, own in jobs.items()}
     meta["training_seconds_this_run"] = time.perf_counter() - began
 
-    envs = make_envs({"split": "test", "resolution": 64}, num_envs=1, frames=1)
-    context = PolicyContext.from_envs(envs)
+    with closing(make_envs({"split": "test", "resolution": 64}, num_envs=1, frames=1)) as envs:
+        context = PolicyContext.from_envs(envs)
     meters = [f"{meter}:{p}" for meter in CLASSIC_METERS for p in PROGRAMS if p != "M"]
     names = ["random", "best_fixed", *(meters[:1] if quick else meters)]
     policies: dict[str, Any] = {name: make_policy(name, context) for name in names}

@@ -23,7 +23,7 @@ from agents.evaluation.intervals import difference_interval
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from benchmarks.harness import Part, Report, Row, benchmark, panels, table
-from simulator.utils.files import data_folder as data_root
+from simulator.utils.files import data_folder
 
 #: Policies, and what a page calls them.
 POLICIES = {
@@ -82,7 +82,7 @@ def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None
 
 def parts(seed: int, quick: bool) -> list[Part]:
     names, found = ("scenes", "budget", "policy"), []
-    for case in product(SETS if data_root() is not None else SETS[:1], BUDGETS, POLICIES):
+    for case in product(SETS if data_folder() is not None else SETS[:1], BUDGETS, POLICIES):
         arguments = dict(zip(names, case, strict=True)) | {"most": QUICK_SCENES if quick else None}
         found.append(Part("{}, {} s, {}".format(*case), measure, arguments, threads=1))
     return found

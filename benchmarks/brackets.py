@@ -18,7 +18,7 @@ from skimage.measure import block_reduce
 from skimage.metrics import structural_similarity
 from skimage.registration import phase_cross_correlation
 
-from benchmarks.harness import Part, Report, Row, benchmark, data_folder, pivot, table
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, real_files, table
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio
 from simulator.camera import BayerPattern, CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
@@ -162,7 +162,7 @@ def _decibel(mean_square: float) -> float | None:
 
 
 def measure(scene: str, seed: int, quick: bool) -> dict[str, Any]:
-    folder = data_folder("boreal_brackets")
+    folder = real_files("boreal_brackets")
     frames, estimates = calibrated({t: load(folder, scene, t) for t in TIMES_MS})
     rows = ratio_rows(scene, frames)
     steps = [(1, t) for t in TIMES_MS[1:]] + [(t, 1) for t in TIMES_MS[1:]]
@@ -173,7 +173,7 @@ def measure(scene: str, seed: int, quick: bool) -> dict[str, Any]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    data_folder("boreal_brackets")  # raises before any work
+    real_files("boreal_brackets")  # raises before any work
     return [Part(s, measure, {"scene": s}, threads=1) for s in SCENES[: 1 if quick else None]]
 
 

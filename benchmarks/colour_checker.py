@@ -17,7 +17,7 @@ import torch
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
 from ae_env.scorers.measures import srgb_decode
-from benchmarks.harness import Part, Report, Row, benchmark, data_folder, pivot, rounded, table
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, real_files, rounded, table
 from simulator import RawImage, develop, read_raw
 from simulator.raw.develop import XYZ_FROM_SRGB, srgb_from_camera
 
@@ -148,7 +148,7 @@ def summary(rows: list[Row]) -> Row:
 
 
 def measure_file(file: str) -> dict[str, Any]:
-    raw, chart = read_raw(data_folder("canon_crw_cc0") / file), FILES[file]
+    raw, chart = read_raw(real_files("canon_crw_cc0") / file), FILES[file]
     rows, summaries = [], []
     for white_balance in ("camera", "chart"):
         own = measure(raw, chart, white_balance)
@@ -160,7 +160,7 @@ def measure_file(file: str) -> dict[str, Any]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    data_folder("canon_crw_cc0")  # raises before any work
+    real_files("canon_crw_cc0")  # raises before any work
     return [
         Part(file, measure_file, {"file": file}) for file in list(FILES)[: 1 if quick else None]
     ]

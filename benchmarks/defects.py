@@ -197,7 +197,8 @@ error = {mae:.3f} [{mae_ci95[0]:.3f}, {mae_ci95[1]:.3f}] | constant = {mae_of_a_
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
+    maps = results["maps"]["maps"]
+    tests = [results[f"test {size}"] for size in (RESOLUTION, OTHER_RESOLUTION)]
     for name, knots in maps.items():
         columns = ", ".join(repr(column) for column in zip(*knots, strict=True))
         print_line(f'"{name}": ({columns}),')

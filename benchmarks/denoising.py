@@ -22,13 +22,14 @@ from skimage.restoration import denoise_nl_means
 from torch import Tensor
 
 from benchmarks.fidelity.models import trained_noise_modules
-from benchmarks.harness import Part, Report, Row, benchmark, data_root, interval, pivot, table
+from benchmarks.harness import Part, Report, Row, benchmark, interval, pivot, table
 from simulator import CameraProfile, get_camera
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
 from simulator.training.crops import DetailPicture
 from simulator.training.scenes import detail_pictures
+from simulator.utils.files import data_folder
 
 #: Sources are photographed by both cameras in turn.
 CAMERAS = ("nikon_z6", "canon_70d")
@@ -60,7 +61,7 @@ class Case:
 
 def sources() -> list[DetailPicture]:
     found: dict[str, DetailPicture] = {}
-    for picture in detail_pictures("test", data=data_root(), drawn=0):
+    for picture in detail_pictures("test", data=data_folder(), drawn=0):
         if picture.kind != "linear" and min(picture.light.shape[1:]) >= 2 * SIZE:
             found.setdefault(picture.group, picture)
     return [found[group] for group in sorted(found)]

@@ -38,13 +38,10 @@ from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT
 from simulator import CameraProfile
 from simulator.reference.reference_camera import ReferenceScene
-from simulator.utils import files as result_files
 from simulator.utils.cache import CACHE_VARIABLE, Store, cache_key
-from simulator.utils.files import result_meta, write_atomically, write_results
+from simulator.utils.files import data_folder, result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
-#: The folder of real files, if there is one.
-data_root = result_files.data_folder
 #: Content of the cells by heading; or as text: ``"heading = content | heading = content"``.
 Columns = str | Mapping[str, Cell]
 #: Significant digits of numbers in result files.
@@ -291,13 +288,13 @@ def panels(curves: Iterable[Row], width: float = 3.6, **axes: Any) -> Figure:
     return figure
 
 
-def data_folder(name: str) -> Path:
+def real_files(name: str) -> Path:
     """Sub-folder `name` of the folder of real files.
 
     Raises:
         FileNotFoundError: If it is not there.
     """
-    root = data_root()
+    root = data_folder()
     if root is None or not (root / name).is_dir():
         where = f"{root or 'AE_ENV_DATA'}: set AE_ENV_DATA to the folder that holds it"
         raise FileNotFoundError(f"there is no folder {name!r} of real files in {where}")

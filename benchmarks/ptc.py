@@ -149,8 +149,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             own.append(row | {"path": "put in", "text": f"{row['put_in'][key]:.4g}"})
             own.append(row | {"text": f"{row[key]:.4g} ({low:.4g} to {high:.4g})"})
         tables[key] = pivot(own, "camera = {camera}, ISO {iso:g}", "{path}", "{text}")
-    meta = {"fitted": FITTED, "size": SIZE}
-    return Report(rows, tables, meta=meta, figures={"ptc.png": curves(shown)})
+    about = {"fitted": FITTED, "size": SIZE}
+    return Report(rows, tables, meta=about, figures={"ptc.png": curves(shown)})
 
 
 def _coverage(rows: list[Row], path: str, rows_on: bool) -> Row:

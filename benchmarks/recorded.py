@@ -32,7 +32,7 @@ from ae_env.scorers.score_table import ScoreTables
 from benchmarks import brackets
 from benchmarks.brackets import texture
 from benchmarks.fidelity.models import radiance_views
-from benchmarks.harness import Part, Report, Row, benchmark, clipped, data_folder, psnr, table
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, real_files, table
 from benchmarks.isolated import median_seconds
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
 from simulator.radiance.light import MEAN_SIGNAL
@@ -91,7 +91,7 @@ def _of_folder(folder: str) -> list[Scene]:
 
 
 def _boreal(grid: ExposureGrid) -> list[Scene]:
-    folder, scenes = data_folder(BOREAL), []
+    folder, scenes = real_files(BOREAL), []
     for name in brackets.SCENES:
         taken = {t: brackets.load(folder, name, t) for t in brackets.TIMES_MS}
         frames, _ = brackets.calibrated(taken)

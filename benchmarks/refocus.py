@@ -20,7 +20,7 @@ from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, ren
 from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs
-from simulator.utils.files import data_folder as data_root
+from simulator.utils.files import data_folder
 
 CAMERA, F_SOURCE = "nikon_z6", 11.0
 ISOS, F_NUMBERS = (100, 1600), (4.0, 2.8, 2.0, 1.4)
@@ -40,7 +40,7 @@ METHODS = {
 @torch.no_grad()
 def measure(number: int, seed: int, quick: bool) -> list[Row]:
     camera = get_camera(CAMERA)
-    scene = depth_photographs(camera, data=data_root())[number]
+    scene = depth_photographs(camera, data=data_folder())[number]
     reference = ReferenceCamera(camera)
     simulator = CameraSimulator.from_pretrained("large", cache=None)
     rows, edges = [], _edges(reference, scene)
@@ -125,7 +125,7 @@ def _methods(
 @torch.no_grad()
 def picture(seed: int) -> Figure:
     camera, iso, f_number = get_camera(CAMERA), ISOS[0], F_NUMBERS[-1]
-    scene = depth_photographs(camera, data=data_root())[0]
+    scene = depth_photographs(camera, data=data_folder())[0]
     reference = ReferenceCamera(camera)
     settings = equal_exposure(scene.reference, iso, F_SOURCE)
     sample = reference.capture(scene, settings, seed).sample
@@ -144,7 +144,7 @@ def picture(seed: int) -> Figure:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    count = len(depth_photographs(get_camera(CAMERA), data=data_root()))
+    count = len(depth_photographs(get_camera(CAMERA), data=data_folder()))
     numbers = range(0, count, 2 if quick else 1)
     return [Part(f"scene {n}", measure, {"number": n}, threads=1) for n in numbers]
 

@@ -11,8 +11,6 @@ from simulator import CameraSettings, NoiseLevelFunction
 from simulator.camera import BayerPattern, CameraProfile
 from simulator.capture.prepared_scene import PreparedScene
 
-Mosaic = tuple[CameraProfile, np.ndarray]
-
 SEEDS = st.integers(0, 2**32 - 1)
 #: Single pixels, rows and columns, odd sizes; 256 samples make a block of a kernel.
 SHAPES = st.one_of(
@@ -54,11 +52,8 @@ def cameras(draw: st.DrawFn, *, noise: bool = True) -> CameraProfile:
     black = draw(st.one_of(quarters.map(lambda b: (b,) * 4), st.tuples(*[quarters] * 4)))
     nlf = NoiseLevelFunction.zero()
     if noise:
-        shot, read = (
-            draw(st.tuples(*[log_uniform(low, high)] * 4))
-            for low, high in ((1e-6, 1e-2), (1e-9, 1e-3))
-        )
-        nlf = NoiseLevelFunction(shot, read)
+        ranges = (1e-6, 1e-2), (1e-9, 1e-3)  # of shot and read noise
+        nlf = NoiseLevelFunction(*(draw(st.tuples(*[log_uniform(*r)] * 4)) for r in ranges))
     order = draw(st.sampled_from(list(BayerPattern)))
     depth = white.bit_length()
     return CameraProfile("drawn", order, black, white, depth, nlf_by_iso={100.0: nlf})
@@ -74,7 +69,7 @@ def lights(draw: st.DrawFn, elements: st.SearchStrategy[float] = LIGHT) -> torch
 
 
 @st.composite
-def mosaics(draw: st.DrawFn, bodies: st.SearchStrategy[CameraProfile]) -> Mosaic:
+def mosaics(draw: st.DrawFn, bodies: st.SearchStrategy[CameraProfile]) -> tuple:
     """A body and digital numbers (2H, 2W) of it, with black and white among them."""
     camera, (height, width) = draw(bodies), draw(SHAPES)
     rng, white = np.random.default_rng(draw(SEEDS)), int(camera.white_level)

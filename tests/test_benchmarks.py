@@ -27,7 +27,7 @@ from benchmarks.features import training
 from benchmarks.harness import Part, Report, benchmark, pivot, rounded, table
 from benchmarks.transfer import agents, tables
 from benchmarks.transfer.agents import TableSet, TransferPlan, World
-from benchmarks.work_precision import pareto_front
+from benchmarks.work_precision import undominated
 from benchmarks.work_precision.plans import distance
 from simulator import NoiseLevelFunction, exposure_ratio
 from simulator.networks.weights import build_modules, load_modules, save_modules
@@ -127,7 +127,7 @@ def test_errors_before_any_work(ae_env, benchmarks_here: Path, arguments, named:
 
 def test_the_front_of_time_and_error() -> None:
     points = [(1.0, 30.0), (2.0, 35.0), (3.0, 34.0), (4.0, 35.004)]
-    assert pareto_front(points) == [True, True, False, False]
+    assert undominated(points) == [True, True, False, False]
 
 
 @pytest.mark.parametrize(("shift", "spread"), [(0.5, 1.5), (0.0, 0.8), (2.0, 1.0)])

@@ -189,7 +189,7 @@ class EpisodeCore:
         apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
         self._settings = encode_settings(apex)
         # (4, S), see `_STATE_INFO`
-        self._bounds = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
+        self._state_info = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._at_rest: dict[int, PreparedScene] = {}
         self._captures: FrameSource
         transitions = None
@@ -283,9 +283,9 @@ class EpisodeCore:
         wrong = (actions < 0) | (actions >= self.num_actions)
         if wrong.any():
             raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {self.num_actions})")
-        takes, displaced = self.task.transition(env_indices, actions)
+        takes, moved = self.task.transition(env_indices, actions)
         changed = self.episodes.act(env_indices[takes], actions[takes])
-        for others in (displaced, changed):
+        for others in (moved, changed):
             if len(others):
                 self._forget(others)
         return self.task.terminal(env_indices, takes)
@@ -304,7 +304,7 @@ class EpisodeCore:
         terms, reward = self.task.reward(env_indices, columns)
         observation |= self.task.observation(env_indices)
         info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
-        info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
+        info |= zip(_STATE_INFO, self._state_info[:, states], strict=True)
         info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
         return Frames(observation, info, reward, raw)
 
@@ -317,7 +317,7 @@ class EpisodeCore:
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
         gains, rows = np.ones(len(env_indices)), None
         if not episodes.static:
-            gains, rows = episodes.gains(env_indices, self._bounds[1, states])
+            gains, rows = episodes.gains(env_indices, self._state_info[1, states])
         self._captures.prepare(lights, states, gains)
         small = self.task.in_chunks or rows is not None
         step = max(1, CHUNK_SAMPLES // (4 * size**2) if small else len(env_indices))

@@ -101,7 +101,7 @@ def load_scenes(
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
             made them has split them.
-        camera: In whose colours scenes are made. A raw brings its own camera.
+        camera: In whose colours scenes are made. A raw has its own camera.
         resolution: Packed pixels a side; None keeps each scene's own size.
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
         resize: Called with each scene at its finest resolution, `resolution` and `crop`.
@@ -115,8 +115,7 @@ def load_scenes(
             or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
-    hint = "; `simulator.get_camera` gives one by name"
-    check_type("camera", camera, CameraProfile, more=hint)
+    check_type("camera", camera, CameraProfile, more="; `simulator.get_camera` gives one by name")
     request = SceneRequest(split, camera, resolution, crop, resize)
     scenes: Sequence[Scene]
     recorded = RecordedOptions.of(spec)

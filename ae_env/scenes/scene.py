@@ -456,8 +456,8 @@ class SceneSet(Sequence[Scene]):
 class SceneRequest:
     """The split, the camera and the size that scenes are loaded for.
 
-    `camera` is that in whose colours light is stated, unless a raw brings its own; `resize` brings
-    each scene to `resolution` and `crop`, as `Scene.resized` does.
+    `camera` is that in whose colours light is stated, unless a raw has its own; `resize` makes
+    each scene fit `resolution` and `crop`, as `Scene.resized` does.
     """
 
     split: Split

@@ -88,16 +88,9 @@ def register_scorer(name: str) -> Callable[[Factory], Factory]:
     return register
 
 
-def list_scorers(*, self_contained: bool = False) -> list[str]:
-    """Names of all known scorers, those of installed packages included.
-
-    Args:
-        self_contained: Leave out those that need a file of the user's own or an optional package.
-    """
-    names = {*_REGISTRY, *(point.name for point in scorer_entry_points())}
-    if self_contained:
-        names -= {name for name, made in _REGISTRY.items() if getattr(made, "needs", "")}
-    return sorted(names)
+def list_scorers() -> list[str]:
+    """Names of all known scorers, those of installed packages included."""
+    return sorted({*_REGISTRY, *(point.name for point in scorer_entry_points())})
 
 
 def scorer_entry_points() -> list[EntryPoint]:

@@ -130,13 +130,13 @@ class TermScores:
         names = [] if self.torch_terms is None else self.torch_terms.names(*kinds)
         if self.torch_terms is None or not names:
             return {}
-        parts = [self.torch_terms.parts[name] for name in names]
-        if all(type(part) is Sharpness for part in parts):  # few states differ in blur
+        terms = [self.torch_terms.parts[name] for name in names]
+        if all(type(term) is Sharpness for term in terms):  # few states differ in blur
             blur, alike = self.captures.blur(scene, prepared)
             score = Sharpness.of(blur, scene.light.shape[-2])[alike].numpy()
             return dict.fromkeys(names, score)
         chunks = []
-        for part in slices(len(self.states), CHUNK if any(map(reads_pixels, parts)) else None):
+        for part in slices(len(self.states), CHUNK if any(map(reads_pixels, terms)) else None):
             captures = self.captures.describe(scene, prepared, part, gain, row_gain)
             chunks.append(self.torch_scores(None, captures, *kinds))
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}

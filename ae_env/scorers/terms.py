@@ -396,8 +396,9 @@ class Balanced(CompositeScorer):
         """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
         # The logarithm of arrays by NumPy: torch's threads do not survive a fork.
         log: Any = torch.log if torch.is_tensor(scores["highlights"]) else np.log
-        blown = -self.parts["highlights"].scale * log(scores["highlights"])
-        blocked = -self.parts["shadows"].scale * log(scores["shadows"])
+        parts: Mapping[str, Any] = self.parts
+        blown = -parts["highlights"].scale * log(scores["highlights"])
+        blocked = -parts["shadows"].scale * log(scores["shadows"])
         # Rounding may leave a share above 1.
         score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
         for name, weight in self.weights.items():

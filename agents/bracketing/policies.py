@@ -344,22 +344,16 @@ class Hasinoff(Bracketing):
         return float(low), limit + self.headroom if white > _TAIL else float(high)
 
 
-def describe(
-    light: Floats, precision: Floats, limit: float, reference: float
-) -> NDArray[np.float32]:
-    """(3, L) histograms of clear samples, of white ones, of those in the noise.
+def light_shares(light: Floats, precision: Floats, limit: float, reference: float) -> Floats:
+    """(L,) shares of the samples in `BINS`, which are relative to `reference` [EV100].
 
     White samples count where they begin, at `limit`; those in the noise at the noise. See
-    `Bracketing.merged`; `BINS` are relative to `reference` [EV100].
+    `Bracketing.merged`.
     """
-    white = precision <= 0.0
     deviation = 1.0 / np.sqrt(np.maximum(precision, 1e-300))
-    noisy = ~white & (light < 2.0 * deviation)
-    clear = ~white & ~noisy
-    place = np.log2(np.where(clear, light, np.where(noisy, deviation, 2.0**limit))) - reference
-    bins = bin_of(place)
-    counts = [np.bincount(bins[which], minlength=len(BINS)) for which in (clear, white, noisy)]
-    return (np.stack(counts) / len(light)).astype(np.float32)
+    shown = np.where(light < 2.0 * deviation, deviation, light)
+    place = np.log2(np.where(precision <= 0.0, 2.0**limit, shown)) - reference
+    return np.bincount(bin_of(place), minlength=len(BINS)) / len(light)
 
 
 class Planner(Bracketing):
@@ -389,8 +383,7 @@ class Planner(Bracketing):
 
     def light(self, camera: int) -> Floats:
         """(L,) shares of the samples in `BINS`, as the frames so far show them."""
-        described = describe(*self.merged(camera), float(self._reference[camera]))
-        return described.sum(axis=0, dtype=np.float64)
+        return light_shares(*self.merged(camera), float(self._reference[camera]))
 
 
 def blur_error(pixels: Floats) -> Floats:

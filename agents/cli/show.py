@@ -95,7 +95,7 @@ def film(
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
-    from agents.report.plots import record, write_film
+    from agents.report.film import record, write_film
     from agents.rollouts import scenes_of
     from simulator.utils.checks import check_word, did_you_mean
 

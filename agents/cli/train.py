@@ -131,10 +131,10 @@ def export(
     from agents.onboard.controller import Controller
     from agents.onboard.export import export_agent
     from agents.policy import PolicyContext
-    from agents.policy_names import make_policy, training_seeds
+    from agents.policy_names import LEARNT_AGENTS, make_policy, training_seeds
 
     kind = policy.partition(":")[0].partition("?")[0]
-    if kind not in ("regression", "ppo") or "*" in policy or "?" in policy:
+    if kind not in LEARNT_AGENTS or "*" in policy or "?" in policy:
         raise ValueError(
             f"`policy` (={policy!r}) must be regression or ppo, alone or with :video or :PATH"
         )

@@ -224,8 +224,9 @@ class EvaluationRun:
         A key begins with the condition, whose environments stay open until those of another are
         needed, or with None for those that stay to the end.
         """
-        for other in [k for k in self._envs if None not in (k[0], key[0]) and k[0] != key[0]]:
-            self._envs.pop(other).close()
+        for other in list(self._envs):
+            if key[0] is not None and other[0] not in (None, key[0]):
+                self._envs.pop(other).close()
         if key not in self._envs:
             self._envs[key] = make(**arguments)
         return self._envs[key]
@@ -233,9 +234,7 @@ class EvaluationRun:
     def _make_envs(
         self, condition: Condition, num_envs: int, frames: int, *, scored: bool = False
     ) -> VectorEnv:
-        """Environments of a condition; policies see those without the plan's scorer."""
-        if condition.budget is not None:
-            return self._make_brackets(condition, scenes=self.scenes, split="all")
+        """Environments of a condition of frames; policies see those without the plan's scorer."""
         unused = ("costs",) if scored else ("costs", "reward")
         options = {k: v for k, v in self.plan.arguments(condition).items() if k not in unused}
         options |= {"delay": 0} if scored else {"scorer": _CHEAP}
@@ -244,7 +243,9 @@ class EvaluationRun:
         key = repr(condition), num_envs, frames, scored
         return self._open(make_envs, *key, env_options=options, num_envs=num_envs, frames=frames)
 
-    def _make_brackets(self, condition: Condition, **options: Any) -> VectorEnv:
+    def _make_brackets(self, condition: Condition, *, fit: bool = False) -> VectorEnv:
+        """Environments of a budget; with `fit` of its training scenes."""
+        options = {"split": "train"} if fit else {"split": "all", "scenes": self.scenes}
         limits = {"budget": condition.budget, "max_frames": self.plan.max_frames}
         arguments = {**self.plan.environment, **options, **limits, "autoreset_mode": "DISABLED"}
         make, key = partial(gym.make_vec, self.plan.env_id), (repr(condition), options["split"])
@@ -281,8 +282,11 @@ class EvaluationRun:
 
     def make(self, trained: TrainedPolicy, condition: Condition) -> Policy:
         """The policy `trained`, for the camera of `condition`; not fitted."""
-        context = PolicyContext.from_envs(self._make_envs(condition, 1, TIMED_FRAMES))
-        policy = make_policy(trained.name, context, device=self.device)
+        if condition.budget is not None:
+            envs = self._make_brackets(condition)
+        else:
+            envs = self._make_envs(condition, 1, TIMED_FRAMES)
+        policy = make_policy(trained.name, PolicyContext.from_envs(envs), device=self.device)
         check_captures(trained.name, policy)
         return policy
 
@@ -292,7 +296,7 @@ class EvaluationRun:
         if not _learns(policy):
             return policy
         if condition.budget is not None:
-            envs = self._make_brackets(condition, split="train")
+            envs = self._make_brackets(condition, fit=True)
         else:  # the same in all conditions, which share score tables
             base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
             base = fitting_arguments(base, self.plan.options().resolution)
@@ -339,11 +343,10 @@ class EvaluationRun:
     def _run_brackets(
         self, name: str, policy: Policy, condition: Condition, report: Report
     ) -> Track:
-        envs = self._make_envs(condition, BRACKET_BATCH, self.plan.max_frames)
-        runs = []
+        envs, runs = self._make_brackets(condition), []
         for seed in self.plan.seeds:
             runs.append(run_brackets(policy, envs, seed=seed * SEED_STRIDE, name=name))
-            report(float(len(self.scenes) * self.plan.frames))
+            report(float(len(self.scenes) * self.plan.max_frames))
         arrays = {key: np.concatenate([run[key] for run in runs])[None] for key in BRACKET_METRICS}
         return Track(
             arrays | {"start_states": np.zeros(arrays["frames"].shape, np.int64)},
@@ -359,8 +362,11 @@ class EvaluationRun:
         scenes = [self.scenes[i] for i in self.episodes.scene]
         table = np.arange(len(scenes)) % max(self.num_tables, 1)
         known: dict[str, Any] = {name: values[table] for name, values in light.items()}
-        for name, kind in (("scores", float), ("allowed", bool)):  # the reset frame does not count
-            known[name] = known[name][:, 1:] if light else np.zeros((len(scenes), 0, 0), kind)
+        if light:  # the reset frame does not count
+            known |= {name: known[name][:, 1:] for name in ("scores", "allowed")}
+        else:
+            empty = np.zeros((len(scenes), 0, 0))
+            known |= {"scores": empty, "allowed": empty.astype(bool)}
         of_policy: dict[str, list[Track]] = {}
         for trained, track in tracks.items():
             of_policy.setdefault(trained.policy, []).append(track)

@@ -35,6 +35,7 @@ from agents.learning.workers import core_count, run_in_parallel, send_progress
 from agents.policy_names import (
     FORECASTERS,
     LEARNT,
+    LEARNT_AGENTS,
     split_class,
     split_options,
     training_seeds,
@@ -91,7 +92,7 @@ class Jobs(EvaluationRun):
 
     def policy_key(self, trained: TrainedPolicy, condition: Condition) -> str:
         """Key of the part with the track of `trained` in `condition`."""
-        own = (trained.name, policy_content(trained.name), self.device)
+        own = (trained.name, named_content(trained.name), self.device)
         shown = (condition.delay, condition.budget, self.plan.starts)
         return cache_key("policy", [self.light_key(condition), *shown, *own])
 
@@ -158,7 +159,8 @@ class Jobs(EvaluationRun):
 
     def _left(self) -> list[Job]:
         """Jobs that are left: light first; of each the longest first, so that all end together."""
-        conditions, frames = self.plan.all_conditions, self.plan.frames
+        plan, conditions = self.plan, self.plan.all_conditions
+        frames = plan.max_frames if plan.budgets else plan.frames
         lights: dict[str, str] = {}
         for name, condition in conditions.items() if self.num_tables else ():
             lights.setdefault(self.light_key(condition), name)
@@ -286,14 +288,14 @@ def scene_content(scenes: Sequence[Scene]) -> list[Any]:
 def file_content(spec: Any) -> list[str]:
     """Hashes of the files that a scorer's or a lighting's specification, name or mapping, names."""
     names = [*spec, *spec.values()] if isinstance(spec, Mapping) else [spec]
-    return [policy_content(name) for name in names if isinstance(name, str)]
+    return [named_content(name) for name in names if isinstance(name, str)]
 
 
-def policy_content(name: str) -> str:
-    """Hash of the files that decide a policy: its module, weights and folders; "" without any.
+def named_content(name: str) -> str:
+    """Hash of the files that the name of a policy, a scorer or a file means; "" without any.
 
-    With a Python file, all others of its folder count, since it may import them; data that it reads
-    is not known. The name of a scorer or a file works as well.
+    They are its module, weights and folders. With a Python file, all others of its folder count,
+    since it may import them; data that it reads is not known.
     """
     base, options = split_options(name)
     files = _own_files(base) or _named_files(base)
@@ -311,7 +313,7 @@ def policy_content(name: str) -> str:
 def _own_files(base: str) -> list[Path]:
     """Files of a name's own kind; of a module, the first `_MAX_NEIGHBOURS` beside it, too."""
     head, tail = split_class(base)
-    if head in ("ppo", "regression"):
+    if head in LEARNT_AGENTS:
         names = training_seeds(base)
         return [file for name in names for file in _named_files(name.partition(":")[2])]
     if head == "recorded":

@@ -34,7 +34,7 @@ Ints = NDArray[np.int64]
 Results = Mapping[str, "EvaluationResult"]
 
 #: Parts of the static condition.
-CONDITIONS = ("all", "hard", "rest")
+PARTS = ("all", "hard", "rest")
 #: Columns of `results.json`, in its order, and those that `metrics.csv` has besides.
 ROW_COLUMNS = (
     *("policy", "condition", "source", "split", "num_groups", "seed", "mean_score"),
@@ -237,39 +237,39 @@ class EvaluationResult:
         }
 
     @property
-    def conditions(self) -> tuple[str, ...]:
+    def parts(self) -> tuple[str, ...]:
         """Parts that have scenes: always ``"all"``, and both others or neither."""
-        return CONDITIONS if self.hard.any() and not self.hard.all() else CONDITIONS[:1]
+        return PARTS if self.hard.any() and not self.hard.all() else PARTS[:1]
 
-    def condition(self, name: str) -> NDArray[np.bool_]:
+    def part(self, name: str) -> NDArray[np.bool_]:
         """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
-        check_word("condition", name, CONDITIONS)
+        check_word("part", name, PARTS)
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
     def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
         """Mean of a metric over a source group's episodes, then over groups and seeds; of the
         `episodes` that are True, ``(E,)``, or of all.
         """
-        members = self.condition("all") if episodes is None else episodes
+        members = self.part("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]
         return float(metrics.group_means(values, self.groups[members]).mean())
 
     def group_gains(
-        self, policy: str, condition: str | NDArray[np.bool_] = "all"
+        self, policy: str, part: str | NDArray[np.bool_] = "all"
     ) -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
-        Of the episodes of `condition`, a name or a mask ``(E,)``.
+        Of the episodes of `part`, a name or a mask ``(E,)``.
         """
-        members = self.condition(condition) if isinstance(condition, str) else condition
+        members = self.part(part) if isinstance(part, str) else part
         gains = (self.episode_metrics(policy)[self.measure] - self.random)[:, members]
         span = (self.oracle - self.random)[members]
         groups = self.groups[members]
         return metrics.group_means(gains, groups), metrics.group_means(span, groups)
 
-    def normalised(self, policy: str, condition: str | NDArray[np.bool_] = "all") -> float:
+    def normalised(self, policy: str, part: str | NDArray[np.bool_] = "all") -> float:
         """Normalised score of a policy over its training seeds; arguments as of `group_gains`."""
-        gains, span = self.group_gains(policy, condition)
+        gains, span = self.group_gains(policy, part)
         return float(gains.mean(axis=0).sum() / span.sum())
 
 
@@ -301,7 +301,7 @@ def result_rows(
     """A row per policy and condition: `ROW_COLUMNS` and `MORE_COLUMNS`.
 
     The static condition gives rows ``"all"``, ``"hard"`` and ``"rest"`` (see
-    `EvaluationResult.conditions`), every other one a row with its own name.
+    `EvaluationResult.parts`), every other one a row with its own name.
 
     Args:
         results: The result of one condition, or results by condition.
@@ -320,7 +320,7 @@ def result_rows(
         scenes = environment.get("scenes", "bundled")
         if not isinstance(scenes, str):  # those that have no name
             scenes = str(scenes) if isinstance(scenes, Mapping) else f"{len(scenes)} scenes"
-        for part in result.conditions if name == static else CONDITIONS[:1]:
+        for part in result.parts if name == static else PARTS[:1]:
             for policy in result.tracks:
                 row = {
                     "policy": policy,
@@ -333,7 +333,7 @@ def result_rows(
 
 
 def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> dict[str, Any]:
-    members, track = result.condition(part), result.tracks[policy]
+    members, track = result.part(part), result.tracks[policy]
     gains, span = result.group_gains(policy, part)
     interval = score_interval(gains, span, resamples=resamples)
     errors = result.episode_metrics(policy)["ev_error"][:, members]
@@ -453,7 +453,7 @@ def difference_rows(
 ) -> pd.DataFrame:
     """Paired differences of every other policy's normalised score to that of `minus`, by part."""
     rows = []
-    for part in result.conditions:
+    for part in result.parts:
         other, span = result.group_gains(minus, part)
         for policy in (name for name in result.tracks if name != minus):
             gains = result.group_gains(policy, part)[0]
@@ -487,16 +487,15 @@ def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataF
     return rank(gains, np.mean(spans, axis=0), resamples=resamples)
 
 
-def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
+def training_seed_rows(result: EvaluationResult) -> pd.DataFrame:
     """Normalised score per policy, training seed and part, for those with several seeds."""
-    rows: list[dict[str, Any]] = []
-    for part in result.conditions:
+    rows = []
+    for part in result.parts:
         for policy in (name for name, track in result.tracks.items() if track.num_seeds > 1):
             gains, span = result.group_gains(policy, part)
-            for k, value in enumerate((gains.sum(axis=1) / span.sum()).tolist()):
-                run = {"policy": policy, "condition": part, "training_run": k}
-                rows.append({**run, "normalised_score": value})
-    return rows
+            for k, value in enumerate(gains.sum(axis=1) / span.sum()):
+                rows.append((policy, part, k, value))
+    return pd.DataFrame(rows, columns=["policy", "condition", "training_run", "normalised_score"])
 
 
 def oracle_histogram(result: EvaluationResult) -> dict[str, dict[str, float]]:

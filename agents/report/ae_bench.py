@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
-from agents.policy_names import split_class, split_options
+from agents.policy_names import WITH_FILE, split_class, split_options
 from agents.report.evaluation import fill
 from simulator.utils.files import machine, versions, write_atomically
 
@@ -34,8 +34,6 @@ BLOCKS, STEP_EV = 4, 0.1
 #: Raised when an episode or its score is made otherwise. 2: depth and motion of each pixel, terms
 #: that are measured on the capture.
 RULES = 2
-#: Kinds of policies whose names have a file's or folder's path behind the colon.
-_WITH_FILES = ("ppo", "regression", "recorded")
 COLUMNS = (
     *("task", "policy", "observation", "author", "date", "score", "ci95_low", "ci95_high"),
     *("procedural", "real", "regret", "ev_within_third", "frames_to_converge", "converged"),
@@ -111,7 +109,7 @@ def row_name(policy: str) -> str:
     head, tail = split_class(base)
     if head.endswith(".py"):
         return f"{Path(head).name}:{tail}{options}"
-    if head in _WITH_FILES and tail:
+    if head in WITH_FILE and tail:
         return f"{head}:{Path(tail).name}{options}"
     return policy
 

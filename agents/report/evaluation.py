@@ -236,8 +236,8 @@ def write_report(
         meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
         scenes = repr(result.plan.environment.get("scenes", "bundled"))
         apart = pd.Series(map(_difference, rows.to_best, rows.to_best_ci95))
-        shown = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
-        text = fill("brackets.md", plan=result.plan, rows=shown, meta=meta, scenes=scenes)
+        compared = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
+        text = fill("brackets.md", plan=result.plan, rows=compared, meta=meta, scenes=scenes)
         return {
             "results.json": write_results(folder / "results.json", _records(rows), meta),
             "report.md": write_atomically(folder / "report.md", text),
@@ -319,7 +319,7 @@ def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int)
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
         "differences_to_best_meter": differences,
-        "training_seeds": training_seed_rows(result),
+        "training_seeds": _records(training_seed_rows(result)),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
     }
@@ -355,7 +355,7 @@ def _report(
             row | {"best": _change(row["to_best"]), "next": _change(row["to_next"])}
             for row in meta["ranking"]
         ],
-        parts={part: ordered[ordered.condition == part] for part in result.conditions},
+        parts={part: ordered[ordered.condition == part] for part in result.parts},
         min_groups=MIN_GROUPS,
         groups=group_rows(result),
         conditions=_condition_tables(results, by, order) if len(results) > 1 else [],
@@ -480,7 +480,7 @@ def summary(
     if len(results) == 1:
         rows = result_rows(result, resamples=2000)
         table = rows.pivot(index="policy", columns="condition", values="normalised_score")
-        table = table.loc[list(result.tracks), list(result.conditions)].map("{:.3f}".format)
+        table = table.loc[list(result.tracks), list(result.parts)].map("{:.3f}".format)
         pairs = rows[rows.condition == "all"].set_index("policy").ci95
         table["95 % interval (all)"] = [_interval(pair) for pair in pairs[table.index]]
         table = table.reset_index()

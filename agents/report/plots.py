@@ -1,21 +1,17 @@
-"""The pictures of a report: figures of an evaluation, contact sheets, and films of an episode."""
+"""The pictures of a report: figures of an evaluation, and contact sheets."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
-from agents.policy import Policy
-from agents.rollouts import errors_of
 from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
@@ -113,15 +109,9 @@ def plot_convergence(
 
 
 def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
-    """Write `learning_figure` as PNG."""
-    return _write(path, learning_figure(curves))
+    """Draw learning curves, a panel per reported value, and write them as PNG.
 
-
-def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Learning curves, a panel per reported value.
-
-    Args:
-        curves: By training: ``frames``, and each value it reported after so many.
+    `curves` are, by training, ``frames`` and each value it reported after so many.
     """
     values = [name for name in next(iter(curves.values())) if name != "frames"]
     figure = _figure(max(7.5, 4.5 * len(values)), 3.6)
@@ -137,7 +127,7 @@ def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figu
     if len(curves) > 1:
         lines = panels[0].get_lines()
         figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
-    return figure
+    return _write(path, figure)
 
 
 def line_style(index: int) -> dict[str, str]:
@@ -245,107 +235,3 @@ def write_palette_png(path: Path, picture: Image.Image) -> Path:
     indexed = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     indexed.save(stream, format="PNG", optimize=True)
     return write_atomically(path, stream.getvalue())
-
-
-#: Size of a picture, height of the chart below it and of the title above [pixel].
-PICTURE, CHART, TITLE, GAP = 192, 64, 34, 8
-#: Pictures per second; half of the camera's, so that one can follow.
-FRAME_RATE = 15
-#: Colours of the picture file.
-COLOURS = 64
-_INK, _PAPER, _ORACLE, _CHOSEN = "#202020", "#ffffff", "#b0b0b0", "#c0392b"
-
-
-@dataclass
-class Recording:
-    """One policy's episode: lists with a value for every frame."""
-
-    name: str
-    pictures: list[np.ndarray] = field(default_factory=list)  # (H, W, 3) uint8
-    ev100: list[float] = field(default_factory=list)
-    best: list[float] = field(default_factory=list)  # EV100 of the best state
-    scores: list[float] = field(default_factory=list)
-    states: list[int] = field(default_factory=list)
-    regrets: list[float] = field(default_factory=list)
-
-
-def record(
-    name: str,
-    policy: Policy,
-    envs: gym.vector.VectorEnv[Any, Any, Any],
-    frames: int,
-    seed: int,
-    scene: str | None = None,
-) -> Recording:
-    """Runs `policy`, which is fitted, through one episode of so many actions.
-
-    `envs` is one environment, made with ``with_oracle=True`` and ``render_mode="rgb_array"``;
-    `seed` decides the light and the start, and the scene where its id is not given.
-    """
-    base: Any = envs.unwrapped
-    options = None if scene is None else {"scene": scene}
-    observations, info = envs.reset(seed=seed, options=options)
-    with errors_of(name, "reset"):
-        policy.reset(1, seed=seed)
-    found = Recording(name)
-    for frame in range(frames + 1):
-        if frame:
-            with errors_of(name, "act"):
-                extra = {"info": info} if getattr(policy, "privileged", False) else {}
-                actions = policy.act(observations, base.action_masks(), **extra)
-            observations, _, _, _, info = envs.step(actions)
-        pictures: Any = envs.render()
-        found.pictures.append(pictures[0])
-        found.ev100.append(float(info["ev100"][0]))
-        found.best.append(float(base.grid.ev100[info["oracle_state"][0]]))
-        found.scores.append(float(info["rewards.score"][0]))
-        found.states.append(int(info["state"][0]))
-        found.regrets.append(float(info["regret"][0]))
-    return found
-
-
-def write_film(
-    path: Path, recordings: Sequence[Recording], progress: Callable[[int, int], None] | None = None
-) -> Path:
-    """Writes the recordings side by side as an animated GIF, each over a chart of its exposure.
-
-    The chart has the EV100 of the best state in grey, that of the policy in colour up to now.
-    """
-    images = []
-    total = len(recordings[0].pictures)
-    for frame in range(total):
-        panels = [_panel(recording, frame) for recording in recordings]
-        width = (PICTURE + GAP) * len(panels) - GAP
-        image = Image.new("RGB", (width, panels[0].height), _PAPER)
-        for i, panel in enumerate(panels):
-            image.paste(panel, (i * (PICTURE + GAP), 0))
-        images.append(image.quantize(COLOURS, dither=Image.Dither.NONE))
-        if progress is not None:
-            progress(frame + 1, total)
-    content = io.BytesIO()
-    more: dict[str, Any] = {"append_images": images[1:], "duration": 1000 // FRAME_RATE}
-    images[0].save(content, format="GIF", save_all=True, loop=0, optimize=True, **more)
-    return write_atomically(path, content.getvalue())
-
-
-def _panel(recording: Recording, frame: int) -> Image.Image:
-    panel = Image.new("RGB", (PICTURE, TITLE + PICTURE + CHART), _PAPER)
-    draw = ImageDraw.Draw(panel)
-    score = float(np.mean(recording.scores[1 : frame + 1])) if frame else recording.scores[0]
-    for i, text in enumerate((recording.name, f"mean score so far {score:.2f}")):
-        font: Any = ImageFont.load_default(12)
-        while draw.textlength(text, font) > PICTURE and font.size > 7:
-            font = ImageFont.load_default(int(font.size) - 1)
-        draw.text((0, 2 + 15 * i), text, _INK, font)
-    panel.paste(Image.fromarray(recording.pictures[frame]).resize((PICTURE, PICTURE)), (0, TITLE))
-    bottom, height = TITLE + PICTURE + CHART - 4, CHART - 8
-    low, high = min(recording.best + recording.ev100), max(recording.best + recording.ev100)
-    step, scale = PICTURE / max(len(recording.best) - 1, 1), max(high - low, 1.0)
-
-    def points(values: Sequence[float]) -> list[tuple[float, float]]:
-        return [(i * step, bottom - (v - low) / scale * height) for i, v in enumerate(values)]
-
-    draw.line(points(recording.best), fill=_ORACLE, width=3)
-    if frame:
-        draw.line(points(recording.ev100[: frame + 1]), fill=_CHOSEN, width=2)
-    return panel

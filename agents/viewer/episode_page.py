@@ -19,7 +19,7 @@ from ae_env.scenes import Scene
 from agents.evaluation.engine import fit_policies
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
-from agents.report.plots import FRAME_RATE, Recording, record
+from agents.report.film import FRAME_RATE, Recording, record
 from agents.viewer.tab import Tab, curves, loading
 from agents.viewer.viewed_scene import ViewedScene, encoded
 

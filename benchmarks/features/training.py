@@ -18,13 +18,14 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from ae_env.scorers.measures import srgb_decode
-from benchmarks.harness import RUNS, data_root
+from benchmarks.harness import RUNS
 from benchmarks.isolated import ROOT
 from simulator import develop
 from simulator.augment import ExposureAugmentation, sample_seeds
 from simulator.radiance.reading import read_radiance
 from simulator.raw.develop import GREY_CARD_SIGNAL, srgb_encode
 from simulator.training.scenes import Split, photograph_pictures, radiance_files, recorded_mosaics
+from simulator.utils.files import data_folder
 
 # -- pictures, and pairs of views of them with a known homography ---------------------------------
 
@@ -54,7 +55,7 @@ class View(NamedTuple):
 
 
 def sources(split: Split, *, raws: bool, limit: int | None = None) -> list[Source]:
-    data = data_root()
+    data = data_folder()
     if data is None:
         raise FileNotFoundError("set AE_ENV_DATA to the folder of real files (photo_pool, maps)")
     found = []

@@ -12,7 +12,8 @@ from typing import Any
 
 from benchmarks.fidelity import defocus, pairs, pictures
 from benchmarks.fidelity.models import load_models, train_missing
-from benchmarks.harness import Part, Report, benchmark, data_root, table
+from benchmarks.harness import Part, Report, benchmark, table
+from simulator.utils.files import data_folder
 
 _CARDS = """model = `{name}` | parameters = {parameters:,} | stage: steps in CPU time = {steps} |
 weights (SHA-256) = `{sha}`"""
@@ -38,7 +39,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     tables |= pairs.tables([row for row in rows if row["part"] == "pairs"])
     tables |= defocus.tables(rows)
     tables |= pictures.tables([row for row in rows if row["part"] == "pictures"])
-    return Report(rows, tables, meta={"models": cards, "real_files": data_root() is not None})
+    return Report(rows, tables, meta={"models": cards, "real_files": data_folder() is not None})
 
 
 run = benchmark("simulator", parts, report)

@@ -22,7 +22,7 @@ from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from benchmarks.fidelity.models import equal_exposure, load_models
-from benchmarks.harness import Row, clipped, cropped, data_root, pivot, sections, table
+from benchmarks.harness import Row, clipped, cropped, pivot, sections, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
@@ -30,6 +30,7 @@ from simulator.noise.noise_level_function import noise_variance
 from simulator.optics.discs import DiscBank, added_blur
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, mosaic_scenes, reference_scenes
+from simulator.utils.files import data_folder
 
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].
 FULL, QUICK = (32, 256), (8, 128)
@@ -58,7 +59,7 @@ def measure(seed: int, quick: bool) -> list[Row]:
     camera, (groups, size) = get_camera("nikon_z6"), QUICK if quick else FULL
     scenes = reference_scenes("test", camera, number=groups, size=size)
     scenes = [scene for scene in scenes if scene.kind == "depth"]
-    photographs = depth_photographs(camera, data=data_root())
+    photographs = depth_photographs(camera, data=data_folder())
     chosen = [*scenes[::4], *photographs[::2]] if quick else [*scenes, *photographs]
     frame = pd.DataFrame([row for scene in chosen for row in _errors(scene, seed)])
     rows = []
@@ -156,7 +157,7 @@ asked = {{asked:.0%}}"""
 
 def measure_in_focus(seed: int, quick: bool) -> list[Row]:
     simulator = CameraSimulator.from_pretrained(device="cpu", cache=None)
-    camera, data, rows = get_camera("nikon_z6"), data_root(), []
+    camera, data, rows = get_camera("nikon_z6"), data_folder(), []
     scenes = list(reference_scenes("test", camera, number=0, data=data))
     if data is not None:
         scenes += mosaic_scenes("test", data)

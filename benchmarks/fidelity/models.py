@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from benchmarks.harness import Row, clipped, data_root, psnr, ssim
+from benchmarks.harness import Row, clipped, psnr, ssim
 from benchmarks.isolated import ROOT
 from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraProfile, CameraSettings, CameraSimulator, RawImage, get_camera
@@ -21,6 +21,7 @@ from simulator.networks.weights import load_modules
 from simulator.reference.reference_camera import ReferenceScene
 from simulator.training.crops import settings_parameters
 from simulator.training.scenes import reference_scenes
+from simulator.utils.files import data_folder
 
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
 FOLDER, CONFIGS = ROOT / "runs" / "simulator", ROOT / "configs" / "simulator"
@@ -81,8 +82,8 @@ def trained_noise_modules() -> dict[str, NoiseModule]:
 @torch.no_grad()
 def baseline(network: nn.Module, raw: RawImage, target: CameraSettings) -> Tensor:
     """What one of the paper's baselines makes of a raw, (4, H, W): it is told both settings."""
-    told = [v for settings in (raw.settings, target) for v in settings_parameters(settings)]
-    image: Tensor = network(raw.data[None], torch.tensor([told]))[0].float()
+    stated = [v for settings in (raw.settings, target) for v in settings_parameters(settings)]
+    image: Tensor = network(raw.data[None], torch.tensor([stated]))[0].float()
     return image
 
 
@@ -96,7 +97,7 @@ def scores(estimate: Tensor, truth: Tensor, camera: CameraProfile) -> Row:
 def held_out_scenes(camera: str, quick: bool) -> tuple[ReferenceScene, ...]:
     """The test split: procedural groups, photographs and, where present, radiance maps."""
     number, size, _ = QUICK if quick else FULL
-    profile, folder = get_camera(camera), data_root()
+    profile, folder = get_camera(camera), data_folder()
     return tuple(reference_scenes("test", profile, number=number, size=size, data=folder))
 
 
@@ -107,6 +108,6 @@ def equal_exposure(reference: CameraSettings, iso: float, f_number: float) -> Ca
 
 def radiance_views(camera: str, size: int) -> list[ReferenceScene]:
     """Views of held-out radiance maps, one of each."""
-    scenes = reference_scenes("test", get_camera(camera), number=0, size=size, data=data_root())
+    scenes = reference_scenes("test", get_camera(camera), number=0, size=size, data=data_folder())
     groups = {s.group: s for s in reversed(scenes) if s.kind == "radiance" and s.pitch == 2}
     return list(groups.values())

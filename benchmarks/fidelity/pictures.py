@@ -17,7 +17,7 @@ from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import depth_photographs, reference_scenes
-from simulator.utils.files import data_folder as data_root
+from simulator.utils.files import data_folder
 
 #: The published picture; a quick run leaves it alone.
 IMAGE = ROOT / "docs" / "images" / "simulator_stages.webp"
@@ -44,7 +44,7 @@ CASES: dict[str, tuple[dict[str, tuple[float, float]], Any, Any]] = {
 
 def measure(seed: int, quick: bool) -> list[Row]:
     camera = get_camera("nikon_z6")
-    found = list(reference_scenes("test", camera, number=0, data=data_root()))
+    found = list(reference_scenes("test", camera, number=0, data=data_folder()))
     scenes = {s.scene_id: s for s in (*found, *depth_photographs(camera, data=None))}
     rows, lines = [], []
     for case, (crops, source, target) in CASES.items():

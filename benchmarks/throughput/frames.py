@@ -24,12 +24,13 @@ import torch
 from scipy.stats import linregress
 
 import ae_env  # noqa: F401  registers the environment
-from benchmarks.harness import RUNS, Part, Row, data_root
+from benchmarks.harness import RUNS, Part, Row
 from benchmarks.isolated import forget_peak, peak_memory, timed
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.discs import disc_blur
 from simulator.radiance.procedural import LeafStyle, dead_leaves
 from simulator.raw.dng import SOFTWARE_NAME
+from simulator.utils.files import data_folder
 
 # -- growth ---------------------------------------------------------------------------------------
 
@@ -142,7 +143,7 @@ def frame_parts(quick: bool) -> Iterator[Part]:
     synthetic = RUNS / "throughput" / f"frame{'_quick' * quick}.dng"
     synthetic.parent.mkdir(parents=True, exist_ok=True)
     _write_foreign_dng(synthetic, *(QUICK if quick else FULL))
-    data = data_root()
+    data = data_folder()
     real = sorted((data / "canon_crw_cc0").glob("*.CRW")) if data is not None else []
     for path in [synthetic, *(real[:1] if not quick else [])]:
         file = {"path": str(path.absolute())}

@@ -28,7 +28,7 @@ from benchmarks.work_precision.methods import Method, all_methods
 from benchmarks.work_precision.plans import GRID, SIZES, Trial, trials
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage
 from simulator.noise.noise_level_function import noise_variance
-from simulator.utils.files import data_folder as data_root
+from simulator.utils.files import data_folder
 
 #: Processes among which the scenes of the plan's predictions are shared out: of the validation
 #: split, which the plan's constants were calibrated on, and of the test split.
@@ -73,7 +73,7 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         row |= {"noise_variance_error": float(np.median(own["noise"] or np.nan))}
         rows.append(row | {"scenes": len(chosen), "states_per_scene": count})
     points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
-    for row, best in zip(rows, pareto_front(points), strict=True):
+    for row, best in zip(rows, undominated(points), strict=True):
         row["pareto"] = best
     return rows
 
@@ -157,7 +157,7 @@ def noise_ratios(
     return [float(found[at].mean() / wanted[at].mean()) for at in levels if len(at) >= _FEWEST]
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+def undominated(points: Sequence[tuple[float, float]]) -> list[bool]:
     """Which of (milliseconds, PSNR [dB]) no other beats in both.
 
     One that is faster and, to a hundredth of a decibel, as good beats another.
@@ -233,7 +233,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "left-out": table(kinds, _LEFT_OUT),
     }
     figures: dict[Any, Figure] = {QUICK if meta["quick"] else HEADLINE: _headline(precise)}
-    more = {"threads": CORES, "real_files": data_root() is not None}
+    more = {"threads": CORES, "real_files": data_folder() is not None}
     return Report(rows, tables, meta=more, figures=figures)
 
 

@@ -29,7 +29,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ae_env import ExposureGrid
-from benchmarks.harness import Row, cropped, data_root
+from benchmarks.harness import Row, cropped
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, incident_ev100
@@ -39,6 +39,7 @@ from simulator.capture.sensor import exposed_light, exposure_table, missing_vari
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import Split, reference_scenes
+from simulator.utils.files import data_folder
 
 #: Height and width [packed pixel].
 Size = tuple[int, int]
@@ -144,7 +145,7 @@ def _scenes(
 ) -> dict[str, list[ReferenceScene]]:
     """Scenes of exactly `size` by kind."""
     profile = get_camera(CAMERA)
-    found = reference_scenes(split, profile, number=groups, size=drawn, data=data_root())
+    found = reference_scenes(split, profile, number=groups, size=drawn, data=data_folder())
     names = ("depth", "flat", "photograph", "radiance")
     kinds: dict[str, list[ReferenceScene]] = {kind: [] for kind in names}
     for scene in found:
@@ -280,13 +281,13 @@ KINDS: dict[str, tuple[Sequence[str], tuple[float, float] | None, dict[str, Any]
 
 def left_out(kind: str, seed: int, quick: bool) -> Row:
     """Share of the 64 states that run each module, and the time of a sweep, of a kind of scene."""
-    own, names, (scenes, taken, told) = simulator("compact"), dict[str, float](), KINDS[kind]
+    own, names, (scenes, taken, stated) = simulator("compact"), dict[str, float](), KINDS[kind]
     known = [t for t in all_trials() if t.scene.kind in scenes]
     known = known or [t for t in all_trials() if t.scene.depth is None]
     predicted, times, every = [], [], []
     examples = [_source(t, taken, seed) for t in known[: 1 if quick else SCENES]]
     for source in examples:
-        prepared: Any = partial(own.prepare, source, tolerance=DEFAULT, **told)
+        prepared: Any = partial(own.prepare, source, tolerance=DEFAULT, **stated)
         for plan in map(prepared().plan, GRID):
             for step in plan.steps:
                 share = int(step.runs) / (len(examples) * len(GRID))
@@ -295,7 +296,7 @@ def left_out(kind: str, seed: int, quick: bool) -> Row:
         some = [GRID[(i * len(GRID) // FULL_STATES + i) % len(GRID)] for i in range(FULL_STATES)]
         for _ in range(1 if quick else REPEATS):
             times.append(timed(lambda p=prepared: p().expose(GRID)))  # type: ignore[misc]
-            full_run = partial(own.simulate, source, tolerance=None, **told)
+            full_run = partial(own.simulate, source, tolerance=None, **stated)
             every += [timed(partial(full_run, settings)) for settings in some]
     sweep, full = 1e3 * float(np.median(times)), 1e3 * float(np.mean(every)) * len(GRID)
     row = {"part": "left_out", "kind": kind, "scenes": len(examples), "share": names}

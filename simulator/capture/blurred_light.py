@@ -294,10 +294,10 @@ class BlurredLight:
     # -- batches ------------------------------------------------------------------------------
 
     def begin(self, exposure: Exposure) -> tuple[Tensor, Blur | Callable[[], None] | None]:
-        """The light (4, H, W) with every blur of `exposure`, valid until the next call; and the
-        blur or the function that fills it, None where that was done before.
+        """The light (4, H, W) with every blur of `exposure`, and what is left to do to fill it.
 
-        The latest light is cached, because an agent that has settled repeats its state.
+        It is valid until the next call. The latest is cached, because an agent that has settled
+        repeats its state; nothing is left to do then.
         """
         if self._latest is not None and self._latest[0] == exposure.blur:
             return self._latest[1], None

@@ -1,6 +1,7 @@
 """A camera, a grid and synthetic frames for the policies' tests."""
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -53,14 +54,6 @@ def coarse_plots() -> None:
     matplotlib.rcParams["figure.dpi"] = 40
 
 
-@pytest.fixture
-def make_tiny_envs() -> Iterator[Callable[..., gym.vector.VectorEnv]]:
-    made: list[gym.vector.VectorEnv] = []
-
-    def make(num_envs: int = 4, mode: str = "SAME_STEP", **arguments: Any) -> gym.vector.VectorEnv:
-        made.append(make_envs(num_envs, autoreset_mode=mode, **arguments))
-        return made[-1]
-
-    yield make
-    for envs in made:
-        envs.close()
+@pytest.fixture(scope="session")
+def make_tiny_envs() -> Callable[..., gym.vector.VectorEnv]:
+    return functools.partial(make_envs, num_envs=4, autoreset_mode="SAME_STEP")

@@ -1,18 +1,27 @@
-"""Other people's training code runs every task unchanged."""
+"""Other people's training code runs every task unchanged, and reads recorded episodes."""
 
+import errno
+import os
 import runpy
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from filelock import FileLock
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
+from ae_env import UserCodeError
 from ae_env.registration import TASKS
-from agents import PolicyContext, make_policy
-from tests.ae_env.environments import SMALL
+from agents import Policy, PolicyContext, make_policy
+from agents.recording import record_dataset
+from agents.rollouts import fitting_arguments, training_arguments
+from tests.ae_env.environments import SMALL, make_envs
+from tests.ae_env.scene_files import GRID, write_raws
 
 ROOT = Path(__file__).parents[2]
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -71,12 +80,8 @@ def test_torchrl(task: str) -> None:
 @pytest.mark.slow
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It trains, its weights come back, and a reset forgets the episode."""
-    make_vec = gym.make_vec
-
-    def with_few(task: str, **arguments: Any) -> gym.vector.VectorEnv:
-        return make_vec(task, **{**arguments, **SMALL, "num_envs": 8})
-
-    monkeypatch.setattr(gym, "make_vec", with_few)
+    make_vec, few = gym.make_vec, {**SMALL, "num_envs": 8}
+    monkeypatch.setattr(gym, "make_vec", lambda task, **given: make_vec(task, **given | few))
     program, weights = ROOT / "examples" / "recurrent_ppo.py", tmp_path / "recurrent.safetensors"
     runpy.run_path(str(program))["train"](weights, frames=128)
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")
@@ -92,3 +97,92 @@ def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     first, again = np.array(memories)
     np.testing.assert_array_equal(first, again)
     assert np.abs(first).max() > 0.0
+
+
+TASK, RECORDED = "ae_env/AutoExposure-v0", {**SMALL, "split": "test"}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
+
+
+@pytest.fixture
+def context() -> PolicyContext:
+    return PolicyContext.from_envs(make_envs(1, split="test"))
+
+
+@pytest.mark.parametrize("name", ["centre_weighted:P", "oracle"])
+def test_recorded_episodes_happen_again(name: str, context: PolicyContext) -> None:
+    policy = make_policy(name, context)
+    dataset = record_dataset(policy, name, TASK, RECORDED, "ae/mine-v0", episodes=3, seed=5)
+    assert (dataset.total_episodes, dataset.total_steps) == (3, 24)
+    env = dataset.recover_environment()
+    metadata = dataset.storage.get_episode_metadata(range(3))
+    for seed, episode, own in zip((5, 6, 7), dataset.iterate_episodes(), metadata, strict=True):
+        assert own["seed"] == seed
+        shown, _ = env.reset(seed=seed, options=own["options"])
+        for step, action in enumerate(episode.actions):
+            for key, value in shown.items():
+                np.testing.assert_array_equal(episode.observations[key][step], value)
+            shown, reward, *_ = env.step(action)
+            assert reward == pytest.approx(episode.rewards[step], abs=1e-9)
+        assert episode.truncations.tolist() == [False] * 7 + [True]
+
+
+class Stops(Policy):
+    def act(self, observations, action_masks=None):
+        raise KeyError("lost")
+
+
+def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context, monkeypatch):
+    with pytest.raises(UserCodeError, match=r"'stops'.*KeyError: 'lost'"):
+        record_dataset(Stops(context), "stops", TASK, RECORDED, "mine-v0", episodes=1)
+    assert list(folder.iterdir()) == []
+    policy = make_policy("random", context)
+    for left in ("mine-v0", "other-v1", "x81nf"):  # of processes that have died
+        (folder / f".unfinished-{left}").mkdir()
+    with FileLock(folder / ".unfinished-ae-mine-v0.lock"):  # another process records it
+        (folder / ".unfinished-ae-mine-v0").mkdir()
+        with pytest.raises(ValueError, match=r"`out`.* another process"):
+            record_dataset(policy, "random", TASK, RECORDED, "ae/mine-v0", episodes=1)
+        record_dataset(policy, "random", TASK, RECORDED, "mine-v0", episodes=1)
+        left = {path.name for path in folder.iterdir() if path.is_dir()}
+        assert left == {".unfinished-ae-mine-v0", "mine-v0"}
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr("minari.data_collector.EpisodeBuffer", Mock(side_effect=full))
+    with pytest.raises(OSError, match=r"`out`.*No space left") as caught:
+        record_dataset(policy, "random", TASK, RECORDED, "new-v0", episodes=1)
+    assert caught.value.errno == errno.ENOSPC
+    for wrong in ("mine", "a/mine-v0", "mine-v0"):  # namespaces have two letters or more; is there
+        with pytest.raises(ValueError, match=rf"`out` \(='{wrong}'\)"):
+            record_dataset(policy, "random", TASK, RECORDED, wrong, episodes=1)
+
+
+STATES = {name: list(values) for name, values in asdict(GRID).items()}
+
+
+def test_recorded_grids_are_trained_for_on_their_own_states(tmp_path: Path) -> None:
+    write_raws(tmp_path / "a")
+    named = f"recorded:{tmp_path}"
+    for spec in (named, {"recorded": str(tmp_path)}):
+        assert training_arguments(spec, 36) == ({"scenes": "bundled", "grid": STATES}, True)
+    assert training_arguments(str(tmp_path), 36) == ({"scenes": "bundled"}, True)
+    assert training_arguments("bundled") == ({"scenes": "bundled"}, False)
+    judged = {"scenes": named, "split": "test", "grid": "video"}
+    assert fitting_arguments(judged, 36) == {**judged, "scenes": "bundled"}  # what is named stays
+
+
+def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(ae_env, tmp_path, monkeypatch):
+    few: tuple[dict[str, Any], bool] = ({"scenes": "bundled:small", "grid": STATES}, True)
+    monkeypatch.setattr("agents.rollouts.training_arguments", lambda *_: few)
+    write_raws(tmp_path / "grid" / "a")
+    (tmp_path / "env.yaml").write_text("{scenes: 'recorded:grid', split: train, resolution: 36}")
+    options = ("--env", "env.yaml", "--split", "all", "--episodes", "1")  # no scene to train on
+    code, _, error = ae_env("record", "--policy", "average", "-o", "ae/mine-v0", *options)
+    assert code == 0, error
+    write_raws(tmp_path / "grid" / "b", tuple(GRID)[1:], seed=1)
+    policies = ("--policy", "best_fixed", "--policy", "average", "--policy", "oracle")
+    code, out, _ = ae_env("evaluate", *policies, *options, "--frames", "2", "--out", "out")
+    assert (code, "best_fixed" in out) == (0, True)

@@ -13,7 +13,7 @@ import torch
 import agents
 from agents import evaluate
 from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
-from agents.evaluation.jobs import policy_content
+from agents.evaluation.jobs import named_content
 from agents.foresight import POINTS, Foresight, TrendTracker
 from agents.metering.reading import Reading
 from agents.policy import PolicyContext
@@ -231,7 +231,7 @@ def test_agents_for_moving_light_come_with_their_forecasts():
     assert gains["regression:video?foresight=learnt"] > 1.2 * gains["regression:video"]
     assert gains["ppo:video"] > 1.2 * gains["average:P"]
     # A stored evaluation is of these files: each other one decides another result.
-    content = {n: policy_content(n) for n in ("regression", *names)}
+    content = {n: named_content(n) for n in ("regression", *names)}
     assert len(set(content.values())) == 5
     assert content["average:P"] == ""
     late = dataclasses.replace(context, delays=(4, 4, 4))

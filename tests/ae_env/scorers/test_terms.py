@@ -128,6 +128,10 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     noises = [read(18.0**-2), read(18.0**-2 / 16), read(0.0), read(18.0**-2 / 16)]
     noises[2] = NoiseLevelFunction((shot,) * 4, nothing)
     captures = replace(captures, nlf=noises)
+    own = Noise()
+    own.half_snr = 72.0  # (72 / 18)^1.5 = 8
+    wanted = [1 / 9, 0.5, 1 / 9, 0.5]
+    assert own(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
     wanted = [0.5, 8 / 9, 0.5, 8 / 9]
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
     # A source that brings more noise than the settings have, or less.

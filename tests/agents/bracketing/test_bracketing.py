@@ -126,10 +126,9 @@ def test_hasinoff_takes_the_largest_ratio_in_the_worst_light() -> None:
 def test_what_frames_show_is_counted_by_hand() -> None:
     light = np.array([1.0, 4.0, 4.0, 0.0, 0.01])
     precision = np.array([100.0, 100.0, 100.0, 0.0, 1.0])  # white where 0; the last is noise
-    found = brackets.describe(light, precision, limit=6.0, reference=2.0)
-    counted = [{float(BINS[i]): round(5 * row[i]) for i in np.flatnonzero(row)} for row in found]
-    # Clear, white, and noisy at its standard deviation, 1.
-    assert counted == [{-2.0: 1, 0.0: 2}, {4.0: 1}, {-2.0: 1}]
+    found = brackets.light_shares(light, precision, limit=6.0, reference=2.0)
+    # Clear, and noisy at its standard deviation, 1; clear twice; white.
+    assert dict(zip(BINS[found > 0], found[found > 0], strict=True)) == {-2: 0.4, 0: 0.4, 4: 0.2}
 
 
 def test_blur_costs_what_was_measured() -> None:

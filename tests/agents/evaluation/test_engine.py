@@ -17,7 +17,7 @@ from agents import Policy, evaluate, fit_policies, make_policy
 from agents.evaluation import engine
 from agents.evaluation import evaluation_plan as plans
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
-from agents.evaluation.jobs import policy_content, run_plan
+from agents.evaluation.jobs import named_content, run_plan
 from agents.policy import PolicyContext
 from agents.rollouts import make_envs
 
@@ -393,10 +393,10 @@ def test_what_a_name_points_to_counts_and_nothing_else(name, counts, tmp_path):
     files = ("a", "a.safetensors", "a.json", "a.py", "other.py", "sub/b.py")
     for file in files:
         (tmp_path / file).write_text("before")
-    contents = [policy_content(name.format(tmp_path))]
+    contents = [named_content(name.format(tmp_path))]
     for file in files:
         (tmp_path / file).write_text("after!")
-        contents.append(policy_content(name.format(tmp_path)))
+        contents.append(named_content(name.format(tmp_path)))
     changed = [after != before for before, after in itertools.pairwise(contents)]
     assert {file for file, own in zip(files, changed, strict=True) if own} == counts
-    assert policy_content("ppo") != policy_content("regression") != policy_content("spot") == ""
+    assert named_content("ppo") != named_content("regression") != named_content("spot") == ""

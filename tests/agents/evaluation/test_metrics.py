@@ -199,18 +199,12 @@ def test_training_seeds_that_differ_widen_the_interval_by_their_variance():
     assert one.high - one.low == pytest.approx(0.0, abs=1e-12)
 
 
-SPAN = np.ones(60)
-
-
-def _gains(seed: int = 0, **means: float) -> dict[str, np.ndarray]:
-    """Policies that share the difficulty of the groups, with noise of 0.02 of their own."""
-    rng = np.random.default_rng(seed)
-    groups = rng.normal(0.0, 0.2, 60)
-    return {n: (m + groups + rng.normal(0, 0.02, 60))[None] for n, m in means.items()}
-
-
 def test_differences_far_beyond_the_noise_make_tiers():
-    found = rank(_gains(low=0.3, best=0.8, alike=0.799), SPAN, resamples=4000)
+    """Policies share the difficulty of the groups, with noise of 0.02 of their own."""
+    rng = np.random.default_rng(0)
+    groups, means = rng.normal(0.0, 0.2, 60), {"low": 0.3, "best": 0.8, "alike": 0.799}
+    gains = {n: (m + groups + rng.normal(0, 0.02, 60))[None] for n, m in means.items()}
+    found = rank(gains, np.ones(60), resamples=4000)
     assert found.policy.tolist() == ["best", "alike", "low"]
     assert found.tier.tolist() == [1, 1, 2]
     best, alike, low = found.itertuples()

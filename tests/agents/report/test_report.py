@@ -24,7 +24,7 @@ from agents.evaluation.jobs import run_plan
 from agents.evaluation.result import BRACKET_METRICS, Track, overall_ranking
 from agents.report import ae_bench
 from agents.report.evaluation import code, code_block, escape, summary, to_markdown
-from agents.report.plots import CHART, GAP, PICTURE, TITLE, record, write_film
+from agents.report.film import CHART, GAP, PICTURE, TITLE, record, write_film
 from simulator.capture.prepared_scene import Layout
 from tests.ae_env.environments import make_envs
 
@@ -131,9 +131,9 @@ def test_best_meter_differences_and_histogram():
     scores = result_rows(result, resamples=10).query("condition == 'all'").set_index("policy")
     scores = scores.normalised_score
     assert ppo.difference.iloc[0] == pytest.approx(scores["ppo"] - scores["spot:P"])
-    seeds = [r for r in made.training_seed_rows(result) if r["condition"] == "all"]
-    assert [r["training_run"] for r in seeds] == [0, 1, 2]
-    assert np.mean([r["normalised_score"] for r in seeds]) == pytest.approx(scores["ppo"])
+    seeds = made.training_seed_rows(result).query("condition == 'all'")
+    assert seeds.training_run.tolist() == [0, 1, 2]
+    assert seeds.normalised_score.mean() == pytest.approx(scores["ppo"])
     histogram = made.oracle_histogram(result)
     assert [len(v) for v in histogram.values()] == [4, 4, 4]
     assert sum(histogram["f_number"].values()) == pytest.approx(1.0)
@@ -178,17 +178,13 @@ def test_brackets_by_hand(tmp_path):
     assert files["report.md"].read_text().count(" -0.050 |") == 2  # too few for an interval
 
 
-NAMES = {
-    *("results.json", "scenes.csv", "metrics.csv", "report.md", "report.html"),
-    *("scores.png", "ev_error.png"),
-}
-
-
 def test_files_of_a_report(tmp_path):
     names = {"command": "ae-env evaluate --seed 11", "source": "bundled", "split": "test"}
     following = ["ae-env quickstart --scenes my_raws"]
     files = write_report(made_result(), tmp_path / "out", **names, next_commands=following)
-    assert {p.name for p in (tmp_path / "out").iterdir()} == set(files) == NAMES
+    tables, pages = {"results.json", "scenes.csv", "metrics.csv"}, {"report.md", "report.html"}
+    assert set(files) == tables | pages | {"scores.png", "ev_error.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(files)
     meta = json.loads(files["results.json"].read_text())["meta"]
     assert (meta["command"], meta["best_meter"]) == (names["command"], "spot:P")
     assert [row["policy"] for row in meta["ranking"]] == ["spot:P", "matrix:P", "ppo"]

