@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: was led by the ISO, whose factor is that of cameras without their last ISOs.
 _BOUND = {
     "left out": 1.48,
-    "network": 1.02,
+    "network": 1.05,
     "clipped highlights": 2.12,
     "unknown depth": 1.0,
     "ISO": 2.5,
