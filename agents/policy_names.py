@@ -215,7 +215,7 @@ def make_policy(
         if not isinstance(error, ValueError | FileNotFoundError):
             raise
         kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
-        raise kind(f"`policy` (={_shown(name)!r}): {error}") from error
+        raise kind(*_refusal(name, f": {error}").args) from error
     if named:
         policy.name = name
     return policy
@@ -288,12 +288,7 @@ def _known(base: str) -> str:
     )
 
 
-def _shown(name: Any) -> Any:
-    """`name` for a message: agents that come with the package are known by no path."""
-    for agent, file in _SHIPPED.items() if isinstance(name, str) else ():
-        name = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, name)
-    return name
-
-
-def _refusal(policy: object, text: str) -> ValueError:
-    return ValueError(f"`policy` (={_shown(policy)!r}){text}")
+def _refusal(policy: Any, text: str) -> ValueError:
+    for agent, file in _SHIPPED.items() if isinstance(policy, str) else ():
+        policy = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, policy)  # without the path
+    return ValueError(f"`policy` (={policy!r}){text}")

@@ -109,15 +109,9 @@ def plot_convergence(
 
 
 def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
-    """Write `learning_figure` as PNG."""
-    return _write(path, learning_figure(curves))
+    """Draw learning curves, a panel per reported value, and write them as PNG.
 
-
-def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Learning curves, a panel per reported value.
-
-    Args:
-        curves: By training: ``frames``, and each value it reported after so many.
+    `curves` are, by training, ``frames`` and each value it reported after so many.
     """
     values = [name for name in next(iter(curves.values())) if name != "frames"]
     figure = _figure(max(7.5, 4.5 * len(values)), 3.6)
@@ -133,7 +127,7 @@ def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figu
     if len(curves) > 1:
         lines = panels[0].get_lines()
         figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
-    return figure
+    return _write(path, figure)
 
 
 def line_style(index: int) -> dict[str, str]:

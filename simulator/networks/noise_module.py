@@ -244,7 +244,8 @@ class NoiseModule(nn.Module):
     @functools.cached_property
     def operations(self) -> int:
         """Arithmetic operations of its convolutions per packed pixel, a sum and a product each."""
-        twin, side, counted = copy.deepcopy(self.network).to("meta"), 64, []
+        # Not on torch's device "meta", whose first use imports its compiler, for two seconds.
+        twin, side, counted = copy.deepcopy(self.network).cpu(), 32, []
 
         def count(layer: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
             samples = inputs[0] if isinstance(layer, nn.ConvTranspose2d) else output
@@ -253,8 +254,9 @@ class NoiseModule(nn.Module):
         for layer in twin.modules():
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                 layer.register_forward_hook(count)
-        image, noise = (torch.empty(1, 4, *size, device="meta") for size in ((side, side), ()))
-        twin(*(image, noise, noise) if self.commutes else (torch.cat([image, image], dim=1),))
+        image, noise = torch.zeros(1, 4, side, side), torch.zeros(1, 4)
+        with torch.no_grad():
+            twin(*(image, noise, noise) if self.commutes else (torch.cat([image, image], dim=1),))
         return round(sum(counted) / side**2)
 
     def forward(self, exposed: Tensor, shot: Tensor, read: Tensor) -> Tensor:
