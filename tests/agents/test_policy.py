@@ -127,9 +127,8 @@ def test_own_file(context, photograph, tmp_path):
         with pytest.raises(ValueError, match=f"`policy` .*{name}.*{message}"):
             make_policy(f"{file}:{name}", context)
     file.write_text("import a_module_that_is_not_there\n")
-    with pytest.raises(ValueError, match="a_module_that_is_not_there") as caught:
+    with pytest.raises(ValueError, match="a_module_that_is_not_there"):
         make_policy(f"{file}:Mine", context)
-    assert isinstance(caught.value.__cause__, ModuleNotFoundError)
 
 
 def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
