@@ -1,6 +1,5 @@
 """Fixtures shared by all tests."""
 
-import json
 import logging
 import multiprocessing
 import multiprocessing.forkserver
@@ -79,19 +78,6 @@ def forkserver() -> Any:
 def quick_spawn(forkserver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes that the package spawns come from `forkserver`: importing torch takes seconds."""
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": forkserver}.__getitem__)
-
-
-@pytest.fixture
-def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder; parts of benchmarks run in this process, and keep their results there."""
-    from benchmarks import harness
-
-    def run(part: harness.Part) -> Any:
-        return json.loads(json.dumps(part.task(**part.arguments)))
-
-    monkeypatch.setattr(harness.Part, "run", run)
-    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
-    return tmp_path
 
 
 @pytest.fixture

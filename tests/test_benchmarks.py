@@ -40,6 +40,18 @@ from tests.simulator.training.scenes import write_dataset
 # -- the harness ----------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder; parts of benchmarks run in this process, and keep their results there."""
+
+    def run(part: Part) -> Any:
+        return json.loads(json.dumps(part.task(**part.arguments)))
+
+    monkeypatch.setattr(Part, "run", run)
+    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
+    return tmp_path
+
+
 def lines_of(text: str) -> list[str]:
     return text.replace(" ", "").splitlines()[0:1] + text.replace(" ", "").splitlines()[2:]
 
