@@ -36,6 +36,41 @@ torch.set_num_threads(max(1, min(2, torch.get_num_threads() // _WORKERS)))
 os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # of processes they start
 
 
+#: Files of whole runs (commands, pages, trainings, evaluations, exports): all of their tests are
+#: slow, and `make test-fast` does not even import them.
+SLOW_FILES = [
+    *("test_docs.py", "test_benchmarks.py", "simulator/test_camera_simulator.py"),
+    *("simulator/networks/test_*.py", "ae_env/scorers/test_pictures.py"),
+    *("simulator/training/*.py", "ae_env/scenes/test_bundled.py", "agents/test_*.py"),
+    *(
+        "agents/bracketing/*.py",
+        "agents/evaluation/test_engine.py",
+        "agents/learning/test_training.py",
+    ),
+    *(
+        "agents/learning/test_learners.py",
+        "agents/metering/test_programs.py",
+        "agents/metering/test_rpi_agc.py",
+        "agents/onboard/*.py",
+    ),
+    "agents/report/*.py",
+]
+
+
+def _is_slow_file(path: Path) -> bool:
+    return any(path.match(f"tests/{pattern}") for pattern in SLOW_FILES)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    return True if config.option.markexpr == "not slow" and _is_slow_file(collection_path) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if _is_slow_file(item.path):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real files named by AE_ENV_DATA, or a skip that says what is missing."""

@@ -70,7 +70,6 @@ def test_torchrl(task: str) -> None:
     assert envs.rollout(1)["next", "reward"].shape == (2, 1, 1)
 
 
-@pytest.mark.slow
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It trains, its weights come back, and a reset forgets the episode."""
     make_vec, few = gym.make_vec, {**SMALL, "num_envs": 8}

@@ -333,7 +333,6 @@ def test_a_stopped_run_continues_with_what_it_lacks(results, folder, tmp_path, m
     assert _arrays(tmp_path) == _arrays(folder)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("quick_spawn")
 def test_two_processes_give_what_one_does(results, folder, tmp_path):
     run_plan(JOBS, tmp_path, workers=2)

@@ -23,7 +23,6 @@ from simulator.utils.files import sibling
 TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
 
 
-@pytest.mark.slow
 def test_it_learns(make_tiny_envs) -> None:
     rewards: list[float] = []
     session = Session(progress=lambda d, t, values: rewards.append(values["reward"]))
