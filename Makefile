@@ -1,6 +1,6 @@
 # make demo   sets up .venv and runs the quickstart
 # make test   sets up .venv and runs the test suite; T=tests/ae_env/test_env.py runs one file or folder
-# make test-fast  the tests that take no more than a few seconds each, without doctests
+# make test-fast  the tests but for whole runs (SLOW_FILES of tests/conftest.py), without doctests
 # make check  lint, format, types, spelling and the budget of lines
 # make docs   the site, in build/site
 # make dist   the wheel and the source distribution, in dist/

@@ -124,7 +124,7 @@ class Foresight:
         return self._tracker.ahead(frames)[0]
 
     def utility(self, scores: Callable[[Floats], Floats]) -> Floats:
-        """What each state promises in the first frames that have its controls, ``(N, S)``.
+        """Expected score of each state in the first frames that have its controls, ``(N, S)``.
 
         A control that is in effect earlier than another is free in the other's frame, as the next
         decision will choose it; one that is in effect later is that of an earlier decision there.

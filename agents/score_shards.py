@@ -37,7 +37,7 @@ _LOCAL, _RAY = "local", "ray"
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """What a run does; every shard is made from it and its own number alone.
+    """The work of a run; every shard is made from it and its own number alone.
 
     `files` are raws and radiance maps as the workers find them, `names` those in the tables; `out`
     is a folder that all workers reach. Scenes are averaged to `resolution` packed pixels a side;

@@ -1,6 +1,5 @@
 """Fixtures shared by all tests."""
 
-import json
 import logging
 import multiprocessing
 import multiprocessing.forkserver
@@ -35,6 +34,41 @@ hypothesis.settings.load_profile("tests")
 _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 torch.set_num_threads(max(1, min(2, torch.get_num_threads() // _WORKERS)))
 os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # of processes they start
+
+
+#: Files of whole runs (commands, pages, trainings, evaluations, exports): all of their tests are
+#: slow, and `make test-fast` does not even import them.
+SLOW_FILES = [
+    *("test_docs.py", "test_benchmarks.py", "simulator/test_camera_simulator.py"),
+    *("simulator/networks/test_*.py", "ae_env/scorers/test_pictures.py"),
+    *("simulator/training/*.py", "ae_env/scenes/test_bundled.py", "agents/test_*.py"),
+    *(
+        "agents/bracketing/*.py",
+        "agents/evaluation/test_engine.py",
+        "agents/learning/test_training.py",
+    ),
+    *(
+        "agents/learning/test_learners.py",
+        "agents/metering/test_programs.py",
+        "agents/metering/test_rpi_agc.py",
+        "agents/onboard/*.py",
+    ),
+    "agents/report/*.py",
+]
+
+
+def _is_slow_file(path: Path) -> bool:
+    return any(path.match(f"tests/{pattern}") for pattern in SLOW_FILES)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    return True if config.option.markexpr == "not slow" and _is_slow_file(collection_path) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if _is_slow_file(item.path):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")
@@ -79,19 +113,6 @@ def forkserver() -> Any:
 def quick_spawn(forkserver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes that the package spawns come from `forkserver`: importing torch takes seconds."""
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": forkserver}.__getitem__)
-
-
-@pytest.fixture
-def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder; parts of benchmarks run in this process, and keep their results there."""
-    from benchmarks import harness
-
-    def run(part: harness.Part) -> Any:
-        return json.loads(json.dumps(part.task(**part.arguments)))
-
-    monkeypatch.setattr(harness.Part, "run", run)
-    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
-    return tmp_path
 
 
 @pytest.fixture

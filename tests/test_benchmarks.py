@@ -40,6 +40,18 @@ from tests.simulator.training.scenes import write_dataset
 # -- the harness ----------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder; parts of benchmarks run in this process, and keep their results there."""
+
+    def run(part: Part) -> Any:
+        return json.loads(json.dumps(part.task(**part.arguments)))
+
+    monkeypatch.setattr(Part, "run", run)
+    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
+    return tmp_path
+
+
 def lines_of(text: str) -> list[str]:
     return text.replace(" ", "").splitlines()[0:1] + text.replace(" ", "").splitlines()[2:]
 
@@ -204,7 +216,6 @@ def test_views_of_a_picture_agree_under_their_homography() -> None:
         assert one == pytest.approx(other, abs=0.5 / 1600)
 
 
-@pytest.mark.slow
 def test_features_are_trained_judged_and_reported(
     ae_env, benchmarks_here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,7 +276,6 @@ def test_a_recorded_grid_of_ones_own(ae_env, benchmarks_here: Path) -> None:
     assert "boreal" not in page
 
 
-@pytest.mark.slow
 def test_the_papers_table_in_one_command(
     ae_env, benchmarks_here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -493,7 +503,6 @@ def train_here(jobs: list[learning.TrainingJob]) -> None:
         learning.train_agent(job.config, job.out)
 
 
-@pytest.mark.slow
 def test_a_tiny_transfer_trains_judges_and_predicts(
     benchmarks_here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

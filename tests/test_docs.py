@@ -119,9 +119,7 @@ WITH_CODE = [page for page in PAGES if page != SCORER_PAGE and _blocks(page, "py
 _FIRST, *_OTHERS = (*WITH_CODE, *TUTORIALS)
 
 
-@pytest.mark.parametrize(
-    "page", [_FIRST, *(pytest.param(page, marks=pytest.mark.slow) for page in _OTHERS)], ids=_name
-)
+@pytest.mark.parametrize("page", [_FIRST, *(pytest.param(page) for page in _OTHERS)], ids=_name)
 def test_code_runs_as_printed(page: Path, tmp_path: Path, forkserver: Any) -> None:
     code = page.read_text() if page.suffix == ".py" else "\n".join(_blocks(page, "python"))
     for printed, short in (
@@ -158,7 +156,6 @@ def test_commands_parse(page: Path) -> None:
             assert {word for word in rest if word.startswith("-")} <= {*known, "--help"}
 
 
-@pytest.mark.slow
 def test_the_scorer_computes_what_it_says_and_is_used_as_printed(ae_env, tmp_path, capsys):
     """In Python, in a configuration, on the command line and in a package."""
     (tmp_path / "my_scorer.py").write_text(_blocks(SCORER_PAGE, "python")[0])
@@ -215,7 +212,6 @@ def _build(folder: Path) -> tuple[str, set[str]]:
     return warnings.getvalue(), images
 
 
-@pytest.mark.slow
 def test_the_site(tmp_path: Path, forkserver: Any) -> None:
     with ProcessPoolExecutor(1, mp_context=forkserver) as pool:
         warnings, images = pool.submit(_build, tmp_path).result()

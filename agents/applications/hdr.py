@@ -42,7 +42,7 @@ _LEAST = 1e-12
 
 
 class HdrPicture(NamedTuple):
-    """What `hdr_picture` returns.
+    """Result of `hdr_picture`.
 
     Args:
         radiance: (4, H, W) float32 packed light with little noise, 1.0 is the raw's white; what

@@ -1,4 +1,4 @@
-"""What there is to look at: ``ae-env view``, ``film``, ``scorers``."""
+"""Looking at scenes, episodes and scorers: ``ae-env view``, ``film``, ``scorers``."""
 
 from __future__ import annotations
 

@@ -358,7 +358,7 @@ class EvaluationRun:
     def result(
         self, condition: Condition, light: Arrays, tracks: Mapping[TrainedPolicy, Track]
     ) -> EvaluationResult:
-        """What `score_light` (nothing for brackets) and `run_policy` measured in `condition`."""
+        """The results of `score_light` (nothing for brackets) and `run_policy` in `condition`."""
         scenes = [self.scenes[i] for i in self.episodes.scene]
         table = np.arange(len(scenes)) % max(self.num_tables, 1)
         known: dict[str, Any] = {name: values[table] for name, values in light.items()}

@@ -48,7 +48,7 @@ _ONLY_OF = {
 
 
 class Condition(Configuration):
-    """What some episodes have that others have not: light and delay, or the time of a bracket.
+    """Light and delay of some of the episodes, or the time of a bracket.
 
     Args:
         lighting: As the environment's argument: a name, or a mapping with ``kind``.
@@ -164,7 +164,7 @@ class EvaluationPlan(Configuration):
 
     @property
     def measure(self) -> Literal["score", "quality"]:
-        """What the policies are compared by."""
+        """Measure that the policies are compared by."""
         return "quality" if self.budgets else "score"
 
     @property
@@ -179,7 +179,7 @@ class EvaluationPlan(Configuration):
 
     @property
     def observation(self) -> str:
-        """What policies are shown."""
+        """Name of the observation that policies are shown."""
         return str(self.environment.get("observation", "uint8"))
 
     @property

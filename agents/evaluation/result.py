@@ -60,7 +60,7 @@ _MEANS = (
 
 @dataclass(frozen=True)
 class Track:
-    """What one policy did in all episodes.
+    """States and measurements of one policy in all episodes.
 
     Leading axis K: training seeds (1 where there is nothing to train).
 
@@ -152,7 +152,7 @@ class EvaluationResult:
         return "score" if self.plan is None else self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
-        """What blur depends on, as arguments of `ae_env.scorers.captures.prepare_scene`."""
+        """Arguments of `ae_env.scorers.captures.prepare_scene` that blur depends on."""
         drawn = () if self.movement is None else self.movement[episode].tolist()
         return {
             "speed": 0.0 if self.speed is None else float(self.speed[episode]),

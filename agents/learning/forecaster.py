@@ -80,7 +80,7 @@ class LightForecaster(nn.Module):
     def forward(
         self, readings: torch.Tensor, state: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What is expected of the next frames, from each of the `readings` (B, T, 4) on.
+        """Forecast of the next frames, from each of the `readings` (B, T, 4) on.
 
         Changes of the light (B, T, HORIZON + 1) [EV]; their spreads, the mean absolute error
         expected; and the `state` (1, B, width) for the frames that follow.
@@ -90,8 +90,8 @@ class LightForecaster(nn.Module):
         return changes, nn.functional.softplus(spreads) + _LEAST_SPREAD, state
 
 
-def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np.float32]:
-    """What the network sees of a frame, (..., 4): changes and exposure in stops, clipping.
+def network_inputs(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np.float32]:
+    """Inputs of the network for a frame, (..., 4): changes and exposure in stops, clipping.
 
     `before` is the metered EV100 of the frame before, `exposed_at` that of the settings.
     """
@@ -115,7 +115,7 @@ class LearntTracker:
     def update(self, reading: Reading, exposed_at: Floats) -> None:
         """Take in one frame's reading."""
         before = reading.ev100 if self._before is None else self._before
-        inputs = torch.from_numpy(describe(reading, before, exposed_at))[:, None]
+        inputs = torch.from_numpy(network_inputs(reading, before, exposed_at))[:, None]
         inputs = inputs.to(next(self.networks[0].parameters()).device)
         found = []
         with torch.inference_mode():
@@ -193,7 +193,7 @@ def sample(
     light += rng.uniform(4.0, 14.0, (count, 1))
     reading, exposed_at = metered(light, rng)
     before = np.concatenate([reading.ev100[:, :1], reading.ev100[:, :-1]], axis=1)
-    described = describe(reading, before, exposed_at)[:, :_LENGTH]
+    described = network_inputs(reading, before, exposed_at)[:, :_LENGTH]
     ahead = np.stack([light[:, k : k + _LENGTH] for k in range(HORIZON + 1)], axis=-1)
     changes = np.clip(ahead - reading.ev100[:, :_LENGTH, None], -_LARGEST, _LARGEST)
     return described, changes.astype(np.float32)
@@ -214,7 +214,7 @@ def _bent(light: Floats, share: float, rng: np.random.Generator) -> Floats:
 
 
 def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
-    """What an average meter reads on frames exposed for the light three frames before, (B, T).
+    """Readings of an average meter on frames exposed for the light three frames before, (B, T).
 
     A frame is 64 luminances, normal in stops with a mean of 1; each exposure is off by about half a
     stop, and of a grid of whole stops. `light` (B, T) is in EV100. Returns the readings, matched

@@ -266,7 +266,7 @@ class StateHead(nn.Module):
 
 
 class MeterHistory:
-    """What a light meter read in the last `frames` frames of each camera, and what was asked for.
+    """Readings of a light meter in the last `frames` frames of each camera, and the actions then.
 
     The frame in hand is among them.
     """

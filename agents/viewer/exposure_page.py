@@ -146,7 +146,7 @@ class ExposurePage(Tab):
 
     @property
     def view(self) -> View:
-        """What the page shows now."""
+        """State and marks of the picture that the page shows."""
         iso, time = ISOS[int(self._iso.value)], TIMES[int(self._time.value)]
         return View(
             CameraSettings(iso, time, F_NUMBERS[int(self._f_number.value)]),

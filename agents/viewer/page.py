@@ -51,7 +51,7 @@ class PictureStore:
         return f"/frame/{key}"
 
     def fetch(self, key: str) -> Response:
-        """What the browser gets."""
+        """The answer to a browser that asks for a picture."""
         if key not in self._kept:
             return Response(status_code=404)
         headers = {"Cache-Control": "no-store"}
@@ -60,7 +60,7 @@ class PictureStore:
 
 @dataclass
 class Options:
-    """What `ae-env view` was asked for; all tabs of the browser share it.
+    """The options of `ae-env view`, which all tabs of the browser share.
 
     `thumbnails` are JPEGs of scenes that were asked for; in `folder` lie uploads and downloads.
     """

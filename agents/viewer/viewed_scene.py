@@ -174,7 +174,7 @@ def _bundled() -> dict[str, Callable[[], OpenedScene]]:
 
 @dataclass(frozen=True)
 class View:
-    """What one picture shows.
+    """State and marks of one picture.
 
     Args:
         settings: Of the camera.

@@ -350,6 +350,9 @@ class BlurredLight:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
         left: Tensor | None = None
         path, layout, defocus_px = exposure.path, exposure.layout, exposure.defocus_px
+        blurs = exposure.motion_px or defocus_px or exposure.subject_path
+        if not blurs and exposure.opened_to is None:
+            return exposure  # nothing averages it
         if path is None and exposure.motion_px:
             path = Path(exposure.motion_px)
         if exposure.is_uniform:

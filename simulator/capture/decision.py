@@ -138,10 +138,10 @@ class Exposure:
         """Noise of the source on the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
-        energy = self.energy
-        if energy is None:
+        exposed, energy = self.source.exposed(self.ratio), self.energy
+        if energy is None and (self.motion_px or self.defocus_px):
             energy = kernel_energy(self.motion_px, self.defocus_px)
-        return self.source.exposed(self.ratio).scaled(energy)
+        return exposed if energy is None else exposed.scaled(energy)
 
     @property
     def is_uniform(self) -> bool:

@@ -314,7 +314,6 @@ def _draw(folder: Path) -> None:
     find_scenes("bundled:small")
 
 
-@pytest.mark.slow
 def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, forkserver: Any) -> None:
     """Commands use the kernels of the warm-up, at its types, all of which are kept on disk.
 
@@ -410,7 +409,6 @@ def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
     assert read_raw(files[63]).settings == CameraSettings(6400, 1 / 2, 11)
 
 
-@pytest.mark.slow
 def test_networks_run_once_for_a_raw(ae_env, raw, tmp_path, monkeypatch):
     write_dng(dng := tmp_path / "IMG_1.dng", replace(raw, data=raw.data[:, :40, :44]))
     modules = build_modules("compact").requires_grad_(False)
@@ -522,7 +520,6 @@ def test_broken_files_of_a_folder_are_skipped_when_asked(ae_env, dng, tmp_path, 
     assert "1 of 2 scene files skipped (IMG_2.dng: " in caplog.text
 
 
-@pytest.mark.slow
 def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     code, text, _ = ae_env("evaluate", "--preset", preset, "--out", "first")
     assert (code, "over 4 conditions" in text) == (0, True)
@@ -558,7 +555,6 @@ def check_files(out: Path) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("quick_spawn")
 def test_quickstart_on_bundled_scenes_then_on_ones_own(ae_env, raw, tmp_path, monkeypatch):
     few = {"REGRESSION_FRAMES": 128, "PPO_FRAMES": 1024, "EPISODES": 1}
@@ -605,7 +601,6 @@ aperture: {steps: 2, batch: 2, crop: 16}
 """
 
 
-@pytest.mark.slow
 def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the second stage; the same command finishes, and simulate takes the result.
 
@@ -641,7 +636,6 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
 
 
-@pytest.mark.slow
 def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(
         "agent: regression\nnum_envs: 4\nenvironment: {scenes: 'bundled:small', resolution: 36}\n"

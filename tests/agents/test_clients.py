@@ -23,7 +23,6 @@ from agents.rollouts import fitting_arguments, training_arguments
 from tests.ae_env.environments import SMALL, make_envs
 from tests.ae_env.scene_files import GRID, write_raws
 
-ROOT = Path(__file__).parents[2]
 every_task = pytest.mark.parametrize("task", TASKS)
 
 
@@ -77,12 +76,12 @@ def test_torchrl(task: str) -> None:
     assert envs.rollout(1)["next", "reward"].shape == (2, 1, 1)
 
 
-@pytest.mark.slow
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It trains, its weights come back, and a reset forgets the episode."""
     make_vec, few = gym.make_vec, {**SMALL, "num_envs": 8}
     monkeypatch.setattr(gym, "make_vec", lambda task, **given: make_vec(task, **given | few))
-    program, weights = ROOT / "examples" / "recurrent_ppo.py", tmp_path / "recurrent.safetensors"
+    program = Path(__file__).parents[2] / "examples" / "recurrent_ppo.py"
+    weights = tmp_path / "recurrent.safetensors"
     runpy.run_path(str(program))["train"](weights, frames=128)
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")
     context = PolicyContext.from_envs(envs)

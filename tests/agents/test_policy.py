@@ -127,9 +127,8 @@ def test_own_file(context, photograph, tmp_path):
         with pytest.raises(ValueError, match=f"`policy` .*{name}.*{message}"):
             make_policy(f"{file}:{name}", context)
     file.write_text("import a_module_that_is_not_there\n")
-    with pytest.raises(ValueError, match="a_module_that_is_not_there") as caught:
+    with pytest.raises(ValueError, match="a_module_that_is_not_there"):
         make_policy(f"{file}:Mine", context)
-    assert isinstance(caught.value.__cause__, ModuleNotFoundError)
 
 
 def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
@@ -145,39 +144,31 @@ def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_
     assert policy.act(photograph(np.ones((64, 64)), 9.0, states), masks)[0] != states[0]
 
 
-FRAMES = {"raw": np.zeros((500, 4, 8, 8), np.uint8)}
-
-
 def test_policies_that_look_at_no_frame(context):
     """Random is seeded, uniform and masked; others need a fit, or to be told the best state."""
-    policy = make_policy("random", context)
+    policy, frames = make_policy("random", context), {"raw": np.zeros((500, 4, 8, 8), np.uint8)}
     masks = np.zeros((500, 64), bool)
     masks[:, 10:14] = True
     policy.reset(500, seed=3)
-    first, second = policy.act(FRAMES, masks), policy.act(FRAMES, masks)
+    first, second = policy.act(frames, masks), policy.act(frames, masks)
     assert set(first) == {10, 11, 12, 13}
     assert np.bincount(first)[10:].min() > 90  # 125 expected, standard deviation 9.7
     assert not np.array_equal(first, second)
     policy.reset(500, seed=3)
-    np.testing.assert_array_equal(policy.act(FRAMES, masks), first)
+    np.testing.assert_array_equal(policy.act(frames, masks), first)
     fixed, oracle = (make_policy(name, context) for name in ("best_fixed", "oracle"))
     with pytest.raises(ValueError, match="call fit"):
-        fixed.act(FRAMES)
+        fixed.act(frames)
     with pytest.raises(ValueError, match="with_oracle=True"):
         oracle.act({})
-
-
-SETTINGS = (
-    (100, 1 / 1000, 4.0),
-    (400, 1 / 125, 5.6),
-    (3200, 1 / 16, 11.0),  # ISO 1600 and 6400 are as near; the EV decides with 1/15
-)
 
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_recording_is_replayed_on_its_own_raws(tmp_path, delay):
     """Every frame of the sequence is shot at the settings that its raw was recorded at."""
-    for i, settings in enumerate(SETTINGS):
+    # ISO 1600 and 6400 are as near to 3200; the EV decides with 1/15.
+    recorded = (100, 1 / 1000, 4.0), (400, 1 / 125, 5.6), (3200, 1 / 16, 11.0)
+    for i, settings in enumerate(recorded):
         light = torch.full((4, 40, 40), 0.1)
         raw = RawImage(light, CameraSettings(*settings), get_camera("nikon_z6"))
         write_dng(tmp_path / f"frame_{i:02d}.dng", raw)
@@ -189,7 +180,7 @@ def test_a_recording_is_replayed_on_its_own_raws(tmp_path, delay):
     result = evaluate({"recorded": policy}, options, frames=4)
     for frame in range(delay, 4):
         found = result.grid[result.tracks["recorded"].states[0, 0, frame]]
-        _, time, f_number = SETTINGS[min(frame + 1, 2)]
+        _, time, f_number = recorded[min(frame + 1, 2)]
         assert found.f_number == f_number
         assert found.exposure_time == pytest.approx(time, rel=0.07)
     # The raws show light of 10, 6 and 1.1 EV, and the last one stays.

@@ -99,7 +99,6 @@ def test_what_cannot_run_leaves_no_folder(ae_env, folder, tmp_path, monkeypatch)
     assert not out.exists()
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Ray, of its own settings
 def test_a_cluster_of_two_nodes_loses_nothing_with_a_worker(folder, done, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="needs the extra ray, in an environment of its own")

@@ -353,7 +353,6 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
     assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
 
 
-@pytest.mark.slow
 def test_real_scenes_alone_and_mixed(data_dir):
     request = SceneRequest("test", CAMERA, 36)
     # The second time from the cache.

@@ -24,7 +24,7 @@ from simulator import (
 NO_NOISE = NoiseLevelFunction((1e-12,) * 4, (1e-12,) * 4)
 #: Pixel pitch such that packed pixels are 10 um.
 CAMERA = replace(get_camera("nikon_z6"), pixel_pitch_um=5.0)
-LENS = Lens(0.05, 2.0)
+LENS, SIMULATOR = Lens(0.05, 2.0), CameraSimulator(device="cpu")
 SETTINGS = CameraSettings(100, 1 / 64, 5.6)
 
 
@@ -33,17 +33,12 @@ def make_raw(light: torch.Tensor) -> RawImage:
     return RawImage(light, SETTINGS, CAMERA.with_nlf(100, NO_NOISE), nlf=NO_NOISE)
 
 
-@pytest.fixture(scope="module")
-def simulator() -> CameraSimulator:
-    return CameraSimulator(device="cpu")
-
-
-def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator) -> None:
+def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy() -> None:
     dark = 160.0 / CAMERA.span[0]  # whole digital numbers: rounding errors would add up
     light = torch.full((4, 161, 161), dark)
     light[:, 80, 80] = dark + 0.89
     raw = make_raw(light)
-    out = refocus(raw, 1.4, depth=np.full((161, 161), 2.2), lens=LENS, simulator=simulator)
+    out = refocus(raw, 1.4, depth=np.full((161, 161), 2.2), lens=LENS, simulator=SIMULATOR)
     disc = out.data[1, 68:93, 68:93].double() - dark
     assert out.settings.f_number == 1.4
     assert out.settings.exposure_time == pytest.approx(1 / 64 / 16)
@@ -61,10 +56,10 @@ def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator
     assert out.metadata["largest_disc_px"] == pytest.approx(np.sqrt(area / np.pi * 4), rel=1e-6)
 
 
-def test_what_is_before_the_focus_spreads_over_its_neighbours_and_nothing_else(simulator) -> None:
+def test_what_is_before_the_focus_spreads_over_its_neighbours_and_nothing_else() -> None:
     light = torch.full((4, 64, 96), 0.8)
     light[:, :, :48] = 0.02
-    left, both = np.arange(96) < 48, {"lens": LENS, "simulator": simulator}
+    left, both = np.arange(96) < 48, {"lens": LENS, "simulator": SIMULATOR}
     depth = np.where(left, 2.0, 20.0).repeat(2)[None].repeat(128, 0)  # at the sensor's pitch
     out = refocus(make_raw(light), 1.4, depth=depth, **both)
     assert out.data[:, :, :48].equal(light[:, :, :48])  # kept bit by bit
@@ -77,19 +72,19 @@ def test_what_is_before_the_focus_spreads_over_its_neighbours_and_nothing_else(s
     np.testing.assert_allclose(profile[-8:], 0.8, rtol=1e-6)
 
 
-def test_what_is_blurred_has_the_noise_of_the_sensor(simulator) -> None:
+def test_what_is_blurred_has_the_noise_of_the_sensor() -> None:
     raw = RawImage(torch.full((4, 128, 128), 0.2), CameraSettings(6400, 1 / 64, 5.6), CAMERA)
     depth = np.full((128, 128), 9.0)
-    out = refocus(raw, 1.4, depth=depth, lens=LENS, simulator=simulator, seed=1)
+    out = refocus(raw, 1.4, depth=depth, lens=LENS, simulator=SIMULATOR, seed=1)
     nlf = CAMERA.nlf(6400)
     expected = np.array(nlf.shot) * 0.2 + nlf.read
     np.testing.assert_allclose(out.data.var(dim=(1, 2)), expected, rtol=0.05)
 
 
-def test_the_source_s_own_aperture_and_a_sharp_picture_change_nothing(simulator) -> None:
+def test_the_source_s_own_aperture_and_a_sharp_picture_change_nothing() -> None:
     light = (torch.rand(4, 64, 64) * 0.5).round(decimals=1) + 0.05
     depth = np.full((64, 64), 9.0)
-    same = refocus(make_raw(light), 5.6, depth=depth, lens=LENS, simulator=simulator)
+    same = refocus(make_raw(light), 5.6, depth=depth, lens=LENS, simulator=SIMULATOR)
     assert (same.settings, same.metadata["depth"]) == (SETTINGS, "given")
     networks = CameraSimulator.from_pretrained(device="cpu")
     sharp = refocus(make_raw(light), 1.4, simulator=networks)
@@ -111,8 +106,8 @@ def test_the_source_s_own_aperture_and_a_sharp_picture_change_nothing(simulator)
         ({"depth": np.full((32, 40), 9.0), "lens": LENS, "pitch": None}, "raw"),
     ],
 )
-def test_bad_arguments(simulator, arguments, named: str) -> None:
-    given = {"f_number": 1.4, "simulator": simulator, **arguments}
+def test_bad_arguments(arguments, named: str) -> None:
+    given = {"f_number": 1.4, "simulator": SIMULATOR, **arguments}
     camera = replace(CAMERA, pixel_pitch_um=given.pop("pitch", 5.0))
     raw = replace(make_raw(torch.full((4, 32, 40), 0.1)), camera=camera)
     with pytest.raises(ValueError, match=f"`{named}`"):
@@ -210,12 +205,12 @@ def test_bracket_exposures() -> None:
             hdr.bracket_exposures(stops, step)
 
 
-def test_shadows_and_highlights_of_a_raw_show_their_detail(simulator) -> None:
+def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
     stripes = (torch.arange(96) // 8 % 2).float()[None, :, None]
     shadow, bright = 0.002 + 0.002 * stripes, 0.80 + 0.15 * stripes
     light = torch.cat([shadow.expand(4, 96, 64), bright.expand(4, 96, 64)], dim=2)
     raw = RawImage(light, SETTINGS, CAMERA)
-    picture = hdr.hdr_picture(raw, simulator=simulator)
+    picture = hdr.hdr_picture(raw, simulator=SIMULATOR)
     single = render_srgb(raw).float() / 255.0
     for columns, least in ((slice(40, 88), 1.3), (slice(168, 216), 1.05)):
         contrast = [float(p[1, 20:-20, columns].std()) for p in (single, picture.fused)]

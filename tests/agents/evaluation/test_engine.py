@@ -139,7 +139,6 @@ def test_delay_scores_the_frame_that_was_exposed(small, few):
     options = {**few, "delay": 1}
     result = evaluate({"oracle": make_policy("oracle", small)}, options, frames=3, batch=8)
     states = result.tracks["oracle"].states[0]
-    np.testing.assert_array_equal(states[:, 0], result.start_states)
     np.testing.assert_array_equal(states[:, 1], result.oracle_states)
     found = result.episode_metrics("oracle")
     np.testing.assert_allclose(found["regret_delayed"], 0.0, atol=1e-12)
@@ -225,8 +224,6 @@ def test_digests_are_of_the_episodes_and_do_not_move():
     again = EvaluationPlan.model_validate({**turned, "policies": ["spot:P"], "hash": "x"})
     assert digest(again.protocol()) == digest(PLAN.protocol())
     assert digest(PLAN.changed(frames=9).protocol()) != digest(PLAN.protocol())
-    counts = [len(load_plan(n).all_conditions) for n in ("quick", "standard", "bracket")]
-    assert counts == [4, 24, 2]
 
 
 @pytest.fixture(scope="module")
@@ -336,7 +333,6 @@ def test_a_stopped_run_continues_with_what_it_lacks(results, folder, tmp_path, m
     assert _arrays(tmp_path) == _arrays(folder)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("quick_spawn")
 def test_two_processes_give_what_one_does(results, folder, tmp_path):
     run_plan(JOBS, tmp_path, workers=2)

@@ -210,8 +210,7 @@ def test_save_and_load_give_the_same_regression(tmp_path):
 
 CONTROLLERS = (*METERS, "rpi_agc")
 SMALL = {"scenes": "bundled:small", "split": "all", "resolution": 36}
-#: Scenes of the loops: each sixth of the small ones.
-COUNT = 7
+COUNT = 7  # scenes of the loops: each sixth of the small ones
 GREY = np.ones((64, 64))
 
 

@@ -22,8 +22,6 @@ from simulator.camera import get_camera
 from tests.ae_env.environments import make_envs
 
 ROOT = Path(__file__).parents[3]
-pytestmark = pytest.mark.slow  # an export takes seconds
-
 
 small_envs = functools.partial(make_envs, split="test", max_episode_steps=None, resolution=64)
 
