@@ -21,6 +21,7 @@ from ae_env.episodes.core import (
 )
 from ae_env.episodes.lookup import RECORDED
 from ae_env.episodes.state import Episode, Episodes, check_options
+from ae_env.first_frame import compile_beside
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
@@ -283,6 +284,7 @@ class AutoExposureBase(SpecProperty):
     def _set_up(self, arguments: Mapping[str, Any], num_envs: int, render_mode: str | None) -> None:
         """Makes the core of `num_envs` episodes."""
         check_word("render_mode", render_mode, ("rgb_array",), None)
+        compile_beside()
         self.render_mode, self._last = render_mode, None
         self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs, self._make_task)
 

@@ -20,7 +20,7 @@ from simulator.capture.prepared_scene import MAX_IMAGE_SPEED, PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DIAMETERS
 from simulator.optics.motion import ALONG_ROWS, Movement
-from simulator.settings import CameraSettings, exposure_ratio
+from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number, check_type
 
 ColourMatrix = tuple[tuple[float, float, float], ...]
@@ -236,7 +236,8 @@ def describe_captures(
         each = zip(scenes, moves, speed.tolist(), numbers, strict=True)
         pixel_blur = _stacked([layout_blur(*one) for one in each], blur)
     nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
-    ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
+    pairs = zip(scenes, settings, strict=True)
+    ratios = [2.0 ** (s.log2_exposure - c.reference.log2_exposure) for c, s in pairs]
     return Captures(
         settings=settings,
         scene_ids=[c.scene_id for c in scenes],
@@ -330,7 +331,7 @@ class SceneCaptures:
             pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
             blur = blur.rms_px
         gains = np.broadcast_to(gain, len(self.states))[part]
-        ratios = [exposure_ratio(scene.reference, s) for s in states]
+        ratios = [2.0 ** (s.log2_exposure - scene.reference.log2_exposure) for s in states]
         light = scene.clean_light.clone() if self.copies else scene.clean_light
         return Captures(
             settings=states,

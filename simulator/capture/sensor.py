@@ -590,6 +590,12 @@ def _record(  # type: ignore[no-untyped-def]
             counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
 
 
+def is_compiled() -> bool:
+    """Whether the kernel that records frames was compiled before, on this machine."""
+    file = getattr(getattr(_record, "_cache", None), "_cache_file", None)
+    return file is None or bool(file._load_index())  # without a cache a second process is no use
+
+
 def _record_fused(
     transitions: Transitions,
     camera: CameraProfile,
