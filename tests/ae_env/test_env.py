@@ -11,6 +11,7 @@ import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +25,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 
 import ae_env
 from ae_env import AutoExposureEnv, AutoExposureVectorEnv, contact_sheet
+from ae_env.first_frame import compile_beside
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
 from ae_env.options import EnvOptions
@@ -608,3 +610,14 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: s
     for path, name in ((tmp_path / "none.py", "Mine"), (file, "")):
         with pytest.raises(ValueError, match=r"`thing` \(='mine.py:Mine'\)"):
             load_from_file(str(path), name, ARGUMENT)
+
+
+def test_a_second_process_compiles_where_nothing_was_compiled(monkeypatch) -> None:
+    started = Mock()
+    monkeypatch.setattr("ae_env.first_frame.subprocess.Popen", started)
+    monkeypatch.setattr("ae_env.first_frame.thread_count", lambda: 2)
+    monkeypatch.setattr("ae_env.first_frame._started", False)
+    for compiled, children in ((True, 0), (False, 1), (False, 1)):  # once
+        monkeypatch.setattr("ae_env.first_frame.is_compiled", lambda known=compiled: known)
+        compile_beside()
+        assert started.call_count == children
