@@ -26,7 +26,7 @@ from simulator import CameraSimulator
 from simulator.camera_simulator import Depth
 
 #: Largest file that is taken [byte].
-_LARGEST_UPLOAD = 300_000_000
+LARGEST_UPLOAD = 300_000_000
 #: Files of all tabs together, from which on no other is taken [byte].
 _MOST_STORED = 4_000_000_000
 #: Pictures that wait to be fetched, at most.
@@ -118,10 +118,10 @@ class Page:
                 self._thumbs = ui.element("div").classes("thumbs w-full")
             self._listed: set[str] = set()
             ui.button("Scenes", icon="photo_library", on_click=self._open_picker).props("dense")
-            most = f"a raw may have {_LARGEST_UPLOAD // 10**6} MB at most"
+            most = f"a raw may have {LARGEST_UPLOAD // 10**6} MB at most"
             upload = ui.upload(
                 auto_upload=True,
-                max_file_size=_LARGEST_UPLOAD,
+                max_file_size=LARGEST_UPLOAD,
                 on_upload=_weakly(self._take_upload),
                 on_rejected=lambda: ui.notify(most, type="negative"),
             ).classes("hidden")

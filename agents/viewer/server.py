@@ -20,11 +20,11 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketClose
 
-from agents.viewer.page import Options, show_page
+from agents.viewer.page import LARGEST_UPLOAD, Options, show_page
 
 HOST = "127.0.0.1"
-#: Largest file that is taken, with what a browser sends around it [byte].
-LARGEST_UPLOAD = 301_000_000
+#: Largest request: a file, and what a browser sends around it [byte].
+_LARGEST_REQUEST = LARGEST_UPLOAD + 1_000_000
 _COOKIE = "ae-env-view"
 
 
@@ -58,7 +58,7 @@ class TokenGuard:
             await refusal(scope, receive, send)
             return
 
-        if int(asked.headers.get("content-length", "0")) > LARGEST_UPLOAD:
+        if int(asked.headers.get("content-length", "0")) > _LARGEST_REQUEST:
             await PlainTextResponse("The file is too large.", 413)(scope, receive, send)
             return
         taken = 0
@@ -67,7 +67,7 @@ class TokenGuard:
             nonlocal taken
             message = await receive()
             taken += len(message.get("body", b""))
-            return message if taken <= LARGEST_UPLOAD else {"type": "http.disconnect"}
+            return message if taken <= _LARGEST_REQUEST else {"type": "http.disconnect"}
 
         async def with_cookie(message: Any) -> None:
             if message["type"] == "http.response.start":
