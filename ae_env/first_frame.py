@@ -44,6 +44,9 @@ def _compile() -> None:
     import numpy as np
     import torch
 
+    from ae_env.grid import ExposureGrid
+    from ae_env.scorers import make_scorer
+    from ae_env.scorers.term_scores import TermScores
     from simulator.camera import get_camera
     from simulator.capture.sensor import Transitions, record
 
@@ -52,6 +55,9 @@ def _compile() -> None:
     keys, codes = np.ones(1, np.uint64), np.empty((1, 4, 16, 16), np.uint8)
     camera = get_camera("nikon_z6")
     record(Transitions(light, table, None), camera, keys=keys, noise="bank", codes=codes)
+    states = ExposureGrid.default().states
+    terms = TermScores(make_scorer("balanced"), camera, states, noise=True)
+    terms.measured(codes, np.zeros(1, np.int64), np.zeros((1, 2, 4)))
 
 
 if __name__ == "__main__":
