@@ -207,10 +207,11 @@ class ExposureBracket(Task):
 
     def transition(
         self, env_indices: np.ndarray, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Uses up the time of the frames that are taken.
 
-        A state that does not fit into the time left is not photographed and ends the episode.
+        A state that does not fit into the time left is not photographed and ends the episode, as
+        the last frame does.
         """
         takes = self.allowed(env_indices)[np.arange(len(actions)), actions]
         takes &= actions != self.stop
@@ -222,11 +223,8 @@ class ExposureBracket(Task):
         self._left[taking] = np.maximum(self._left[taking] - times - FRAME_GAP, 0.0)
         self._count[taking] += 1
         self._fresh[taking] = True
-        return takes, taking[self._offsets(taking).any(axis=1)]
-
-    def terminal(self, env_indices: np.ndarray, takes: np.ndarray) -> np.ndarray:
-        """(K,) bool: no frame was taken, or the last."""
-        return ~takes | (self._count[env_indices] == self.max_frames)
+        moved = taking[self._offsets(taking).any(axis=1)]
+        return takes, moved, ~takes | (self._count[env_indices] == self.max_frames)
 
     def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
         """Merges the frames that were taken: what that adds to the quality (B,)."""

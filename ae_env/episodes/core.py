@@ -118,17 +118,14 @@ class Task:
 
     def transition(
         self, env_indices: np.ndarray, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
         """Applies the actions (K,).
 
         Returns:
-            (K,) bool, which of them take a frame; and the episodes whose `displaced` changed.
+            (K,) bool, which of them take a frame, or None for all; the episodes whose `displaced`
+            changed; and (K,) bool, which have ended.
         """
-        return np.ones(len(env_indices), bool), env_indices[:0]
-
-    def terminal(self, env_indices: np.ndarray, takes: np.ndarray) -> np.ndarray:
-        """(K,) bool: which episodes have ended, after the actions of which `takes` took a frame."""
-        return ~takes
+        return None, env_indices[:0], np.zeros(len(env_indices), bool)
 
     def displaced(self, env_index: int) -> Scene | None:
         """The scene of an episode where its subject has moved since the first frame; else None."""
@@ -260,7 +257,9 @@ class EpisodeCore:
     ) -> None:
         """Draws new episodes for `env_indices` (K,), as `Episodes.draw`; those there end."""
         drawn = self.episodes.draw(rngs, options)
-        self._forget(env_indices)
+        own = env_indices[self.episodes.light_index[env_indices] >= len(self.scenes)]
+        if len(own):
+            self._forget(own)
         self.episodes.begin(env_indices, drawn)
         self.task.initial(env_indices, options)
 
@@ -283,12 +282,14 @@ class EpisodeCore:
         wrong = (actions < 0) | (actions >= self.num_actions)
         if wrong.any():
             raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {self.num_actions})")
-        takes, moved = self.task.transition(env_indices, actions)
-        changed = self.episodes.act(env_indices[takes], actions[takes])
+        takes, moved, ended = self.task.transition(env_indices, actions)
+        if takes is not None:
+            env_indices, actions = env_indices[takes], actions[takes]
+        changed = self.episodes.act(env_indices, actions)
         for others in (moved, changed):
             if len(others):
                 self._forget(others)
-        return self.task.terminal(env_indices, takes)
+        return ended
 
     def observe(self, env_indices: np.ndarray) -> Frames:
         """Captures the episodes of `env_indices` (B,), each in its current state."""
