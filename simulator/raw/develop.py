@@ -41,9 +41,11 @@ _SRGB_TOE = 0.0031308
 _LARGEST_GAIN = 2.0**32  # of a plane against another: float32 holds its product with any code
 _CHUNK = 2**18  # elements
 
-#: Light of a wholly clipped pixel over the least that would clip all of its planes: about the
-#: median of natural highlights, which lie anywhere above it.
-ABOVE_WHITE = 2.0
+#: Light of a wholly clipped pixel over the least that would clip all of its planes, amid others
+#: like it: about the median of natural highlights, which lie anywhere above it. Alone, it is less
+#: bright: measured neighbours are below white. Both, and the side of the window that tells [packed
+#: pixel], are the best of a few on maps of the training and validation splits.
+ABOVE_WHITE, _LEAST_ABOVE_WHITE, _AMID_PX = 2.0, 1.2, 17
 #: A clipped plane is raised to this many times white at most: white balance of no light asks for
 #: more, only a damaged one.
 MOST_WHITE = 16.0
@@ -363,9 +365,9 @@ def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
     a lamp or the sky is brighter than the sensor can tell: all planes clip at the same number, but
     the white of the scene is another number in each, so a clipped lamp that is darkened as it was
     recorded turns pink. There a clipped plane takes the mean level (value times white balance gain)
-    of the pixel's measured planes, so that the pixel is neutral, or twice the highest of all where
-    every plane is clipped. Its spread is that of what nobody measured: highlights lie anywhere
-    above white, with a median of twice that.
+    of the pixel's measured planes, so that the pixel is neutral, or where every plane is clipped 1.2
+    to 2 times the highest of all, the more, the more pixels around are so. Its spread is that of
+    what nobody measured: highlights lie anywhere above white, with a median of about twice that.
 
     Pixels that are not `saturated`, (H, W), are left out; `raw.data` itself is returned where no
     sample has to be raised.
@@ -387,7 +389,12 @@ def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
     levels = values * gains
     known = (~clipped).sum(dim=0)
     mean = levels.masked_fill(clipped, 0.0).sum(dim=0) / known.clamp(min=1)
-    neutral = torch.where(known > 0, mean, ABOVE_WHITE * levels.amax(dim=0)) / gains
+    amid = full.all(dim=0).float()[None]
+    for window in ((_AMID_PX, 1), (1, _AMID_PX)):
+        padding = (window[0] // 2, window[1] // 2)
+        amid = F.avg_pool2d(amid, window, 1, padding, count_include_pad=False)
+    above = _LEAST_ABOVE_WHITE + (ABOVE_WHITE - _LEAST_ABOVE_WHITE) * amid[0][saturated]
+    neutral = torch.where(known > 0, mean, above * levels.amax(dim=0)) / gains
     near = _clipped_by_noise(raw, full)[:, saturated]
     wanted = torch.where(near > 0.0, near, neutral.float())
     raised = clipped & (wanted > values.clamp(min=1.0))

@@ -250,7 +250,8 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     pixels = [(v / 2, v, v / 1.25) for v in WHITE]
     raw, settings = clipped(*pixels), CameraSettings(100, ratio / 64, 4)
     prepared = CameraSimulator(device="cpu").prepare(raw)
-    level = torch.tensor([0.5, 1.1, 1.6, 4.0]) * ratio
+    # A quarter of all pixels is wholly clipped: 1.2 + 0.8 / 4 times red's white, which is 2.
+    level = torch.tensor([0.5, 1.1, 1.6, 2.8]) * ratio
     expected = level / torch.tensor([2, 1, 1, 1.25])[:, None]
     scene = Scene.from_raw(raw, scene_id="raw")
     assert (scene.illuminance, scene.reference) == (None, raw.settings)
@@ -264,6 +265,7 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
         assert found.saturated.tolist() == [[False, True, True, True]]
     black = RawImage(torch.cat([raw.data, torch.zeros(4, 3, 4)], 1), BASE, Z6, None, BALANCE)
     small = Scene.from_raw(black, scene_id="raw").resized(1).light.flatten()
+    expected[:, 3] *= 2.5 / 2.8  # now a 16th
     torch.testing.assert_close(small, expected.mean(1) / ratio / 4)  # averaged after, not before
     dark = clipped(pixels[0])
     assert Scene.from_raw(dark, scene_id="raw").saturated is None
