@@ -6,8 +6,9 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from ae_env.scenes.folder import find_files
@@ -17,9 +18,6 @@ from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
 from simulator.utils.files import RAW_SUFFIXES
-
-if TYPE_CHECKING:
-    import gymnasium as gym
 
 #: What oracles know, and the entry of ``info`` that holds it.
 ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}

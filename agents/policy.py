@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    import gymnasium as gym
-
     from ae_env.grid import ExposureGrid
     from simulator.camera import CameraProfile
 

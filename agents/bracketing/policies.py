@@ -11,8 +11,9 @@ import copy
 import itertools
 from functools import lru_cache
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -27,10 +28,6 @@ from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
 from simulator.camera import CameraProfile
 from simulator.radiance.light import WHITE_SIGNAL
 from simulator.utils.checks import check_flag, check_number
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
 
 #: Centres of the bins of log2 luminance, relative to the EV100 of the viewfinder's frame.
 BINS = np.arange(-16.0, 16.0, 0.5)

@@ -35,7 +35,7 @@ from agents.evaluation.evaluation_plan import (
 )
 from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
 from agents.metering.reading import linear_signal, signal_codes
-from agents.policy import Policy, PolicyContext
+from agents.policy import Ints, Policy, PolicyContext
 from agents.policy_names import make_policy, training_seeds
 from agents.rollouts import (
     EpisodeBatch,
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from ae_env.scenes import Scene
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
-Ints = NDArray[np.int64]
 Arrays = dict[str, NDArray[Any]]
 #: Called with work done, work in all, and what is being done.
 Progress = Callable[[int, int, str], None]

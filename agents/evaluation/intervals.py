@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from agents.policy import Floats
 
 RESAMPLES = 10_000
 #: Coverage of the intervals.

@@ -19,6 +19,7 @@ from agents.evaluation.intervals import (
     rank,
     score_interval,
 )
+from agents.policy import Bools, Floats, Ints
 from agents.policy_names import is_metering
 from simulator.optics.motion import Movement
 from simulator.utils.checks import check_word
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from ae_env.scenes import Scene
     from agents.evaluation.evaluation_plan import EvaluationPlan
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 #: By condition.
 Results = Mapping[str, "EvaluationResult"]
 
@@ -132,10 +131,10 @@ class EvaluationResult:
     scene_ids: NDArray[Any]
     groups: NDArray[Any]
     kinds: NDArray[Any]
-    hard: NDArray[np.bool_]
+    hard: Bools
     start_states: Ints
     scores: Floats
-    allowed: NDArray[np.bool_]
+    allowed: Bools
     tracks: dict[str, Track]
     seed: int
     delays: tuple[int, int, int] = (0, 0, 0)
@@ -241,12 +240,12 @@ class EvaluationResult:
         """Parts that have scenes: always ``"all"``, and both others or neither."""
         return PARTS if self.hard.any() and not self.hard.all() else PARTS[:1]
 
-    def part(self, name: str) -> NDArray[np.bool_]:
+    def part(self, name: str) -> Bools:
         """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
         check_word("part", name, PARTS)
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
-    def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
+    def mean(self, policy: str, key: str, episodes: Bools | None = None) -> float:
         """Mean of a metric over a source group's episodes, then over groups and seeds; of the
         `episodes` that are True, ``(E,)``, or of all.
         """
@@ -254,9 +253,7 @@ class EvaluationResult:
         values = self.episode_metrics(policy)[key][:, members]
         return float(metrics.group_means(values, self.groups[members]).mean())
 
-    def group_gains(
-        self, policy: str, part: str | NDArray[np.bool_] = "all"
-    ) -> tuple[Floats, Floats]:
+    def group_gains(self, policy: str, part: str | Bools = "all") -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
         Of the episodes of `part`, a name or a mask ``(E,)``.
@@ -267,7 +264,7 @@ class EvaluationResult:
         groups = self.groups[members]
         return metrics.group_means(gains, groups), metrics.group_means(span, groups)
 
-    def normalised(self, policy: str, part: str | NDArray[np.bool_] = "all") -> float:
+    def normalised(self, policy: str, part: str | Bools = "all") -> float:
         """Normalised score of a policy over its training seeds; arguments as of `group_gains`."""
         gains, span = self.group_gains(policy, part)
         return float(gains.mean(axis=0).sum() / span.sum())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,10 +20,6 @@ from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyConte
 from agents.policy_names import PROGRAMS
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.utils.checks import check_word
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
 
 #: Meters whose reading is the most exposure that may be given: no state above it is chosen.
 CEILING_METERS = ("highlight_weighted",)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -15,8 +16,6 @@ from agents.rollouts import errors_of
 from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
-    import gymnasium as gym
-
     from agents.policy import Policy
 
 #: Size of a picture, height of the chart below it and of the title above [pixel].
