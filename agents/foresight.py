@@ -109,8 +109,7 @@ class Foresight:
         self._tracker.update(reading, exposed_at)
         if not self._actions:  # what the first frame was taken with stays until a decision is there
             shown = np.stack(decode_settings(observations["settings"]), axis=1)
-            apex = np.array([(s.aperture_value, s.time_value, s.speed_value) for s in self.grid])
-            nearest = np.abs(shown[:, None] - apex[None]).sum(axis=2).argmin(axis=1)
+            nearest = np.abs(shown[:, None] - self.grid.apex).sum(axis=2).argmin(axis=1)
             self._actions = [nearest] * max(self.leads)
         return reading
 

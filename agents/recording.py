@@ -54,14 +54,12 @@ def record_dataset(
     reset option, its scene: ``env.reset(seed=seed, options=options)`` begins it again.
 
     Args:
-        policy: The policy, for one environment.
-        name: Its name, which the dataset has as that of its algorithm.
-        task: Id of the environment, such as ``"ae_env/AutoExposure-v0"``.
-        options: Arguments of the environment, JSON values.
+        policy, name: The policy, for one environment, and its name, that of the algorithm.
+        task, options: Id of the environment, such as ``"ae_env/AutoExposure-v0"``, and its
+            arguments, JSON values.
         dataset_id: Name of the dataset in Minari's folder (MINARI_DATASETS_PATH names another). It
             appears there when all episodes are recorded.
         episodes: How many; episode i has the seed ``seed + i``.
-        seed: Of the first.
         progress: Called with the episodes that are done, and all.
 
     Raises:

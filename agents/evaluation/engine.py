@@ -80,8 +80,7 @@ def evaluate(
 ) -> EvaluationResult:
     """Run every policy over the same episodes, from starts that are drawn.
 
-    Frames are counted after each action. Scores are always the expected scores q, whatever the
-    environment's reward.
+    Scores are always the expected scores q, whatever the environment's reward.
 
     Args:
         policies: By name in the tables; a list holds the same agent from several training seeds.
@@ -89,8 +88,7 @@ def evaluate(
             ``{"scenes": "bundled", "split": "test", "resolution": 64}``.
         episodes_per_scene: Episodes of each scene, each with its own start, motion and defocus:
             those of the seeds `seed`, `seed` + 1 and so on.
-        frames: Actions per episode.
-        seed: Decides the episodes.
+        frames: Actions per episode; a frame is counted after each.
         batch: Episodes at a time, at most.
         other_scorers: Names of scorers that no policy was trained on; states that were chosen in
             some of the scenes are also rated by these.
@@ -396,14 +394,10 @@ def fit_policies(
     batch: int = BATCH,
     progress: Progress | None = None,
 ) -> None:
-    """Call `fit` of every policy that has one, on the training split.
+    """Call `fit` of every policy that has one, on the training split of an environment.
 
-    Args:
-        policies: By name; changed in place.
-        env_options: Arguments of the environment; `split` is set to ``"train"``.
-        seed: Decides the training episodes.
-        batch: Episodes at a time.
-        progress: Called before and after each fit.
+    `env_options` are its arguments, `seed` decides the episodes, of which `batch` run at a time;
+    `progress` is called before and after each fit.
     """
     learners = [(name, policy) for name, policy in policies.items() if _learns(policy)]
     if not learners:

@@ -235,18 +235,13 @@ def run_plan(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> dict[str, EvaluationResult]:
-    """Runs a plan, or the part of it that is left.
+    """Runs a plan, or the part of it that `folder` does not hold yet; the results by condition.
 
     Args:
-        plan: The plan, with its policies.
-        folder: Folder of finished parts.
         scenes: Those of the plan where they are loaded already.
         workers: Processes; None for one per core where the work is enough to pay for them.
         device: Torch device of a learnt agent's network.
         progress: Called with work done, work in all, and what is being done.
-
-    Returns:
-        The results by condition.
 
     Raises:
         ValueError: If a policy, a scorer or a scene is unknown, or a policy does not fit the

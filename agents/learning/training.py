@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 from pydantic import Field, ValidationError, model_validator
 
 from ae_env.options import EnvOptions
@@ -211,10 +212,9 @@ class LearningCurve:
         means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
         self._rows.append({"frames": done, **means})
         self._recent = []
-        lines = [["frames", *values]]
-        for row in self._rows:
-            lines.append([str(int(row["frames"])), *(f"{row[name]:.6g}" for name in values)])
-        write_atomically(self.path, "".join(",".join(line) + "\n" for line in lines))
+        frame = pd.DataFrame(self._rows, columns=["frames", *values]).astype({"frames": int})
+        text = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        write_atomically(self.path, text)
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.observation import PEDESTAL, decode_observation, decode_settings
+from ae_env.observation import PEDESTAL, decode_observation, decode_settings, encode_array
 from agents.policy import Bools, Floats, Observations
 from simulator.camera import CameraProfile
 
@@ -59,15 +60,9 @@ class Reading:
     black: Bools
 
 
-class Meter(Protocol):
-    """A light meter for a batch of cameras."""
-
-    def __call__(self, observations: Observations, estimate: Floats | None = None) -> Reading:
-        """Meter the frames in hand of N cameras.
-
-        A meter that improves step by step on the `estimate` that the controller holds, EV100
-        ``(N,)``, NaN in the first frame, continues there. The others ignore it.
-        """
+#: A light meter: a function of the observations of N cameras and, optionally, the EV100 ``(N,)`` that
+#: the controller holds, NaN in the first frame. A meter that improves step by step continues there.
+Meter = Callable[..., Reading]
 
 
 def frame_ev100(observations: Observations) -> Floats:
@@ -104,9 +99,7 @@ def signal_codes(
     """The 8-bit codes of observed frames, from any kind of observation; see `linear_signal`."""
     if raw.dtype == np.uint8:
         return raw[:, planes]
-    signal = linear_signal(raw, camera, planes).clip(-PEDESTAL, 1.0)
-    codes = (CODES - 1.0) * np.sqrt((signal + PEDESTAL) / (1.0 + PEDESTAL))
-    return np.asarray(np.rint(codes).astype(np.uint8))
+    return encode_array(linear_signal(raw, camera, planes))
 
 
 def mean_reading(mean: Floats, saturated: Floats, ev: Floats) -> Reading:

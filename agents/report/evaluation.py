@@ -218,11 +218,9 @@ def write_report(
         results: The return value of `evaluate` or `run_plan`.
         out: Folder, made where missing.
         command: The command line that repeats the evaluation.
-        source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
-        split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
+        source, split, resamples: See `result_rows`.
         next_commands: Command lines for the reader to try next.
         extra_meta: Further entries of the JSON's ``meta``, such as training seeds.
-        resamples: Bootstrap resamples.
 
     Returns:
         The files by name.
@@ -424,15 +422,11 @@ def _histogram_rows(histogram: Mapping[str, Mapping[str, float]]) -> list[dict[s
         "exposure_time": format_exposure_time,
         "f_number": "f/{:g}".format,
     }
-    return [
-        {
-            "control": name.replace("_", " "),
-            "share": ", ".join(
-                f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()
-            ),
-        }
-        for name, own in histogram.items()
-    ]
+    rows = []
+    for name, own in histogram.items():
+        shares = (f"{labels[name](float(value))}: {share:.0%}" for value, share in own.items())
+        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
+    return rows
 
 
 def fill(template: str, **values: Any) -> str:

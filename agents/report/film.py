@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from agents.rollouts import errors_of
-from simulator.utils.files import write_atomically
+from simulator.utils.files import write_picture
 
 if TYPE_CHECKING:
     from agents.policy import Policy
@@ -93,10 +92,9 @@ def write_film(
         images.append(image.quantize(COLOURS, dither=Image.Dither.NONE))
         if progress is not None:
             progress(frame + 1, total)
-    content = io.BytesIO()
-    more: dict[str, Any] = {"append_images": images[1:], "duration": 1000 // FRAME_RATE}
-    images[0].save(content, format="GIF", save_all=True, loop=0, optimize=True, **more)
-    return write_atomically(path, content.getvalue())
+    timing = {"loop": 0, "duration": 1000 // FRAME_RATE}
+    animation = {"save_all": True, "append_images": images[1:], "optimize": True}
+    return write_picture(path, images[0], **animation, **timing)
 
 
 def _panel(recording: Recording, frame: int) -> Image.Image:
