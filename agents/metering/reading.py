@@ -60,8 +60,8 @@ class Reading:
     black: Bools
 
 
-#: A light meter: a function of the observations of N cameras and, optionally, the EV100 ``(N,)`` that
-#: the controller holds, NaN in the first frame. A meter that improves step by step continues there.
+#: A light meter: a function of the observations of N cameras and, optionally, the EV100 ``(N,)``
+#: that the controller holds, NaN in the first frame; one that improves step by step continues there.
 Meter = Callable[..., Reading]
 
 
