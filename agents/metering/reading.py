@@ -61,7 +61,7 @@ class Reading:
 
 
 #: A light meter: a function of the observations of N cameras and, optionally, the EV100 ``(N,)``
-#: that the controller holds, NaN in the first frame; one that improves step by step continues there.
+#: that the controller holds, NaN in the first frame; one that goes step by step continues there.
 Meter = Callable[..., Reading]
 
 
