@@ -72,7 +72,6 @@ class Oracle(Policy):
     """Knows the expected score of every state, in the light that it knows.
 
     Args:
-        context: The camera.
         knows: ``"last_frame"``: the light of the frame that it has just seen, as a policy does
             that measures light without error but foresees nothing; ``"clairvoyant"``: that of the
             frames that its decision exposes, each control's own: the ceiling that regret is
@@ -111,7 +110,6 @@ class Recorded(Policy):
     time, ISO and EV, in stops, add up.
 
     Args:
-        context: The camera.
         path: Folder of raws, or a single raw.
 
     Raises:

@@ -17,7 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from agents.policy import Policy
-from agents.rollouts import checked_states, errors_of
+from agents.rollouts import checked_states, choose, errors_of
 
 #: The variable that names Minari's folder.
 _ROOT = "MINARI_DATASETS_PATH"
@@ -161,11 +161,8 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
     while not done:
         shown = {key: np.asarray(value)[None] for key, value in observation.items()}
         masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
-        extra: dict[str, Any] = {}
-        if getattr(policy, "privileged", False):
-            extra = {"info": {"oracle_state": np.array([info["oracle_state"]])}}
-        with errors_of(name, "act"):
-            actions = policy.act(shown, masks, **extra)
+        told = {"oracle_state": np.array([info.get("oracle_state")])}
+        actions = choose(name, policy, shown, masks, told)
         state = checked_states(name, actions, masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)
         done = terminated or truncated

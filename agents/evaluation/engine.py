@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import astuple, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.options import EnvOptions
+from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
@@ -42,15 +43,13 @@ from agents.rollouts import (
     RolloutPlan,
     action_masks,
     checked_states,
+    choose,
     errors_of,
     expected_scores,
     fitting_arguments,
     make_envs,
 )
 from simulator.utils.checks import check_integer, check_number
-
-if TYPE_CHECKING:
-    from ae_env.scenes import Scene
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 Arrays = dict[str, NDArray[Any]]
@@ -443,13 +442,9 @@ def run_batch(
     seen: dict[str, list[NDArray[Any]]] = {}
     seconds = []
     for frame in range(frames):
-        extra: dict[str, Any] = {}
-        if getattr(policy, "privileged", False):
-            known = {} if oracle is None else _oracle_info(base, oracle, frame)
-            extra = {"info": {**info, **known}}
+        told = info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}
         begin = time.perf_counter()
-        with errors_of(name, "act"):
-            actions = policy.act(observations, masks, **extra)
+        actions = choose(name, policy, observations, masks, told)
         seconds.append(time.perf_counter() - begin)
         observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
         masks = action_masks(envs)  # the next frame of a sequence is another scene

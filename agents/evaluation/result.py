@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene
 from agents.evaluation import metrics
+from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.evaluation.intervals import (
     RANK_COLUMNS,
     RESAMPLES,
@@ -23,11 +26,6 @@ from agents.policy import Bools, Floats, Ints
 from agents.policy_names import is_metering
 from simulator.optics.motion import Movement
 from simulator.utils.checks import check_word
-
-if TYPE_CHECKING:
-    from ae_env.grid import ExposureGrid
-    from ae_env.scenes import Scene
-    from agents.evaluation.evaluation_plan import EvaluationPlan
 
 #: By condition.
 Results = Mapping[str, "EvaluationResult"]

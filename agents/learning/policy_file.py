@@ -141,14 +141,12 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
 class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
-    Args:
-        context: The camera.
-        weights: File that a training wrote; or give `network`, one in memory.
-        device: Torch device for `weights`.
+    Either `weights` are given, a file that a training wrote, for the torch `device`; or `network`,
+    one in memory.
 
     Raises:
-        ValueError: Unless one of `weights` and `network` is given, and was trained for such an
-            observation and for a grid whose ranges hold that of the context.
+        ValueError: Unless the network was trained for such an observation, and for a grid whose
+            ranges hold that of the context.
     """
 
     #: The name of this kind of agent in its files.

@@ -42,7 +42,6 @@ class MeteringPolicy(Policy):
     """A light meter and a program that splits its EV between ISO, shutter and aperture.
 
     Args:
-        context: The camera.
         meter: One of `agents.policy_names.METERS`, such as ``"average"``.
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).

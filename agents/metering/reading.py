@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.grid import ExposureGrid
 from ae_env.observation import PEDESTAL, decode_observation, decode_settings, encode_array
-from agents.policy import Bools, Floats, Observations
+from agents.policy import Bools, Floats, Ints, Observations
 from simulator.camera import CameraProfile
 
 #: The planes that carry luminance.
@@ -74,6 +75,12 @@ def frame_ev100(observations: Observations) -> Floats:
         np.asarray(v, dtype=np.float64) for v in decode_settings(observations["settings"])
     )
     return np.round(3.0 * aperture) / 3.0 + time - (speed - 5.0)
+
+
+def frame_states(observations: Observations, grid: ExposureGrid) -> Ints:
+    """State of `grid` that is nearest to the (nominal) settings of each frame, ``(N,)``."""
+    shown = np.stack(decode_settings(observations["settings"]), axis=1)
+    return np.asarray(np.abs(shown[:, None] - grid.apex).sum(axis=2).argmin(axis=1))
 
 
 def linear_signal(

@@ -241,7 +241,6 @@ class RpiAgc(Policy):
     """The Raspberry Pi's AGC (`LibcameraAgc`): the state of the grid that is nearest to it.
 
     Args:
-        context: The camera.
         program: ``"P"``: the ladder, at an aperture of `f_number`; ``"A"``: the same, and no other
             aperture; ``"S"``: shutter by hand, the gain follows, and the aperture where the gain
             alone comes less near to the EV; ``"M"``: aperture and shutter by hand.

@@ -7,24 +7,21 @@ import io
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from filelock import FileLock
 from numpy.typing import NDArray
+from torch import Tensor
 
+from ae_env.scenes import Scene
 from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import WITH_FILE, split_class, split_options
 from agents.report.evaluation import fill
 from simulator.utils.files import machine, versions, write_atomically
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from ae_env.scenes import Scene
 
 logger = logging.getLogger(__name__)
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from agents.rollouts import errors_of
+from agents.policy import Policy
+from agents.rollouts import choose, errors_of
 from simulator.utils.files import write_picture
-
-if TYPE_CHECKING:
-    from agents.policy import Policy
 
 #: Size of a picture, height of the chart below it and of the title above [pixel].
 PICTURE, CHART, TITLE, GAP = 192, 64, 34, 8
@@ -60,9 +58,7 @@ def record(
     found = Recording(name)
     for frame in range(frames + 1):
         if frame:
-            with errors_of(name, "act"):
-                extra = {"info": info} if getattr(policy, "privileged", False) else {}
-                actions = policy.act(observations, base.action_masks(), **extra)
+            actions = choose(name, policy, observations, base.action_masks(), info)
             observations, _, _, _, info = envs.step(actions)
         pictures: Any = envs.render()
         found.pictures.append(pictures[0])
