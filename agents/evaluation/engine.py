@@ -374,7 +374,6 @@ class EvaluationRun:
             hard=np.array([bool(s.hard) for s in scenes]),
             start_states=next(iter(tracks.values())).arrays["start_states"][0],
             tracks={name: Track.of_seeds(own) for name, own in of_policy.items()},
-            seed=self.plan.seeds[0],
             delays=self.plan.options(condition).delays,
             plan=self.plan,
             scenes=scenes,
@@ -497,7 +496,6 @@ def other_scores(result: EvaluationResult) -> dict[str, dict[str, float]]:
     averaged over frames, then training seeds, episodes of a source group, and source groups.
     """
     plan = result.plan
-    assert plan is not None
     pairs = len(result.scene_ids) // len(plan.starts)  # of scenes and seeds
     count = pairs // len(plan.seeds)
     scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first

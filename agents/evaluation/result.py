@@ -113,11 +113,9 @@ class EvaluationResult:
         start_states: State of the reset frame; empty for brackets, as `scores` and `allowed`.
         scores: q of every state, ``(E, T, S)``.
         allowed: Action masks of every frame, ``(E, T, S)``.
-        seed: The plan's first seed.
         delays: Frames between a decision and the frame that has its ISO, its exposure time and
             its aperture.
-        plan: The plan that the condition belongs to; None where a result was put together by hand,
-            as everything below.
+        plan: The plan that the condition belongs to.
         speed: Image speed of each episode [frame heights per second], ``(E,)``.
         defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
         movement: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
@@ -134,9 +132,8 @@ class EvaluationResult:
     scores: Floats
     allowed: Bools
     tracks: dict[str, Track]
-    seed: int
+    plan: EvaluationPlan
     delays: tuple[int, int, int] = (0, 0, 0)
-    plan: EvaluationPlan | None = None
     scenes: Sequence[Scene] = ()
     speed: Floats | None = None
     defocus: Floats | None = None
@@ -146,7 +143,7 @@ class EvaluationResult:
     @property
     def measure(self) -> str:
         """``"score"`` of frames, or ``"quality"`` of brackets: the metric that decides."""
-        return "score" if self.plan is None else self.plan.measure
+        return self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
         """Arguments of `ae_env.scorers.captures.prepare_scene` that blur depends on."""
@@ -198,11 +195,6 @@ class EvaluationResult:
     def _metrics(self) -> dict[str, dict[str, NDArray[Any]]]:
         return {policy: self._measured(policy) for policy in self.tracks}
 
-    @cached_property
-    def settling(self) -> Ints:
-        """Frame from which an episode's convergence counts, ``(E,)``; see `metrics.settling`."""
-        return metrics.settling(self.scores)
-
     def _measured(self, policy: str) -> dict[str, NDArray[Any]]:
         arrays = self.tracks[policy].arrays
         if self.measure == "quality":
@@ -210,7 +202,8 @@ class EvaluationResult:
         states, ev100, allowed = self.tracks[policy].states, self.grid.ev100, self.allowed
         score = metrics.score_of(self.scores, states).mean(axis=-1)
         errors = metrics.ev_error(self.scores, states, ev100, allowed)
-        frames, converged = metrics.frames_to_converge(errors, since=self.settling)
+        settled = metrics.settling(self.scores)
+        frames, converged = metrics.frames_to_converge(errors, since=settled)
         start = np.broadcast_to(self.start_states[:, None], (*states.shape[:-1], 1))
         evs = ev100[np.concatenate([start, states], axis=-1)]
         static = np.all(self.scores[:, 1:] == self.scores[:, :-1], axis=-1)  # (E, T - 1)
@@ -223,8 +216,8 @@ class EvaluationResult:
             "ev_error": errors,
             "frames_to_converge": frames,
             "converged": converged,
-            "frames_to_settle": metrics.frames_to_settle(evs, since=self.settling),
-            "overshoot": metrics.overshoot(evs, since=self.settling),
+            "frames_to_settle": metrics.frames_to_settle(evs, since=settled),
+            "overshoot": metrics.overshoot(evs, since=settled),
             "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
             "reversals": metrics.reversals(evs),
             "flicker": metrics.flicker(arrays["image_mean"], static),
@@ -273,17 +266,13 @@ class EvaluationResult:
 
 def as_results(results: EvaluationResult | Results) -> Results:
     """Results by condition, of a single one too."""
-    if not isinstance(results, EvaluationResult):
-        return results
-    plan = results.plan
-    return {"static" if plan is None else plan.static_condition: results}
+    single = isinstance(results, EvaluationResult)
+    return {results.plan.static_condition: results} if single else results
 
 
 def static_condition(results: Results) -> str:
     """Name of the condition of unchanging light without delay; of the first where there is none."""
-    first = next(iter(results))
-    plan = results[first].plan
-    return first if plan is None else plan.static_condition
+    return next(iter(results.values())).plan.static_condition
 
 
 def result_rows(
@@ -311,7 +300,7 @@ def result_rows(
     results = as_results(results)
     static, rows = static_condition(results), []
     for name, result in results.items():
-        environment = {} if result.plan is None else result.plan.environment
+        environment = result.plan.environment
         scenes = environment.get("scenes", "bundled")
         if not isinstance(scenes, str):  # those that have no name
             scenes = str(scenes) if isinstance(scenes, Mapping) else f"{len(scenes)} scenes"
@@ -339,7 +328,7 @@ def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> di
     weights = np.broadcast_to(share[None, :, None], errors.shape) / (seeds * frames)
     return {
         "num_groups": interval.num_groups,
-        "seed": result.seed,
+        "seed": result.plan.seeds[0],
         "mean_score": result.mean(policy, "score", members),
         "normalised_score": interval.value,
         "ci95": interval.pair,
@@ -361,9 +350,8 @@ def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     to the best policy over all budgets; the other metrics are means.
     """
     names, rows = ranking.policy.tolist(), []
-    plan = next(iter(results.values())).plan
-    assert plan is not None
-    for budget, result in zip(plan.budgets or (), results.values(), strict=True):
+    budgets = next(iter(results.values())).plan.budgets or ()
+    for budget, result in zip(budgets, results.values(), strict=True):
         best = result.group_gains(names[0])[0]
         for policy in names:
             gains, span = result.group_gains(policy)

@@ -230,8 +230,7 @@ def write_report(
     ranking = overall_ranking(results, resamples=resamples)
     if result.measure == "quality":
         rows = bracket_rows(results, ranking)
-        assert result.plan is not None
-        meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
+        meta = result_meta(command, result.plan.seeds[0]) | {"plan": result.plan.protocol()}
         scenes = repr(result.plan.environment.get("scenes", "bundled"))
         apart = pd.Series(map(_difference, rows.to_best, rows.to_best_ci95))
         compared = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
@@ -242,8 +241,7 @@ def write_report(
         }
     rows = result_rows(results, source=source, split=split, resamples=resamples)
     meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
-    title = f"{rows.source[0]}, {rows.split[0]} split"
-    title = title if result.plan is None else result.plan.name
+    title = result.plan.name
     ends = pd.DataFrame([pair or (None, None) for pair in rows.ci95])
     table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
     columns = [name for name in ROW_COLUMNS if name != "ci95"]
@@ -299,16 +297,13 @@ def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
 
 def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
-    best, described, differences = best_meter(result), None, []
-    if result.plan is not None:
-        described = result.plan.describe()
-        protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
-        described["sha256"] = digest(protocol)
+    best, described, differences = best_meter(result), result.plan.describe(), []
+    protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
     if best is not None:
         differences = _records(difference_rows(result, best, resamples=resamples))
     return {
-        **result_meta(command, result.seed),
-        "plan": described,
+        **result_meta(command, result.plan.seeds[0]),
+        "plan": described | {"sha256": digest(protocol)},
         "episodes": len(result.scene_ids),
         "scenes": len(set(result.scene_ids.tolist())),
         "frames": result.scores.shape[1],
@@ -347,7 +342,6 @@ def _report(
         static=static,
         plan=plan,
         row=rows.iloc[0],
-        seed=result.seed,
         training_seeds=rows.training_seeds.max(),
         ranking=[
             row | {"best": _change(row["to_best"]), "next": _change(row["to_next"])}
@@ -364,7 +358,7 @@ def _report(
         histogram=_histogram_rows(meta["oracle_histogram"]),
         run=[
             {"condition": name, "lighting": str(one.lighting), "delay": str(one.delay)}
-            for name, one in (plan.all_conditions.items() if plan else ())
+            for name, one in plan.all_conditions.items()
         ],
         **more,
     )

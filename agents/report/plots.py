@@ -179,7 +179,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
     """
     from ae_env.rendering import MAX_SHEET_STATES, contact_sheet
 
-    if result.plan is None or not result.scenes or len(result.grid) > MAX_SHEET_STATES:
+    if not result.scenes or len(result.grid) > MAX_SHEET_STATES:
         return {}
     kinds = result.kinds.tolist()
     episode = next((kinds.index(kind) for kind in _KINDS if kind in kinds), 0)
