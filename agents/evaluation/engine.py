@@ -94,7 +94,6 @@ def evaluate(
         progress: Called with frames done, frames in all, and the name of the policy.
 
     Raises:
-        ValueError: If an argument is out of range.
         UserCodeError: If a policy raises (the cause is chained), or returns something else than
             allowed states.
     """

@@ -77,7 +77,6 @@ class EvaluationPlan(Configuration):
             are those of the conditions.
         scene_ids: Scenes to use, in this order; empty for all of the split.
         max_scenes: Use at most so many scenes, source groups in turn; None for all.
-        conditions: By name.
         delays: Each condition is run with each of these delays; except for the first, it is called
             ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
         starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.

@@ -288,7 +288,6 @@ def result_rows(
     `EvaluationResult.parts`), every other one a row with its own name.
 
     Args:
-        results: The result of one condition, or results by condition.
         source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
         split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
         resamples: Bootstrap resamples of the interval.

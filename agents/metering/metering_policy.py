@@ -56,9 +56,6 @@ class MeteringPolicy(Policy):
             first frame that has all of the decision (an alpha-beta filter); ``"model"``, of a tuned
             program: the trend is rolled through the delay of each control, and the state is taken
             that promises most (`Foresight`).
-
-    Raises:
-        ValueError: If an argument is unknown, out of range or of another program.
     """
 
     def __init__(

@@ -255,9 +255,6 @@ class RpiAgc(Policy):
             are whole periods, and the gain makes up for it (P and A). None: lamps are steady.
         speed: Share of the distance to the target that the filter goes per frame, in (0, 1].
         startup_frames: Frames of an episode in which it goes all of the way.
-
-    Raises:
-        ValueError: If an argument is unknown, out of range or of another program.
     """
 
     def __init__(

@@ -48,12 +48,7 @@ class ExposureState(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What `Controller.decide` says.
-
-    Args:
-        state: The next exposure.
-        reason: Why it is the last one still; empty where it was chosen from the frame.
-    """
+    """The next exposure, and the reason why it is still the last one; empty where it is not."""
 
     state: ExposureState
     reason: str = ""

@@ -92,7 +92,6 @@ def to_markdown(
     """A Markdown table with a line for each row; columns but the first are aligned to the right.
 
     Args:
-        rows: The rows.
         columns: Content of the cells by heading. Texts of a row are shown as they are, whatever
             they mean to Markdown; the result of a function is Markdown.
         missing: Text of a cell a value of which is missing, None or NaN. Where it is empty, columns
@@ -208,7 +207,7 @@ def write_report(
     extra_meta: Mapping[str, Any] | None = None,
     resamples: int = RESAMPLES,
 ) -> dict[str, Path]:
-    """Write everything that an evaluation shows into `out`.
+    """Write everything that an evaluation shows into `out`; returns the files by name.
 
     Those are ``results.json`` and ``report.md``; of frames also ``scenes.csv``, ``metrics.csv``,
     ``report.html`` and pictures: ``scores.png``, ``ev_error.png``, ``cost.png`` where decisions of
@@ -221,9 +220,6 @@ def write_report(
         source, split, resamples: See `result_rows`.
         next_commands: Command lines for the reader to try next.
         extra_meta: Further entries of the JSON's ``meta``, such as training seeds.
-
-    Returns:
-        The files by name.
     """
     folder, results = Path(out), as_results(results)
     result = results[static_condition(results)]
