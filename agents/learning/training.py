@@ -213,7 +213,7 @@ class LearningCurve:
         self._rows.append({"frames": done, **means})
         self._recent = []
         frame = pd.DataFrame(self._rows, columns=["frames", *values]).astype({"frames": int})
-        text = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        text = frame.to_csv(index=False, float_format="%.6g", na_rep="nan", lineterminator="\n")
         write_atomically(self.path, text)
 
 
