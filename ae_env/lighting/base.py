@@ -49,17 +49,11 @@ _RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
 
 
 class RollingShutter(NamedTuple):
-    """Readout of a frame, one sensor row after the other.
+    """Readout of a frame, one sensor row after the other."""
 
-    Args:
-        rows: Rows of the packed frame.
-        row_time: Time from the start of one sensor row to the start of the next [s].
-        sensor_rows: Number of sensor rows that are averaged into one row of the frame.
-    """
-
-    rows: int
-    row_time: float
-    sensor_rows: int
+    rows: int  # of the packed frame
+    row_time: float  # from the start of one sensor row to the start of the next [s]
+    sensor_rows: int  # that are averaged into one row of the frame
 
 
 #: Lightings by name: every subclass of `Lighting` with a `name` of its own.

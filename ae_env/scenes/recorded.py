@@ -292,21 +292,14 @@ def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
 
 @dataclass(frozen=True)
 class RecordedFile:
-    """One real capture.
-
-    Args:
-        path, settings: Its file, and the settings that it was taken at.
-        scene: Name of what it shows, of a frame of video with the frame's number.
-        group: Source group: what it shows whatever the light.
-        sequence, frame: The video that it is a frame of, empty for a still scene, and which.
-    """
+    """One real capture."""
 
     path: Path
-    settings: CameraSettings
-    scene: str
-    group: str
-    sequence: str
-    frame: int
+    settings: CameraSettings  # that it was taken at
+    scene: str  # name of what it shows, of a frame of video with the frame's number
+    group: str  # source group: what it shows whatever the light
+    sequence: str  # the video that it is a frame of, empty for a still scene
+    frame: int  # which of its frames
 
     @property
     def is_picture(self) -> bool:

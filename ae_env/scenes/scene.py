@@ -198,9 +198,6 @@ class Scene:
             group: Source group; `scene_id` by default.
             nlf: Noise left in `packed`; none by default.
             illuminance, white_balance, kind, fields: As in `Scene`.
-
-        Raises:
-            ValueError: If a value has the wrong shape or lies outside its range.
         """
         scene = cls(
             scene_id=scene_id,

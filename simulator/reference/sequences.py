@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
@@ -119,13 +120,9 @@ def draw_settings(
 @functools.cache
 def _candidates(lowest_iso: float, highest_iso: float) -> tuple[list[CameraSettings], np.ndarray]:
     """Every triple, in ascending order, and (n, 3): log2 exposure, ISO and aperture in stops."""
-    candidates = [
-        CameraSettings(iso, time, f_number)
-        for iso in ISO_SPEEDS
-        if lowest_iso <= iso <= highest_iso
-        for time in EXPOSURE_TIMES
-        for f_number in F_NUMBERS
-    ]
+    isos = [iso for iso in ISO_SPEEDS if lowest_iso <= iso <= highest_iso]
+    triples = itertools.product(isos, EXPOSURE_TIMES, F_NUMBERS)
+    candidates = [CameraSettings(*triple) for triple in triples]
     widest = 4  # f/4 lets 4 stops less light through than f/1
     stops = [
         (s.log2_exposure, math.log2(s.iso / 100.0), s.aperture_stop / 3 - widest)
@@ -172,9 +169,7 @@ def any_pairs(sequences: SequenceOf[HasSettings]) -> list[Pair]:
     return [
         Pair(index, source, target)
         for index, sequence in enumerate(sequences)
-        for source in range(len(sequence.settings))
-        for target in range(len(sequence.settings))
-        if source != target
+        for source, target in itertools.permutations(range(len(sequence.settings)), 2)
     ]
 
 

@@ -283,13 +283,8 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
         stem, settings, content = f"capture_{index:03d}", raw.settings, io.BytesIO()
         np.save(content, raw.data.detach().cpu().numpy()[[0, 1, 3, 2]], allow_pickle=False)
         write_atomically(folder / f"{stem}.npy", content.getvalue())
-        values = (
-            f"{folder.name}/{stem}.jpg",
-            settings.exposure_time,
-            settings.iso,
-            settings.f_number,
-        )
-        row: dict[str, object] = dict(zip(COLUMNS, values, strict=True))
+        row: dict[str, object] = {"path": f"{folder.name}/{stem}.jpg"}
+        row |= {"time": settings.exposure_time, "iso": settings.iso, "aperture": settings.f_number}
         if nikon:
             row["wb"] = [*raw.white_balance, 0.0]
         means = [
