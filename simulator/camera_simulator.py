@@ -287,10 +287,8 @@ class CameraSimulator:
         """The prepared scene's light (4, H, W) with little noise, by `noise` or the best module.
 
         The result serves every exposure: the family commutes with exposure. Those of the paper
-        and of its authors' code do not; they are run at the exposure of the source.
-
-        Raises:
-            ValueError: If this simulator has no noise module.
+        and of its authors' code do not; they are run at the exposure of the source. A `ValueError`
+        if there is no noise module.
         """
         noise = _required("noise", self.noise if noise is None else noise)
         image, (shot, read) = prepared.light[None], self._noise_of(prepared)
@@ -315,8 +313,7 @@ class CameraSimulator:
     def estimate_defocus(self, prepared: PreparedScene) -> torch.Tensor:
         """Circle of confusion of each pixel (H, W), at the prepared scene's own aperture [pixel].
 
-        Raises:
-            ValueError: If this simulator's aperture module has no such map.
+        A `ValueError` if the aperture module has no such map.
         """
         aperture = _required("aperture", self.aperture)
         shot, read = self._noise_of(prepared)

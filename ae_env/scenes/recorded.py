@@ -150,10 +150,8 @@ def recorded_scenes(
     """The recorded scenes of a split, frames of one video after the other.
 
     Each capture is resized before the next is read. Captures at settings that are not in `grid` are
-    left out, states without a capture are forbidden (`Scene.allowed`).
-
-    Raises:
-        ValueError: If a capture cannot be read, or a scene's captures are no grid of one size.
+    left out, states without a capture are forbidden (`Scene.allowed`). A `ValueError` if a capture
+    cannot be read, or a scene's captures are no grid of one size.
     """
     camera = options.camera(request.camera)
     scenes: list[Scene] = []
@@ -310,10 +308,8 @@ class RecordedFile:
 def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
     """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
-    `known` are settings by name that the files do not state; those that they do come first.
-
-    Raises:
-        ValueError: If there is no capture, one does not state its settings, or a table is wrong.
+    `known` are settings by name that the files do not state; those that they do come first. A
+    `ValueError` if there is no capture, one does not state its settings, or a table is wrong.
     """
     tables = _read_tables(folder)
     paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))

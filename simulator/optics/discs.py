@@ -426,9 +426,7 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
     The sum of squared weights of the blended kernel,
     ``(1 - t)^2 E_aa + 2 t (1 - t) E_ab + t^2 E_bb`` between discs a and b.
 
-    Args:
-        diameter: (..., H, W) blur diameter of each pixel [pixel].
-        taps: Of a motion behind the discs; None for none.
+    `taps` are those of a motion behind the discs; `diameter` is (..., H, W) [pixel].
     """
     products = _kernel_products()
     if taps is not None:

@@ -64,9 +64,6 @@ class Lamp:
             rows: Their number.
             row_time: From one sensor row's begin to the next one's [s].
             sensor_rows: Sensor rows that one packed row is the mean of.
-
-        Raises:
-            ValueError: If there are no rows, or too many, or time goes backwards.
         """
         check_integer("rows", rows, 1, 2**20)
         check_integer("sensor_rows", sensor_rows, 1, 2**12)

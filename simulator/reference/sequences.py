@@ -100,10 +100,7 @@ def draw_settings(
 
     `illuminance` is the light on the scene [lux], 1 to 20,000 in the paper. ISOs above 2.5 times
     the highest calibrated one of `camera` are not drawn. The settings are in ascending order (ISO,
-    then time, then f-number).
-
-    Raises:
-        ValueError: If fewer than 25 triples expose such a scene to within 3 EV.
+    then time, then f-number). A `ValueError` if fewer than 25 expose such a scene to within 3 EV.
     """
     candidates, stops = _candidates(min(camera.nlf_by_iso), _ISO_BEYOND * max(camera.nlf_by_iso))
     weights = _weights(stops, incident_ev100(illuminance))

@@ -97,8 +97,7 @@ class PackedCapture:
     def read(self) -> RawImage:
         """Read the capture from its file; nothing pickled is loaded.
 
-        Raises:
-            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers.
+        A `ValueError` unless it is a finite (4, H, W) array of floating-point numbers.
         """
         try:
             red, green_1, blue, green_2 = np.load(self.file, allow_pickle=False)
@@ -334,10 +333,7 @@ def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pa
     ``"exposure"`` and ``"baseline"``: any two captures of a sequence. ``"noise"``: the same
     f-number, a target at ISO 400 or less with at most a quarter of the source's noise variance at
     mid grey. ``"aperture"``: a target that is more open, and for a tenth of the pairs one that is
-    as open.
-
-    Raises:
-        ValueError: If there is no such pair.
+    as open. A `ValueError` if there is no such pair.
     """
     pairs = opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
     if stage == "noise":
