@@ -94,7 +94,7 @@ class Exposure:
     layout: Layout | None = None
     path: Path | None = None  # of the background; None for a streak along the rows
     subject_path: Path | None = None  # of the layout's subject where it moves on its own
-    #: Share of the source's noise variance that these blurs leave; None for a disc and a streak's.
+    #: Share of the source's noise variance that blurs leave; None for what a disc and streak leave.
     energy: float | None = None
     #: Noise-reduced light that it starts from, `source` is zero then; None for the recorded one.
     denoised: DenoisedLight | None = None
