@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import re
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -19,8 +19,8 @@ from simulator.utils.checks import did_you_mean
 MAX_BYTES = 2**20
 #: Environment variable: folders whose YAML files may name Python code, or ``all``.
 TRUST_VARIABLE = "AE_ENV_TRUST"
-#: A class or function of a file or module, with options behind it or not.
-_CODE = re.compile(r"(?P<head>.+\.py|[A-Za-z_]\w*(\.[A-Za-z_]\w*)*):[A-Za-z_][\w.]*(\?.*)?|.+\.py")
+#: A package that stands before the names of its metrics, of which none is code.
+_METRICS = "pyiqa"
 
 #: Words for pydantic's errors that name Python types.
 _PLAIN = {
@@ -103,25 +103,28 @@ def _is_trusted(file: Path) -> bool:
 
 
 def _texts(content: Any) -> Iterator[str]:
-    """All texts of a YAML file, keys among them."""
-    if isinstance(content, str):
-        yield content
-    elif isinstance(content, dict):
-        for pair in content.items():
-            yield from _texts(list(pair))
-    elif isinstance(content, list):
-        for value in content:
-            yield from _texts(value)
+    """All texts of a YAML file, keys among them, those of an alias once."""
+    waiting, seen = [content], set[int]()
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, bytes):  # of `!!binary`; pydantic takes them as text
+            value = value.decode(errors="replace")
+        if isinstance(value, str):
+            yield value
+        elif isinstance(value, Iterable) and id(value) not in seen:
+            seen.add(id(value))
+            waiting.extend(chain(*value.items()) if isinstance(value, dict) else value)
 
 
 def _names_code(text: str) -> bool:
-    """Whether a text names a Python file, or a class or function of a module that there is."""
-    found = _CODE.fullmatch(text)
-    if found is None:
-        return False
-    head = found["head"] or text
+    """Whether a text names a Python file, or anything of a module that there is."""
+    text = text.strip()
+    head, colon, _ = text.partition(":")
+    top = head.partition(".")[0]  # to look for a submodule would run its parent
+    if ".py:" in text or text.endswith(".py"):
+        return True
     try:
-        return head.endswith(".py") or "." in head or importlib.util.find_spec(head) is not None
+        return bool(colon and top and find_spec(top)) and head != _METRICS
     except ValueError:  # such as `__main__`
         return True
 

@@ -148,7 +148,14 @@ def test_a_good_file(tmp_path, monkeypatch):
     "text",
     [
         *("scorer: their/evil.py:X", "scorer: {noise: 0.5, '~/evil.py:X': 0.5}", "a: evil.py"),
-        *("scenes: pkg.mod:attr", "policies: [matrix:P, 'evil.py:Mine?gain=2']", "scenes: json:x"),
+        *(
+            "scenes: json.tool:attr",
+            "policies: [matrix:P, 'evil.py:Mine?gain=2']",
+            "scenes: json:x",
+        ),
+        # What loads a module runs it before it looks for the name in it.
+        *("a: evil.py:1", "a: evil.py:\u00e9", "a: 'json:X-v0'", 'a: "a\\nb/evil.py:X"'),
+        *("a: !!binary ZXZpbC5weTpY", "a: !!set {evil.py:X: }", "a: !!pairs [b: evil.py:X]"),
     ],
 )
 def test_code_in_a_file_needs_trust(tmp_path, monkeypatch, text):
@@ -164,6 +171,9 @@ def test_names_of_our_own_are_no_code(tmp_path):
     text = "[bundled:snow, matrix:P, 'recorded:my_grid?iso=100', ppo:video, a.dng, 'x.yaml', '1:2']"
     (tmp_path / "a.yaml").write_text(text)
     assert len(read_yaml(tmp_path / "a.yaml")) == 7
+    doubled = (f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60))
+    (tmp_path / "a.yaml").write_text(f"a0: &a0 [x]\n{''.join(doubled)}")  # 2^59 texts
+    assert len(read_yaml(tmp_path / "a.yaml")) == 60
 
 
 @pytest.mark.parametrize(
