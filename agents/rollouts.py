@@ -148,7 +148,7 @@ def choose(
     name: str, policy: Policy, observations: Observations, masks: Bools, info: Mapping[str, Any]
 ) -> Any:
     """What `act` returns, see `errors_of`; `info` is for a privileged policy only."""
-    told = {"info": info} if getattr(policy, "privileged", False) else {}
+    told: dict[str, Any] = {"info": info} if getattr(policy, "privileged", False) else {}
     with errors_of(name, "act"):
         return policy.act(observations, masks, **told)
 

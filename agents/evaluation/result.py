@@ -266,8 +266,9 @@ class EvaluationResult:
 
 def as_results(results: EvaluationResult | Results) -> Results:
     """Results by condition, of a single one too."""
-    single = isinstance(results, EvaluationResult)
-    return {results.plan.static_condition: results} if single else results
+    if isinstance(results, EvaluationResult):
+        return {results.plan.static_condition: results}
+    return results
 
 
 def static_condition(results: Results) -> str:
