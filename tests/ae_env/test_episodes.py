@@ -106,15 +106,6 @@ def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
     assert torch.equal(first[bright], codes[bright])
 
 
-@pytest.mark.parametrize("noise", ["bank", "exact", False])
-def test_frames_do_not_depend_on_the_number_of_threads(noise: Any) -> None:
-    frames = []
-    for number in (1, 2):
-        torch.set_num_threads(number)
-        frames.append(_frames(make_envs(noise=noise)))
-    assert_equal(*frames)
-
-
 def test_white_is_1_whatever_the_black_level() -> None:
     """In float32 (1023 - 103.34) / (1023 - 103.34) is 1.0000001."""
     camera = replace(CAMERA, black_level=(103.34,) * 4, white_level=1023.0)

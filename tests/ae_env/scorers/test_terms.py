@@ -100,26 +100,6 @@ def test_noise_is_that_of_the_cameras_own_pixels() -> None:
         np.testing.assert_allclose(found, wanted, atol=0.01)
 
 
-def test_values_by_hand() -> None:
-    """Flat frames at white and at black, and a stop, 0.1 stop of bands, b0 of blur."""
-    state = GRID[0]
-    captures = make_captures(make_scene(np.full((4, 40, 40), 0.25)), [state] * 3)
-    images = torch.tensor([1.0, 0.0, 0.25])[:, None, None, None].expand(3, 4, 40, 40)
-    ev = captures.ev100
-    captures = replace(captures, proper_ev=ev + torch.tensor([0.0, 1.0, -2.0]))
-    captures = replace(captures, blur_px=torch.tensor([0.0, 40 / 64, 3 * 40 / 64]).double())
-    expected = {
-        "brightness": [1.0, math.exp(1 - math.sqrt(2)), math.exp(1 - math.sqrt(5))],
-        "highlights": [math.exp(-1.0 / 0.15), 1.0, 1.0],
-        "shadows": [1.0, math.exp(-1.0 / 0.2), 1.0],
-        "sharpness": [1.0, 0.5, 0.1],
-        "banding": [1.0, 1.0, 1.0],
-    }
-    for name, wanted in expected.items():
-        found = make_scorer(name)(images, captures).tolist()
-        assert found == pytest.approx(wanted, rel=2e-5, abs=1e-6), name
-
-
 def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     """With read noise alone SNR = x / sqrt(read), with shot noise alone sqrt(x / shot)."""
     captures = make_captures(make_scene(np.full((4, 40, 40), 0.5)), [GRID[0]] * 4)
@@ -147,12 +127,12 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
 def test_bands_by_hand() -> None:
     """Half of the rows at 1.2 of the light, half at 0.8; brightness is the mean over the rows."""
     captures = make_captures(make_scene(np.full((4, 40, 40), 0.1)), [GRID[0]])
+    assert make_scorer("banding")(None, captures).item() == 1.0
+    spread = 0.5 * math.log2(1.2 / 0.8)
     rows = torch.tensor([1.2, 0.8], dtype=torch.float64).repeat_interleave(20)[None]
     captures = replace(captures, row_gain=rows, proper_ev=captures.ev100 + 1.0)
-    spread = 0.5 * math.log2(1.2 / 0.8)
-    assert make_scorer("banding")(None, captures).item() == pytest.approx(
-        1 / (1 + (spread / 0.1) ** 2)
-    )
+    found = make_scorer("banding")(None, captures).item()
+    assert found == pytest.approx(1 / (1 + (spread / 0.1) ** 2))
     errors = [1 + math.log2(1.2), 1 + math.log2(0.8)]
     wanted = sum(math.exp(1 - math.sqrt(1 + e * e)) for e in errors) / 2
     assert make_scorer("brightness")(None, captures).item() == pytest.approx(wanted)
@@ -295,11 +275,7 @@ def test_mixed_scorer_averages_only_what_is_noisy() -> None:
             _tables(**{name: value})
 
 
-def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
-    table = _tables().table(_scene())
-    assert table.mean[table.oracle] == table.mean.max()
-    assert (table.mean.shape, table.mean.dtype) == ((8,), np.float64)
-    assert set(table.parts) == {"brightness", "highlights", "shadows", "noise", "sharpness"}
+def test_ties_go_to_the_lower_iso() -> None:
     # Under `brightness` alone all states of one EV are alike: ISO 100 at 1/25 s equals ISO 400
     # at 1/100 s and ISO 1600 at 1/400 s; times that are no powers of two round differently.
     grid = ExposureGrid((100, 400, 1600), (1 / 400, 1 / 100, 1 / 25), (4, 8))

@@ -69,16 +69,6 @@ def test_every_step_runs_or_has_a_reason(settings, networks, tolerance):
     assert (plan.network is None) is ("noise_reduction" not in plan.modules)
 
 
-def test_the_networks_run_where_they_are_needed() -> None:
-    first, last = ("exposure",), ("noise", "clip_and_quantise")
-    for settings, modules in (
-        (CLEANER, ("noise_reduction",)),
-        (OPENER, ("aperture",)),
-        (CameraSettings(100, 1 / 16, 4), ("noise_reduction", "aperture")),
-    ):
-        assert prepared().plan(settings).modules == first + modules + last
-
-
 @pytest.mark.parametrize(
     ("changes", "settings", "left_out", "word"),
     [

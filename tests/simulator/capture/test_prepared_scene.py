@@ -372,35 +372,6 @@ def test_a_frame_is_the_same_alone_in_a_sweep_and_in_any_order(
         assert len(plan.explain().splitlines()) == 3
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 0.1, 10.0])
-def test_what_is_left_out_stays_within_the_tolerance(tolerance: float) -> None:
-    """Over all kinds of transitions of a textured, noisy, moving scene of unknown depth."""
-    rng = np.random.default_rng(2)
-    clean = torch.from_numpy((0.02 + 0.5 * rng.random((4, 32, 48))).astype(np.float32))
-    found = torch.from_numpy(rng.random((32, 48)).astype(np.float32)) * 0.05
-    denoised, seen = DenoisedLight(clean), set()
-    blur = MapApertureBlur(clean, found, 8.0)
-    states = itertools.product((100, 800, 6400), (1 / 500, 1 / 64, 1 / 4), (4, 8))
-    states = [CameraSettings(*values) for values in states]
-    for iso, speed, disc in itertools.product((100, 1600), (0.0, 1e-3, 0.1), (0.0, 0.01, 1.0)):
-        reference = CameraSettings(iso, 1 / 64, 8)
-        made = PreparedScene(clean, reference, Z6, Z6.nlf(iso), tolerance=tolerance)
-        scene = {"image_speed": speed, "defocus": disc}
-        made = replace(made, denoised_lights=(denoised,), aperture_blur=blur, **scene)
-        for exposure in map(made.exposure, states):
-            applied = {
-                "noise_reduction": exposure.denoised is not None,
-                "aperture": exposure.opened_to is not None,
-                "defocus": exposure.defocus_px > 0,
-                "motion_blur": exposure.motion_px > 0,
-            }
-            assert applied == {step.name: step.runs for step in exposure.steps}
-            errors = {step.name: step.error for step in exposure.steps if not step.runs}
-            seen |= {name for name, error in errors.items() if error}
-            assert math.hypot(*errors.values()) <= tolerance * (1 + 1e-9)
-    assert tolerance < 0.1 or seen == {"noise_reduction", "aperture", "defocus", "motion_blur"}
-
-
 @given(lights(), lights(), ANY_SETTINGS, ANY_SETTINGS, cameras(noise=False))
 def test_more_light_never_lowers_the_raw(first, second, reference, settings, camera):
     second = torch.from_numpy(np.resize(second.numpy(), first.shape))
