@@ -21,15 +21,9 @@ from ae_env.scenes.load import _LOADED
 from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
 from simulator.reference.reference_camera import ReferenceCamera
+from tests.ae_env import scene_files
 from tests.ae_env.environments import ID, check_parity, make_env
-from tests.ae_env.scene_files import (
-    GRID,
-    capture,
-    write_picture,
-    write_raws,
-    write_states,
-    write_video,
-)
+from tests.ae_env.scene_files import GRID, capture, write_picture, write_raws, write_states
 from tests.simulator.training.scenes import scene as reference_scene
 
 CAMERA = get_camera("nikon_z6")
@@ -241,7 +235,7 @@ def test_imagenet_es_and_video_stacks(tmp_path: Path) -> None:
     assert recorded.recorded_grid(files) == grid
     by_folder = {f.path.parts[-3]: f.settings for f in files}
     assert by_folder == {f"param_{i + 1}": s for i, s in enumerate(grid)}
-    write_video(tmp_path / "video", frames=11, times=("1-1000s", "1-60s"))
+    scene_files.write_video(tmp_path / "video", frames=11, times=("1-1000s", "1-60s"))
     scenes = load({"recorded": tmp_path / "video", "iso": 400, "f_number": 4})
     assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]
     assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
@@ -266,7 +260,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("video")
-    write_video(folder)
+    scene_files.write_video(folder)
     return {"recorded": str(folder), "iso": 400, "f_number": 4}
 
 

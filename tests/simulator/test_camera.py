@@ -1,4 +1,4 @@
-"""Settings against APEX, ISO 12232 and the tables printed on cameras; camera profiles."""
+"""Settings against APEX, ISO 12232 and the tables printed on cameras; profiles; public names."""
 
 import json
 import math
@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 
+import simulator
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
-from simulator.settings import (
-    CameraSettings,
-    exposure_ratio,
-    format_exposure_time,
-    incident_ev100,
-    snap_exposure_time,
-)
+from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, snap_exposure_time
 from tests.simulator.z6_noise import z6_noise
 from tests.strategies import settings_within
 
@@ -141,7 +136,7 @@ def test_ranges_include_their_ends(name: str, low: float, high: float) -> None:
     ],
 )
 def test_format(exposure_time: float, text: str) -> None:
-    assert format_exposure_time(exposure_time) == text
+    assert simulator.settings.format_exposure_time(exposure_time) == text
     assert str(CameraSettings(400, exposure_time, 5.6)) == f"ISO 400, {text}, f/5.6"
 
 
@@ -306,3 +301,11 @@ def test_unknown_names_propose_the_nearest() -> None:
     for wrong in ("qqqq", ["nikon_z6"]):
         with pytest.raises(ValueError, match=r"`camera` .*'canon_5d4', .*'sony_a7s2'"):
             get_camera(wrong)
+
+
+def test_public_names_are_all_there_is() -> None:
+    assert dir(simulator) == sorted(simulator.__all__)
+    for name in simulator.__all__:
+        assert getattr(simulator, name).__name__ == name
+    with pytest.raises(AttributeError, match="module 'simulator' has no attribute 'Raw'"):
+        simulator.Raw  # noqa: B018

@@ -14,20 +14,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulator import (
-    CameraProfile,
-    CameraSettings,
-    CameraSimulator,
-    NoiseLevelFunction,
-    PreparedScene,
-    RawImage,
-    exposure_ratio,
-    get_camera,
-)
+from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
+from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.statistics import Residual
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.weights import save_modules
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import added_blur
 from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
 from simulator.training.scenes import detail_pictures, reference_scenes

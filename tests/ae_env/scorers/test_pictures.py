@@ -32,15 +32,8 @@ from ae_env.utils.user_files import UserCodeError
 from benchmarks import defects as benchmark
 from simulator import CameraSettings, NoiseLevelFunction, incident_ev100
 from simulator.raw.develop import srgb_encode
-from tests.ae_env.scorer_images import (
-    CAMERA,
-    GRID,
-    captures_of,
-    make_captures,
-    make_scene,
-    random_pictures,
-    random_scene,
-)
+from tests.ae_env import scorer_images
+from tests.ae_env.scorer_images import CAMERA, GRID, captures_of, make_captures, random_pictures
 
 
 def _levels(count: int = 3, height: int = 40, width: int = 60) -> np.ndarray:
@@ -322,7 +315,7 @@ def test_colour_is_the_published_difference_and_structure_that_of_even_lightness
 
 
 def test_what_a_camera_does_costs():
-    scorer, scene = make_scorer("fidelity"), random_scene(illuminance=1000.0)
+    scorer, scene = make_scorer("fidelity"), scorer_images.random_scene(illuminance=1000.0)
     state = CameraSettings(100, 2.0 ** -(math.log2(1000 / 2.5) - 4), 4)
     captures = make_captures(scene, [state] * 5)
     (ideal,) = reference_pictures(captures, [0])
@@ -343,7 +336,7 @@ needs_opencv = pytest.mark.skipif(find_spec("cv2") is None, reason="needs the ex
 
 
 def _scene(light: np.ndarray, name: str = "test") -> Scene:
-    return make_scene(np.repeat(light[None], 4, axis=0), scene_id=name)
+    return scorer_images.make_scene(np.repeat(light[None], 4, axis=0), scene_id=name)
 
 
 def _camera_man(size: int = 128) -> np.ndarray:

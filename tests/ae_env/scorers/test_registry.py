@@ -24,16 +24,9 @@ from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
 from ae_env.utils.user_files import UserCodeError
 from simulator import NoiseLevelFunction
+from tests.ae_env import scorer_images
 from tests.ae_env.environments import SMALL
-from tests.ae_env.scorer_images import (
-    CAMERA,
-    GRID,
-    Own,
-    make_captures,
-    mean_signal,
-    random_pictures,
-    random_scene,
-)
+from tests.ae_env.scorer_images import CAMERA, GRID, Own, make_captures, mean_signal, random_scene
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 MINE = '''
@@ -182,7 +175,7 @@ IMAGE_SCORERS += ["blind_noise", *(f"analytic_{defect}" for defect in DEFECTS)]
 def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
     scorer = make_scorer(name).parts[name]
     channels = 3 if scorer.domain == "srgb" else 4
-    pictures = random_pictures()[:, :channels].contiguous()
+    pictures = scorer_images.random_pictures()[:, :channels].contiguous()
     before = pictures.clone()
     scores = scorer(pictures, None)
     assert torch.equal(pictures, before)
@@ -193,7 +186,7 @@ def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
     for height, width in ((1, 1), (1, 7), (2, 2), (3, 1), (5, 9), (13, 11), (36, 36)):
         extremes = torch.zeros(3, channels, height, width)
         extremes[1] = 1.0
-        extremes[2] = random_pictures(1, height, width)[:, :channels]
+        extremes[2] = scorer_images.random_pictures(1, height, width)[:, :channels]
         values = scorer(extremes, None)
         assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
 

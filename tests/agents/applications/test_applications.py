@@ -11,15 +11,9 @@ from PIL import Image
 from agents.applications import hdr
 from agents.applications.hdr import expose_and_develop, fuse, linear_rgb, write_exr
 from agents.applications.refocus import read_depth, refocus
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    Lens,
-    NoiseLevelFunction,
-    RawImage,
-    get_camera,
-    render_srgb,
-)
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.thin_lens import Lens
 
 NO_NOISE = NoiseLevelFunction((1e-12,) * 4, (1e-12,) * 4)
 #: Pixel pitch such that packed pixels are 10 um.

@@ -10,18 +10,14 @@ from scipy.integrate import quad
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
+from simulator.capture import statistics
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
 from simulator.capture.decision import Exposure, Step
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
 from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT, KEPT_BLUR_ERROR, MISSED_BLUR
 from simulator.capture.prepared_scene import Layout
-from simulator.capture.statistics import (
-    DenoisedLight,
-    LightStatistics,
-    Residual,
-    ResidualStatistics,
-)
+from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.optics.motion import Movement
 
 Z6 = get_camera("nikon_z6")
@@ -149,7 +145,7 @@ class Statistics(LightStatistics):
 
 #: A flat field of unit noise: a network's error there is that of its first knot.
 UNIT = NoiseLevelFunction((0.0,) * 4, (1.0,) * 4)
-FLAT = ResidualStatistics(torch.ones(4, 16, 16), UNIT)
+FLAT = statistics.ResidualStatistics(torch.ones(4, 16, 16), UNIT)
 
 
 class Opening(ApertureBlur):

@@ -12,17 +12,9 @@ from torch import Tensor, nn
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import get_camera
-from simulator.networks import aperture_module
+from simulator.networks import aperture_module, noise_module
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
-from simulator.networks.noise_module import (
-    SIZES,
-    Denoiser,
-    NoiseModule,
-    Preset,
-    Stabiliser,
-    smoothed,
-    variance_map,
-)
+from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Preset, Stabiliser
 from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
@@ -233,7 +225,7 @@ def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> N
     expected = np.sqrt(read + shot * image.double().numpy()[0].clip(min=0))
     np.testing.assert_allclose(deviation[0].numpy(), expected, rtol=1e-5)
     smooth = uniform_filter(image.double().numpy(), (1, 1, 5, 5), mode="nearest")
-    np.testing.assert_allclose(smoothed(image).numpy(), smooth, atol=1e-6)
+    np.testing.assert_allclose(noise_module.smoothed(image).numpy(), smooth, atol=1e-6)
 
 
 def test_operations_by_hand() -> None:
@@ -258,7 +250,7 @@ def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> Non
     for i in (0, 2):
         inputs = image[i : i + 1], factor[i] * SHOT, factor[i] * READ
         if preset == "paper":
-            level = variance_map(*inputs).sqrt()
+            level = noise_module.variance_map(*inputs).sqrt()
             expected = inputs[0] + module.network(torch.cat([inputs[0], level], dim=1))
         else:
             expected = module.network(*inputs)

@@ -20,15 +20,9 @@ from simulator.optics.discs import DiscBank
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
+from simulator.training import crops as crops_module
 from simulator.training import losses
-from simulator.training.crops import (
-    Batch,
-    DetailCrops,
-    DetailPicture,
-    NoiseBatch,
-    ReferencePairs,
-    draw_sequences,
-)
+from simulator.training.crops import Batch, DetailCrops, DetailPicture, NoiseBatch, ReferencePairs
 from tests.simulator.training.scenes import REFERENCE, scene
 
 Z6, CANON = get_camera("nikon_z6"), get_camera("canon_70d")
@@ -50,7 +44,9 @@ def test_batches_and_sequences_are_those_of_their_seed_and_index():
         assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
     torch.manual_seed(77)
     assert all(map(torch.equal, batches[1], pairs().batch(1, 4, 16)))  # the first that it draws
-    first, again, other = (draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1))
+    first, again, other = (
+        crops_module.draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1)
+    )
     assert [s.settings for s in first] == [s.settings for s in again]
     assert first[1].settings != first[0].settings != other[0].settings
     with pytest.raises(ValueError, match="`sequences`"):
