@@ -413,6 +413,22 @@ def test_mean_is_put_at_the_target_of_its_illuminance(context, photograph, scene
     assert found == pytest.approx(scene_ev - math.log2(target / 0.12), abs=0.04)
 
 
+#: Weights of the zones as raspberrypi/libcamera has them in src/ipa/rpi/vc4/data/imx477.json.
+ZONES = {"matrix": [1] * 15, "spot": [2, 1, 1] + [0] * 12}
+ZONES["centre_weighted"] = [3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("metering", ZONES)
+def test_zones_weigh_as_published(context, photograph, metering):
+    """Zones whose mean is 1 by these weights, in bright light: the mean is put at 0.17."""
+    for seed in (0, 6):  # a level close to 1 shows no weight: each is elsewhere in one of them
+        levels = np.random.default_rng(seed).permutation(np.geomspace(0.25, 3.0, 15))
+        levels /= np.average(levels, weights=ZONES[metering])
+        frame = photograph(levels[zone_map(64, 64)], 12.0, context.grid.nearest(12.0))
+        found = _wanted_ev(make_policy(f"rpi_agc?metering={metering}", context), frame)
+        assert found == pytest.approx(12.0 - math.log2(0.17 / 0.12), abs=0.02)
+
+
 def test_constraints(context, photograph):
     """Wide range: half of the frame dark, 4 % of it highlights in the corners."""
     light = np.full((64, 64), 1.3)
