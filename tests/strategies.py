@@ -87,7 +87,7 @@ def prepared(
     **fields: float,
 ) -> PreparedScene:
     """`light` ready to be exposed, noise-free by default."""
-    return PreparedScene(light, reference, camera, nlf or NoiseLevelFunction.zero(), **fields)  # type: ignore[arg-type]
+    return PreparedScene(light, reference, camera, nlf or NoiseLevelFunction.zero(), **fields)
 
 
 @st.composite

@@ -5,7 +5,6 @@ import pickle
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -152,7 +151,7 @@ def link(path: Path) -> None:
         (only_one_state, "1 of 1 captures in the grid, .*param_3"),
     ],
 )
-def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil: Any, message: str) -> None:
+def test_bad_files_get_one_line_that_names_them(tmp_path, spoil, message):
     write_states(tmp_path)
     if spoil:
         spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
@@ -258,13 +257,13 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def video(tmp_path_factory):
     folder = tmp_path_factory.mktemp("video")
     scene_files.write_video(folder)
     return {"recorded": str(folder), "iso": 400, "f_number": 4}
 
 
-def arguments(scenes: Any, **more: Any) -> dict[str, Any]:
+def arguments(scenes, **more):
     spec = f"recorded:{scenes}" if isinstance(scenes, Path) else scenes
     return {"scenes": spec, "split": "test", **more}
 
@@ -291,7 +290,7 @@ def test_every_observation_is_the_capture(raws: Path) -> None:
 
 
 def test_states_without_a_capture_are_masked_and_never_shown(raws: Path) -> None:
-    base: Any = make_env(**arguments(raws)).unwrapped
+    base = make_env(**arguments(raws)).unwrapped
     assert base.action_space.n == len(GRID)
     for seed in range(8):  # no episode starts there
         _, info = base.reset(seed=seed, options={"scene": "b"})
@@ -307,7 +306,7 @@ def test_states_without_a_capture_are_masked_and_never_shown(raws: Path) -> None
     _, info = base.reset(seed=0, options={"scene": "b", "state": 5})
     assert info["state"] == 3
     # Of the 64 states those at f/4 and f/8 with ISO 100 or 1600 and 1/1000 or 1/125 s were taken.
-    named: Any = make_env(**arguments(raws, grid="default")).unwrapped
+    named = make_env(**arguments(raws, grid="default")).unwrapped
     assert named.action_space.n == 64
     (whole,) = (scene for scene in named.scenes if scene.scene_id == "a")
     assert whole.allowed.sum() == 8
@@ -322,7 +321,7 @@ def test_the_nearest_capture_is_nearest_in_exposure_first() -> None:
     assert nearest_recorded(scene, grid).tolist() == [0, 1, 1, 3, 4, 3]
 
 
-def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str, Any]) -> None:
+def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video):
     env = make_env(**arguments(video))
     _, info = env.reset(seed=0, options={"scene": "street", "state": 0})
     shown = [info["scene_id"]]
@@ -339,7 +338,7 @@ def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str,
 def test_the_table_is_what_stepping_gives(raws: Path) -> None:
     for scorer in ("balanced", {"entropy": 0.5, "noise": 0.5}):
         env = make_env(**arguments(raws, scorer=scorer, with_oracle=True))
-        base: Any = env.unwrapped
+        base = env.unwrapped
         env.reset(seed=0, options={"scene": "b"})
         rewards = np.full(len(GRID), -1.0)
         for state in np.flatnonzero(base.action_masks()):
@@ -351,7 +350,7 @@ def test_the_table_is_what_stepping_gives(raws: Path) -> None:
         assert info["oracle_state"] == rewards.argmax()
 
 
-def test_many_and_pickled_copies_show_the_same(raws: Path, video: dict[str, Any]) -> None:
+def test_many_and_pickled_copies_show_the_same(raws, video):
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
         check_parity(0, 4, max_episode_steps=3, **given)
@@ -380,7 +379,7 @@ REAL = {"motion": 0.3, "depth": 1.0, "lighting": "step", "noise": "exact", "sour
 
 
 @pytest.mark.parametrize(("name", "value"), [*REAL.items(), ("noise", False)])
-def test_nothing_of_real_captures_can_be_simulated(raws: Path, name: str, value: Any) -> None:
+def test_nothing_of_real_captures_can_be_simulated(raws, name, value):
     with pytest.raises(ValueError, match=rf"`{name}` .* must be .* for recorded"):
         make_env(**arguments(raws, **{name: value}))
     scenes = load_scenes(f"recorded:{raws}", "all", camera=CAMERA, resolution=36)

@@ -4,8 +4,6 @@ import inspect
 import json
 import math
 from dataclasses import fields
-from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ae_env
-from ae_env import ExposureGrid, Scene
+from ae_env import ExposureGrid
 from ae_env.lighting import KINDS, MAX_STOPS, Lighting, RollingShutter, make_lighting
 from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.merging import log_error, merge
@@ -33,7 +31,7 @@ GRID = ExposureGrid.bracket()
 STOP = len(GRID)
 
 
-def bracket(**arguments: Any) -> gym.Env:
+def bracket(**arguments):
     return make_env(ID, **arguments)
 
 
@@ -91,7 +89,7 @@ def test_log_error_by_hand() -> None:
     np.testing.assert_allclose(error[2], 1.0, rtol=1e-6)  # (0 + 0.1) / (0.1 + 0.1)
 
 
-def two_lights(low: float, high: float) -> Scene:
+def two_lights(low, high):
     """A scene at EV100 10: one half is `low` of white, the other `high`."""
     light = np.full((4, 36, 36), low * WHITE_SIGNAL)
     light[:, :, 18:] = high * WHITE_SIGNAL
@@ -214,7 +212,7 @@ def test_bad_arguments_are_refused() -> None:
 
 
 VIDEO_ID = "ae_env/AutoExposureVideo-v0"
-VIDEO: dict[str, Any] = {
+VIDEO = {
     "grid": "video",
     "lighting": "moving",
     "delay": {"iso": 1, "exposure_time": 2, "f_number": 2},
@@ -295,7 +293,7 @@ def _gains(spec: object, frames: int, phase: float = 0.0) -> list[float]:
         ({"kind": "sine", "stops": 2, "period": 4}, [0, 2, 0, -2, 0]),
     ],
 )
-def test_light_follows_its_rule(spec: dict[str, Any], stops: list[float]) -> None:
+def test_light_follows_its_rule(spec, stops):
     assert _gains(spec, len(stops)) == pytest.approx([2.0**s for s in stops], rel=1e-12)
     sine = {"kind": "sine", "stops": 2, "period": 8}
     assert _gains(sine, 5, phase=0.25) == pytest.approx(_gains(sine, 7)[2:])
@@ -327,7 +325,7 @@ def test_light_follows_its_rule(spec: dict[str, Any], stops: list[float]) -> Non
         *(("a,b\n1,2\n", "columns"), ("frame,ev\n0,1\n1\n", "row 3")),
     ],
 )
-def test_bad_lightings_are_refused(tmp_path: Path, spec: Any, message: str) -> None:
+def test_bad_lightings_are_refused(tmp_path, spec, message):
     if isinstance(spec, str) and "\n" in spec:
         (tmp_path / "light.csv").write_text(spec)
         spec = {"kind": "schedule", "file": tmp_path / "light.csv"}
@@ -348,7 +346,7 @@ def test_a_subclass_is_known_by_its_name() -> None:
 
 
 @st.composite
-def lightings(draw: st.DrawFn) -> dict[str, Any]:
+def lightings(draw):
     stops, frames = st.floats(-MAX_STOPS, MAX_STOPS), st.integers(-(2**31), 2**31)
     values = {"period": log_uniform(1e-3, 2**31), "stops": stops}
     values |= {"stops_per_frame": st.floats(0, MAX_STOPS), "edge": st.integers(0, 2**31)}
@@ -380,7 +378,7 @@ def test_light_is_positive_and_finite_in_every_frame(spec, frame, exposure_time,
     assert make_lighting(json.loads(json.dumps(spec))) == lighting
 
 
-def test_each_frame_has_its_stops_and_the_last_holds(tmp_path: Path) -> None:
+def test_each_frame_has_its_stops_and_the_last_holds(tmp_path):
     wanted = [1.0, 0.5, 4.0, 4.0, 4.0]
     same = make_lighting({"kind": "schedule", "ev": [0, -1, 2]})
     for ev in ((0, -1, 2.0), np.array([0, -1, 2]), np.array([0, -1, 2], np.float32)):

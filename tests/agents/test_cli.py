@@ -11,7 +11,6 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -314,7 +313,7 @@ def _draw(folder: Path) -> None:
     find_scenes("bundled:small")
 
 
-def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, forkserver: Any) -> None:
+def test_nothing_is_compiled_or_drawn_afterwards(dng, forkserver):
     """Commands use the kernels of the warm-up, at its types, all of which are kept on disk.
 
     So the kernels may come from the cache of all tests: none has to be compiled for this."""
@@ -543,7 +542,7 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     assert json.loads((folder / "results.json").read_text())["rows"] == rows
 
 
-def check_files(out: Path) -> dict[str, Any]:
+def check_files(out):
     names = {"scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png", "ev_error.png"}
     names |= {"cost.png", "contact_sheet.webp", "contact_sheet_2.webp"}
     assert {path.name for path in out.iterdir() if path.stat().st_size > 200} >= names

@@ -6,7 +6,6 @@ import itertools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -153,7 +152,7 @@ def noisy_raw(height: int = 18, width: int = 21) -> RawImage:
     return RawImage(torch.from_numpy(data), SOURCE, Z6)
 
 
-def with_networks(preset: Literal["compact", "paper"] = "compact") -> CameraSimulator:
+def with_networks(preset="compact"):
     torch.manual_seed(0)
     made = CameraSimulator(preset, device="cpu")
     if preset == "compact":

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from itertools import pairwise
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -475,7 +474,7 @@ def test_a_converted_file_scores_as_keras_does(tmp_path, monkeypatch):
         assert 0.0 < float(score) < 1.0
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path):
     with h5py.File(tmp_path / "other.hdf5", "w") as file:
         file["conv1_bn/conv1_bn/gamma:0"] = np.zeros(64)
     with pytest.raises(ValueError, match="gamma:0"):
@@ -496,9 +495,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
-def write_network(
-    path: Path, batch: int | str = "batch", size: int | str = "side", *, softmax: bool = False
-) -> Path:
+def write_network(path, batch="batch", size="side", *, softmax=False):
     """Three classes: the logits are the means of red, green and blue."""
     onnx = pytest.importorskip("onnx")
     node, info = onnx.helper.make_node, onnx.helper.make_tensor_value_info
@@ -559,7 +556,7 @@ def test_a_callable_sees_normalised_squares() -> None:
     np.testing.assert_allclose(own(images, None).numpy(), expected, rtol=1e-4)
 
 
-def test_what_is_no_classifier_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_classifier_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
     with pytest.raises(ValueError, match=r"AE_ENV_CLASSIFIER=FILE"):
         make_scorer("classifier")

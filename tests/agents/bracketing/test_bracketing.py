@@ -3,7 +3,6 @@
 import functools
 import itertools
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -96,7 +95,7 @@ def test_hasinoff_takes_the_largest_ratio_in_the_worst_light() -> None:
     """A scene of two lights, 12 stops apart: over all schedules, tried one by one."""
     envs = make_envs(1)
     context = PolicyContext.from_envs(envs)
-    policy: Any = make_policy("bracket:hasinoff?headroom=0&longest=1/4", context)
+    policy = make_policy("bracket:hasinoff?headroom=0&longest=1/4", context)
     policy.reset(1)
     policy._range = lambda camera: (1.0, 13.0)  # log2 of the luminances
     policy._reference[0] = 8.0
@@ -173,7 +172,7 @@ def test_mistakes_are_named(context: PolicyContext) -> None:
     schedule.reset(4)
     with pytest.raises(ValueError, match="fit"):
         schedule.act(make_envs(4).reset(seed=0)[0])
-    policy: Any = Policy(context)
+    policy = Policy(context)
     policy.act = lambda observations, masks=None: np.full(4, 999)
     with pytest.raises(UserCodeError, match=r"'mine': state 999 is not in \[0, 25\)"):
         run_brackets(policy, make_envs(4), name="mine")

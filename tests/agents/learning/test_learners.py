@@ -7,9 +7,7 @@ import os
 import signal
 import time
 from dataclasses import replace
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -288,13 +286,13 @@ def test_a_finer_grid_gives_known_states_their_values(name: str, context: Policy
 
 CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
 ENVIRONMENT = {"scenes": "bundled:small", "resolution": 36}
-HYPERPARAMETERS: dict[str, dict[str, Any]] = {
+HYPERPARAMETERS = {
     "regression": {"frames": 24, "width": 8},
     "ppo": {"total_timesteps": 32, "n_steps": 4, "batch_size": 8, "n_epochs": 1, "width": 8},
 }
 
 
-def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
+def tiny(agent="regression", **changes):
     own = {"environment": ENVIRONMENT, "training": HYPERPARAMETERS[agent] | changes}
     return training.AgentConfig(agent=agent, num_envs=4, **own)
 
@@ -366,7 +364,7 @@ def test_an_interrupted_call_ends_its_workers_and_keeps_what_is_trained(tmp_path
     todo = [training.TrainingJob(name, own, tmp_path / name) for name, own in configs.items()]
     seen: list[int] = []
 
-    def report(name: str, done: int, *_: Any) -> None:
+    def report(name, done, *_):
         if name == "1":
             raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
         seen.append(done)
@@ -401,13 +399,13 @@ def _never_end(job: int) -> None:
     time.sleep(600)
 
 
-def _wait_for_ever(pipe: Connection) -> None:
+def _wait_for_ever(pipe):
     contexts = {"spawn": multiprocessing.get_context("fork")}  # its workers have the pipe, too
-    multiprocessing.get_context = contexts.__getitem__  # type: ignore[assignment]
+    multiprocessing.get_context = contexts.__getitem__
     workers.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
 
 
-def test_workers_do_not_outlive_a_killed_parent(forkserver: Any) -> None:
+def test_workers_do_not_outlive_a_killed_parent(forkserver):
     here, there = forkserver.Pipe()
     parent = forkserver.Process(target=_wait_for_ever, args=(there,))
     parent.start()
@@ -453,7 +451,7 @@ def test_a_terminated_command_goes_on(ae_env, tmp_path: Path, monkeypatch) -> No
     config, out, seen, curve = tiny(), tmp_path / "agent", [], LearningCurve.__call__
     (tmp_path / "mine.yaml").write_text(json.dumps(config.model_dump(mode="json")))
 
-    def report(self: LearningCurve, done: int, *values: Any) -> None:
+    def report(self, done, *values):
         curve(self, done, *values)
         if done == 16:
             os.kill(os.getpid(), signal.SIGTERM)

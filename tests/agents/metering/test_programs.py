@@ -6,7 +6,6 @@ import json
 import math
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -320,14 +319,14 @@ def test_a_policy_that_was_not_reset_says_so(context, photograph):
 
 
 @functools.cache
-def _loop(name: str, frames: int, start: int | None = None, step: float | None = None) -> Any:
+def _loop(name, frames, start=None, step=None):
     """EVs of the grid's ends, of the states (E, T), and of the light at the start (E,)."""
     lighting = {"kind": "step", "stops": step, "at": 12}  # seen two frames later
     options = {**SMALL, "motion": "none", "depth": "far"}
     if step is not None:
         options |= {"lighting": lighting, "delay": 2}
     with closing(make_envs(options, num_envs=COUNT, frames=frames)) as envs:
-        base: Any = envs.unwrapped
+        base = envs.unwrapped
         scenes = range(0, len(base.scenes), 6)
         policy = make_policy(name, PolicyContext.from_envs(envs))
         policy.reset(COUNT, seed=0)

@@ -12,7 +12,6 @@ import signal
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -176,7 +175,7 @@ def test_only_wider_f_numbers_than_the_raw_s_are_offered():
         assert wider_f_numbers(raw) == wider[len(wider) - offered :]
 
 
-def _view(log: Path) -> None:
+def _view(log):
     """Runs as `ae-env view`."""
     from agents.cli.main import main
 

@@ -3,14 +3,12 @@
 import functools
 import math
 from dataclasses import replace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import correlate
-from torch import Tensor
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import batch as batch_module
@@ -19,7 +17,7 @@ from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, Netwo
 from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import Layout
-from simulator.capture.sensor import Noise, Transitions, noise_keys, record
+from simulator.capture.sensor import Transitions, noise_keys, record
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur
@@ -33,7 +31,7 @@ ZERO = NoiseLevelFunction.zero()
 # -- opening the aperture ---------------------------------------------------------------------
 
 
-def light(seed: int = 0) -> Tensor:
+def light(seed=0):
     values = np.random.default_rng(seed).random((4, 24, 24), dtype=np.float32)
     return torch.from_numpy(values)
 
@@ -157,7 +155,7 @@ def _layout() -> Layout:
     return Layout(defocus, subject)
 
 
-def _prepared(noisy: bool = False, **fields: Any) -> PreparedScene:
+def _prepared(noisy=False, **fields):
     nlf = Z6.nlf(800) if noisy else ZERO
     given = {"layout": _layout(), "movement": MOVEMENT, "tolerance": 0.0, **fields}
     return PreparedScene(SCENE, REFERENCE, Z6, nlf, **given)
@@ -216,7 +214,7 @@ def test_whole_captures_by_hand() -> None:
     soft = disc_blur(SCENE.double(), DIAMETERS[5]).numpy()
     light = np.where(layout.defocus.numpy() > 0.0, soft, sharp)
 
-    def kernel(path: Any) -> np.ndarray:
+    def kernel(path):
         taps, reach = path_taps(path, SIZE, SIZE), 16
         dense = np.zeros((2 * reach + 1, 2 * reach + 1))
         np.add.at(dense, (taps.rows + reach, taps.columns + reach), taps.weights)
@@ -247,7 +245,7 @@ def prepared(index: int) -> PreparedScene:
     """Two at rest, one that moves, one that is also out of focus, one whose aperture opens,
     two with a layout and a subject that moves; the first and third are free of noise."""
     light = LIGHTS[index]
-    changes: dict[str, Any] = {"image_speed": 0.3} if index in (2, 3) else {}
+    changes = {"image_speed": 0.3} if index in (2, 3) else {}
     if index == 3:
         changes["defocus"] = 2.0
     if index == 4:
@@ -274,7 +272,7 @@ def photographed(batch, states, gains=(1.0,) * 7, **options):
     return frames, batch.record(SCENES, chosen, SCENES, SCENES + 5, signals=frames, **options)
 
 
-def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "bank") -> Any:
+def alone(index, state, gain, key, noise="bank"):
     scene, frame = prepared(index), torch.empty(1, 4, 24, 20)
     exposure = scene.exposure(STATES[state], gain=gain)
     transitions = Transitions.of([scene.blurred_light.blurred(exposure)], [exposure])
@@ -285,7 +283,7 @@ def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "
 
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
 @pytest.mark.parametrize("cache_light", [True, False])
-def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: bool) -> None:
+def test_frames_are_those_of_each_scene_alone(noise, cache_light):
     scenes, rng, seen = Mock(side_effect=prepared), np.random.default_rng(0), set()
     batch = made(noise, cache_light=cache_light, scenes=scenes)
     for _ in range(12):
@@ -331,7 +329,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     photographed(batch, 0)
     original = getattr(batch_module, stage)
 
-    def fail(*args: Any, **kwargs: Any) -> Any:
+    def fail(*args, **kwargs):
         calls.append(args)
         if stage == "decide" and len(calls) < 4:
             return original(*args, **kwargs)

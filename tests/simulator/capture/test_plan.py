@@ -12,7 +12,7 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposur
 from simulator.capture import plan as plan_module
 from simulator.capture import statistics
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
-from simulator.capture.decision import Exposure, Step
+from simulator.capture.decision import Exposure
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
 from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT, KEPT_BLUR_ERROR, MISSED_BLUR
@@ -177,7 +177,7 @@ def decided(tolerance, found, networks=(), *, opened_px=None, noise=True, nlf=(U
     return scene.exposure(SOURCE, noise=noise)
 
 
-def steps(*given: object, **options: object) -> tuple[Step, ...]:
+def steps(*given, **options):
     return decided(*given, **options).steps
 
 
@@ -190,7 +190,7 @@ def streak(extent: float) -> dict[str, float]:
     return {"image_speed": 4.0 * extent}
 
 
-def left_out(made: tuple[Step, ...]) -> list[str]:
+def left_out(made):
     return [step.name for step in made if not step.runs and step.error]
 
 

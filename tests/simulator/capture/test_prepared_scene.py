@@ -12,7 +12,6 @@ import pytest
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import prepared_scene
@@ -29,11 +28,11 @@ LOW, HIGH = CameraSettings(100, 1 / 64, 8), CameraSettings(6400, 1 / 64, 8)
 SIDE = 128
 
 
-def flat(level: float) -> Tensor:
+def flat(level):
     return torch.full((4, SIDE, SIDE), level)
 
 
-def recorded(level: float, nlf: NoiseLevelFunction, seed: int = 0) -> Tensor:
+def recorded(level, nlf, seed=0):
     """A flat field with the noise of `nlf`, drawn by NumPy."""
     rng = np.random.default_rng(seed)
     deviation = [math.sqrt(r + s * level) for r, s in zip(nlf.read, nlf.shot, strict=True)]
@@ -45,7 +44,7 @@ def expected_variance(level: float, nlf: NoiseLevelFunction) -> np.ndarray:
     return np.array(nlf.read) + np.array(nlf.shot) * level
 
 
-def variance(frame: Tensor) -> np.ndarray:
+def variance(frame):
     """Per plane; of 16,384 pixels, so within 4 * sqrt(2 / 16384) = 4.4 %."""
     return frame.double().flatten(1).var(dim=1).numpy()
 

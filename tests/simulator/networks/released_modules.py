@@ -1,10 +1,8 @@
 """Networks of the released layout in plain torch layers, written down without our code."""
 
-from typing import Any
-
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import nn
 
 
 class ExposureNet(nn.Module):
@@ -44,8 +42,8 @@ class UNet(nn.Module):
         self.up3, self.up4 = level(256, 64), level(128, 64)
         self.outc = Holder("conv", nn.Conv2d(64, 4, 1))
 
-    def forward(self, x: Tensor) -> Tensor:
-        m: Any = self
+    def forward(self, x):
+        m = self
         skips = [m.inc.conv.conv(x)]
         for down in (m.down1, m.down2, m.down3, m.down4):
             pool, double = down.mpconv
@@ -66,7 +64,7 @@ class Norm(nn.Module):
             self.style.linear.weight.mul_(0.02)
             self.style.linear.bias[:channels] = 1.0
 
-    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+    def forward(self, x, p):
         scale, shift = self.style.linear(p)[:, :, None, None].chunk(2, dim=1)
         return scale * self.norm(x) + shift
 
@@ -77,7 +75,7 @@ class conv_block(nn.Module):
         self.conv1, self.norm1 = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(outputs)
         self.conv2, self.norm2 = nn.Conv2d(outputs, outputs, 3, padding=1), Norm(outputs)
 
-    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+    def forward(self, x, p):
         x = self.norm1(self.conv1(x), p).relu()
         return self.norm2(self.conv2(x), p).relu()
 
@@ -88,7 +86,7 @@ class up_conv(nn.Module):
         self.up = nn.Upsample(scale_factor=2)
         self.conv, self.norm = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(outputs)
 
-    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+    def forward(self, x, p):
         return self.norm(self.conv(self.up(x)), p).relu()
 
 
@@ -102,8 +100,8 @@ class Attention_block(nn.Module):
         self.conv_down = nn.Conv2d(inner, inner // 4, 1, bias=False)
         self.conv_up = nn.Conv2d(inner // 4, width, 1, bias=False)
 
-    def forward(self, g: Tensor, x: Tensor, p: Tensor) -> Tensor:
-        m: Any = self
+    def forward(self, g, x, p):
+        m = self
         joint = (m.W_g_norm1(m.W_g_conv1(g), p) + m.W_x_norm1(m.W_x_conv1(x), p)).relu()
         place = m.psi_norm(m.psi_conv(joint), p).sigmoid()
         mean = m.W_g_norm2(m.W_g_conv2(g), p) + m.W_x_norm2(m.W_x_conv2(x), p)
@@ -124,8 +122,8 @@ class AttenUnet_style(nn.Module):
             setattr(self, f"Up_conv{level}", conv_block(2 * width, width))
         self.Conv = nn.Conv2d(32, 4, 1)
 
-    def forward(self, image: Tensor, p: Tensor) -> Tensor:
-        m: Any = self
+    def forward(self, image, p):
+        m = self
         planes = p[:, :, None, None].expand(-1, -1, *image.shape[2:])
         skips = [m.Conv1(torch.cat([image, planes], dim=1), p)]
         for level in (m.Conv2, m.Conv3, m.Conv4, m.Conv5):

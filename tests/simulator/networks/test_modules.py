@@ -8,13 +8,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
-from torch import Tensor, nn
+from torch import nn
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import get_camera
 from simulator.networks import aperture_module, noise_module
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
-from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Preset, Stabiliser
+from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Stabiliser
 from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
@@ -61,7 +61,7 @@ def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None
 # -- the aperture ----------------------------------------------------------------------------------
 
 
-def picture(*size: int) -> Tensor:
+def picture(*size):
     values = np.random.default_rng(0).random((2, 4, *size), dtype=np.float32)
     return torch.from_numpy(values) * 5.0
 
@@ -216,7 +216,7 @@ SHOT, READ = torch.tensor([NLF.shot]), torch.tensor([NLF.read])
 
 def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> None:
     module, image = NoiseModule("paper"), 0.06 * normal(1, 4, 16, 18, dtype=torch.float32)
-    given: list[tuple[Tensor, ...]] = []
+    given = []
     module.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
     assert torch.equal(module(image, SHOT, READ), image + module.network(*given[0]))
     seen, deviation = given[0][0].split(4, dim=1)
@@ -240,7 +240,7 @@ def test_operations_by_hand() -> None:
 
 
 @pytest.mark.parametrize("preset", ["nano", "paper"])
-def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> None:
+def test_the_gate_is_each_images_own_and_changes_no_other(preset):
     module = NoiseModule(preset).eval().requires_grad_(False)
     torch.nn.init.normal_(module.network.tail.weight)
     image = (0.06 * normal(1, 4, 16, 18, dtype=torch.float32)).expand(3, -1, -1, -1)
@@ -262,7 +262,7 @@ def stabiliser(shot: float, read: float) -> Stabiliser:
     return Stabiliser.of(torch.full((1, 4), shot), torch.full((1, 4), read))
 
 
-def flat_field(level: float = 0.2, side: int = 64, seed: int = 0) -> Tensor:
+def flat_field(level=0.2, side=64, seed=0):
     """A flat field with the noise of the Z6 at ISO 6400, drawn by NumPy, (1, 4, side, side)."""
     rng, shape = np.random.default_rng(seed), (1, 4, side, side)
     shot, read = (np.array(v)[:, None, None] for v in (NLF.shot, NLF.read))
@@ -407,10 +407,10 @@ def test_against_a_transcription() -> None:
         nn.init.normal_(parameter, std=0.3)
     parameters = net.parameters()
 
-    def convolved(x: Tensor) -> Tensor:
+    def convolved(x):
         return F.conv2d(F.pad(x, (1, 1, 1, 1), "replicate"), next(parameters), next(parameters))
 
-    def level(x: Tensor) -> Tensor:
+    def level(x):
         return F.leaky_relu(convolved(F.leaky_relu(convolved(x), 0.2)), 0.2)
 
     fine = level(image := normal(1, 8, 6, 4))

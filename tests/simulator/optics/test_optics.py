@@ -7,7 +7,7 @@ of the aperture, each of which sees two planes through its own pinhole.
 import importlib.util
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 
@@ -83,7 +83,7 @@ def test_sharp_foreground_is_untouched_by_a_bright_blurred_background():
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def light_of_planes(hides: np.ndarray, near: Sequence, far: Sequence) -> np.ndarray:
+def light_of_planes(hides, near, far):
     """Each plane's texture at its own rows and columns."""
     nearer = 0.5 + 0.3 * np.sin(near[0] * 0.9) * np.cos(near[1] * 0.7)
     farther = 3.0 + 1.5 * np.sin(far[0] * 0.25 + 1.0) + 0.5 * np.cos(far[1] * 0.25)

@@ -4,8 +4,6 @@ import itertools
 import math
 import warnings
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -108,7 +106,7 @@ def test_saturated_pixels_of_frames_in_shares(rows):
 NLF = NoiseLevelFunction((1.5e-4, 2e-4, 2e-4, 2.5e-4), (1e-6, 2e-6, 2e-6, 3e-6))
 
 
-def make_raw(camera: CameraProfile | None = None, **changes: Any) -> RawImage:
+def make_raw(camera=None, **changes):
     profile = camera or CameraProfile("bench_camera", BayerPattern.RGGB, (512.0,) * 4, 15000, 14)
     options = {"nlf": NLF, "white_balance": (2.1, 1.0, 1.6), **changes}
     settings = options.pop("settings", CameraSettings(iso=800, exposure_time=1 / 60, f_number=4.0))
@@ -117,7 +115,7 @@ def make_raw(camera: CameraProfile | None = None, **changes: Any) -> RawImage:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "a.dng"
 
 

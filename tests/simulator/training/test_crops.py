@@ -2,19 +2,18 @@
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from simulator import CameraSettings, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE, ApertureModule
 from simulator.networks.exposure_module import ExposureModule
-from simulator.networks.noise_module import NoiseModule, Preset
+from simulator.networks.noise_module import NoiseModule
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DiscBank
 from simulator.reference.reference_camera import ReferenceCamera
@@ -209,11 +208,11 @@ SHOT, READ = 4e-4, 1e-6
 class Fixed(nn.Module):
     """A network whose output is known; one parameter, so that it can be trained."""
 
-    def __init__(self, output: Callable[..., Tensor]) -> None:
+    def __init__(self, output):
         super().__init__()
         self.output, self.shift = output, nn.Parameter(torch.zeros(()))
 
-    def forward(self, *given: Tensor) -> Tensor:
+    def forward(self, *given):
         return self.output(*given) + self.shift
 
 
@@ -235,7 +234,7 @@ def batch(level: float = 0.2, ratio: float = 2.0, noise: bool = True) -> Batch:
     )
 
 
-def denoiser(output: Callable[..., Tensor], preset: Preset = "nano") -> NoiseModule:
+def denoiser(output, preset="nano"):
     made = NoiseModule(preset)
     made.network = Fixed(output)
     return made
@@ -306,7 +305,7 @@ def test_black_and_blown_out_batches_teach_finite_gradients(level, preset):
         assert_finite(losses.NoiseLoss(module)(data), module)
 
 
-def assert_finite(values: dict[str, Tensor], module: nn.Module) -> None:
+def assert_finite(values, module):
     values["loss"].backward()
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
     assert all(bool(value.isfinite().all()) for value in (*values.values(), *gradients))
@@ -320,7 +319,7 @@ def opened(data: Batch) -> Batch:
     return data._replace(source=texture, target=target, ratio=torch.ones(2))
 
 
-def aperture_loss(log_blur: Callable[..., Tensor]) -> losses.ApertureLoss:
+def aperture_loss(log_blur):
     module = ApertureModule("compact")
     module.network.forward = Fixed(log_blur).forward
     return losses.ApertureLoss(ExposureModule(), denoiser(lambda image, *_: image), module)

@@ -5,11 +5,9 @@ import json
 import logging
 import math
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +22,6 @@ from simulator.radiance.procedural import KINDS
 from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from simulator.training import paper_dataset
 from simulator.training import scenes as pictured
-from simulator.training.crops import DetailPicture
 from simulator.training.paper_dataset import packed_camera, read_dataset, split_dataset
 from simulator.training.scenes import reference_scenes
 from simulator.training.trainer import SimulatorConfig, StageConfig, first_modules
@@ -163,11 +160,11 @@ def test_softness_is_that_of_edges() -> None:
     assert pictured._edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
 
 
-def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
+def by_split(data, drawn=0):
     return {s: pictured.detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}
 
 
-def the_only(folder: Path, name: str) -> DetailPicture:
+def the_only(folder, name):
     (found,) = (p for own in by_split(folder).values() for p in own if p.name == name)
     return found
 
@@ -284,12 +281,12 @@ def author_file(path: Path, mosaic: np.ndarray, black: float, white: float) -> N
     np.save(path, np.array(tile, np.float32))
 
 
-def author_table(path: Path, header: Sequence[str], *rows: Sequence[Any]) -> None:
+def author_table(path, header, *rows):
     with path.open("w", newline="") as stream:
         csv.writer(stream).writerows([header, *rows])
 
 
-def nikon_row(path: str, **changes: Any) -> list[Any]:
+def nikon_row(path, **changes):
     values = (path, 0.008, 800, 5.6, [1.9, 1.0, 1.4, 0.0], PROFILE)
     return [*(dict(zip(NIKON, values, strict=True)) | changes).values()]
 

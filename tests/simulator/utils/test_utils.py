@@ -8,12 +8,10 @@ import os
 import pickle
 import subprocess
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -24,7 +22,6 @@ import torch.nn.functional as F
 from numba.core import caching
 from pydantic import Field
 from safetensors.torch import load_file, save
-from torch import Tensor
 
 from simulator import camera_simulator
 from simulator.networks.aperture_module import DefocusMap
@@ -55,7 +52,7 @@ def test_content_comes_back(tmp_path, content, name):
 def test_a_crash_leaves_the_old_content(tmp_path, fault):
     path = write_atomically(tmp_path / "file", "old")
 
-    def pieces() -> Iterator[bytes]:
+    def pieces():
         yield b"half of it"
         raise fault
 
@@ -257,7 +254,7 @@ def test_the_least_recently_used_goes_first():
     assert (len(cache), cache.nbytes, cache.get(0)) == (0, 0, None)
 
 
-def bits(values: dict[str, Any] | None) -> Any:
+def bits(values):
     """Values with their types, to the bit: NaN and -0.0 as well."""
     arrays = (torch.Tensor, np.ndarray)
     return values and {
@@ -375,7 +372,7 @@ def test_writers_share_a_folder(tmp_path, caplog):
     assert sum(size for _, size in Store(tmp_path).usage().values()) <= 60_000
 
 
-def made(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
+def made(path, identity="a", **values):
     return Checkpoint(path, identity, lambda: {"step": 7, **values})
 
 
@@ -533,11 +530,11 @@ def test_child_processes_make_threads_of_their_own():
     child.join(timeout=60)
 
 
-def frame(*size: int, seed: int = 0) -> Tensor:
+def frame(*size, seed=0):
     return torch.rand(1, 4, *size, generator=torch.Generator().manual_seed(seed))
 
 
-def mean_of_neighbours(*images: Tensor) -> Tensor:
+def mean_of_neighbours(*images):
     """Sees 2 pixels far, and the position modulo 4."""
     total = F.avg_pool2d(F.pad(sum(images), (2,) * 4), 5, stride=1)
     rows = torch.arange(total.shape[-2])[:, None] % 4
@@ -562,7 +559,7 @@ def test_tiles_of_a_function_of_neighbourhood_and_phase(size, tile):
 def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once():
     sizes: list[tuple[int, ...]] = []
 
-    def spy(image: Tensor) -> Tensor:
+    def spy(image):
         sizes.append(tuple(image.shape[-2:]))
         return image.double()[:, :2]
 
