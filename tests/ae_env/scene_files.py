@@ -23,9 +23,7 @@ from tests.simulator.training.scenes import scene
 GRID = ExposureGrid((100, 1600), (1 / 1000, 1 / 125), (4, 8))
 
 
-def load(
-    spec: object, split: str = "all", resolution: int | None = 16, **options: object
-) -> list[Scene]:
+def load(spec, split="all", resolution=16, **options) -> list[Scene]:
     """Scenes of `spec`, which is a path where there are `options`."""
     camera, spec = get_camera("nikon_z6"), {"path": spec, **options} if options else spec
     return load_scenes(spec, split, camera=camera, resolution=resolution)
@@ -59,9 +57,7 @@ def capture(settings: CameraSettings, seed: int = 0, size: int = 40) -> RawImage
     return RawImage(sample, settings, camera)
 
 
-def write_picture(
-    path: Path, settings: CameraSettings, seed: int = 0, *, exif: Sequence[str] = ()
-) -> None:
+def write_picture(path: Path, settings: CameraSettings, seed: int = 0, *, exif=()) -> None:
     """The developed capture as a JPEG or PNG; of its settings, those named stand in its EXIF."""
     rgb = develop(capture(settings, seed).data[None].clamp(0.0, 1.0))[0]
     picture = Image.fromarray((rgb * 255.0).round().byte().permute(1, 2, 0).numpy())
@@ -96,9 +92,7 @@ def write_states(folder: Path, seeds: Sequence[int] = (0, 1), grid: ExposureGrid
         csv.writer(stream).writerows([["", "idx", "iso", "ss", "aperture"], *rows])
 
 
-def write_video(
-    folder: Path, frames: int = 3, times: Sequence[str] = ("1-1000s", "1-250s", "1-60s")
-) -> None:
+def write_video(folder: Path, frames=3, times=("1-1000s", "1-250s", "1-60s")) -> None:
     """Stacks of video: ``SCENE/frame_0002/1-60s.png`` at ISO 400 and f/4, every frame another."""
     for frame in range(frames):
         for time in times:

@@ -39,14 +39,7 @@ def random_scene(**fields: Any) -> Scene:
     return make_scene(light, **fields)
 
 
-def make_captures(
-    scenes: Scene | list[Scene],
-    states: list[CameraSettings],
-    speed: float = 0.0,
-    defocus: float = 0.0,
-    gain: float = 1.0,
-    row_gain: np.ndarray | None = None,
-) -> Captures:
+def make_captures(scenes, states, speed=0.0, defocus=0.0, gain=1.0, row_gain=None) -> Captures:
     """One capture of each state, all of one scene or each of its own."""
     ones = np.ones(len(states))
     scenes = [scenes] * len(states) if isinstance(scenes, Scene) else scenes
@@ -66,9 +59,7 @@ def mean_signal(images: torch.Tensor, captures: Captures) -> torch.Tensor:
 class Own:
     """A scorer that is a function of its images and captures."""
 
-    def __init__(
-        self, function: Any = mean_signal, domain: str = "raw", depends_on: str = "image"
-    ) -> None:
+    def __init__(self, function=mean_signal, domain="raw", depends_on="image") -> None:
         self.function, self.domain, self.depends_on = function, domain, depends_on
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> Any:

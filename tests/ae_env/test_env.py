@@ -583,7 +583,7 @@ def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> Non
     [
         ("import a_module_that_is_not_there", "ModuleNotFoundError: No module named 'a_module"),
         ("def (:", "SyntaxError"),
-        ("raise SystemExit(3)", "SystemExit: 3"),
+        *(("raise SystemExit(3)", "SystemExit: 3"), ("raise SystemExit(0)", "SystemExit: 0")),
         ("x = 1\n1 / 0", r"mine\.py cannot be loaded: ZeroDivisionError: .* \(line 2\)"),
         ("class Mime: ...", "no class 'Mine' there; found Mime; did you mean 'Mime'"),
         ("x = 3", "no class 'Mine' there; found no class at all"),

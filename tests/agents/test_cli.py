@@ -63,9 +63,7 @@ SMALL, FITS = (("--depth", name, "--focal-length", "3") for name in ("small.png"
 V1 = ("--preset", "ae_bench_v1")
 FILES = {
     "text.dng": "not a raw\n",
-    "bad.py": "def (:\n",
     "own.py": OWN,
-    "script.py": "import sys\nsys.exit(0)\n",
     "agent.yaml": "agent: ppo\n",
 }
 BASE = """\
@@ -143,14 +141,10 @@ print("loaded", *sys.modules)
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
         ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
-        ((*PLAIN, "--depth", "near"), "`depth` (='near') must be one of"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
-        (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
-        (("evaluate", "--policy", "script.py:Mine"), "script.py cannot be loaded: SystemExit: 0"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
@@ -159,7 +153,6 @@ print("loaded", *sys.modules)
         (("bench", "transfer", "--part", "table"), "`part` (='table')"),
         (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
         (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
-        (("evaluate", "--policy", "random", "--seed", 2**32), "`seeds` (=4294967296) must"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
         (("evaluate", "--preset", "standrad"), "did you mean 'standard'"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
@@ -575,9 +568,8 @@ def test_quickstart_on_bundled_scenes_then_on_ones_own(ae_env, raw, tmp_path, mo
 
     # Few raws have no training split; the agents are there already.
     monkeypatch.setattr("agents.learning.workers.ProcessPoolExecutor", None)
-    monkeypatch.setattr(
-        "agents.rollouts.training_arguments", lambda _: ({"scenes": "bundled:small"}, True)
-    )
+    bundled = ({"scenes": "bundled:small"}, True)
+    monkeypatch.setattr("agents.rollouts.training_arguments", lambda _: bundled)
     mine = tmp_path / "my raws"
     mine.mkdir()
     for i in range(2):
@@ -651,8 +643,7 @@ def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     assert code == 0
     assert f"regression:{out}" in text
     # A forecaster is evaluated on video.
-    (tmp_path / "tiny.yaml").write_text(
-        "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n"
-    )
+    text = "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n"
+    (tmp_path / "tiny.yaml").write_text(text)
     _, text, _ = ae_env("train", "tiny.yaml", "--out", "a")
     assert "next: ae-env evaluate --preset video --policy 'regression:video?foresight=a'" in text

@@ -104,17 +104,6 @@ def test_incident_meter() -> None:
             incident_ev100(illuminance)
 
 
-@pytest.mark.parametrize("name", ["iso", "exposure_time", "f_number"])
-@pytest.mark.parametrize(
-    "value",
-    [0, -1, -0.0, math.nan, math.inf, -math.inf, "fast", "100", b"1", None, [], 1e99, 1e-99],
-)
-def test_bad_values_are_named(name: str, value: object) -> None:
-    arguments = {"iso": 100, "exposure_time": 0.01, "f_number": 4.0, name: value}
-    with pytest.raises(ValueError, match=rf"^`{name}` \(={'.*'}\) must be a number in \["):
-        CameraSettings(**arguments)
-
-
 @pytest.mark.parametrize(
     ("name", "low", "high"),
     [("iso", 1e-3, 1e8), ("exposure_time", 1e-9, 1e5), ("f_number", 0.5, 1024.0)],
@@ -123,8 +112,9 @@ def test_ranges_include_their_ends(name: str, low: float, high: float) -> None:
     arguments = {"iso": 100.0, "exposure_time": 0.5, "f_number": 4.0}
     for value in (low, high):
         assert getattr(CameraSettings(**arguments | {name: value}), name) == value
-    for value in (0.999 * low, 1.001 * high):
-        with pytest.raises(ValueError, match=f"`{name}`"):
+    odd = (0, -1, -0.0, math.nan, math.inf, -math.inf, "fast", "100", b"1", None, [])
+    for value in (0.999 * low, 1.001 * high, *odd):
+        with pytest.raises(ValueError, match=rf"^`{name}` \(=.*\) must be a number in \["):
             CameraSettings(**arguments | {name: value})
 
 

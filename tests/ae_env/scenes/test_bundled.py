@@ -104,9 +104,6 @@ def test_splits_share_no_group_and_half_are_hard_which_fools_a_meter(unseen):
     assert np.median(errors["night"]) < -1.2
     assert np.median(errors["spot_light"]) < -1.5
     assert max(np.abs(e).max() for e in errors.values()) < 5.0
-
-
-def test_oracles_are_spread_over_every_control(unseen):
     check_oracles_are_spread(unseen)
 
 

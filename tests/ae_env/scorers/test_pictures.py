@@ -209,9 +209,8 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
 def rendered() -> dict[str, torch.Tensor]:
     """Pictures (L, 3, H, W) of a photograph with each defect at its severities."""
     picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
-    scene = Scene.from_radiance(
-        measures.srgb_decode(picture), CAMERA, scene_id="astronaut"
-    ).resized(128)
+    light = measures.srgb_decode(picture)
+    scene = Scene.from_radiance(light, CAMERA, scene_id="astronaut").resized(128)
     generator = torch.Generator().manual_seed(3)
     return {name: benchmark.render(scene, name, generator) for name in DEFECTS}
 

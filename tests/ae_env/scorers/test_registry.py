@@ -198,9 +198,8 @@ def test_scores_are_shares_and_the_oracle_has_the_highest(light, reference, grid
     if float((light[1:3] > 0).double().mean()) <= 0.2:
         illuminance = illuminance or 640.0  # no exposure is right for a black frame
     nlf = CAMERA.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
-    scene = Scene.from_array(
-        light, reference, CAMERA, scene_id="any", nlf=nlf, illuminance=illuminance
-    )
+    known = {"scene_id": "any", "nlf": nlf, "illuminance": illuminance}
+    scene = Scene.from_array(light, reference, CAMERA, **known)
     for name in [row.name for row in describe_scorers() if not row.needs]:
         tables = ScoreTables(grid, CAMERA, make_scorer(name))
         table = tables.table(scene, speed=speed, defocus=defocus, gain=gain)

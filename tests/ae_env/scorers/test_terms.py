@@ -53,9 +53,8 @@ def _by_the_formulas(scene, state, speed, defocus):
     fh = (code == 255).any(axis=0).mean()
     fs = scipy.special.expit(-(np.log2(y.clip(min=2**-40)) + 9) / 0.5).mean()
     snr = y / np.sqrt(shot * y + read)
-    blur = np.hypot(
-        speed * height * state.exposure_time, 4 * defocus * height / 64 / effective(state)
-    )
+    disc = 4 * defocus * height / 64 / effective(state)
+    blur = np.hypot(speed * height * state.exposure_time, disc)
     terms = {
         "brightness": np.exp(-(np.sqrt(1 + e**2) - 1)),
         "highlights": np.exp(-fh / 0.15),

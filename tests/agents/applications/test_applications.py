@@ -155,7 +155,7 @@ def test_pictures_that_are_alike_fuse_to_themselves() -> None:
         fuse([picture])
 
 
-def test_flat_pictures_weigh_as_the_formula_says() -> None:
+def test_pictures_weigh_as_the_formula_says() -> None:
     # Lee et al. 2018: w1 = exp(-(Y - (1 - m))^2 / (2 s^2)), s = 0.75 (m[n + 1] - m[n - 1]), twice
     # the only distance at the ends; all of a flat picture has one brightness, so w2 is the same.
     means = [0.1, 0.5, 0.7]
@@ -165,8 +165,7 @@ def test_flat_pictures_weigh_as_the_formula_says() -> None:
     fused = fuse([torch.full((3, 40, 50), mean) for mean in means])
     np.testing.assert_allclose(fused.numpy(), expected, atol=2e-4)
 
-
-def test_rare_brightnesses_weigh_more() -> None:
+    # Rare brightnesses weigh more.
     luma = torch.full((10, 10), 0.2)
     luma[0, :5] = 0.4
     # Private: nothing shows the weights of a picture alone.

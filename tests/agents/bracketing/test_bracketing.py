@@ -73,9 +73,9 @@ def test_expected_errors_are_those_of_merged_frames() -> None:
             error = log_error(*merged, truth, torch.tensor([2.0**floor]))
             deviation = float(error.std()) / math.sqrt(error.numel())
             # Five standard errors; eleven quantiles cut the tails of the noise off by 4 %.
-            assert float(error.mean()) == pytest.approx(
-                float(expected[place]), abs=5 * deviation + 0.05 * float(expected[place]) + 1e-4
-            )
+            wanted = float(expected[place])
+            bound = 5 * deviation + 0.05 * wanted + 1e-4
+            assert float(error.mean()) == pytest.approx(wanted, abs=bound)
 
 
 def test_fixed_steps_around_the_metered_state() -> None:

@@ -80,7 +80,6 @@ def test_a_stopped_training_goes_on(train, training, stopped_at, done, make_tiny
     network = train(make_tiny_envs(), training, session)
     assert seen == list(range(done + 4, 97 if train is train_ppo else 49, 4))
     end = session.store(training, dict).load()
-    assert end is not None
     name, steps = ("policy", 24) if train is train_ppo else ("network", 12)
     assert all(torch.equal(v, end[name][key]) for key, v in network.state_dict().items())
     # Adam goes on counting, so its moments were restored.

@@ -108,9 +108,8 @@ def test_states_nearby():
 def test_limits_of_shutter_and_aperture():
     blind, seen = np.array([[8.0]]), np.array([[8.0, 1.0, 2.0]])  # 2 frame heights/s, 4 pixels
     np.testing.assert_allclose(programs.shutter_limit(blind), [[np.log2(60)]])
-    np.testing.assert_allclose(
-        programs.shutter_limit(seen), [[np.log2(128)]]
-    )  # a 64th of a frame height
+    # A 64th of a frame height.
+    np.testing.assert_allclose(programs.shutter_limit(seen), [[np.log2(128)]])
     np.testing.assert_allclose(programs.aperture_limit(blind), [[2 * np.log2(5.6)]])
     # The blur 4 * 4 / N pixels is one at f/16: Av 8.
     np.testing.assert_allclose(programs.aperture_limit(seen), [[8.0]])

@@ -1,7 +1,5 @@
 """What is shown of a scene, and the page in a real Chromium: what a user does with it."""
 
-from __future__ import annotations
-
 import io
 import math
 import multiprocessing
@@ -261,9 +259,8 @@ def picture(page):
 
 
 def assert_another_picture(page, source):
-    page.wait_for_function(
-        "s => document.querySelector('.stage img').src.indexOf(s) < 0", arg=source
-    )
+    changed = "s => document.querySelector('.stage img').src.indexOf(s) < 0"
+    page.wait_for_function(changed, arg=source)
 
 
 def slider(page, name):

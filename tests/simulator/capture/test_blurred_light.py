@@ -93,9 +93,8 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(size, tile, monkeypa
     image = torch.rand(4, *size, generator=generator) * 3
     diameter = 12 * torch.rand(size, generator=generator)
     diameter[: size[0] // 2, : 2 * size[1] // 3] = 0.0
-    monkeypatch.setattr(
-        "simulator.capture.blurred_light.make_tiles", functools.partial(make_tiles, tile=tile)
-    )
+    smaller = functools.partial(make_tiles, tile=tile)
+    monkeypatch.setattr("simulator.capture.blurred_light.make_tiles", smaller)
     made = MapApertureBlur(image, diameter, 8.0)
     for f_number in (5.6, 2.8):
         result = made.opened(f_number, None)

@@ -219,7 +219,6 @@ def test_a_larger_network_or_any_may_be_the_worse_one() -> None:
     odd = (network("nano", 0.4), network("compact", 0.1), network("large", 0.2))
     for tolerance, name in ((0.25, "compact"), (0.05, "compact"), (0.0, "compact")):
         chosen = steps(tolerance, Statistics(0.6), odd)[0].network
-        assert chosen is not None
         assert chosen.name == name
     for tolerance in (0.0, 0.04, 0.06):  # noise that errs by less than all of them stays
         assert steps(tolerance, Statistics(0.05), odd)[0].network is None
@@ -325,10 +324,8 @@ def test_each_decision_says_what_it_costs() -> None:
     camera = replace(Z6, nlf_by_iso={100.0: NoiseLevelFunction((0.0,) * 4, (16e-6,) * 4)})
     nlf = NoiseLevelFunction((0.0,) * 4, (25e-6,) * 4)
     light, settings = torch.full((4, 16, 20), 0.2), CameraSettings(100, 1, 8)
-    denoised = (network("nano", 0.08, spread=1.5),)
-    made = PreparedScene(
-        light, settings, replace(camera, segments=()), nlf, denoised_lights=denoised
-    )
+    denoised, camera = (network("nano", 0.08, spread=1.5),), replace(camera, segments=())
+    made = PreparedScene(light, settings, camera, nlf, denoised_lights=denoised)
     tiny, strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.09, 0.2, 0.3))
     assert "leaving it out would be an error of 0.25" in strict.steps[1].reason
     by_network, left_out = 1.5 * _BOUND["network"], _BOUND["left out"]

@@ -340,10 +340,8 @@ def test_the_mean_stays_whatever_is_taken(level: float, side: int) -> None:
     assert float(kept.abs().max()) < 1e-4
     assert float(trained.max()) < -0.7
     wide = flat_field(level, 512)[..., :side, :]
-    wrong = torch.where(
-        torch.arange(512) < 256, level - 0.8 * sigma[..., None], level + 0.8 * sigma[..., None]
-    )
-    wrong = wrong[:, :, None].expand_as(wide)
+    sides = torch.where(torch.arange(512) < 256, -0.8, 0.8) * sigma[..., None]
+    wrong = (level + sides)[:, :, None].expand_as(wide)
     error = (made.corrected(wrong, wide, SHOT, READ) - wide) / sigma[..., None, None]
     for part in (error[..., :180], error[..., -180:]):
         assert float(part.mean(dim=(2, 3)).abs().max()) < 0.05

@@ -78,9 +78,9 @@ def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
 )
 def test_damaged_cards(saved, card, message):
     path = beside(saved, ".json")
-    path.write_text(
-        card if isinstance(card, str) else json.dumps({**json.loads(path.read_text()), **card})
-    )
+    if not isinstance(card, str):
+        card = json.dumps({**json.loads(path.read_text()), **card})
+    path.write_text(card)
     with pytest.raises(ValueError, match=message):
         load_modules(saved)
 
@@ -128,12 +128,10 @@ def test_shipped_weights_load_by_name(saved, monkeypatch, tmp_path_factory):
         assert simulator.noise is simulator.noises[-1]
         assert simulator.aperture is not None
         nano = simulator.noises[0].residual
-        assert nano is not None
         assert nano.to_card() == residual
     assert simulators[1].noise.residual is None
-    with pytest.raises(
-        ValueError, match=r"one of \['compact', 'nano'\] .* did you mean 'compact'\?"
-    ):
+    message = r"one of \['compact', 'nano'\] .* did you mean 'compact'\?"
+    with pytest.raises(ValueError, match=message):
         load_modules("compcat")
     with pytest.raises(ValueError) as caught:
         load_modules("zzz")
@@ -289,7 +287,6 @@ def converted(released: dict[str, nn.Module], tmp_path_factory: pytest.TempPathF
         held = nn.DataParallel(module) if name == "unet_model" else module
         torch.save({"model": held, "iteration": 544000}, folder / name)
     script = re.search(r"needs the authors' files -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
-    assert script is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         exec(script[1], {})

@@ -227,9 +227,8 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     transitions = sensor.Transitions.of([light], [scenes[0].exposure(BASE)])
     signals, numbers = torch.empty(1, 4, 9, 70), np.empty((1, 4, 9, 70), np.uint16)
     given = {"keys": np.array([7], np.uint64), "read_noise": [ReadNoise(ROW, -0.05)]}
-    ((low, high),) = record(
-        transitions, known, signals=signals, numbers=numbers, count=True, **given
-    )
+    both = {"signals": signals, "numbers": numbers}
+    ((low, high),) = record(transitions, known, **both, count=True, **given)
     np.testing.assert_array_equal(numbers, np.rint(signals.numpy() * SPAN + 3000))
     assert (low, high) == ((signals <= 2**-10).sum(), (signals >= 1 - 1e-6).sum())
     assert record(transitions, known, count=True, **given).tolist() == [[low, high]]

@@ -470,7 +470,6 @@ def test_gradient_is_finite_everywhere_and_right():
     values = torch.tensor([0.0, 1e-9, 0.7, 1.3, 4.0, 32.0, 50.0])
     diameter = values.repeat(16, 3)[:, :16].clone().requires_grad_()
     DiscBank(image).blurred(diameter).square().sum().backward()
-    assert diameter.grad is not None
     assert image.grad is None
     assert bool(diameter.grad.isfinite().all())
     assert bool((diameter.grad[:, 0] == 0).all())  # d(diameter^2) is 0 there

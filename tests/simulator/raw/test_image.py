@@ -371,9 +371,8 @@ def test_tone_curve_shows_the_grey_card_as_grey_and_is_inverted():
     curve = developing.apply_tone(linear, "photographic")
     assert (curve.diff() > 0).all()
     assert (curve.diff().diff() < 1e-12).all()  # concave: contrast falls towards the highlights
-    known = developing.apply_tone(
-        torch.tensor([0, 0.18 * 0.6635, 1], dtype=torch.float64), "photographic"
-    )
+    card = torch.tensor([0, 0.18 * 0.6635, 1], dtype=torch.float64)
+    known = developing.apply_tone(card, "photographic")
     np.testing.assert_allclose(known, [0, 0.18, 1], atol=1e-12)
     encoded = developing.srgb_encode(linear.float()).numpy()
     np.testing.assert_allclose(encoded, srgb(linear.numpy()), atol=5e-7)
@@ -507,9 +506,8 @@ def test_malvar_equals_colour_demosaicing_of_a_mirrored_mosaic(pattern, size, dt
 def test_malvar_on_the_gpu_is_not_rounded():
     packed = torch.rand(2, 4, 9, 8)
     on_gpu = developing.demosaic_malvar(packed.cuda(), "GBRG").cpu()
-    torch.testing.assert_close(
-        on_gpu, developing.demosaic_malvar(packed, "GBRG"), atol=3e-7, rtol=0
-    )
+    expected = developing.demosaic_malvar(packed, "GBRG")
+    torch.testing.assert_close(on_gpu, expected, atol=3e-7, rtol=0)
 
 
 BASE = CameraSettings(100, 1 / 64, 4)
@@ -583,7 +581,6 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
         if ratio >= 1.0:  # as bright as the clipped raw would be
             as_clipped = (raw.data[:, 0] * ratio).clamp(max=1.0)
             assert (light.clamp(max=1.0) - as_clipped).abs().max() < 1e-6
-        assert found.saturated is not None
         assert found.saturated.tolist() == [[False, True, True, True]]
     black = RawImage(torch.cat([raw.data, torch.zeros(4, 3, 4)], 1), BASE, Z6, None, BALANCE)
     small = Scene.from_raw(black, scene_id="raw").resized(1).light.flatten()

@@ -43,9 +43,8 @@ def test_batches_and_sequences_are_those_of_their_seed_and_index():
         assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
     torch.manual_seed(77)
     assert all(map(torch.equal, batches[1], pairs().batch(1, 4, 16)))  # the first that it draws
-    first, again, other = (
-        crops_module.draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1)
-    )
+    draw = partial(crops_module.draw_sequences, [scene(), scene()], Z6)
+    first, again, other = (draw(seed) for seed in (0, 0, 1))
     assert [s.settings for s in first] == [s.settings for s in again]
     assert first[1].settings != first[0].settings != other[0].settings
     with pytest.raises(ValueError, match="`sequences`"):
