@@ -298,7 +298,7 @@ def test_scores_are_averaged_over_what_the_light_may_be(context, photograph):
     np.testing.assert_allclose(found, 25.0 + 4.0 * np.pi / 2, rtol=1e-4)
 
 
-def test_a_steady_ramp_is_foreseen_and_a_rest_after_it_too():
+def test_a_trend_foresees_ramps_and_rests_and_follows_jumps_at_once():
     tracker = TrendTracker(1, (-2.0, 18.0), alpha=0.5, beta=0.3, damping=1.0)
     light = np.concatenate([np.arange(40) * 0.25, np.full(40, 9.75)])
     for ev in light[:40]:
@@ -307,9 +307,7 @@ def test_a_steady_ramp_is_foreseen_and_a_rest_after_it_too():
     for ev in light[40:]:
         tracker.update(_reading(ev), np.zeros(1))
     assert tracker.ahead(3)[0] == pytest.approx(9.75, abs=1e-3)
-
-
-def test_a_trend_follows_jumps_at_once_and_clipped_frames_only_where_they_contradict():
+    # Clipped frames count only where they contradict.
     tracker = TrendTracker(3, (0.0, 16.0))
     for _ in range(3):
         tracker.update(_reading([8.0, 8.0, 8.0]), np.zeros(3))

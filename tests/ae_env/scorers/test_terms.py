@@ -404,7 +404,7 @@ def test_bands_have_light_of_their_own() -> None:
         np.testing.assert_allclose(both[name], wanted, atol=1e-5, err_msg=name)
 
 
-def test_a_term_with_a_scale_of_its_own_has_it() -> None:
+def test_terms_and_composites_of_ones_own() -> None:
     plain, other = Highlights(), Highlights()
     other.scale = 0.3  # the square root of the score
     first, second = (
@@ -413,8 +413,6 @@ def test_a_term_with_a_scale_of_its_own_has_it() -> None:
     )
     np.testing.assert_allclose(second, np.sqrt(first), atol=0.01)
 
-
-def test_a_composite_of_ones_own_is_called() -> None:
     class Mine(CompositeScorer):
         def __call__(self, images, captures):
             return torch.full((len(captures),), 0.25)

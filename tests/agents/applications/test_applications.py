@@ -190,12 +190,15 @@ def test_a_large_flat_patch_stays_flat() -> None:
     assert abs(float(row[500:524].mean() - row[330:360].mean())) < 0.03
 
 
-def test_bracket_exposures() -> None:
+def test_bracket_exposures_each_of_which_the_sensor_clips() -> None:
     assert len(hdr.bracket_exposures()) == 17
     np.testing.assert_allclose(hdr.bracket_exposures(1.0, 0.3), 0.3 * np.arange(-3, 4))
     for stops, step in ((0.0, 0.5), (11.0, 0.5), (1.0, 2.0), (1.0, 0.0)):
         with pytest.raises(ValueError, match=r"`(stops|step)`"):
             hdr.bracket_exposures(stops, step)
+    half, eighth = (RawImage(torch.full((4, 8, 8), v), SETTINGS, CAMERA) for v in (0.5, 0.125))
+    assert expose_and_develop(half, 2.0).min() == 1.0
+    assert expose_and_develop(half, -2.0).equal(expose_and_develop(eighth))
 
 
 def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
@@ -209,12 +212,6 @@ def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
         contrast = [float(p[1, 20:-20, columns].std()) for p in (single, picture.fused)]
         assert contrast[1] > least * contrast[0]
     assert picture.fused[1, :, 168:216].mean() > picture.fused[1, :, 40:88].mean()
-
-
-def test_the_sensor_clips_each_picture() -> None:
-    half, eighth = (RawImage(torch.full((4, 8, 8), v), SETTINGS, CAMERA) for v in (0.5, 0.125))
-    assert expose_and_develop(half, 2.0).min() == 1.0
-    assert expose_and_develop(half, -2.0).equal(expose_and_develop(eighth))
 
 
 def test_radiance_as_an_exr(tmp_path) -> None:

@@ -289,15 +289,14 @@ def test_of_a_large_frame_some_rows_are_sampled(monkeypatch: pytest.MonkeyPatch)
     assert ResidualStatistics(light, noise).error(network, 2.0, noise) == pytest.approx(whole)
 
 
-CARD = {"wiener_error": [0.0, 0.5], "bias": [0.5, 0.25], "variance": [1.0, 0.75], "spread": 1.25}
-
-
 def test_cards() -> None:
-    assert Residual.from_card(CARD).to_card() == CARD
+    card = {"wiener_error": [0.0, 0.5], "bias": [0.5, 0.25], "variance": [1.0, 0.75]}
+    card["spread"] = 1.25
+    assert Residual.from_card(card).to_card() == card
     bad = {"spread": [None, 0.9], "bias": [["a", 1], [1.0]], "variance": [[1, math.nan], [1, -1]]}
     for change in ({name: value} for name, values in bad.items() for value in values):
         with pytest.raises(ValueError, match=r"`residual`|must be"):
-            Residual.from_card(CARD | change)
+            Residual.from_card(card | change)
 
 
 def test_the_network_runs_once_when_it_is_needed() -> None:

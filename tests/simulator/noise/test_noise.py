@@ -279,10 +279,16 @@ def key_of(seed: int, *numbers: float) -> int:
 of_sweep = functools.partial(sensor.sweep_keys, states=[])
 
 
-def test_keys_are_those_of_splitmix64() -> None:
+def test_keys_are_those_of_splitmix64_and_of_each_setting_of_a_sweep() -> None:
     """The first two outputs that its authors publish for the seed 1234567."""
     keys = noise_keys(np.array([1234567, 1234567 + STEP], np.uint64))
     assert keys.tolist() == [6457827717110365317, 3203168211198807973]
+    given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
+    states = [CameraSettings(*values) for values in given]
+    for seed in (7, np.int64(8), MASK):  # the last is the largest
+        keys = sensor.sweep_keys(seed, states)
+        assert keys.tolist() == [key_of(int(seed), *values) for values in given]
+    assert len(sensor.sweep_keys(7, [])) == 0
 
 
 @given(st.integers(0, MASK), st.lists(st.floats(allow_nan=False), max_size=4), st.integers(2, 40))
@@ -293,15 +299,6 @@ def test_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: 
     assert batch.tolist() == [expected] * n
     last = np.arange(float(n))
     assert noise_keys(seed, *numbers, last).tolist() == [key_of(seed, *numbers, x) for x in last]
-
-
-def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
-    given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
-    states = [CameraSettings(*values) for values in given]
-    for seed in (7, np.int64(8), MASK):  # the last is the largest
-        keys = sensor.sweep_keys(seed, states)
-        assert keys.tolist() == [key_of(int(seed), *values) for values in given]
-    assert len(sensor.sweep_keys(7, [])) == 0
 
 
 def test_bad_seeds_are_named() -> None:

@@ -319,12 +319,9 @@ def test_clipped_halves_dark_frames_and_grey_cards():
     card = estimate_nlf(0.3 + 1e-2 * noise)
     assert card.read == (0.0,) * 4
     assert 0.3 * card.shot[0] == pytest.approx(1e-4, rel=0.1)
-
-
-@pytest.mark.parametrize("data", [np.random.default_rng(0).random((4, 8, 8)), np.ones((4, 64, 64))])
-def test_what_tells_no_noise(data):
-    with pytest.raises(ValueError, match="`data`"):
-        estimate_nlf(data)
+    for data in (rng.random((4, 8, 8)), np.ones((4, 64, 64))):  # these tell no noise
+        with pytest.raises(ValueError, match="`data`"):
+            estimate_nlf(data)
 
 
 @pytest.mark.real_data

@@ -149,6 +149,10 @@ def test_a_good_file(tmp_path, monkeypatch):
     assert load_yaml("~/a.yaml", Whole).name == "x"
     (tmp_path / "a.yaml").write_text("[1, 2.5, null]")
     assert read_yaml(tmp_path / "a.yaml") == [1, 2.5, None]
+    # Names of our own are no code.
+    text = "[bundled:snow, matrix:P, 'recorded:my_grid?iso=100', ppo:video, a.dng, 'x.yaml', '1:2']"
+    (tmp_path / "a.yaml").write_text(text)
+    assert len(read_yaml(tmp_path / "a.yaml")) == 7
     for name in ("none.yaml", ".", "x" * 5000):
         with pytest.raises(ValueError, match="`preset`"):
             read_yaml(tmp_path / name, name="preset")
@@ -168,12 +172,6 @@ def test_code_in_a_file_needs_trust(tmp_path, monkeypatch, text):
     for trusted in (str(tmp_path), f"/nowhere:{tmp_path.parent}", "all"):
         monkeypatch.setenv("AE_ENV_TRUST", trusted)
         assert read_yaml(tmp_path / "a.yaml")
-
-
-def test_names_of_our_own_are_no_code(tmp_path):
-    text = "[bundled:snow, matrix:P, 'recorded:my_grid?iso=100', ppo:video, a.dng, 'x.yaml', '1:2']"
-    (tmp_path / "a.yaml").write_text(text)
-    assert len(read_yaml(tmp_path / "a.yaml")) == 7
 
 
 @pytest.mark.parametrize(
