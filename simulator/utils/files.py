@@ -14,7 +14,7 @@ import os
 import platform
 import secrets
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,8 +34,9 @@ RAW_SUFFIXES = (
     *(".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
     ".x3f",
 )
-#: Endings of developed pictures.
+#: Endings of developed pictures, and Pillow's formats of those; of others it runs programs (EPS).
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+_PICTURE_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
 #: Most pixels that a raw or a radiance map may claim: more than any camera with a Bayer array has.
 MAX_PIXELS = 2**28
@@ -88,7 +89,7 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
 
 
 @contextmanager
-def open_picture(path: Path, formats: list[str] | None = None) -> Iterator[Image.Image]:
+def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Iterator[Image.Image]:
     """A developed picture, of `formats` of Pillow only; pixels are decoded when they are asked for.
 
     Raises:
@@ -99,7 +100,7 @@ def open_picture(path: Path, formats: list[str] | None = None) -> Iterator[Image
     from PIL import Image
 
     try:
-        with Image.open(path, formats=formats) as picture:
+        with Image.open(path, formats=list(formats)) as picture:
             if picture.width * picture.height > MAX_PICTURE_PIXELS:
                 size = f"{picture.width} x {picture.height} pixels"
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")

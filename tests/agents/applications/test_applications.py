@@ -136,6 +136,9 @@ def test_bad_maps(tmp_path) -> None:
     (tmp_path / "text.exr").write_text("no picture")
     np.save(tmp_path / "pickle.npy", np.array([print], object), allow_pickle=True)
     np.save(tmp_path / "three.npy", np.ones((2, 2, 2)))
+    lie = {"descr": "<f8", "fortran_order": False, "shape": (2**20, 2**22)}  # 32 TB
+    with (tmp_path / "lie.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, lie)
     names = {"missing.png", *(path.name for path in tmp_path.iterdir())}
     for name in names if importlib.util.find_spec("OpenEXR") else names - {"text.exr"}:
         with pytest.raises(ValueError, match=rf"`depth` \(='.*{name}'"):

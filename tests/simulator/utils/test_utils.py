@@ -162,7 +162,14 @@ def test_a_good_file(tmp_path, monkeypatch):
     "text",
     [
         *("scorer: their/evil.py:X", "scorer: {noise: 0.5, '~/evil.py:X': 0.5}", "a: evil.py"),
-        *("scenes: pkg.mod:attr", "policies: [matrix:P, 'evil.py:Mine?gain=2']", "scenes: json:x"),
+        *(
+            "scenes: json.tool:attr",
+            "policies: [matrix:P, 'evil.py:Mine?gain=2']",
+            "scenes: json:x",
+        ),
+        # What loads a module runs it before it looks for the name in it.
+        *("a: evil.py:1", "a: evil.py:\u00e9", "a: 'json:X-v0'", 'a: "a\\nb/evil.py:X"'),
+        *("a: !!binary ZXZpbC5weTpY", "a: !!set {evil.py:X: }", "a: !!pairs [b: evil.py:X]"),
     ],
 )
 def test_code_in_a_file_needs_trust(tmp_path, monkeypatch, text):
@@ -172,6 +179,10 @@ def test_code_in_a_file_needs_trust(tmp_path, monkeypatch, text):
     for trusted in (str(tmp_path), f"/nowhere:{tmp_path.parent}", "all"):
         monkeypatch.setenv("AE_ENV_TRUST", trusted)
         assert read_yaml(tmp_path / "a.yaml")
+
+
+#: Few bytes that stand for 2^59 values.
+DOUBLED = "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60))
 
 
 @pytest.mark.parametrize(
@@ -184,6 +195,8 @@ def test_code_in_a_file_needs_trust(tmp_path, monkeypatch, text):
         ("- a\n- b", ["holds ['a', 'b']: it must map entries"]),
         ("name: x\npart: {steps: 2}\nname: y", ["): the entry 'name' is given twice, again in"]),
         ("name: " + "[" * 700, ["nested too deeply"]),
+        (DOUBLED, ["aliases stand for more than"]),
+        ("name: &a {x: 1}\nb: {<<: [*a, *a]}", ["`<<` merges one mapping"]),
         ("name: 2001-13-45", ["is not YAML"]),
         ("name: x" + " " * 2**20, ["must not be larger than"]),
         (b"name: \xff\xfe", ["is not YAML"]),
