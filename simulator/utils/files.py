@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 import functools
 import importlib.metadata
+import io
 import json
 import operator
 import os
@@ -143,6 +144,13 @@ def write_atomically(
         with suppress(OSError):  # after the renaming there is none
             temporary.unlink()
     return path
+
+
+def write_picture(path: Path, picture: Image.Image, **options: Any) -> Path:
+    """Write a picture of Pillow atomically, in the format that the ending of `path` names."""
+    content = io.BytesIO()
+    picture.save(content, path.suffix[1:].upper(), **options)
+    return write_atomically(path, content.getvalue())
 
 
 def sibling(path: str | Path, suffix: str) -> Path:

@@ -13,7 +13,7 @@ from ae_env import UserCodeError
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from agents import Policy, evaluate, fit_policies, make_policy
-from agents.evaluation import engine
+from agents.evaluation import engine, metrics
 from agents.evaluation import evaluation_plan as plans
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
 from agents.evaluation.jobs import named_content, run_plan
@@ -282,8 +282,8 @@ def test_the_oracle_is_right_in_every_frame_but_the_one_of_the_step(results):
     regret = step.scores.max(-1) - q  # (E, T)
     assert np.abs(np.delete(regret, 2, axis=1)).max() < 1e-6  # frame 3 has index 2
     assert regret[:, 2].mean() > 0.05
-    assert (step.settling == 3).all()
-    assert (static.settling == 0).all()
+    assert (metrics.settling(step.scores) == 3).all()
+    assert (metrics.settling(static.scores) == 0).all()
     assert (step.episode_metrics("oracle")["frames_to_converge"] == 1).all()
     late = results["step+4/late"]
     assert late.episode_metrics("oracle")["frames_to_converge"].max() == 2
