@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,7 +266,7 @@ JOBS = JOBS.changed(policies=("matrix:P", "random", "oracle"))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("parts")
 
 
@@ -296,7 +295,7 @@ def test_the_oracle_is_right_in_every_frame_but_the_one_of_the_step(results):
         np.testing.assert_array_equal(track.states[0][:, 0], late.start_states)
 
 
-def _arrays(folder: Path) -> dict[str, bytes]:
+def _arrays(folder):
     """Arrays of the parts in a folder; the times that they took differ."""
     files = {file.relative_to(folder): load_file(file) for file in folder.rglob("*.safetensors")}
     return {f"{f} {name}": a.tobytes() for f, own in files.items() for name, a in own.items()}

@@ -1,7 +1,5 @@
 """What is shown of a scene, and the page in a real Chromium: what a user does with it."""
 
-from __future__ import annotations
-
 import io
 import math
 import multiprocessing
@@ -12,7 +10,6 @@ import signal
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -179,7 +176,7 @@ def test_only_wider_f_numbers_than_the_raw_s_are_offered():
         assert wider_f_numbers(raw) == wider[len(wider) - offered :]
 
 
-def _view(log: Path) -> None:
+def _view(log):
     """Runs as `ae-env view`."""
     from agents.cli.main import main
 
@@ -265,9 +262,8 @@ def picture(page):
 
 
 def assert_another_picture(page, source):
-    page.wait_for_function(
-        "s => document.querySelector('.stage img').src.indexOf(s) < 0", arg=source
-    )
+    changed = "s => document.querySelector('.stage img').src.indexOf(s) < 0"
+    page.wait_for_function(changed, arg=source)
 
 
 def slider(page, name):
