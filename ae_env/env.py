@@ -333,9 +333,9 @@ class AutoExposureBase(SpecProperty):
         """Expected scores in an environment's current frame, with standard errors and parts."""
         return self.core.score_table(env_index)
 
-    def info_of(self, columns: dict[str, Any], row: int) -> dict[str, Any]:
+    def info_of(self, columns: Mapping[str, np.ndarray], row: int) -> dict[str, Any]:
         """The info of one environment, plain numbers and names, from the columns of many."""
-        info = _row(columns, row)
+        info: dict[str, Any] = {name: values.item(row) for name, values in columns.items()}
         info["scene_id"] = self.scene_ids[info["scene_id"]]
         info["modules"] = self.module_names[info["modules"]]
         return info
@@ -479,6 +479,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    _ended = True  # until the first episode begins
 
     @takes_env_arguments()
     def __init__(
@@ -507,7 +508,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         """Takes the next frame with the state `action`."""
         chosen = check_actions("action", action, ())[None]
         if self._ended:
-            raise gym.error.ResetNeeded("the episode has ended: call reset() before step()")
+            raise gym.error.ResetNeeded("no episode runs: call reset() before step()")
         self._ended = bool(self.core.transition(_FIRST, chosen)[0])
         observation, info = self._observe()
         assert self._last is not None
@@ -533,10 +534,3 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         """
         pictures = self._pictures(1)
         return None if pictures is None else pictures[0]
-
-
-def _row(columns: dict[str, Any], row: int) -> dict[str, Any]:
-    return {
-        name: _row(values, row) if isinstance(values, dict) else values.item(row)
-        for name, values in columns.items()
-    }

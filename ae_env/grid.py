@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 from numbers import Real
 from typing import Any
 
@@ -43,9 +43,6 @@ class ExposureGrid:
         isos: ISO speeds, ascending.
         exposure_times: Exposure times [s], ascending (shortest first).
         f_numbers: F-numbers, ascending.
-
-    Raises:
-        ValueError: If a list is empty, out of range, or not strictly ascending.
 
     >>> grid = ExposureGrid.default()
     >>> len(grid), str(grid[0]), str(grid[63])
@@ -123,17 +120,18 @@ class ExposureGrid:
     @cached_property
     def states(self) -> tuple[CameraSettings, ...]:
         """Settings of every state, by index."""
-        return tuple(
-            CameraSettings(iso, time, f_number)
-            for iso in self.isos
-            for time in self.exposure_times
-            for f_number in self.f_numbers
-        )
+        triples = product(self.isos, self.exposure_times, self.f_numbers)
+        return tuple(CameraSettings(*triple) for triple in triples)
 
     @cached_property
     def ev100(self) -> np.ndarray:
         """(S,) float64, EV100 of each state with the effective f-number (see `CameraSettings`)."""
         return np.array([-s.log2_exposure for s in self.states])
+
+    @cached_property
+    def apex(self) -> np.ndarray:
+        """(S, 3) float64, Av, Tv and Sv of each state."""
+        return np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self.states])
 
     def index(self, iso_index: int, time_index: int, aperture_index: int) -> int:
         """Index of the state with these positions in the three lists."""

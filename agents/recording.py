@@ -17,7 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from agents.policy import Policy
-from agents.rollouts import checked_states, errors_of
+from agents.rollouts import checked_states, choose, errors_of
 
 #: The variable that names Minari's folder.
 _ROOT = "MINARI_DATASETS_PATH"
@@ -29,7 +29,8 @@ def check_dataset_id(dataset_id: str) -> None:
     """Checks the name of a dataset that is to be written, and that the extra is installed."""
     rule = None
     if not _ID.fullmatch(dataset_id):
-        rule = "must be a name of Minari, such as 'ae_env/matrix-v0'"
+        rule = "must be a name of letters, digits, - and _, after a namespace of two or more or "
+        rule += "none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
     elif dataset_id in _minari().list_local_datasets():
         rule = "is there already: take a higher version, or remove it with "
         rule += f"`minari delete {dataset_id}`"
@@ -54,14 +55,12 @@ def record_dataset(
     reset option, its scene: ``env.reset(seed=seed, options=options)`` begins it again.
 
     Args:
-        policy: The policy, for one environment.
-        name: Its name, which the dataset has as that of its algorithm.
-        task: Id of the environment, such as ``"ae_env/AutoExposure-v0"``.
-        options: Arguments of the environment, JSON values.
+        policy, name: The policy, for one environment, and its name, that of the algorithm.
+        task, options: Id of the environment, such as ``"ae_env/AutoExposure-v0"``, and its
+            arguments, JSON values.
         dataset_id: Name of the dataset in Minari's folder (MINARI_DATASETS_PATH names another). It
             appears there when all episodes are recorded.
         episodes: How many; episode i has the seed ``seed + i``.
-        seed: Of the first.
         progress: Called with the episodes that are done, and all.
 
     Raises:
@@ -163,11 +162,8 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
     while not done:
         shown = {key: np.asarray(value)[None] for key, value in observation.items()}
         masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
-        extra: dict[str, Any] = {}
-        if getattr(policy, "privileged", False):
-            extra = {"info": {"oracle_state": np.array([info["oracle_state"]])}}
-        with errors_of(name, "act"):
-            actions = policy.act(shown, masks, **extra)
+        told = {"oracle_state": np.array([info.get("oracle_state")])}
+        actions = choose(name, policy, shown, masks, told)
         state = checked_states(name, actions, masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)
         done = terminated or truncated

@@ -3,10 +3,8 @@ import os
 import shutil
 import struct
 import tracemalloc
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,20 +34,13 @@ MATRIX = (0.9943, -0.3269, -0.0839, -0.5323, 1.3269, 0.2259, -0.1198, 0.2083, 0.
 CODE = tifffile.TIFF.EXIF_TAGS  # of a tag's name
 
 
-def fractions(values: Any) -> tuple[int, ...]:
+def fractions(values):
     return tuple(part for v in np.ravel(values) for part in (round(v * 10000), 10000))
 
 
-def write_sample_dng(
-    path: Path,
-    mosaic: np.ndarray = MOSAIC,
-    *,
-    black: tuple[int, ...] = (64,),
-    photometric: int = 32803,
-    **changes: tuple[str, Any],
-) -> Path:
+def write_sample_dng(path, mosaic=MOSAIC, *, black=(64,), photometric=32803, **changes):
     """A DNG by tifffile, not by the code under test; `changes` are types and values of tags."""
-    tags: dict[str, tuple[str, Any]] = {
+    tags = {
         "Make": ("s", "Test"),
         "Model": ("s", "Sensor"),
         "DNGVersion": ("B", (1, 4, 0, 0)),
@@ -340,7 +331,7 @@ def test_a_dng_cut_anywhere_is_refused(path, own_dng, name):
             read_raw(cut, settings=SETTINGS, nlf=NLF)
 
 
-def fields(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
+def fields(content):
     """Tag, position of the entry, position of the value (TIFF 6.0); the EXIF directory's, too."""
     pending = [struct.unpack_from("<I", content, 4)[0]]
     for offset in pending:
@@ -353,7 +344,7 @@ def fields(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
                 pending.append(value)
 
 
-def patch(path: Path, name: str, form: str, *values: Any) -> None:
+def patch(path, name, form, *values):
     """Overwrites a tag's value; with the form ``count``, how many values it claims to have."""
     content = bytearray(path.read_bytes())
     entry, position = next((at, v) for tag, at, v in fields(content) if tag == CODE[name])
