@@ -205,11 +205,11 @@ def is_raw_container(stream: BinaryIO) -> bool:
 def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple[str, str]:
     """Make and model as the camera recorded them; ``("", "")`` where the file does not say."""
     for tags in directories:
-        if "Model" in tags:
+        if tags.get("Model", ("",))[0]:
             return str(tags.get("Make", ("",))[0]), str(tags["Model"][0])
-    unique = first(directories, "UniqueCameraModel")  # all that a DNG has to say
-    if unique is not None and isinstance(unique[0], str) and unique[0]:
-        return unique[0].split()[0], unique[0]
+    unique = str((first(directories, "UniqueCameraModel") or ("",))[0])  # all that a DNG must say
+    if unique:
+        return unique.split()[0], unique
     head = _read_at(stream, 0, 2**16)
     if head[_CIFF[0]] == _CIFF[1]:
         return _ciff_identity(stream, struct.unpack_from("<I", head, 2)[0])

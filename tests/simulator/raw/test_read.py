@@ -13,8 +13,6 @@ import pytest
 import rawpy
 import tifffile
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from skimage.io import imsave
 
 from simulator import CameraSettings, NoiseLevelFunction, RawFileError, RawImage, read_raw
@@ -89,85 +87,35 @@ def own_dng(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (3, 5)])
-def test_cfa_orders_black_levels_and_margins(tmp_path, order, corner):
-    """By the DNG specification's rule: the tile begins at the area's corner."""
-    top, left = corner
-    tags = {"CFAPattern": ("B", CFA_BYTES[order]), "ActiveArea": ("I", (top, left, 62, 94))}
-    path = write_sample_dng(tmp_path / "a.dng", black=BLACK, **tags)
-    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
-    # LibRaw begins an odd visible area one row or column further in.
-    rows, columns = np.mgrid[top + top % 2 : 62, left + left % 2 : 94]
-    tile = 2 * ((rows - top) % 2) + (columns - left) % 2
-    values = (MOSAIC[rows, columns] - np.take(BLACK, tile)) / (4095 - np.take(BLACK, tile))
-    red, blue = order.index("R"), order.index("B")
-    planes = [red, red ^ 1, blue ^ 1, blue]  # G1 is on red's rows, G2 on blue's
-    expected = [values[tile == i].reshape(len(rows) // 2, -1) for i in planes]
-    np.testing.assert_allclose(raw.data, expected, atol=1e-7)
-    assert raw.camera.black_level == tuple(BLACK[i] for i in planes)
-
-
-@given(
-    rows=st.integers(1, 5),
-    columns=st.integers(1, 5),
-    by_row=st.sampled_from([0.0, 3.0]),
-    by_column=st.sampled_from([0.0, -0.5]),
-    seed=st.integers(0, 99),
-)
-def test_black_levels_of_every_form(tmp_path, rows, columns, by_row, by_column, seed):
-    """Tile, rows and columns add up, at every pixel (DNG specification 1.4)."""
-    tile = np.random.default_rng(seed).integers(60, 120, (rows, columns))
-    tags = {"BlackLevelRepeatDim": ("H", (rows, columns)), "ActiveArea": ("I", (0, 0, 64, 96))}
-    if by_row:
-        tags["BlackLevelDeltaV"] = ("2i", fractions(by_row * np.arange(64)))
-    if by_column:
-        tags["BlackLevelDeltaH"] = ("2i", fractions(by_column * np.arange(96)))
-    path = write_sample_dng(tmp_path / "a.dng", black=tuple(tile.ravel().tolist()), **tags)
-    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
-    r, c = np.mgrid[:64, :96]
-    level = tile[r % rows, c % columns] + by_row * r + by_column * c
-    for plane, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
-        own, stored = level[row::2, column::2], MOSAIC[row::2, column::2]
-        assert raw.camera.black_level[plane] == pytest.approx(own.mean())
-        expected = (stored - own) / (4095 - own.mean())
-        np.testing.assert_allclose(raw.data[plane], expected, atol=1e-6)
-
-
-def test_black_levels_without_a_size_are_of_a_bayer_tile(tmp_path):
-    tags = {"BlackLevelRepeatDim": ("H", (1, 1))}  # hdr-plus leaves it out; LibRaw then says 0
-    content = write_sample_dng(tmp_path / "a.dng", black=BLACK, **tags).read_bytes()
-    entry = struct.pack("<HHI", CODE["BlackLevelRepeatDim"], 3, 2)
-    assert content.count(entry) == 1
-    (tmp_path / "a.dng").write_bytes(content.replace(entry, struct.pack("<HHI", 50703, 3, 2)))
-    assert read_raw(tmp_path / "a.dng", settings=SETTINGS, nlf=NLF).camera.black_level == BLACK
-
-
-@pytest.mark.parametrize(
-    ("make", "time", "seconds"),
-    [
-        *(("Canon", (1, 60), 1 / 64), ("NIKON CORPORATION", (10, 600), 1 / 64)),
-        *(("Google", (1, 60), 1 / 60), ("RaspberryPi", (1, 60), 1 / 60)),
-        ("samsung", (16666667, 10**9), 0.016666667),
-    ],
-)
-def test_settings_where_phones_write_them(tmp_path, make, time, seconds):
-    """In the first directory; only cameras that mark stops round them."""
-    tags = {"Make": ("s", make), "ExposureTime": ("2I", time)}
-    tags |= {"FNumber": ("2I", (18, 10)), "PhotographicSensitivity": ("H", (50,))}
-    path = write_sample_dng(tmp_path / "a.dng", **tags)
-    raw = read_raw(path, nlf=NLF)
-    wanted = {"iso": 50.0, "exposure_time": pytest.approx(seconds), "f_number": 1.8}
-    assert vars(raw.settings).items() >= wanted.items()
-    assert read_settings(path) == wanted
-    del tags["PhotographicSensitivity"]
+def test_one_setting_alone_is_given(tmp_path):
+    tags = {"ExposureTime": ("2I", (1, 60)), "FNumber": ("2I", (18, 10))}
     path = write_sample_dng(tmp_path / "a.dng", **tags)
     with pytest.raises(ValueError, match=r"`settings` .* iso;"):
         read_raw(path, nlf=NLF)
     raw = read_raw(path, nlf=NLF, settings={"iso": 64, "f_number": 2.8})
-    assert raw.settings == CameraSettings(64, seconds, 2.8)
+    assert raw.settings == CameraSettings(64, 1 / 60, 2.8)
     with pytest.raises(ValueError, match="`settings`"):
         read_raw(path, nlf=NLF, settings={"speed": 64})
+
+
+def test_what_libraw_takes_for_something_else(tmp_path):
+    """Floating-point black levels, long ISOs, one level for a tile, cameras by their one name."""
+    tags = {"BlackLevel": ("2I", (64, 4095)), "WhiteLevel": ("I", (1,)), "Model": ("s", "")}
+    tags |= {"PhotographicSensitivity": ("I", (204_800,)), "BlackLevelRepeatDim": ("H", (2, 2))}
+    path = write_sample_dng(tmp_path / "a.dng", (MOSAIC / 4095).astype(np.float32), **tags)
+    assert read_settings(path) == {"iso": 204_800}
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    light = (MOSAIC[::2, ::2] - 64) / (4095 - 64)
+    np.testing.assert_allclose(raw.data[0], light, atol=1e-4)  # of 14 bits
+    assert (raw.camera.make, raw.camera.model) == ("Test", "Test Sensor")
+    path = write_sample_dng(path, CFALayout=("H", (3,)))
+    with pytest.raises(RawFileError, match="CFALayout"):
+        read_raw(path)
+    with path.open("rb") as stream:
+        (apart,) = read_directories(stream)
+    apart |= {"StripOffsets": (512, 8000), "RowsPerStrip": (32,), "CFALayout": (1,)}
+    with pytest.raises(RawFileError, match="strips one after another"):
+        read_module._check_structure([apart], True, 10**6)
 
 
 def test_gain_maps_and_baseline_go_along(tmp_path):
@@ -502,21 +450,6 @@ def test_a_panasonic_whose_strip_has_no_position(tmp_path):
     with rawpy.imread(str(path)) as decoded:
         np.testing.assert_array_equal(raw.to_mosaic(), decoded.raw_image_visible.clip(0, 3986))
     assert (raw.settings.iso, raw.camera.name) == (200, "panasonic_dmc-gf1")
-
-
-@pytest.mark.parametrize("byteorder", ["<", ">"])
-def test_sub_directories_and_both_byte_orders(tmp_path, byteorder):
-    model = (CODE["Model"], "s", 0, "Sensor", True)
-    white, path = (CODE["WhiteLevel"], "I", 1, 4095, True), tmp_path / "a.tif"
-    options = {"photometric": "minisblack", "metadata": None, "software": False}
-    with tifffile.TiffWriter(path, byteorder=byteorder) as writer:
-        writer.write(np.zeros((2, 2), np.uint8), subifds=1, extratags=[model], **options)
-        writer.write(np.zeros((4, 6), np.uint16), extratags=[white], **options)
-    with path.open("rb") as stream:
-        first, second = read_directories(stream)
-        assert camera_identity(stream, [first, second]) == ("", "Sensor")
-    assert (first["ImageWidth"], second["ImageWidth"]) == ((2,), (6,))
-    assert (second["WhiteLevel"], second["BitsPerSample"]) == ((4095,), (16,))
 
 
 def test_identities_of_other_containers(tmp_path):
