@@ -333,9 +333,9 @@ class AutoExposureBase(SpecProperty):
         """Expected scores in an environment's current frame, with standard errors and parts."""
         return self.core.score_table(env_index)
 
-    def info_of(self, columns: dict[str, Any], row: int) -> dict[str, Any]:
+    def info_of(self, columns: Mapping[str, np.ndarray], row: int) -> dict[str, Any]:
         """The info of one environment, plain numbers and names, from the columns of many."""
-        info = _row(columns, row)
+        info: dict[str, Any] = {name: values.item(row) for name, values in columns.items()}
         info["scene_id"] = self.scene_ids[info["scene_id"]]
         info["modules"] = self.module_names[info["modules"]]
         return info
@@ -533,10 +533,3 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         """
         pictures = self._pictures(1)
         return None if pictures is None else pictures[0]
-
-
-def _row(columns: dict[str, Any], row: int) -> dict[str, Any]:
-    return {
-        name: _row(values, row) if isinstance(values, dict) else values.item(row)
-        for name, values in columns.items()
-    }

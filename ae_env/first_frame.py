@@ -15,8 +15,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+import torch
+
 from simulator.capture.sensor import is_compiled
-from simulator.utils.compute import thread_count
 
 #: Set in the process that compiles, which starts none itself.
 _MARK = "AE_ENV_COMPILES_FIRST_FRAME"
@@ -28,7 +29,7 @@ def compile_beside() -> None:
     global _started
     python = Path(sys.executable or "").name.lower().startswith("python")  # no application with one
     child = multiprocessing.parent_process() is not None or _MARK in os.environ
-    if _started or child or not python or thread_count() < 2 or is_compiled():
+    if _started or child or not python or torch.get_num_threads() < 2 or is_compiled():
         return
     _started = True
     root, own = str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")
@@ -42,7 +43,6 @@ def compile_beside() -> None:
 
 def _compile() -> None:
     import numpy as np
-    import torch
 
     from ae_env.grid import ExposureGrid
     from ae_env.scorers import make_scorer

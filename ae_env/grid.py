@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 from numbers import Real
 from typing import Any
 
@@ -43,9 +43,6 @@ class ExposureGrid:
         isos: ISO speeds, ascending.
         exposure_times: Exposure times [s], ascending (shortest first).
         f_numbers: F-numbers, ascending.
-
-    Raises:
-        ValueError: If a list is empty, out of range, or not strictly ascending.
 
     >>> grid = ExposureGrid.default()
     >>> len(grid), str(grid[0]), str(grid[63])
@@ -123,12 +120,8 @@ class ExposureGrid:
     @cached_property
     def states(self) -> tuple[CameraSettings, ...]:
         """Settings of every state, by index."""
-        return tuple(
-            CameraSettings(iso, time, f_number)
-            for iso in self.isos
-            for time in self.exposure_times
-            for f_number in self.f_numbers
-        )
+        triples = product(self.isos, self.exposure_times, self.f_numbers)
+        return tuple(CameraSettings(*triple) for triple in triples)
 
     @cached_property
     def ev100(self) -> np.ndarray:

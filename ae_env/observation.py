@@ -47,11 +47,7 @@ _TINY = sys.float_info.min
 def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """8-bit codes ``round(255 sqrt((x + p) / (1 + p)))`` of a signal whose white is 1.
 
-    x is clipped to [-p, 1], p = 1/1024.
-
-    Args:
-        signal: Float tensor of any shape.
-        out: uint8 tensor of this shape to write to, instead of a new one.
+    x is clipped to [-p, 1], p = 1/1024; `out` is uint8 to write to, instead of a new tensor.
     """
     codes = signal.clamp(-PEDESTAL, 1.0).add_(PEDESTAL).div_(1.0 + PEDESTAL)
     codes = codes.sqrt_().mul_(255.0).round_()
@@ -120,10 +116,8 @@ def decode_settings(settings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 def encode_sensors(speed: np.ndarray, defocus: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Readings (N, 2) float32 in [-1, 1] of the gyro and the focus drive; no motion reads -1.
 
-    Args:
-        speed: (N,) image speed [frame heights/s], >= 0.
-        defocus: (N,) blur diameter at f/4 [pixel of a 64-pixel frame], > 0.
-        noise: (N, 2) standard normals; the readings are off by 15 % times these.
+    `speed` (N,) is the image's [frame heights/s], `defocus` (N,) the blur diameter at f/4 [pixel of
+    a 64-pixel frame], > 0; readings are off by 15 % times the standard normals `noise` (N, 2).
     """
     # A kernel, because a dozen NumPy calls for two numbers are 8 % of the time of a step.
     out = np.empty((len(speed), 2), np.float32)

@@ -178,8 +178,7 @@ class EnvOptions:
     def make_grid(self) -> ExposureGrid:
         """The exposure grid; by default, of recorded scenes, that of their captures.
 
-        Raises:
-            ValueError: If a value of it cannot be shown by an observation's ``settings``.
+        A `ValueError` if an observation's ``settings`` cannot show a value of it.
         """
         if self.recorded is not None and self.grid is None:
             grid = self.recorded.grid

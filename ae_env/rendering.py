@@ -146,13 +146,6 @@ def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
     return paths
 
 
-def _focus(scene: Scene, defocus: float) -> str:
-    if defocus:
-        return f"defocus {defocus:.3g} px of 64 at f/4"
-    own = scene.own_blur(4.0) * 64.0 / scene.light.shape[-2]
-    return f"its own defocus, {own:.3g} px of 64 at f/4" if own else "all in focus"
-
-
 def _title(
     scene: Scene, moves: dict[str, Any], grid: ExposureGrid, table: ScoreTable
 ) -> tuple[str, str]:
@@ -167,7 +160,10 @@ def _title(
         parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
     if own and scene.layout is not None:
         parts.append(f"subject {own:.3g}")
-    parts.append(_focus(scene, moves["defocus"]))
+    blur = scene.own_blur(4.0) * 64.0 / scene.light.shape[-2]
+    focus = f"its own defocus, {blur:.3g} px of 64 at f/4" if blur else "all in focus"
+    drawn = moves["defocus"]
+    parts.append(f"defocus {drawn:.3g} px of 64 at f/4" if drawn else focus)
     return "   ·   ".join(parts), best
 
 

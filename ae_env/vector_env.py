@@ -206,9 +206,7 @@ class AutoExposureVectorEnv(
         masks = np.zeros((len(columns), self.num_envs), dtype=bool)
         masks[:, env_indices] = True
         for mask, (name, values) in zip(masks, columns.items(), strict=True):
-            if isinstance(values, dict):
-                values = self._vector_info(values, env_indices)
-            elif len(env_indices) < self.num_envs:
+            if len(env_indices) < self.num_envs:
                 some, values = values, np.zeros(self.num_envs, values.dtype)
                 values[env_indices] = some
             info[name], info[f"_{name}"] = values, mask

@@ -221,6 +221,12 @@ def make_policy(
     return policy
 
 
+def check_policy(name: str) -> None:
+    """Raises a `ValueError` unless there is a policy called `name`; options are not checked."""
+    for one in training_seeds(name):
+        _find(one, split_options(one)[0].removesuffix(":"))
+
+
 def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     """The class of a policy, and the arguments that `base`, the `name` without options, gives."""
     found = (_POLICIES | _BRACKETS).get(_SHORT.get(base, base))

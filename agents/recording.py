@@ -29,7 +29,8 @@ def check_dataset_id(dataset_id: str) -> None:
     """Checks the name of a dataset that is to be written, and that the extra is installed."""
     rule = None
     if not _ID.fullmatch(dataset_id):
-        rule = "must be a name of Minari, such as 'ae_env/matrix-v0'"
+        rule = "must be a name of letters, digits, - and _, after a namespace of two or more or "
+        rule += "none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
     elif dataset_id in _minari().list_local_datasets():
         rule = "is there already: take a higher version, or remove it with "
         rule += f"`minari delete {dataset_id}`"

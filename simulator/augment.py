@@ -140,9 +140,6 @@ class ExposureAugmentation:
         Returns:
             Tensor of the shape and on the device of `images`, float32: pictures in [0, 1], raws
             in whole digital numbers from minus the pedestal to 1. Without modules, `images`.
-
-        Raises:
-            ValueError: If an argument has the wrong shape, dtype or range.
         """
         images = _check_images(images)
         words = _check_seeds(seeds, len(images))

@@ -253,10 +253,6 @@ def list_cameras() -> list[str]:
 
 
 def get_camera(name: str) -> CameraProfile:
-    """The built-in camera called `name`.
-
-    Raises:
-        ValueError: If there is none; the message proposes the nearest name.
-    """
+    """The built-in camera called `name`; a `ValueError` proposes the nearest one."""
     check_word("camera", name, tuple(list_cameras()))
     return _built_in()[name]

@@ -20,14 +20,7 @@ from simulator.capture.blurred_light import (
 )
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
-from simulator.capture.sensor import (
-    Noise,
-    Transitions,
-    check_noise,
-    exposed_light,
-    record,
-    sweep_keys,
-)
+from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
@@ -70,21 +63,13 @@ class SceneArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """Every intermediate result of the full pipeline (paper, figure 2), each (4, H, W).
+    """Every intermediate result of the full pipeline (paper, figure 2), each (4, H, W)."""
 
-    Args:
-        exposed: After the exposure module (EXP).
-        denoised: After the noise module (NS).
-        opened: After the aperture module (Full).
-        light: With the blur of a known disc and of motion, before the output's noise.
-        capture: With the output settings' noise, clipped and quantised.
-    """
-
-    exposed: torch.Tensor
-    denoised: torch.Tensor
-    opened: torch.Tensor
-    light: torch.Tensor
-    capture: torch.Tensor
+    exposed: torch.Tensor  # after the exposure module (EXP)
+    denoised: torch.Tensor  # after the noise module (NS)
+    opened: torch.Tensor  # after the aperture module (Full)
+    light: torch.Tensor  # with the blur of a known disc and of motion, before the output's noise
+    capture: torch.Tensor  # with the output settings' noise, clipped and quantised
 
 
 def prepared_of(source: Source, device: torch.device) -> PreparedScene:
@@ -302,10 +287,8 @@ class CameraSimulator:
         """The prepared scene's light (4, H, W) with little noise, by `noise` or the best module.
 
         The result serves every exposure: the family commutes with exposure. Those of the paper
-        and of its authors' code do not; they are run at the exposure of the source.
-
-        Raises:
-            ValueError: If this simulator has no noise module.
+        and of its authors' code do not; they are run at the exposure of the source. A `ValueError`
+        if there is no noise module.
         """
         noise = _required("noise", self.noise if noise is None else noise)
         image, (shot, read) = prepared.light[None], self._noise_of(prepared)
@@ -330,8 +313,7 @@ class CameraSimulator:
     def estimate_defocus(self, prepared: PreparedScene) -> torch.Tensor:
         """Circle of confusion of each pixel (H, W), at the prepared scene's own aperture [pixel].
 
-        Raises:
-            ValueError: If this simulator's aperture module has no such map.
+        A `ValueError` if the aperture module has no such map.
         """
         aperture = _required("aperture", self.aperture)
         shot, read = self._noise_of(prepared)
@@ -515,7 +497,7 @@ class CameraSimulator:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
             ``metadata["clipped_source"]`` declare what could not be made exact.
         """
-        check_noise(noise)
+        check_word("noise", noise, get_args(Noise))
         if tolerance is None and self.noise is not None:
             if noise != "exact":
                 raise ValueError(f"`noise` (={noise!r}) needs a `tolerance`: not in the full run")

@@ -44,9 +44,6 @@ class CameraSettings:
         log2_exposure: log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective
             f-number.
 
-    Raises:
-        ValueError: If a value is not a number in its range.
-
     >>> CameraSettings(iso=100, exposure_time=1 / 125, f_number=16).ev100
     14.965784284662087
     """

@@ -39,35 +39,20 @@ _NUMBERS, _VALUES = 12, 2.0**53
 
 @dataclass(frozen=True)
 class Episode:
-    """One scene being photographed, at one moment.
+    """One scene being photographed, at one moment."""
 
-    Args:
-        scene: Index of the scene.
-        state: Current exposure state.
-        speed: Image speed [frame heights per second].
-        direction: Of the image's motion when a shutter opens [rad], 0 along the rows.
-        turn: Rate at which it turns [rad/s].
-        subject_speed: Own speed of the scene's subject [frame heights per second].
-        subject_direction: Its direction [rad].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
-        focus_drive: Blur at f/4 that the focus drive reports [pixel of a 64-pixel frame].
-        phase: Phase of a periodic lighting, in [0, 1).
-        noise_seed: Seed of the noise, which differs from frame to frame.
-        frame: Number of the current frame.
-    """
-
-    scene: int
-    state: int
-    speed: float
-    direction: float
-    turn: float
-    subject_speed: float
-    subject_direction: float
-    defocus: float
-    focus_drive: float
-    phase: float
-    noise_seed: int
-    frame: int = 0
+    scene: int  # index of the scene
+    state: int  # current exposure state
+    speed: float  # of the image [frame heights per second]
+    direction: float  # of the image's motion when a shutter opens [rad], 0 along the rows
+    turn: float  # rate at which that turns [rad/s]
+    subject_speed: float  # own speed of the scene's subject [frame heights per second]
+    subject_direction: float  # of that [rad]
+    defocus: float  # blur diameter at f/4 of what is least in focus [pixel of a 64-pixel frame]
+    focus_drive: float  # blur at f/4 that the focus drive reports [pixel of a 64-pixel frame]
+    phase: float  # of a periodic lighting, in [0, 1)
+    noise_seed: int  # of noise that differs from frame to frame
+    frame: int = 0  # number of the current frame
 
     @property
     def movement(self) -> Movement:
@@ -333,8 +318,7 @@ class Episodes:
     def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
         """Light of an exposure [s] in an episode's current frame, relative to its scene's own.
 
-        Returns:
-            That of the frame, and (R,) that of each row relative to it, or None (`Lighting.rows`).
+        And (R,) that of each row relative to the frame's, or None (`Lighting.rows`).
         """
         frame, phase = self.frame.item(env_index), self.phase.item(env_index)
         if not self.lighting.within_frame:

@@ -49,17 +49,11 @@ _RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
 
 
 class RollingShutter(NamedTuple):
-    """Readout of a frame, one sensor row after the other.
+    """Readout of a frame, one sensor row after the other."""
 
-    Args:
-        rows: Rows of the packed frame.
-        row_time: Time from the start of one sensor row to the start of the next [s].
-        sensor_rows: Number of sensor rows that are averaged into one row of the frame.
-    """
-
-    rows: int
-    row_time: float
-    sensor_rows: int
+    rows: int  # of the packed frame
+    row_time: float  # from the start of one sensor row to the start of the next [s]
+    sensor_rows: int  # that are averaged into one row of the frame
 
 
 #: Lightings by name: every subclass of `Lighting` with a `name` of its own.
@@ -100,12 +94,9 @@ class Lighting:
                 )
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """Mean relative light of an exposure.
+        """Mean relative light of an exposure [s]; frame 0 is the one that `reset` returns.
 
-        Args:
-            frame: Frame of the episode; 0 is the one that `reset` returns.
-            exposure_time: Time the shutter is open [s].
-            phase: The episode's own phase, in [0, 1).
+        `phase` is the episode's own, in [0, 1).
         """
         return float(2.0 ** self._stops(frame, phase))
 
@@ -118,9 +109,8 @@ class Lighting:
     ) -> tuple[float, np.ndarray | None]:
         """Light of an exposure as of `gain`, row by row of a frame that `shutter` reads.
 
-        Returns:
-            Mean relative light of the frame, and (rows,) float64 that of each row relative to this
-            mean; None where all rows have the same.
+        The mean of the frame, and (rows,) float64 that of each row relative to this mean; None
+        where all rows have the same.
         """
         return self.gain(frame, exposure_time, phase), None
 
@@ -131,8 +121,7 @@ KINDS[Lighting.name] = Lighting
 def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     """A lighting from a name or from a mapping such as ``{"kind": "step", "stops": 3}``.
 
-    Raises:
-        ValueError: If the kind or one of its options is unknown, or an option is out of range.
+    A `ValueError` if the kind or an option is unknown, or an option out of range.
 
     >>> make_lighting({"kind": "step", "stops": 3, "at": 2}).gain(2, 0.01, 0.0)
     8.0

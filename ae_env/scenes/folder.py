@@ -113,13 +113,8 @@ def folder_scenes(
 ) -> list[Scene]:
     """The scenes of a split among the user's files; each is resized before the next file is read.
 
-    Args:
-        spec: A file, a folder (searched with its sub-folders; hidden ones left out) or a glob.
-        request: Split, camera and size.
-        options: Facts about the files that the caller knows.
-
-    Raises:
-        ValueError: If a file cannot be read, or there are too few groups to train on.
+    `spec` is a file, a folder (searched with its sub-folders; hidden ones left out) or a glob. A
+    `ValueError` if a file cannot be read, or there are too few groups to train on.
     """
     base, files = find_files(spec)
     named = _named_groups(sorted({base, *(p.parent for p in files)}))
@@ -142,10 +137,8 @@ def sequence_scenes(
     folder below has that name.
 
     The arguments are those of `folder_scenes`; `on_error` must be ``"stop"``, and fewer than 15
-    sequences are all for test.
-
-    Raises:
-        ValueError: If there are no raws, one cannot be read, or there are too few to train on.
+    sequences are all for test. A `ValueError` if there are no raws, one cannot be read, or there
+    are too few to train on.
     """
     if options.on_error == "skip":
         raise ValueError(
@@ -183,13 +176,9 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
-    """The raws and radiance maps that `spec` names as of `folder_scenes`, in natural order.
+    """The folder, and the raws and radiance maps that `spec` names as of `folder_scenes`.
 
-    Returns:
-        Their folder, and the files.
-
-    Raises:
-        ValueError: If there is nothing by that name, or no raw or radiance map in it.
+    They are in natural order. A `ValueError` if there is nothing by that name, or none in it.
     """
     try:
         base, found = _listed(spec)
@@ -469,8 +458,7 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
 def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
     """The scenes whose source group is in `split`; the log tells the groups and how many are not.
 
-    Raises:
-        ValueError: If `split` is ``"train"`` and there are too few groups.
+    A `ValueError` if there are too few groups to train on.
     """
     members: dict[str, list[str]] = {}
     for scene in scenes:

@@ -293,7 +293,6 @@ def simulate_source_raw(
     simulator, as in the paper.
 
     Args:
-        scene: The scene.
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
         iso: ISO of the raw; drawn by default from `iso_range`, log-uniformly.
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by

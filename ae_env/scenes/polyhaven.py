@@ -73,20 +73,13 @@ _VERSION = 6
 
 
 class Asset(Configuration):
-    """A panorama.
-
-    Args:
-        name, bytes, sha256: Public name of its file, the file's length and hash.
-        kind, split: Kind of light; ``"train"`` or ``"test"``.
-        group: Source group: the place; by default the asset itself.
-        file: Where it lies in a folder of real files.
-    """
+    """A panorama, whose file has a public name, a length and a hash."""
 
     name: str = Field(pattern=r"[a-z0-9_]+")
     kind: Literal[tuple(ILLUMINANCE)]  # type: ignore[valid-type]
     split: Literal["train", "test"]
-    group: str | None = None
-    file: str | None = None
+    group: str | None = None  # source group: the place; by default the asset itself
+    file: str | None = None  # where it lies in a folder of real files
     bytes: int = Field(gt=0)
     sha256: str = Field(pattern=r"[0-9a-f]{64}")
 
@@ -127,10 +120,9 @@ def list_assets() -> tuple[Asset, ...]:
 
 
 def split_assets(name: str, split: str) -> list[Asset]:
-    """The assets of a split, whose maps are there; errors call the scenes `name`.
+    """The assets of a split; errors call the scenes `name`.
 
-    Raises:
-        FileNotFoundError: If maps are missing; the message names the command that fetches them.
+    A `FileNotFoundError` names the command that fetches maps that are missing.
     """
     assets = [a for a in list_assets() if split in ("all", a.split)]
     missing = [asset.name for asset in assets if asset.path is None]

@@ -150,10 +150,8 @@ def recorded_scenes(
     """The recorded scenes of a split, frames of one video after the other.
 
     Each capture is resized before the next is read. Captures at settings that are not in `grid` are
-    left out, states without a capture are forbidden (`Scene.allowed`).
-
-    Raises:
-        ValueError: If a capture cannot be read, or a scene's captures are no grid of one size.
+    left out, states without a capture are forbidden (`Scene.allowed`). A `ValueError` if a capture
+    cannot be read, or a scene's captures are no grid of one size.
     """
     camera = options.camera(request.camera)
     scenes: list[Scene] = []
@@ -292,21 +290,14 @@ def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
 
 @dataclass(frozen=True)
 class RecordedFile:
-    """One real capture.
-
-    Args:
-        path, settings: Its file, and the settings that it was taken at.
-        scene: Name of what it shows, of a frame of video with the frame's number.
-        group: Source group: what it shows whatever the light.
-        sequence, frame: The video that it is a frame of, empty for a still scene, and which.
-    """
+    """One real capture."""
 
     path: Path
-    settings: CameraSettings
-    scene: str
-    group: str
-    sequence: str
-    frame: int
+    settings: CameraSettings  # that it was taken at
+    scene: str  # name of what it shows, of a frame of video with the frame's number
+    group: str  # source group: what it shows whatever the light
+    sequence: str  # the video that it is a frame of, empty for a still scene
+    frame: int  # which of its frames
 
     @property
     def is_picture(self) -> bool:
@@ -317,10 +308,8 @@ class RecordedFile:
 def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
     """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
-    `known` are settings by name that the files do not state; those that they do come first.
-
-    Raises:
-        ValueError: If there is no capture, one does not state its settings, or a table is wrong.
+    `known` are settings by name that the files do not state; those that they do come first. A
+    `ValueError` if there is no capture, one does not state its settings, or a table is wrong.
     """
     tables = _read_tables(folder)
     paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))

@@ -198,9 +198,6 @@ class Scene:
             group: Source group; `scene_id` by default.
             nlf: Noise left in `packed`; none by default.
             illuminance, white_balance, kind, fields: As in `Scene`.
-
-        Raises:
-            ValueError: If a value has the wrong shape or lies outside its range.
         """
         scene = cls(
             scene_id=scene_id,
@@ -221,10 +218,8 @@ class Scene:
         """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
         Its settings become the reference; `fields` are further arguments of `from_array`, such as
-        an `illuminance` that was measured.
-
-        Raises:
-            ValueError: If neither the raw nor its camera knows the noise.
+        an `illuminance` that was measured. A `ValueError` if neither the raw nor its camera knows
+        the noise.
         """
         saturated = raw.saturated
         fields |= {"scene_id": scene_id, "kind": kind, "saturated": saturated, "sampled": True}

@@ -54,15 +54,10 @@ def reads_pixels(scorer: Scorer) -> bool:
 
 
 class PixelBlur(NamedTuple):
-    """Blur of B captures whose pixels differ in it.
+    """Blur of B captures whose pixels differ in it, (B, K) float64 each."""
 
-    Args:
-        levels: (B, K) float64, extents that pixels of a capture have [pixel of the frame].
-        shares: (B, K) float64, shares of the pixels that have them; they sum to 1.
-    """
-
-    levels: torch.Tensor
-    shares: torch.Tensor
+    levels: torch.Tensor  # extents that pixels of a capture have [pixel of the frame]
+    shares: torch.Tensor  # shares of the pixels that have them; they sum to 1
 
     @property
     def rms_px(self) -> torch.Tensor:
@@ -159,12 +154,8 @@ def prepare_scene(
 ) -> PreparedScene:
     """`scene` as `camera` sees it in an episode; a `ValueError` if a number is out of range.
 
-    Args:
-        scene: The scene.
-        camera: The body that takes the captures.
-        speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
-        movement: Directions of the image's motion, and the subject's own.
+    `speed` is the image's [frame heights per second], `defocus` the blur diameter at f/4 of what is
+    least in focus [pixel of a 64-pixel frame]; `movement` has directions, and the subject's own.
     """
     widest = 64.0 * max(1.0, MAX_DISC_PX / scene.light.shape[-2])
     check_number("speed", speed, 0.0, MAX_IMAGE_SPEED, more=" frame heights per second")

@@ -29,10 +29,8 @@ def find_model_file(
 ) -> tuple[str, str]:
     """The model file of a scorer, and its SHA-256: another file of that name gives other scores.
 
-    It is `given`, else what `variable` names, else `name` in the cache.
-
-    Raises:
-        ValueError: If there is none; the message says where to put it, and `how` to get it.
+    It is `given`, else what `variable` names, else `name` in the cache. A `ValueError` says where
+    to put it, and `how` to get it.
     """
     named = os.environ.get(variable) if given is None else os.fspath(given)
     file = Path(named).expanduser() if named else cache_dir() / name
@@ -121,8 +119,7 @@ PUBLISHED = {
 def read_network(file: str | os.PathLike[str]) -> NimaMobileNet:
     """The network of a ``.safetensors`` that ``examples/convert_nima.py`` wrote, for inference.
 
-    Raises:
-        ValueError: If it cannot be read, or is not of this network.
+    A `ValueError` if it cannot be read, or is not of this network.
     """
     network = NimaMobileNet()
     try:
@@ -185,10 +182,8 @@ class Nima:
 
     Talebi and Milanfar, NIMA: Neural Image Assessment, 2018. The weights do not come with the
     package: `file` (.safetensors), which ``examples/convert_nima.py`` made from the published ones,
-    else what the scorer's environment variable names, else in the cache folder.
-
-    Raises:
-        ValueError: If the file is not there or does not fit.
+    else what the scorer's environment variable names, else in the cache folder. A `ValueError` if
+    the file is not there or does not fit.
     """
 
     domain: Domain = "srgb"

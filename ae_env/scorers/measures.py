@@ -386,14 +386,15 @@ class Clipping:
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        return by_parts(self._kept, images)
 
-    def _kept(self, images: torch.Tensor) -> torch.Tensor:
-        samples = images.flatten(1)
-        high = (samples >= self.white).sum(dim=1).double()
-        low = (samples <= self.black).sum(dim=1).double()
-        lost = self.high_weight * high + self.low_weight * low
-        return (1.0 - lost / samples.shape[1]).clamp_(min=0.0)
+        def kept(part: torch.Tensor) -> torch.Tensor:
+            samples = part.flatten(1)
+            high = (samples >= self.white).sum(dim=1).double()
+            low = (samples <= self.black).sum(dim=1).double()
+            lost = self.high_weight * high + self.low_weight * low
+            return (1.0 - lost / samples.shape[1]).clamp_(min=0.0)
+
+        return by_parts(kept, images)
 
 
 class DynamicRange:

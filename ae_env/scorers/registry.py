@@ -217,25 +217,15 @@ def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
 
 @dataclass(frozen=True)
 class ScorerRow:
-    """One scorer; a field is empty where it is unknown, or there is nothing to say.
+    """One scorer; a field is empty where it is unknown, or there is nothing to say."""
 
-    Args:
-        name: The name that `make_scorer` takes.
-        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``.
-        depends_on: ``"image"``, ``"light"`` or ``"blur"``.
-        needs: File or package that does not come with this one.
-        summary: First line of its docstring.
-        package: The package that it comes from.
-        error: Why it cannot be loaded, unless only what it needs is missing.
-    """
-
-    name: str
-    domain: str = ""
-    depends_on: str = ""
-    needs: str = ""
-    summary: str = ""
-    package: str = "ae-env"
-    error: str = ""
+    name: str  # that `make_scorer` takes
+    domain: str = ""  # "raw", "srgb" or, of parts that differ, "raw, srgb"
+    depends_on: str = ""  # "image", "light" or "blur"
+    needs: str = ""  # file or package that does not come with this one
+    summary: str = ""  # first line of its docstring
+    package: str = "ae-env"  # that it comes from
+    error: str = ""  # why it cannot be loaded, unless only what it needs is missing
 
 
 def describe_scorers() -> list[ScorerRow]:

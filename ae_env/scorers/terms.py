@@ -118,10 +118,9 @@ class CompositeScorer:
         return total.clip(0.0, 1.0) if torch.is_tensor(total) else np.clip(total, 0.0, 1.0)
 
     def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
-        """`combine` of arrays of any one shape, checked, because a user's class may override it.
+        """`combine` of arrays of any one shape; a `UserCodeError` if a total is not in [0, 1].
 
-        Raises:
-            UserCodeError: If a total is not in [0, 1].
+        It is checked because a user's class may override it.
         """
         totals = np.asarray(self.combine(scores), np.float64)
         if not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
@@ -137,10 +136,7 @@ def developed(
 ) -> torch.Tensor:
     """sRGB (B, 3, H, W) of raws (B, 4, H, W), each in the colours of its own scene's camera.
 
-    Args:
-        images: The raws.
-        white_balance: (B, 3) gains of R, G, B.
-        matrices: XYZ (D65) to camera RGB of each, B long; None where unknown.
+    `white_balance` are (B, 3) gains of R, G, B; for `matrices` see `Captures.colour_matrices`.
     """
     if len(set(matrices)) == 1:
         return develop(images, white_balance, matrices[0])
@@ -165,13 +161,9 @@ def check_part(name: str, part: Any) -> None:
 def scores_of(
     name: str, scorer: Scorer, images: torch.Tensor | None, captures: Captures
 ) -> torch.Tensor:
-    """Scores (B,) float64 in [0, 1] of one scorer.
+    """Scores (B,) float64 in [0, 1] of one scorer, which may be the user's own.
 
-    Args:
-        name: Its name in errors.
-        scorer: The scorer, which may be the user's own.
-        images: (B, C, H, W), or None where it has a closed form.
-        captures: The B captures that the images come from.
+    Errors call it `name`; `images` are (B, C, H, W), or None where it has a closed form.
 
     Raises:
         UserCodeError: If it raises (the cause is chained), returns anything but B numbers in

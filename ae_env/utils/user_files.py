@@ -171,8 +171,7 @@ def list_presets(kind: str = "env") -> list[str]:
 def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
     """The YAML file of a preset's name in a folder of ``configs/``, `kind`, or of its own path.
 
-    Raises:
-        ValueError: If there is neither; the message proposes the nearest name.
+    A `ValueError` proposes the nearest name if there is neither.
     """
     option = "env" if kind == "env" else "preset"  # as the command line calls it
     if isinstance(name, str | PathLike):
@@ -203,8 +202,7 @@ def find_config(path: Path) -> Path:
 def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
     """Keyword arguments of ``gymnasium.make`` from a preset of ``configs/env`` or a ``.yaml`` file.
 
-    Raises:
-        ValueError: If there is no such preset, or it cannot be read, is too large or no mapping.
+    A `ValueError` if there is no such preset, or it cannot be read, is too large or no mapping.
     """
     file = find_preset(name)
     from simulator.utils.config_file import read_yaml

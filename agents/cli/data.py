@@ -85,7 +85,7 @@ def record(
     from ae_env.utils.user_files import load_preset
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
-    from agents.policy_names import make_policy
+    from agents.policy_names import check_policy, make_policy
     from agents.recording import check_dataset_id, record_dataset
     from agents.rollouts import fitting_arguments
     from simulator.utils.checks import check_word
@@ -93,6 +93,7 @@ def record(
     console.trust_configuration(trust)
     check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))
     check_dataset_id(out)
+    check_policy(policy)
     options: dict[str, Any] = {"split": "train"} | ({} if env is None else load_preset(env))
     given = {"split": split, "scenes": scenes}
     options |= {name: value for name, value in given.items() if value is not None}

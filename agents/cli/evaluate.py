@@ -129,9 +129,12 @@ def _run(
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.jobs import Jobs
     from agents.evaluation.result import overall_ranking
+    from agents.policy_names import check_policy
     from agents.report.ae_bench import append_rows, bench_rows, check_append, check_hash
     from agents.report.evaluation import write_report
 
+    for name in plan.policies:
+        check_policy(name)  # before scenes are read, which may take minutes
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
     with Jobs(plan, out / "parts", scenes, device=device) as run:

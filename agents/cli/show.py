@@ -94,13 +94,15 @@ def film(
     from ae_env.lighting.moving import KIND_SETS, MOVES
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
-    from agents.policy_names import make_policy
+    from agents.policy_names import check_policy, make_policy
     from agents.report.film import record, write_film
     from agents.rollouts import scenes_of
     from simulator.utils.checks import check_word, did_you_mean
 
     console.check_outputs(out=(out, ".gif"))
     check_word("light", light, (*MOVES, *KIND_SETS))
+    for name in policy or POLICIES:
+        check_policy(name)
     options: dict[str, Any] = {"scenes": scenes, "split": "test", "max_episode_steps": frames + 1}
     options |= {"lighting": {"kind": "moving", "kinds": light}, "with_oracle": True}
     options["render_mode"] = "rgb_array"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from typer import Option
 
@@ -50,9 +50,10 @@ def simulate(
     """
     from simulator import CameraSettings
     from simulator.capture.decision import check_tolerance
-    from simulator.capture.sensor import check_noise
+    from simulator.capture.sensor import Noise
+    from simulator.utils.checks import check_word
 
-    check_noise(noise)
+    check_word("noise", noise, get_args(Noise))
     check_tolerance(tolerance)
     seconds, f_number = console.parse_seconds(shutter), console.parse_f_number(aperture)
     settings = CameraSettings(iso, seconds, f_number)

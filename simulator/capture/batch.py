@@ -20,13 +20,7 @@ from simulator.capture.blurred_light import Pool
 from simulator.capture.decision import LIGHT_LIMIT, Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import (
-    Noise,
-    Transitions,
-    exposure_table,
-    noise_keys,
-    record,
-)
+from simulator.capture.sensor import Noise, Transitions, exposure_table, noise_keys, record
 from simulator.capture.statistics import LightStatistics
 from simulator.optics.discs import Blur, blur_many
 from simulator.settings import CameraSettings
@@ -44,28 +38,18 @@ MODULES = tuple(
 
 @dataclass
 class FrameStatistics:
-    """Statistics of a batch of frames, (B,) each.
+    """Statistics of a batch of frames, (B,) each."""
 
-    Args:
-        clipped_low: Share of the samples that are clipped low: at most 2**-10 of white.
-        clipped_high: Share of the samples that are clipped high: at white.
-        excess_variance: Mean over the pixels of the noise variance beyond the target's, relative
-            to it; in flickering light, that of the frame's mean light.
-        predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
-            light without noise only what is left out.
-        modules: (B,) int64 index into `MODULES`: the steps that ran; of a recorded frame, their
-            number.
-        source_noise: (B, 2, 4) shot and read noise of the source in the frame.
-        keys: Keys of the noise, uint64.
-    """
-
-    clipped_low: np.ndarray
-    clipped_high: np.ndarray
+    clipped_low: np.ndarray  # share of the samples that are clipped low: at most 2**-10 of white
+    clipped_high: np.ndarray  # share of the samples that are clipped high: at white
+    #: Mean over the pixels of the noise variance beyond the target's, relative to it; in flickering
+    #: light, that of the frame's mean light.
     excess_variance: np.ndarray
+    #: `SimulationPlan.predicted_error`; of a light without noise only what is left out.
     predicted_error: np.ndarray
-    modules: np.ndarray
-    source_noise: np.ndarray
-    keys: np.ndarray
+    modules: np.ndarray  # int64 index into `MODULES`; of a recorded frame, their number
+    source_noise: np.ndarray  # (B, 2, 4) shot and read noise of the source in the frame
+    keys: np.ndarray  # of the noise, uint64
 
 
 class FrameSource(Protocol):
@@ -81,10 +65,7 @@ class FrameSource(Protocol):
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
         """Plans the next frames, and makes their light.
 
-        Args:
-            indices: (B,) of the scenes.
-            states: (B,) at which each is photographed.
-            gains: (B,) light of each exposure relative to the scene's own.
+        All are (B,): scenes, the state of each, and its light relative to the scene's own.
         """
 
     def record(

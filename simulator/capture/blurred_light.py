@@ -159,10 +159,7 @@ class MapApertureBlur(ApertureBlur):
 class NetworkApertureBlur(ApertureBlur):
     """Runs the paper's attention U-Net for every f-number (presets ``"paper"``, ``"ncs"``).
 
-    Args:
-        denoised: Light (4, H, W) with little noise.
-        module: The trained network, called as `ApertureModule` is.
-        f_number: Effective f-number of the light.
+    The light has little noise; `module` is the trained network, called as `ApertureModule` is.
     """
 
     needs_denoised = True
@@ -195,8 +192,7 @@ class NetworkApertureBlur(ApertureBlur):
 class Pool:
     """Memory for the light of a batch's scenes: new memory costs more than what is written to it.
 
-    Args:
-        keeps: See `cache_light` of `simulator.capture.batch.CaptureBatch`.
+    `keeps` is `cache_light` of `simulator.capture.batch.CaptureBatch`.
     """
 
     def __init__(self, keeps: bool) -> None:

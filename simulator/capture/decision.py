@@ -60,28 +60,18 @@ def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLe
 
 
 class Step(NamedTuple):
-    """A step that a capture may leave out.
+    """A step that a capture may leave out."""
 
-    Args:
-        name: Its name in `SimulationPlan.modules`.
-        runs: Whether it runs.
-        reason: Why it does, or does not; ``{extent}`` and ``{error}`` stand for the numbers.
-        estimate: Error of leaving it out, in units of the target's noise; or a function for it
-            where nothing is decided by it, and its statistics take time.
-        extent: Extent of its blur [pixel], where it is one.
-        residual: Error that it makes itself where it runs, as far as that is known.
-        network: The network that it runs, if any.
-        operations: Arithmetic operations that it takes, all pixels together, in a plan; those of a
-            network once for all settings.
-    """
-
-    name: str
+    name: str  # in `SimulationPlan.modules`
     runs: bool
-    reason: str
+    reason: str  # why it runs, or does not; ``{extent}`` and ``{error}`` stand for the numbers
+    #: Error of leaving it out, in units of the target's noise; or a function for it where nothing
+    #: is decided by it, and its statistics take time.
     estimate: float | Callable[[], float] = 0.0
-    extent: float = 0.0
-    residual: float = 0.0
-    network: DenoisedLight | None = None
+    extent: float = 0.0  # of its blur [pixel], where it is one
+    residual: float = 0.0  # error that it makes itself where it runs, as far as that is known
+    network: DenoisedLight | None = None  # that it runs
+    #: Arithmetic operations, all pixels together, in a plan; a network's once for all settings.
     operations: int = 0
 
     @property
@@ -92,45 +82,31 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """Exposure of one capture: ratio, noise and blur, from a scene's light to the sensor.
+    """Exposure of one capture: ratio, noise and blur, from a scene's light to the sensor."""
 
-    Args:
-        ratio: Exposure ratio from the prepared scene's reference to the capture.
-        source: Noise in the prepared scene at its reference settings.
-        target: Noise of the camera at the capture's settings.
-        motion_px: How far the image moves while the shutter is open [pixel], at most.
-        defocus_px: Diameter of the defocus disc [pixel], of the largest one.
-        layout: What is out of focus and what is the subject; None for one disc everywhere, and
-            where all of the frame moves together.
-        path: Of the background; None for a streak along the rows, as long as `motion_px`.
-        subject_path: Of the layout's subject where it moves on its own.
-        energy: Share of the source's noise variance that these blurs leave; None for what a disc
-            and a streak leave.
-        denoised: The noise-reduced light that it starts from; `source` is zero then. None for the
-            light as it was recorded.
-        opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
-            None where it does not.
-        remaining_variance: (H, W) share of the source's noise variance that the blurs leave, beyond
-            `energy`: of all of them with a layout, else of `opened_to`; None for all.
-        noise: Whether a capture is wanted; else the light without noise, in which noise of the
-            source cannot count as part of the target's.
-        steps: Noise reduction, aperture, defocus and motion blur, in the order in which they run:
-            why each runs or is left out.
-    """
-
-    ratio: float
-    source: NoiseLevelFunction
-    target: NoiseLevelFunction
-    motion_px: float = 0.0
-    defocus_px: float = 0.0
+    ratio: float  # from the prepared scene's reference to the capture
+    source: NoiseLevelFunction  # in the prepared scene at its reference settings
+    target: NoiseLevelFunction  # of the camera at the capture's settings
+    motion_px: float = 0.0  # how far the image moves while the shutter is open [pixel], at most
+    defocus_px: float = 0.0  # diameter of the largest defocus disc [pixel]
+    #: What is out of focus and what is the subject; None for one disc everywhere, and where all of
+    #: the frame moves together.
     layout: Layout | None = None
-    path: Path | None = None
-    subject_path: Path | None = None
+    path: Path | None = None  # of the background; None for a streak along the rows
+    subject_path: Path | None = None  # of the layout's subject where it moves on its own
+    #: Share of the source's noise variance that blurs leave; None for what a disc and streak leave.
     energy: float | None = None
+    #: Noise-reduced light that it starts from, `source` is zero then; None for the recorded one.
     denoised: DenoisedLight | None = None
+    #: Effective f-number whose wider aperture blurs what the source shows out of focus, if any.
     opened_to: float | None = None
+    #: (H, W) share of the source's noise variance that the blurs leave, beyond `energy`: of all of
+    #: them with a layout, else of `opened_to`; None for all.
     remaining_variance: torch.Tensor | None = None
+    #: Whether a capture is wanted; else the light without noise, in which that of the source cannot
+    #: count as part of the target's.
     noise: bool = True
+    #: Noise reduction, aperture, defocus and motion blur, in the order in which they run.
     steps: tuple[Step, ...] = field(default=(), compare=False)
 
     @cached_property

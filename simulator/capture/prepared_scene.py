@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast, get_args
 
 import numpy as np
 import torch
@@ -17,28 +17,15 @@ from scipy.ndimage import distance_transform_edt
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
-from simulator.capture.decision import (
-    DEFAULT_TOLERANCE,
-    Exposure,
-    check_tolerance,
-    decide,
-    disc_px,
-)
+from simulator.capture.decision import DEFAULT_TOLERANCE, Exposure, check_tolerance, decide, disc_px
 from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
-from simulator.capture.sensor import (
-    Noise,
-    Transitions,
-    check_noise,
-    exposed_light,
-    record,
-    sweep_keys,
-)
+from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_number, check_type
+from simulator.utils.checks import check_number, check_type, check_word
 
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
@@ -49,17 +36,11 @@ _LEVELS = 255
 
 
 class Shares(NamedTuple):
-    """A layout's pixels, counted; K sorts of them.
+    """A layout's pixels, counted; (K,) each, for K sorts of them."""
 
-    Args:
-        defocus: (K,) circle of confusion relative to the largest.
-        subject: (K,) bool, whether they are the subject's.
-        share: (K,) of all pixels.
-    """
-
-    defocus: np.ndarray
-    subject: np.ndarray
-    share: np.ndarray
+    defocus: np.ndarray  # circle of confusion relative to the largest
+    subject: np.ndarray  # bool, whether they are the subject's
+    share: np.ndarray  # of all pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +52,6 @@ class Layout:
             `defocus`; 0 is the plane of focus.
         subject: (H, W) bool, the pixels of the subject, which may move apart from the rest; None
             for no subject.
-
-    Raises:
-        ValueError: If a shape, a type or a value is none of these.
     """
 
     defocus: torch.Tensor
@@ -107,9 +85,6 @@ class Layout:
             depth: (H, W) distance [m], above 0.
             distance: At which the lens is focused [m].
             in_focus: Largest relative circle of confusion of the subject.
-
-        Raises:
-            ValueError: If an argument is out of range.
         """
         if not isinstance(depth, torch.Tensor) or not bool((depth > 0.0).all()):
             raise ValueError("`depth` must be a torch tensor with every value above 0 and not NaN")
@@ -198,9 +173,6 @@ class PreparedScene:
             steps that keep it are taken, or else, as at 0, those with the least error.
         blurred_light: Blurs the light and caches what it has blurred. It is made here, and copies
             (`dataclasses.replace`) with the same light, `nlf` and `aperture_blur` share it.
-
-    Raises:
-        ValueError: If a value has the wrong shape or lies outside its range.
     """
 
     light: torch.Tensor
@@ -381,7 +353,7 @@ class PreparedScene:
             row_gain: (S, H) light of each row relative to that; None where all rows have the same.
             out: (S, 4, H, W) contiguous float32 to write to, instead of new memory.
         """
-        check_noise(noise)
+        check_word("noise", noise, get_args(Noise))
         states = list(states) if isinstance(states, Iterable) else states
         if not isinstance(states, list) or not all(isinstance(s, CameraSettings) for s in states):
             raise ValueError(f"`states` (={states!r}) must be several CameraSettings")

@@ -29,7 +29,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -41,7 +41,7 @@ from simulator.capture.decision import PEDESTAL, SIGNAL_LIMIT, Exposure
 from simulator.noise.generator import BLOCK, draw_block, drawn_normals
 from simulator.noise.noise_level_function import ReadNoise, plane_tensor
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_integer, check_word
+from simulator.utils.checks import check_integer
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
@@ -60,11 +60,6 @@ _NO_BANK = np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
 _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
 _jit = functools.partial(kernel, fastmath=_FAST, boundscheck=False)
-
-
-def check_noise(noise: str) -> None:
-    """Raises a `ValueError` unless `noise` is a kind of noise."""
-    check_word("noise", noise, get_args(Noise))
 
 
 # -- keys: 64 bits from a seed and from the numbers that frames differ by ----------------------
@@ -102,9 +97,6 @@ def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndar
         seeds: (B,) or a single integer, >= 0.
         numbers: Numbers that the noise of the frames differs by, each (B,) or a single one: the
             frame of an episode, the settings of a capture.
-
-    Raises:
-        ValueError: If a seed is not an integer >= 0.
     """
     given = np.asarray(seeds)
     if given.dtype.kind not in "iu" or (given.dtype.kind == "i" and given.min(initial=0) < 0):
@@ -122,8 +114,7 @@ def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndar
 def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
     """(S,) uint64 keys of the noise of a sweep's frames, which differ by their settings.
 
-    Raises:
-        ValueError: Unless `seed` is an integer >= 0 of at most 64 bits.
+    `seed` is an integer >= 0 of at most 64 bits.
     """
     seed = check_integer("seed", seed, 0, 2**64 - 1)
     numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)

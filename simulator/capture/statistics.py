@@ -172,9 +172,7 @@ class LightStatistics:
     The first answer takes a pass over the pixels, the others a few microseconds each. Where its
     methods say nothing else, they take the exposure `ratio` from the light to the target, the noise
     `source` of the light at its own exposure, and the noise `target` that the capture should have.
-
-    Args:
-        light: (4, H, W) linear light at the reference exposure.
+    The light is (4, H, W) at the reference exposure.
     """
 
     def __init__(self, light: torch.Tensor) -> None:
@@ -318,12 +316,8 @@ def wiener_error(light: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
     the noise. S is estimated for each octave from the energy of the Laplacian of the light averaged
     over 1, 2, 4 and 8 pixels, all planes together, in windows of 32 x 32 pixels.
 
-    Args:
-        light: (4, H, W) as recorded.
-        nlf: Its noise, not zero.
-
-    Returns:
-        (H // 8, W // 8) in [0, 1], alike within a window; one block for a frame of fewer pixels.
+    `light` is (4, H, W) as recorded, `nlf` its noise, not zero; the result (H // 8, W // 8) in
+    [0, 1], alike within a window, and one block for a frame of fewer pixels.
     """
     size = light.shape[-2:]
     window = tuple(min(_WINDOW, n) for n in size)
@@ -357,27 +351,16 @@ def _laplacian(light: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Error of one network in units of the standard deviation of the noise that it removes.
+    """Error of one network in units of the standard deviation of the noise that it removes."""
 
-    Args:
-        wiener_error: (K,) ascending values of `wiener_error`.
-        bias: (K,) mean square of the systematic error there: detail that is taken for noise.
-        variance: (K,) mean variance of what comes out: noise that is left.
-        spread: Factor on a predicted error below which 90 % of the measured ones are.
-    """
-
-    wiener_error: np.ndarray
-    bias: np.ndarray
-    variance: np.ndarray
-    spread: float
+    wiener_error: np.ndarray  # (K,) ascending values of `wiener_error`
+    bias: np.ndarray  # (K,) mean square of the systematic error: detail that is taken for noise
+    variance: np.ndarray  # (K,) mean variance of what comes out: noise that is left
+    spread: float  # factor on a predicted error below which 90 % of the measured ones are
 
     @classmethod
     def from_card(cls, values: Mapping[str, Any]) -> Residual:
-        """Of the numbers in a model card.
-
-        Raises:
-            ValueError: If they are not such numbers.
-        """
+        """Of the numbers in a model card; a `ValueError` if they are none."""
         try:
             tables, spread = np.array([values[n] for n in _TABLES], float), float(values["spread"])
         except (KeyError, TypeError, ValueError):

@@ -32,14 +32,11 @@ class NoiseLevelFunction:
     """Variance of a pixel as a function of its signal: ``read + shot * max(signal, 0)``.
 
     Args:
-        shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1.
-        read: Variance at zero signal per plane.
+        shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1, >= 0.
+        read: Variance at zero signal per plane, >= 0.
         extrapolation: Stops by which the ISO lies above the calibrated table, negative where it
             lies below; 0 inside.
         source: Where the numbers come from.
-
-    Raises:
-        ValueError: Unless `shot` and `read` are 4 finite numbers >= 0 each.
     """
 
     shot: tuple[float, float, float, float]

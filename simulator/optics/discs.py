@@ -39,7 +39,7 @@ from simulator.optics.motion import (
 )
 from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
-from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges, thread_count
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32
@@ -187,21 +187,13 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
 
 
 class Blur(NamedTuple):
-    """One image for `blur_many`: a disc, a streak, or one after the other.
+    """One image for `blur_many`: a disc, a streak, or one after the other."""
 
-    Args:
-        light: (..., H, W) contiguous float32 on the CPU.
-        diameter_px: Of the disc, in pixels, >= 0.
-        defocused: Like `light`; the image behind the disc is written here. None for no disc.
-        extent_px: Of the streak, in pixels, >= 0.
-        moved: Like `light`; the image behind both is written here. None for no streak.
-    """
-
-    light: Tensor
-    diameter_px: float = 0.0
-    defocused: Tensor | None = None
-    extent_px: float = 0.0
-    moved: Tensor | None = None
+    light: Tensor  # (..., H, W) contiguous float32 on the CPU
+    diameter_px: float = 0.0  # of the disc [pixel]
+    defocused: Tensor | None = None  # like `light`, to write the image behind the disc to, if any
+    extent_px: float = 0.0  # of the streak [pixel]
+    moved: Tensor | None = None  # like `light`, to write the image behind both to; for a streak
 
 
 def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
@@ -218,7 +210,7 @@ def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
     if not blurs:
         return
     # The costliest first, and dealt out in turn: every thread gets about as much to do.
-    shares = min(thread_count(), len(blurs))
+    shares = min(torch.get_num_threads(), len(blurs))
     ranked = sorted(blurs, key=lambda blur: -blur.diameter_px)
     blurs = [blur for share in range(shares) for blur in ranked[share::shares]]
     light = blurs[0].light
@@ -358,8 +350,7 @@ def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | fl
 class DiscBank:
     """An image behind every disc of the bank; each blur is computed when it is first needed.
 
-    Args:
-        image: (..., H, W) linear light. No gradient flows into it.
+    The image is (..., H, W) linear light. No gradient flows into it.
     """
 
     def __init__(self, image: Tensor) -> None:
@@ -435,9 +426,7 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
     The sum of squared weights of the blended kernel,
     ``(1 - t)^2 E_aa + 2 t (1 - t) E_ab + t^2 E_bb`` between discs a and b.
 
-    Args:
-        diameter: (..., H, W) blur diameter of each pixel [pixel].
-        taps: Of a motion behind the discs; None for none.
+    `taps` are those of a motion behind the discs; `diameter` is (..., H, W) [pixel].
     """
     products = _kernel_products()
     if taps is not None:

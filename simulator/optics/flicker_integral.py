@@ -42,9 +42,7 @@ class Lamp:
     def mean_light(self, start: ArrayLike, exposure_time: float) -> np.ndarray:
         """Mean light (...) float64 of exposures, relative to the lamp's long-term mean.
 
-        Args:
-            start: (...) when each exposure begins [s], in [-1e9, 1e9].
-            exposure_time: How long each lasts [s], in [1e-12, 1e9].
+        `start` (...) in [-1e9, 1e9] and `exposure_time` in [1e-12, 1e9] are in seconds.
         """
         start = np.asarray(start, np.float64)
         time = check_number("exposure_time", exposure_time, _SHORTEST, _LONGEST, more=" s")
@@ -66,9 +64,6 @@ class Lamp:
             rows: Their number.
             row_time: From one sensor row's begin to the next one's [s].
             sensor_rows: Sensor rows that one packed row is the mean of.
-
-        Raises:
-            ValueError: If there are no rows, or too many, or time goes backwards.
         """
         check_integer("rows", rows, 1, 2**20)
         check_integer("sensor_rows", sensor_rows, 1, 2**12)
@@ -79,17 +74,11 @@ class Lamp:
 
 @dataclass(frozen=True)
 class MainsLamp(Lamp):
-    """A lamp on the mains without a capacitor: ``1 + depth cos(2 pi (frequency t + phase))``.
+    """A lamp on the mains without a capacitor: ``1 + depth cos(2 pi (frequency t + phase))``."""
 
-    Args:
-        frequency: Of the light [Hz], twice that of the mains: 100 or 120.
-        depth: From 0 (steady) to 1 (dark once a period).
-        phase: Of the first brightest moment, in periods.
-    """
-
-    frequency: float = 100.0
-    depth: float = 1.0
-    phase: float = 0.0
+    frequency: float = 100.0  # of the light [Hz], twice that of the mains
+    depth: float = 1.0  # from 0 (steady) to 1 (dark once a period)
+    phase: float = 0.0  # of the first brightest moment, in periods
 
     def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
         begin, whole, rest = _periods(start, time, self.frequency, self.phase)
@@ -103,17 +92,11 @@ class MainsLamp(Lamp):
 
 @dataclass(frozen=True)
 class PulsedLamp(Lamp):
-    """A lamp that is switched on for a share of each period: dimmed LEDs, screens, strobes.
+    """A lamp that is switched on for a share of each period: dimmed LEDs, screens, strobes."""
 
-    Args:
-        frequency: Pulses per second [Hz].
-        duty: Share of the period that it is on, in (0, 1]; a strobe's is tiny.
-        phase: Where in a period the time 0 is, in periods; it is on from 0 to `duty`.
-    """
-
-    frequency: float = 1000.0
-    duty: float = 0.5
-    phase: float = 0.0
+    frequency: float = 1000.0  # pulses per second [Hz]
+    duty: float = 0.5  # share of the period that it is on, in (0, 1]; a strobe's is tiny
+    phase: float = 0.0  # where in a period the time 0 is, in periods; it is on from 0 to `duty`
 
     def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
         begin, whole, rest = _periods(start, time, self.frequency, self.phase)
@@ -124,17 +107,11 @@ class PulsedLamp(Lamp):
 
 @dataclass(frozen=True)
 class Flash(Lamp):
-    """Steady light and one flash that decays exponentially: lightning, a photographer's strobe.
+    """Steady light and one flash that decays exponentially: lightning, a photographer's strobe."""
 
-    Args:
-        at: When it fires [s].
-        decay: Time in which it falls to 1/e [s]: microseconds to milliseconds.
-        energy: Its light in all, in seconds of the steady light.
-    """
-
-    at: float = 0.0
-    decay: float = 50e-6
-    energy: float = 1.0
+    at: float = 0.0  # when it fires [s]
+    decay: float = 50e-6  # time in which it falls to 1/e [s]: microseconds to milliseconds
+    energy: float = 1.0  # its light in all, in seconds of the steady light
 
     def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
         since = start - self.at

@@ -52,19 +52,12 @@ _jit = functools.partial(kernel, fastmath={"contract"})
 
 @dataclass(frozen=True)
 class Movement:
-    """How an image moves, apart from the speed of its shake; by default along the rows.
+    """How an image moves, apart from the speed of its shake; by default along the rows."""
 
-    Args:
-        direction: Of the shake when the shutter opens [rad]; 0 is along the rows, pi / 2 down.
-        turn: Rate at which that direction turns [rad/s].
-        subject_speed: Own speed of the subject [frame heights per second], beside the shake.
-        subject_direction: Its direction [rad].
-    """
-
-    direction: float = 0.0
-    turn: float = 0.0
-    subject_speed: float = 0.0
-    subject_direction: float = 0.0
+    direction: float = 0.0  # of the shake when the shutter opens [rad]; pi / 2 is down
+    turn: float = 0.0  # rate at which that direction turns [rad/s]
+    subject_speed: float = 0.0  # the subject's own [frame heights per second], beside the shake
+    subject_direction: float = 0.0  # of that [rad]
 
     def __post_init__(self) -> None:
         numbers = (self.direction, self.turn, self.subject_speed, self.subject_direction)
@@ -77,12 +70,9 @@ class Movement:
         return self.turn == 0.0 and self.direction == 0.0
 
     def path(self, speed: float, time: float, height: int) -> Path:
-        """Path of the background, as the camera shakes.
+        """Path of the background, as the camera shakes at `speed` [frame heights per second].
 
-        Args:
-            speed: Of the shake [frame heights per second].
-            time: That the shutter is open [s].
-            height: Of the frame [pixel].
+        The shutter is open for `time` [s], the frame `height` pixels high.
         """
         return Path(speed * time * height, self.direction, self.turn * time)
 
@@ -103,21 +93,13 @@ ALONG_ROWS = Movement()
 
 
 class Path(NamedTuple):
-    """What is traversed during one exposure: an arc at steady speed, and a straight drift with it.
+    """What is traversed during one exposure: an arc at steady speed, and a straight drift."""
 
-    Args:
-        extent: Length of the arc [pixel].
-        direction: In which it begins [rad].
-        turn: By how much it turns in all [rad].
-        drift_x: How far it drifts along the rows meanwhile [pixel].
-        drift_y: The same down the columns [pixel].
-    """
-
-    extent: float
-    direction: float = 0.0
-    turn: float = 0.0
-    drift_x: float = 0.0
-    drift_y: float = 0.0
+    extent: float  # length of the arc [pixel]
+    direction: float = 0.0  # in which it begins [rad]
+    turn: float = 0.0  # by how much it turns in all [rad]
+    drift_x: float = 0.0  # how far it drifts along the rows meanwhile [pixel]
+    drift_y: float = 0.0  # the same down the columns [pixel]
 
     @property
     def length(self) -> float:
@@ -324,17 +306,11 @@ def move_rows(first, last, rows, n, end, limit, out):  # type: ignore[no-untyped
 
 
 class Taps(NamedTuple):
-    """Weighted shifts, K of them, a multiple of 4: the last may have no weight.
+    """Weighted shifts, K of them, a multiple of 4: the last may have no weight."""
 
-    Args:
-        rows: (K,) int64, by how many rows down each looks.
-        columns: (K,) int64, by how many columns to the right.
-        weights: (K,) float32, >= 0; their sum is 1.
-    """
-
-    rows: np.ndarray
-    columns: np.ndarray
-    weights: np.ndarray
+    rows: np.ndarray  # (K,) int64, by how many rows down each looks
+    columns: np.ndarray  # (K,) int64, by how many columns to the right
+    weights: np.ndarray  # (K,) float32, >= 0; their sum is 1
 
 
 @functools.lru_cache(maxsize=256)

@@ -40,9 +40,6 @@ class Lens:
     Args:
         focal_length: Focal length [m], > 0.
         focus_distance: Distance of the plane in focus [m], above the focal length; inf allowed.
-
-    Raises:
-        ValueError: If a value is out of its range.
     """
 
     focal_length: float = 0.05

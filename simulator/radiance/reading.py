@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,10 +42,8 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
     OpenEXR file that is the part and layer with R, G and B; the picture fills its display window,
     black where there are no data.
 
-    Args:
-        path: The file.
-        layer: Part or layer of an OpenEXR file, such as ``"ViewLayer.Combined"``; needed where
-            several have R, G and B.
+    `layer` is a part or layer of an OpenEXR file, such as ``"ViewLayer.Combined"``; needed where
+    several have R, G and B.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -60,7 +58,7 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix not in RADIANCE_SUFFIXES:
         raise ValueError(f"`path` (={path.name!r}) must end in one of {list(RADIANCE_SUFFIXES)}")
-    with _errors_name(path):
+    try:
         if suffix == ".hdr":
             if layer is not None:
                 raise RadianceError("has no layers: leave out `layer`")
@@ -73,12 +71,6 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
             matrix = np.linalg.inv(_xyz_from_rgb(SRGB)) @ _xyz_from_rgb(primaries)
             image = np.tensordot(matrix.astype(np.float32), image, axes=1)
         return _clean(image.astype(np.float32, copy=False), path)
-
-
-@contextlib.contextmanager
-def _errors_name(path: Path) -> Iterator[None]:
-    try:
-        yield
     except FileNotFoundError:
         raise
     except RadianceError as error:
@@ -140,9 +132,7 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     lines, samples, data = int(shown[3]), int(shown[6]), content[found.end() :]
     _refuse_lies(path, lines, samples)
     if data[:2] != b"\2\2" and len(data) < 4 * lines * samples:
-        raise RadianceError(
-            "is not complete, or has run lengths of before 1991, which are not read"
-        )
+        raise RadianceError("is not complete, or has run lengths of before 1991 (not read)")
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {lines} +X {samples}\n".encode()
     level = cv2.utils.logging.setLogLevel(0)  # the error below says it all
     image = None
@@ -178,7 +168,6 @@ def read_exr(
     """Channels (C, H, W) float32 of an OpenEXR file's display window, and their primaries.
 
     Args:
-        path: The file.
         kinds: Sets of channels by preference, such as R, G and B, or Y alone.
         layer: The part or layer to take them from; None where one alone has them.
         outside: Value of pixels that the file has no data of.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
@@ -99,10 +100,7 @@ def draw_settings(
 
     `illuminance` is the light on the scene [lux], 1 to 20,000 in the paper. ISOs above 2.5 times
     the highest calibrated one of `camera` are not drawn. The settings are in ascending order (ISO,
-    then time, then f-number).
-
-    Raises:
-        ValueError: If fewer than 25 triples expose such a scene to within 3 EV.
+    then time, then f-number). A `ValueError` if fewer than 25 expose such a scene to within 3 EV.
     """
     candidates, stops = _candidates(min(camera.nlf_by_iso), _ISO_BEYOND * max(camera.nlf_by_iso))
     weights = _weights(stops, incident_ev100(illuminance))
@@ -119,13 +117,9 @@ def draw_settings(
 @functools.cache
 def _candidates(lowest_iso: float, highest_iso: float) -> tuple[list[CameraSettings], np.ndarray]:
     """Every triple, in ascending order, and (n, 3): log2 exposure, ISO and aperture in stops."""
-    candidates = [
-        CameraSettings(iso, time, f_number)
-        for iso in ISO_SPEEDS
-        if lowest_iso <= iso <= highest_iso
-        for time in EXPOSURE_TIMES
-        for f_number in F_NUMBERS
-    ]
+    isos = [iso for iso in ISO_SPEEDS if lowest_iso <= iso <= highest_iso]
+    triples = itertools.product(isos, EXPOSURE_TIMES, F_NUMBERS)
+    candidates = [CameraSettings(*triple) for triple in triples]
     widest = 4  # f/4 lets 4 stops less light through than f/1
     stops = [
         (s.log2_exposure, math.log2(s.iso / 100.0), s.aperture_stop / 3 - widest)
@@ -172,9 +166,7 @@ def any_pairs(sequences: SequenceOf[HasSettings]) -> list[Pair]:
     return [
         Pair(index, source, target)
         for index, sequence in enumerate(sequences)
-        for source in range(len(sequence.settings))
-        for target in range(len(sequence.settings))
-        if source != target
+        for source, target in itertools.permutations(range(len(sequence.settings)), 2)
     ]
 
 

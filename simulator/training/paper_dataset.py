@@ -97,8 +97,7 @@ class PackedCapture:
     def read(self) -> RawImage:
         """Read the capture from its file; nothing pickled is loaded.
 
-        Raises:
-            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers.
+        A `ValueError` unless it is a finite (4, H, W) array of floating-point numbers.
         """
         try:
             red, green_1, blue, green_2 = np.load(self.file, allow_pickle=False)
@@ -283,13 +282,8 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
         stem, settings, content = f"capture_{index:03d}", raw.settings, io.BytesIO()
         np.save(content, raw.data.detach().cpu().numpy()[[0, 1, 3, 2]], allow_pickle=False)
         write_atomically(folder / f"{stem}.npy", content.getvalue())
-        values = (
-            f"{folder.name}/{stem}.jpg",
-            settings.exposure_time,
-            settings.iso,
-            settings.f_number,
-        )
-        row: dict[str, object] = dict(zip(COLUMNS, values, strict=True))
+        row: dict[str, object] = {"path": f"{folder.name}/{stem}.jpg"}
+        row |= {"time": settings.exposure_time, "iso": settings.iso, "aperture": settings.f_number}
         if nikon:
             row["wb"] = [*raw.white_balance, 0.0]
         means = [
@@ -339,10 +333,7 @@ def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pa
     ``"exposure"`` and ``"baseline"``: any two captures of a sequence. ``"noise"``: the same
     f-number, a target at ISO 400 or less with at most a quarter of the source's noise variance at
     mid grey. ``"aperture"``: a target that is more open, and for a tenth of the pairs one that is
-    as open.
-
-    Raises:
-        ValueError: If there is no such pair.
+    as open. A `ValueError` if there is no such pair.
     """
     pairs = opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
     if stage == "noise":

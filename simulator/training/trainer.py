@@ -395,10 +395,7 @@ def train_stage(
 
     A stage that was interrupted resumes from its last `checkpoint`, at most 20 s back, if that is
     of the same `identity` (a JSON value). Batches are drawn by step, so where the budget is in
-    steps it goes on as if it had not been interrupted.
-
-    Raises:
-        ValueError: If the loss is not finite.
+    steps it goes on as if it had not been interrupted. A `ValueError` if the loss is not finite.
     """
     from accelerate.utils import broadcast, send_to_device
 

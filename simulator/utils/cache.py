@@ -39,6 +39,9 @@ _FILE = re.compile(r"\.?(bundled-.*-)?[0-9a-f]{24,32}\.(safetensors|npz)(\..*\.t
 #: A half-written file older than this was left by a killed process [s].
 _ABANDONED = 3600.0
 
+#: What `decode` may raise.
+DAMAGE = (SafetensorError, ValueError, LookupError, TypeError)
+
 Value = TypeVar("Value")
 
 
@@ -138,13 +141,13 @@ class Store:
         path = self.path(key)
         try:
             content = path.read_bytes()  # at once: another process may remove the file
-            values = _decode(content)
+            values = decode(content)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
             _warn_once(f"results in {self.folder} cannot be read: {error.strerror or error}")
             return None
-        except (SafetensorError, ValueError, LookupError, TypeError) as error:
+        except DAMAGE as error:
             _LOGGER.warning("%s is damaged (%s) and is made again", path, error)
             return None
         with suppress(OSError):
@@ -153,7 +156,7 @@ class Store:
 
     def put(self, key: str, values: Mapping[str, Any]) -> None:
         """Stores tensors, numpy arrays of numbers and JSON values under a `cache_key`."""
-        content = _encode(values)
+        content = encode(values)
         if self.max_bytes is not None and len(content) > self.max_bytes:
             return
         try:
@@ -214,7 +217,8 @@ def disk_cache() -> Store:
     return Store(cache_dir(), max_bytes=DISK_BYTES)
 
 
-def _encode(values: Mapping[str, Any]) -> bytes:
+def encode(values: Mapping[str, Any]) -> bytes:
+    """A safetensors file of tensors, numpy arrays of numbers and JSON values, and of a digest."""
     tensors, arrays, others = {}, [], {}
     for name, value in values.items():
         if isinstance(value, np.ndarray):
@@ -228,7 +232,8 @@ def _encode(values: Mapping[str, Any]) -> bytes:
     return save(tensors, {"json": text, "digest": _digest(tensors, text)})
 
 
-def _decode(content: bytes) -> dict[str, Any]:
+def decode(content: bytes) -> dict[str, Any]:
+    """The values of `encode`; one of `DAMAGE` is raised where `content` is not what it returned."""
     tensors = load(content)
     # The header is JSON after eight bytes of its length.
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]

@@ -1,7 +1,4 @@
-"""Training states on disk, so that a training that is killed goes on from its last checkpoint.
-
-A file is safetensors, whose metadata hold the plain values as JSON, and its SHA-256 after it.
-"""
+"""Training states on disk, so that a training that is killed goes on from its last checkpoint."""
 
 from __future__ import annotations
 
@@ -9,20 +6,18 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 import torch
 
 from simulator import __version__
+from simulator.utils.cache import DAMAGE, decode, encode
 from simulator.utils.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: Least time between two checkpoints of a training [s].
 INTERVAL = 20.0
-_CHECKSUM_BYTES = 32
 
 
 class Checkpoint:
@@ -62,15 +57,9 @@ class Checkpoint:
         if self.path is None or not self.path.is_file():
             return None
         try:
-            content = self.path.read_bytes()
-            stored, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
-            if sha256(stored).digest() != checksum:
-                raise ValueError("its checksum is wrong")
-            size = int.from_bytes(stored[:8], "little")
-            described = json.loads(stored[8 : 8 + size])["__metadata__"]
-            identity = described["identity"]
-            state = _unpacked(json.loads(described["state"]), safetensors.torch.load(stored))
-        except (OSError, ValueError, KeyError, safetensors.SafetensorError) as error:
+            stored = decode(self.path.read_bytes())
+            identity, state = stored["identity"], _unpacked(stored["state"], stored)
+        except (OSError, *DAMAGE) as error:
             reason = str(error).strip().partition("\n")[0]
             _LOGGER.warning("checkpoint %s is damaged, training restarts: %s", self.path, reason)
             return None
@@ -84,11 +73,11 @@ class Checkpoint:
         """Writes the state; on a full disk the previous one stays, with a warning in the log."""
         if self.path is not None and self.writes:
             tensors: dict[str, torch.Tensor] = {}
-            described = json.dumps(_packed(dict(self.state()), tensors))
-            metadata = {"identity": self.identity, "state": described}
-            content = safetensors.torch.save(tensors, metadata)
+            state = _packed(dict(self.state()), tensors)
             try:
-                write_atomically(self.path, [content, sha256(content).digest()])
+                write_atomically(
+                    self.path, encode({"identity": self.identity, "state": state, **tensors})
+                )
             except OSError as error:
                 _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
         self._saved = time.monotonic()

@@ -59,14 +59,12 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
-        dispatcher: Callable[..., Any]
         try:
-            dispatcher = numba.njit(cache=True, **given)(function)
+            dispatcher: Callable[..., Any] = numba.njit(cache=True, **given)(function)
         except RuntimeError as error:
             logger.info("%s; it is compiled again in each process", error)
-            dispatcher = numba.njit(**given)(function)
-        else:
-            _adapt_cache(dispatcher, Path(function.__code__.co_filename))
+            return numba.njit(**given)(function)
+        _adapt_cache(dispatcher, Path(function.__code__.co_filename))
         return dispatcher
 
     return compiled
@@ -103,9 +101,7 @@ def _checksum(module: Path) -> int:
                 folder = _ROOT.joinpath(*name.split("."))  # a package, or a module without ".py"
                 modules = (folder / part for part in re.findall(r"\w+", imported))
                 pending += [path.with_suffix(".py") for path in (folder, *modules)]
-    return functools.reduce(
-        lambda value, path: zlib.crc32(texts[path].encode(), value), sorted(texts), 0
-    )
+    return zlib.crc32("".join(texts[path] for path in sorted(texts)).encode())
 
 
 class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
@@ -165,11 +161,6 @@ def as_pointer(typing, address):  # type: ignore[no-untyped-def]
 _inside = threading.local()
 
 
-def thread_count() -> int:
-    """Number of threads that share work: `torch.get_num_threads()`."""
-    return torch.get_num_threads()
-
-
 def parallel_ranges(
     task: Callable[[int, int], object], count: int, *, least: int = 1, threads: int | None = None
 ) -> None:
@@ -179,7 +170,7 @@ def parallel_ranges(
     `parallel_ranges` itself gets one share. Returns when all shares are done; an error in any of
     them is raised here.
     """
-    shares = min(thread_count() if threads is None else threads, count // max(least, 1))
+    shares = min(threads or torch.get_num_threads(), count // max(least, 1))
     if shares <= 1 or getattr(_inside, "task", False):
         if count:
             task(0, count)

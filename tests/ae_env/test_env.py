@@ -615,7 +615,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: s
 def test_a_second_process_compiles_where_nothing_was_compiled(monkeypatch) -> None:
     started = Mock()
     monkeypatch.setattr("ae_env.first_frame.subprocess.Popen", started)
-    monkeypatch.setattr("ae_env.first_frame.thread_count", lambda: 2)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("ae_env.first_frame._started", False)
     for compiled, children in ((True, 0), (False, 1), (False, 1)):  # once
         monkeypatch.setattr("ae_env.first_frame.is_compiled", lambda known=compiled: known)

@@ -62,6 +62,7 @@ PLAIN = ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none")
 OPEN = ("refocus", "IMG_1.dng", "--aperture", "1.4")
 SMALL, FITS = (("--depth", name, "--focal-length", "3") for name in ("small.png", "fits.npy"))
 V1 = ("--preset", "ae_bench_v1")
+UNKNOWN = ("--policy", "matrx:P", "--scenes", "text.dng")
 FILES = {
     "text.dng": "not a raw\n",
     "bad.py": "def (:\n",
@@ -148,6 +149,9 @@ print("loaded", *sys.modules)
         ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
         ((*PLAIN, "--depth", "near"), "`depth` (='near') must be one of"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
+        (("evaluate", *UNKNOWN), "`policy` (='matrx:P') must"),  # before scenes are read
+        (("film", *UNKNOWN), "`policy` (='matrx:P') must"),
+        (("record", *UNKNOWN, "-o", "ae_env/b-v0"), "`policy` (='matrx:P') must"),
         (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),

@@ -349,7 +349,7 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind,
     exposures = [Exposure(0.6 * (i + 1), ZERO, Z6.nlf(400 * 4**i)) for i in range(3)]
     keys, transitions = noise_keys(np.arange(3), 2), Transitions.of(lights, exposures)
     for threads in (1, 3):
-        monkeypatch.setattr("simulator.utils.compute.thread_count", lambda n=threads: n)
+        monkeypatch.setattr("torch.get_num_threads", lambda n=threads: n)
         codes, signals = np.empty((3, 4, 250, 265), np.uint8), torch.empty(3, 4, 250, 265)
         outputs = {"codes": codes, "signals": signals, "count": True}
         counts = record(transitions, Z6, keys=keys, noise=kind, **outputs)

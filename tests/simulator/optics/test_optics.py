@@ -411,8 +411,7 @@ def test_light_beyond_the_limit_is_clipped_first(extent):
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_many_images_are_scipys_correlation(threads, monkeypatch):
-    for module in ("utils.compute", "optics.discs"):
-        monkeypatch.setattr(f"simulator.{module}.thread_count", lambda: threads)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     blurs = []
     discs, streaks = (48.0, 0.0, 3.3, 8.0, 1e-4, 2.0, 0.7), (5.0, 5.0, 0.0, 17.0, 1e-7, 90.0, 0.4)
     for extents in zip(discs, streaks, strict=True):
