@@ -161,13 +161,12 @@ def test_exiftool_and_dcraw_agree(tmp_path):
     assert zlib.crc32(b"".join(file.path.read_bytes() for file in files)) == AGREED
     if not (shutil.which("exiftool") and shutil.which("dcraw")):
         pytest.skip("exiftool and dcraw are not installed")
-    names = ["ExposureTime", "FNumber", "Orientation", "Make", "WhiteLevel", "BlackLevel", "ISO"]
-    options = [f"-{name}" for name in (*names, "RecommendedExposureIndex")]
-    out = run(["exiftool", "-j", "-n", *options, tmp_path], check=True, capture_output=True).stdout
+    names = ("ExposureTime", "FNumber", "Orientation", "Make")
+    out = run(["exiftool", "-j", "-n", tmp_path], check=True, capture_output=True).stdout
     answers = sorted(json.loads(out), key=lambda answer: answer["SourceFile"])
     for file, said in zip(files, answers, strict=True):
         wanted = (file.time[0] / file.time[1], file.number / 10, file.orientation, file.make)
-        assert tuple(said.get(name) for name in names[:4]) == pytest.approx(wanted)
+        assert tuple(said.get(name) for name in names) == pytest.approx(wanted)
         assert said.get("ISO", said.get("RecommendedExposureIndex")) == file.iso
         assert said.get("WhiteLevel", 2**file.bits - 1) == file.white
         levels = np.array(str(said["BlackLevel"]).split(), float)
