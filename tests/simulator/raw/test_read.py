@@ -1,9 +1,9 @@
 import io
 import os
+import re
 import shutil
 import struct
 import tracemalloc
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -136,22 +136,18 @@ def test_gain_maps_and_baseline_go_along(tmp_path):
 
 
 def test_levels_colour_and_metadata(tmp_path):
-    turned = {"Orientation": ("H", (6,)), "DefaultScale": ("2I", (2, 1, 1, 1))}
-    path = write_sample_dng(tmp_path / "a.dng", **turned)
+    path = write_sample_dng(tmp_path / "a.dng", DefaultScale=("2I", (2, 1, 1, 1)))
     with pytest.raises(ValueError, match=r"`settings`.*iso, exposure_time, f_number"):
         read_raw(path)
     raw = read_raw(str(path), settings=SETTINGS, nlf=NLF)
     assert raw.metadata["pixel_aspect"] == 2.0
     assert raw.settings == SETTINGS  # given settings are not snapped
-    known = {"path": "a.dng", "make": "Test", "model": "Sensor", "flip": 6, "nlf_source": "given"}
+    known = {"path": "a.dng", "make": "Test", "model": "Sensor", "nlf_source": "given"}
     assert known.items() <= raw.metadata.items()
-    assert (raw.noise, raw.white_balance) == (NLF, pytest.approx((2.0, 1.0, 1.5)))
     camera = raw.camera
-    levels = camera.name, camera.black_level, camera.white_level, camera.bit_depth
-    assert levels == ("test_sensor", (64.0,) * 4, 4095, 12)
+    assert (raw.noise, camera.name, camera.bit_depth) == (NLF, "test_sensor", 12)
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
     assert "ColorMatrix of the file" in camera.colour_matrix_source
-    np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)  # the rotation is not applied
     # Of two colour matrices that of daylight is taken.
     tags = {
         "CalibrationIlluminant1": ("H", (17,)),
@@ -279,24 +275,14 @@ def test_a_dng_cut_anywhere_is_refused(path, own_dng, name):
             read_raw(cut, settings=SETTINGS, nlf=NLF)
 
 
-def fields(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Tag, position of the entry, position of the value (TIFF 6.0); the EXIF directory's, too."""
-    pending = [struct.unpack_from("<I", content, 4)[0]]
-    for offset in pending:
-        for i in range(struct.unpack_from("<H", content, offset)[0]):
-            at = offset + 2 + 12 * i
-            tag, kind, count, value = struct.unpack_from("<HHII", content, at)
-            size = count * {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 10: 8, 12: 8}[kind]
-            yield tag, at, at + 8 if size <= 4 else value
-            if tag == CODE["ExifTag"]:
-                pending.append(value)
-
-
 def patch(path: Path, name: str, form: str, *values: Any) -> None:
     """Overwrites a tag's value; with the form ``count``, how many values it claims to have."""
     content = bytearray(path.read_bytes())
-    entry, position = next((at, v) for tag, at, v in fields(content) if tag == CODE[name])
-    at, form = (entry + 4, "I") if form == "count" else (position, form)
+    code = re.escape(struct.pack("<H", CODE[name]))
+    entry = re.search(code + rb"[\1-\x0c]\0", content).start()
+    kind, count, position = struct.unpack_from("<HII", content, entry + 2)
+    short = count * {1: 1, 2: 1, 3: 2, 4: 4, 7: 1}.get(kind, 8) <= 4
+    at, form = (entry + 4, "I") if form == "count" else (entry + 8 if short else position, form)
     struct.pack_into(f"<{form}", content, at, *values)
     path.write_bytes(content)
 

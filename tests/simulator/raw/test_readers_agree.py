@@ -35,11 +35,11 @@ def directory(order: str, tags: dict[str, Any], at: int) -> bytes:
     """A TIFF directory at `at`: fractions and pairs are RATIONAL, uint32 LONG, others SHORT."""
     entries, outside = b"", b""
     for code, name in sorted((tifffile.TIFF.EXIF_TAGS[name], name) for name in tags):
-        value, kind, count = tags[name], 2, len(str(tags[name])) + 1
-        data = str(value).encode() + b"\0"
-        if isinstance(value, bytes):
-            data, kind, count = value, 1, len(value)
-        elif not isinstance(value, str):
+        value = tags[name]
+        if isinstance(value, str | bytes):
+            data, kind = (value, 1) if isinstance(value, bytes) else (value.encode() + b"\0", 2)
+            count = len(data)
+        else:
             array = np.array(value)
             if array.dtype.kind == "f":
                 array = np.stack([np.rint(1000 * array.ravel()), np.full(array.size, 1000)], -1)
@@ -101,10 +101,9 @@ def draw(seed: int, path: Path) -> SimpleNamespace:
     head |= {"ExifTag": np.uint32(EXIF_AT)} | ({"Orientation": orientation} if orientation else {})
     time, number, iso = pick(*TIMES), pick(18, 28, 80), pick(None, 50, 64000, 102400)
     exposure = {"ExposureTime": [time], "FNumber": [(number, 10)]}
-    if iso:
-        large = iso > 65535
-        name = "RecommendedExposureIndex" if large else "PhotographicSensitivity"
-        exposure[name] = np.uint32(iso) if large else iso
+    if iso is not None:
+        long = {"RecommendedExposureIndex": np.uint32(iso)}
+        exposure |= long if iso > 65535 else {"PhotographicSensitivity": iso}
     exif = pick(exposure, {"DateTimeOriginal": "2020:02:02 20:20:20"})
     head |= {} if exif is exposure else exposure
     if preview:  # RGB or another mosaic
