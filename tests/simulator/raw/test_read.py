@@ -44,19 +44,12 @@ def write_sample_dng(
     **changes: tuple[str, Any],
 ) -> Path:
     """A DNG by tifffile, not by the code under test; `changes` are types and values of tags."""
-    tags: dict[str, tuple[str, Any]] = {
-        "Make": ("s", "Test"),
-        "Model": ("s", "Sensor"),
-        "DNGVersion": ("B", (1, 4, 0, 0)),
-        "DNGBackwardVersion": ("B", (1, 1, 0, 0)),
-        "UniqueCameraModel": ("s", "Test Sensor"),
-        "WhiteLevel": ("I", (4095,)),
-        "ColorMatrix1": ("2i", fractions(MATRIX)),
-        "AsShotNeutral": ("2I", (1, 2, 1, 1, 2, 3)),
-        "CalibrationIlluminant1": ("H", (21,)),
-        "BlackLevel": ("I", black),
-        "BlackLevelRepeatDim": ("H", (len(black) // 4 + 1,) * 2),
-    }
+    tags: dict[str, tuple[str, Any]] = {"Make": ("s", "Test"), "Model": ("s", "Sensor")}
+    tags |= {"UniqueCameraModel": ("s", "Test Sensor"), "DNGVersion": ("B", (1, 4, 0, 0))}
+    tags |= {"DNGBackwardVersion": ("B", (1, 1, 0, 0)), "WhiteLevel": ("I", (4095,))}
+    tags |= {"ColorMatrix1": ("2i", fractions(MATRIX)), "AsShotNeutral": ("2I", (1, 2, 1, 1, 2, 3))}
+    tags |= {"CalibrationIlluminant1": ("H", (21,)), "BlackLevel": ("I", black)}
+    tags["BlackLevelRepeatDim"] = "H", (len(black) // 4 + 1,) * 2
     if photometric == 32803:
         tags["CFARepeatPatternDim"], tags["CFAPattern"] = ("H", (2, 2)), ("B", b"\0\1\1\2")
         tags["CFAPlaneColor"], tags["CFALayout"] = ("B", (0, 1, 2)), ("H", (1,))
@@ -82,17 +75,6 @@ def own_dng(tmp_path: Path) -> Path:
     path = tmp_path / "own.dng"
     write_dng(path, RawImage.from_mosaic(MOSAIC, SETTINGS, get_camera("nikon_z6"), nlf=NLF))
     return path
-
-
-def test_one_setting_alone_is_given(tmp_path):
-    tags = {"ExposureTime": ("2I", (1, 60)), "FNumber": ("2I", (18, 10))}
-    path = write_sample_dng(tmp_path / "a.dng", **tags)
-    with pytest.raises(ValueError, match=r"`settings` .* iso;"):
-        read_raw(path, nlf=NLF)
-    raw = read_raw(path, nlf=NLF, settings={"iso": 64, "f_number": 2.8})
-    assert raw.settings == CameraSettings(64, 1 / 60, 2.8)
-    with pytest.raises(ValueError, match="`settings`"):
-        read_raw(path, nlf=NLF, settings={"speed": 64})
 
 
 def test_what_libraw_takes_for_something_else(tmp_path):
@@ -139,6 +121,8 @@ def test_levels_colour_and_metadata(tmp_path):
     path = write_sample_dng(tmp_path / "a.dng", DefaultScale=("2I", (2, 1, 1, 1)))
     with pytest.raises(ValueError, match=r"`settings`.*iso, exposure_time, f_number"):
         read_raw(path)
+    with pytest.raises(ValueError, match="`settings`"):
+        read_raw(path, settings={"speed": 64})
     raw = read_raw(str(path), settings=SETTINGS, nlf=NLF)
     assert raw.metadata["pixel_aspect"] == 2.0
     assert raw.settings == SETTINGS  # given settings are not snapped
@@ -149,12 +133,9 @@ def test_levels_colour_and_metadata(tmp_path):
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
     assert "ColorMatrix of the file" in camera.colour_matrix_source
     # Of two colour matrices that of daylight is taken.
-    tags = {
-        "CalibrationIlluminant1": ("H", (17,)),
-        "ColorMatrix2": ("2i", fractions(2 * np.eye(3))),
-        "CameraCalibration2": ("2i", fractions(np.diag([0.5, 1, 2]))),
-        "CalibrationIlluminant2": ("H", (21,)),
-    }
+    tags = {"CalibrationIlluminant1": ("H", (17,)), "CalibrationIlluminant2": ("H", (21,))}
+    tags["ColorMatrix2"] = "2i", fractions(2 * np.eye(3))
+    tags["CameraCalibration2"] = "2i", fractions(np.diag([0.5, 1, 2]))
     raw = read_raw(write_sample_dng(tmp_path / "a.dng", **tags), settings=SETTINGS, nlf=NLF)
     np.testing.assert_allclose(raw.camera.colour_matrix, np.diag([1.0, 2.0, 4.0]))
 
@@ -266,15 +247,6 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path):
         read_raw(path)
 
 
-@pytest.mark.parametrize("name", ["a.dng", "own.dng"])
-def test_a_dng_cut_anywhere_is_refused(path, own_dng, name):
-    cut = path.with_name(name)
-    for size in range(cut.stat().st_size - 1, -1, -512):
-        os.truncate(cut, size)
-        with pytest.raises(RawFileError, match=rf"`path` \(='{name}'"):
-            read_raw(cut, settings=SETTINGS, nlf=NLF)
-
-
 def patch(path: Path, name: str, form: str, *values: Any) -> None:
     """Overwrites a tag's value; with the form ``count``, how many values it claims to have."""
     content = bytearray(path.read_bytes())
@@ -346,6 +318,10 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
 def test_damaged_files_are_read_or_refused(path, own_dng, name):
     content, rng, refused = path.with_name(name).read_bytes(), np.random.default_rng(5), 0
+    for size in range(len(content) - 1, -1, -512):
+        path.write_bytes(content[:size])
+        with pytest.raises(RawFileError, match=r"`path` \(='a.dng'"):
+            read_raw(path, settings=SETTINGS, nlf=NLF)
     for _ in range(120):
         path.write_bytes(damaged(content, rng))
         try:
@@ -379,7 +355,7 @@ def test_damaged_radiance_maps_are_read_or_refused(tmp_path):
 
 
 def test_white_levels_that_are_wrong_or_beyond_the_bits_of_a_sample(tmp_path, caplog):
-    """Its brightest sample is four times that level; darker files do not show that it is wrong."""
+    """Its brightest sample is four times that level."""
     camera = CameraProfile("sensor", BayerPattern.RGGB, (64.0,) * 4, 4095, 12)
     given = {"settings": SETTINGS, "nlf": NLF, "camera": camera}
     path = write_sample_dng(tmp_path / "a.dng", WhiteLevel=("I", (1000,)))
@@ -390,9 +366,6 @@ def test_white_levels_that_are_wrong_or_beyond_the_bits_of_a_sample(tmp_path, ca
     times = (MOSAIC.max() - 64.0) / (1000 - 64)
     assert float(wrong.data.max()) == pytest.approx(times, rel=1e-6)
     assert f"{times:.3g} times white" in caplog.text
-    dark = write_sample_dng(tmp_path / "b.dng", MOSAIC // 5, WhiteLevel=("I", (1000,)))
-    with pytest.raises(ValueError, match="`camera`"):
-        read_raw(dark, **given)
     # Private, as there is no such file to test on: Sony's ARW compress 14 bits to 12.
     tags = {"PhotometricInterpretation": (32803,), "BitsPerSample": (12,)}
     stated = tags | {"WhiteLevel": (15360,)}
