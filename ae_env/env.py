@@ -479,6 +479,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    _ended = True  # until the first episode begins
 
     @takes_env_arguments()
     def __init__(
@@ -507,7 +508,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         """Takes the next frame with the state `action`."""
         chosen = check_actions("action", action, ())[None]
         if self._ended:
-            raise gym.error.ResetNeeded("the episode has ended: call reset() before step()")
+            raise gym.error.ResetNeeded("no episode runs: call reset() before step()")
         self._ended = bool(self.core.transition(_FIRST, chosen)[0])
         observation, info = self._observe()
         assert self._last is not None

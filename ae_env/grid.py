@@ -128,6 +128,11 @@ class ExposureGrid:
         """(S,) float64, EV100 of each state with the effective f-number (see `CameraSettings`)."""
         return np.array([-s.log2_exposure for s in self.states])
 
+    @cached_property
+    def apex(self) -> np.ndarray:
+        """(S, 3) float64, Av, Tv and Sv of each state."""
+        return np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self.states])
+
     def index(self, iso_index: int, time_index: int, aperture_index: int) -> int:
         """Index of the state with these positions in the three lists."""
         return int(np.ravel_multi_index((iso_index, time_index, aperture_index), self.shape))

@@ -150,7 +150,7 @@ class _Steps(_GridActions):
 class _Apex(_GridActions):
     def _set_up(self, env: Any) -> None:
         super()._set_up(env)
-        self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self._grid])
+        self._apex = self._grid.apex
 
     def _space(self) -> gym.Space[Any]:
         return gym.spaces.Box(-1.0, 1.0, (3,), np.float32)

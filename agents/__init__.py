@@ -5,21 +5,17 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-_EXPORTS = {
-    "EvaluationPlan": "evaluation.evaluation_plan",
-    "EvaluationResult": "evaluation.result",
-    "MeteringPolicy": "metering.metering_policy",
-    "Policy": "policy",
-    "PolicyContext": "policy",
-    "evaluate": "evaluation.engine",
-    "fit_policies": "evaluation.engine",
-    "list_policies": "policy_names",
-    "load_plan": "evaluation.evaluation_plan",
-    "make_policy": "policy_names",
-    "result_rows": "evaluation.result",
-    "run_plan": "evaluation.jobs",
-    "write_report": "report.evaluation",
+_NAMES_BY_MODULE = {
+    "evaluation.engine": "evaluate fit_policies",
+    "evaluation.evaluation_plan": "EvaluationPlan load_plan",
+    "evaluation.jobs": "run_plan",
+    "evaluation.result": "EvaluationResult result_rows",
+    "metering.metering_policy": "MeteringPolicy",
+    "policy": "Policy PolicyContext",
+    "policy_names": "list_policies make_policy",
+    "report.evaluation": "write_report",
 }
+_EXPORTS = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names.split()}
 __all__ = sorted(_EXPORTS)
 
 if TYPE_CHECKING:

@@ -6,8 +6,9 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from ae_env.scenes.folder import find_files
@@ -17,9 +18,6 @@ from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
 from simulator.utils.files import RAW_SUFFIXES
-
-if TYPE_CHECKING:
-    import gymnasium as gym
 
 #: What oracles know, and the entry of ``info`` that holds it.
 ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}
@@ -74,7 +72,6 @@ class Oracle(Policy):
     """Knows the expected score of every state, in the light that it knows.
 
     Args:
-        context: The camera.
         knows: ``"last_frame"``: the light of the frame that it has just seen, as a policy does
             that measures light without error but foresees nothing; ``"clairvoyant"``: that of the
             frames that its decision exposes, each control's own: the ceiling that regret is
@@ -113,7 +110,6 @@ class Recorded(Policy):
     time, ISO and EV, in stops, add up.
 
     Args:
-        context: The camera.
         path: Folder of raws, or a single raw.
 
     Raises:

@@ -12,12 +12,12 @@ from typing import Protocol
 
 import numpy as np
 
-from ae_env.observation import decode_settings
 from agents.metering.reading import (
     SATURATED_STEP_EV,
     Reading,
     ZoneMatcher,
     frame_ev100,
+    frame_states,
     zone_signals,
 )
 from agents.policy import Floats, Ints, Observations, PolicyContext
@@ -108,10 +108,7 @@ class Foresight:
         reading = self._matcher.match(reading, zones, exposed_at)
         self._tracker.update(reading, exposed_at)
         if not self._actions:  # what the first frame was taken with stays until a decision is there
-            shown = np.stack(decode_settings(observations["settings"]), axis=1)
-            apex = np.array([(s.aperture_value, s.time_value, s.speed_value) for s in self.grid])
-            nearest = np.abs(shown[:, None] - apex[None]).sum(axis=2).argmin(axis=1)
-            self._actions = [nearest] * max(self.leads)
+            self._actions = [frame_states(observations, self.grid)] * max(self.leads)
         return reading
 
     @property

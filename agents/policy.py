@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    import gymnasium as gym
-
-    from ae_env.grid import ExposureGrid
-    from simulator.camera import CameraProfile
+from ae_env.grid import ExposureGrid
+from simulator.camera import CameraProfile
 
 Observations = Mapping[str, NDArray[Any]]
 Bools = NDArray[np.bool_]
@@ -31,16 +29,14 @@ class BracketLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class PolicyContext:
-    """The camera that a policy drives.
+    """The camera that a policy drives; an action is an index into its `grid`.
 
     Args:
-        grid: The exposure states; an action is an index into it.
-        camera: The camera body.
         observation_space: Observation of a single environment (a `Dict` with ``raw``,
             ``settings`` and, where the camera has them, ``sensors``).
         delays: Frames after the next until a decision's ISO, exposure time and aperture are in
             effect.
-        bracket: Limits of a bracket; None for tasks without one.
+        bracket: None for tasks without a bracket.
     """
 
     grid: ExposureGrid

@@ -179,16 +179,11 @@ def make_policy(
     """The policy called `name`.
 
     Args:
-        name: ``"random"``, ``"best_fixed"``; ``"oracle"``, alone or with what it knows, such as
-            ``"oracle:clairvoyant"``; a meter and a program such as ``"centre_weighted:P"`` (the
-            program defaults to P); ``"rpi_agc"``, alone or with a program; ``"recorded:FOLDER"``;
-            ``"regression"`` and ``"ppo"``, the agents that come with the package, with ``":video"``
-            those for `AutoExposureVideo-v0`, with ``":PATH"`` weights of one's own; for
-            `ExposureBracket-v0` ``"bracket:fixed"``, ``"bracket:hasinoff"``, ``"bracket:planned"``
-            and ``"bracket"``, which also allows for blur; ``"package.module:Class"`` or
-            ``"path/to/file.py:Class"`` for a policy of one's own. Options may follow:
-            ``"centre_weighted:P?compensation=-1&damping=0.5"``.
-        context: The camera.
+        name: One of `list_policies`, where a meter's program defaults to P; ``"recorded:FOLDER"``;
+            ``"regression:PATH"`` or ``"ppo:PATH"``, weights of one's own; ``"bracket"``,
+            ``"bracket:planned"``, ``"bracket:fixed"`` or ``"bracket:hasinoff"`` for
+            `ExposureBracket-v0`; ``"package.module:Class"`` or ``"path/to/file.py:Class"``. Options
+            may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
 

@@ -17,7 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from agents.policy import Policy
-from agents.rollouts import checked_states, errors_of
+from agents.rollouts import checked_states, choose, errors_of
 
 #: The variable that names Minari's folder.
 _ROOT = "MINARI_DATASETS_PATH"
@@ -55,14 +55,12 @@ def record_dataset(
     reset option, its scene: ``env.reset(seed=seed, options=options)`` begins it again.
 
     Args:
-        policy: The policy, for one environment.
-        name: Its name, which the dataset has as that of its algorithm.
-        task: Id of the environment, such as ``"ae_env/AutoExposure-v0"``.
-        options: Arguments of the environment, JSON values.
+        policy, name: The policy, for one environment, and its name, that of the algorithm.
+        task, options: Id of the environment, such as ``"ae_env/AutoExposure-v0"``, and its
+            arguments, JSON values.
         dataset_id: Name of the dataset in Minari's folder (MINARI_DATASETS_PATH names another). It
             appears there when all episodes are recorded.
         episodes: How many; episode i has the seed ``seed + i``.
-        seed: Of the first.
         progress: Called with the episodes that are done, and all.
 
     Raises:
@@ -164,11 +162,8 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
     while not done:
         shown = {key: np.asarray(value)[None] for key, value in observation.items()}
         masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
-        extra: dict[str, Any] = {}
-        if getattr(policy, "privileged", False):
-            extra = {"info": {"oracle_state": np.array([info["oracle_state"]])}}
-        with errors_of(name, "act"):
-            actions = policy.act(shown, masks, **extra)
+        told = {"oracle_state": np.array([info.get("oracle_state")])}
+        actions = choose(name, policy, shown, masks, told)
         state = checked_states(name, actions, masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)
         done = terminated or truncated

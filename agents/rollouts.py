@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.options import EnvOptions
-from ae_env.scenes.load import BUNDLED, REAL
+from ae_env.scenes import Scene
+from ae_env.scenes.load import BUNDLED, REAL, SceneSpec
 from ae_env.utils.user_files import UserCodeError
-from agents.policy import Bools, Floats, Ints, Observations
-
-if TYPE_CHECKING:
-    from ae_env.scenes import Scene
-    from ae_env.scenes.load import SceneSpec
+from agents.policy import Bools, Floats, Ints, Observations, Policy
 
 ENV_ID = "ae_env:ae_env/AutoExposure-v0"
 #: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
@@ -145,6 +142,15 @@ def errors_of(policy: str, method: str) -> Iterator[None]:
     except Exception as error:  # the policy may be the user's own, and raise anything
         text = f"policy {policy!r}: `{method}` raised {type(error).__name__}: {error}"
         raise UserCodeError(text) from error
+
+
+def choose(
+    name: str, policy: Policy, observations: Observations, masks: Bools, info: Mapping[str, Any]
+) -> Any:
+    """What `act` returns, see `errors_of`; `info` is for a privileged policy only."""
+    told: dict[str, Any] = {"info": info} if getattr(policy, "privileged", False) else {}
+    with errors_of(name, "act"):
+        return policy.act(observations, masks, **told)
 
 
 def checked_states(name: str, actions: Any, masks: Bools) -> Ints:

@@ -31,11 +31,8 @@ def log_uniform(low: float, high: float) -> st.SearchStrategy[float]:
     return st.one_of(inner, st.sampled_from([low, high]))
 
 
-def settings_within(
-    iso: tuple[float, float] = (1e-3, 1e8),
-    exposure_time: tuple[float, float] = (1e-9, 1e5),
-    f_number: tuple[float, float] = (0.5, 1024.0),
-) -> st.SearchStrategy[CameraSettings]:
+def settings_within(iso=(1e-3, 1e8), exposure_time=(1e-9, 1e5), f_number=(0.5, 1024.0)):
+    """Strategy of settings within these ranges."""
     ranges = iso, exposure_time, f_number
     return st.builds(CameraSettings, *(log_uniform(*limits) for limits in ranges))
 
@@ -79,15 +76,9 @@ def mosaics(draw: st.DrawFn, bodies: st.SearchStrategy[CameraProfile]) -> tuple:
     return camera, numbers.astype(np.uint16)
 
 
-def prepared(
-    light: torch.Tensor,
-    reference: CameraSettings,
-    camera: CameraProfile,
-    nlf: NoiseLevelFunction | None = None,
-    **fields: float,
-) -> PreparedScene:
+def prepared(light, reference, camera, nlf=None, **fields) -> PreparedScene:
     """`light` ready to be exposed, noise-free by default."""
-    return PreparedScene(light, reference, camera, nlf or NoiseLevelFunction.zero(), **fields)  # type: ignore[arg-type]
+    return PreparedScene(light, reference, camera, nlf or NoiseLevelFunction.zero(), **fields)
 
 
 @st.composite

@@ -2,8 +2,6 @@
 
 import importlib
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +28,7 @@ from benchmarks.transfer.agents import TableSet, TransferPlan, World
 from benchmarks.work_precision import undominated
 from benchmarks.work_precision.plans import distance
 from simulator import NoiseLevelFunction, exposure_ratio
-from simulator.networks.weights import build_modules, load_modules, save_modules
+from simulator.networks.weights import build_modules
 from simulator.training.paper_dataset import split_dataset
 from simulator.training.scenes import detail_split
 from tests.ae_env.scene_files import GRID, capture, write_raws
@@ -41,10 +39,10 @@ from tests.simulator.training.scenes import write_dataset
 
 
 @pytest.fixture
-def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def benchmarks_here(tmp_path, monkeypatch):
     """A folder; parts of benchmarks run in this process, and keep their results there."""
 
-    def run(part: Part) -> Any:
+    def run(part):
         return json.loads(json.dumps(part.task(**part.arguments)))
 
     monkeypatch.setattr(Part, "run", run)
@@ -69,10 +67,10 @@ def test_tables_and_numbers() -> None:
     assert rounded(given) == {"a": [0.333333, None, 10**9], "b": True, "c": 1.23457e-12}
 
 
-def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[Any] = []
+def test_a_run_that_was_stopped_continues(tmp_path, monkeypatch):
+    calls = []
 
-    def once(part: Part) -> Any:
+    def once(part):
         calls.append(part.arguments)
         if len(calls) == 2:
             raise RuntimeError("stopped")
@@ -125,7 +123,7 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("recorded", "runs", "--weights", "a"), "`weights` (='a')"),
     ],
 )
-def test_errors_before_any_work(ae_env, benchmarks_here: Path, arguments, named: str) -> None:
+def test_errors_before_any_work(ae_env, benchmarks_here, arguments, named):
     (benchmarks_here / "runs").mkdir()
     write_dataset(benchmarks_here / "data")
     code, _, error = ae_env("bench", *arguments, "--out", "here")
@@ -165,7 +163,7 @@ def test_the_inverse_anscombe_transform_is_unbiased() -> None:
     assert found.tolist() == pytest.approx(electrons.tolist(), rel=0.02)
 
 
-def test_the_noise_of_two_real_captures_is_told(tmp_path: Path) -> None:
+def test_the_noise_of_two_real_captures_is_told(tmp_path):
     """The ceiling, worked out from the calibration, against two captures of one light."""
     write_raws(tmp_path / "a")
     (scene,) = recorded._of_folder(str(tmp_path))
@@ -216,9 +214,7 @@ def test_views_of_a_picture_agree_under_their_homography() -> None:
         assert one == pytest.approx(other, abs=0.5 / 1600)
 
 
-def test_features_are_trained_judged_and_reported(
-    ae_env, benchmarks_here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_features_are_trained_judged_and_reported(ae_env, benchmarks_here, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "RUNS", tmp_path / "runs" / "bench")
     monkeypatch.setattr(training, "QUICK_STEPS", 1)
     monkeypatch.setattr(features, "TIMED", (80,))
@@ -243,7 +239,7 @@ def test_features_are_trained_judged_and_reported(
 # -- recorded grids and the paper's layout ---------------------------------------------------------
 
 
-def test_a_recorded_grid_of_ones_own(ae_env, benchmarks_here: Path) -> None:
+def test_a_recorded_grid_of_ones_own(ae_env, benchmarks_here):
     write_raws(benchmarks_here / "grid" / "a")
     write_raws(benchmarks_here / "grid" / "b", tuple(GRID)[:-1], seed=1)
     code, _, error = ae_env("bench", "recorded", "grid", "--quick")  # into ./results
@@ -276,9 +272,7 @@ def test_a_recorded_grid_of_ones_own(ae_env, benchmarks_here: Path) -> None:
     assert "boreal" not in page
 
 
-def test_the_papers_table_in_one_command(
-    ae_env, benchmarks_here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_papers_table_in_one_command(ae_env, benchmarks_here, monkeypatch):
     monkeypatch.setattr(paper, "WEIGHTS", benchmarks_here / "runs" / "paper")
     monkeypatch.setattr(paper, "TRAINED", ("paper", "pc"))
     monkeypatch.setattr(paper, "QUICK_STAGE", {"steps": 1, "batch": 1, "crop": 16})
@@ -344,19 +338,15 @@ def test_scaled_parameters() -> None:
     """ISO 100, 1/8000 s is the origin; the paper's whole range is positive and of order one."""
     extremes = torch.tensor([[0.0, -12.97, 2.0, 7.33, 2.0, 4.46]])
     expected = [[0.0, 0.00375, 0.25, 0.91625, 1.875, 0.5575]]
-    torch.testing.assert_close(
-        baselines.scaled_parameters(extremes, normal(1, 1)), torch.tensor(expected)
-    )
+    found = baselines.scaled_parameters(extremes, normal(1, 1))
+    torch.testing.assert_close(found, torch.tensor(expected))
 
 
-def test_trained_baselines_come_back(tmp_path: Path) -> None:
+def test_baselines_have_as_many_parameters_as_published():
     # CAN32 of Chen et al. 2017, six more inputs; 7 numbers a weight of 20 convolutions, 19 norms.
     for preset, parameters in (("pc", 77_046), ("dl", 4_884_288)):
         modules = build_modules(preset)
         assert sum(p.numel() for p in modules.parameters()) == parameters
-        save_modules(tmp_path / preset, modules, preset, {})
-        loaded, card = load_modules(tmp_path / preset)
-        assert (list(loaded), card["preset"]) == (["baseline"], preset)
 
 
 def test_adaptive_normalisation() -> None:
@@ -382,7 +372,6 @@ def test_receptive_field_of_the_published_table() -> None:
         nn.init.ones_(parameter)  # positive, lest contributions cancel
     image = torch.ones(1, 4, 1, 701, requires_grad=True)
     net(image, torch.zeros(1, 6))[0, 0, 0, 350].backward()
-    assert image.grad is not None
     reached = image.grad[0, 0, 0].nonzero().flatten()
     assert (int(reached[0]), int(reached[-1])) == (350 - 256, 350 + 256)
 
@@ -390,7 +379,7 @@ def test_receptive_field_of_the_published_table() -> None:
 @pytest.mark.parametrize("options", [{}, {"stride": 2}, {"dilation": 4}, {"upsample": True}])
 def test_generated_convolution_is_each_sample_s_own(options: dict[str, int]) -> None:
     torch.manual_seed(0)
-    layer = baselines.GeneratedConvolution(5, 5, **options).double()  # type: ignore[arg-type]
+    layer = baselines.GeneratedConvolution(5, 5, **options).double()
     x = normal(3, 5, 7, 6).double()
     parameters = baselines.scaled_parameters(PARAMETERS, x)
     result = layer(x, parameters)
@@ -457,7 +446,7 @@ def test_tables_are_averaged_over_source_groups_and_compared_in_pairs() -> None:
     measured = []
     for group, regret in (("a", 0.1), ("a", 0.3), ("b", 0.4)):
         for name, more in (("EXP", 0.05), ("compact", 0.0)):
-            row: dict[str, Any] = {"simulator": name, "group": group, "regret": regret + more}
+            row = {"simulator": name, "group": group, "regret": regret + more}
             row |= {"rank_correlation": 1.0, "absolute_error": 0.0, "ms": 2.0, "saturated": 0.5}
             measured.append(row | {"terms": {"noise": 0.1, "shadows": regret}})
     exp, compact = tables.summary(measured)
@@ -482,7 +471,7 @@ def test_the_drop_by_hand() -> None:
 
 
 def test_sources_of_high_iso_differ_from_others_in_nothing_else() -> None:
-    options: dict[str, Any] = {"split": "test", "resolution": 64, "simulator": None}
+    options = {"split": "test", "resolution": 64, "simulator": None}
     plain = EnvOptions(scenes="bundled:small", **options).load_scenes()
     world = World("EXP", high_iso=True).options("bundled:small")
     found = EnvOptions.from_kwargs({**options, **world}).load_scenes()
@@ -493,7 +482,7 @@ def test_sources_of_high_iso_differ_from_others_in_nothing_else() -> None:
         assert (scene.content, scene.reference) == (again.content, again.reference)
 
 
-def load_small_config(path: Path) -> learning.AgentConfig:
+def load_small_config(path):
     return learning.load_config(path).model_copy(update={"num_envs": 4})
 
 
@@ -503,9 +492,7 @@ def train_here(jobs: list[learning.TrainingJob]) -> None:
         learning.train_agent(job.config, job.out)
 
 
-def test_a_tiny_transfer_trains_judges_and_predicts(
-    benchmarks_here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tiny_transfer_trains_judges_and_predicts(benchmarks_here, monkeypatch):
     monkeypatch.setattr(agents, "QUICK", TINY)
     monkeypatch.setattr(agents, "RUNS", benchmarks_here / "runs" / "bench")
     monkeypatch.setattr(agents, "load_config", load_small_config)
@@ -516,10 +503,7 @@ def test_a_tiny_transfer_trains_judges_and_predicts(
     assert "| `compact-iso1600`" in page
     assert "<!-- tables -->\nNot measured in this run." in page
     again = [job for own in agents.training_jobs(TINY, folder).values() for job in own]
-    assert [learning.is_trained(job.config, job.out) for job in again] == [
-        True,
-        True,
-    ]  # so not again
+    assert [learning.is_trained(job.config, job.out) for job in again] == [True] * 2
     transfer.run(out, part="tables", quick=True)
     page = (out / "transfer.md").read_text()
     assert "| ISO 6400, -3 EV |" in page

@@ -7,10 +7,8 @@ import re
 import shlex
 import sys
 import tomllib
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -84,7 +82,7 @@ def test_printed_examples_are_those_in_the_folder() -> None:
 def _write_files(folder: Path) -> None:
     """Writes the files that pages read: raws, and samples of an industrial camera."""
     nlf = {100: NoiseLevelFunction(shot=(2e-4,) * 4, read=(1e-6,) * 4)}
-    levels: Any = {"black_level": (256,) * 4, "white_level": 4095, "bit_depth": 12}
+    levels = {"black_level": (256,) * 4, "white_level": 4095, "bit_depth": 12}
     bench = CameraProfile(name="bench", cfa=BayerPattern.GBRG, nlf_by_iso=nlf, **levels)
     light = torch.rand(4, 64, 96, generator=torch.Generator().manual_seed(0)) * 0.5
     settings = CameraSettings(100, 1 / 64, 4.0)
@@ -102,7 +100,7 @@ def _run(code: str, folder: Path) -> None:
     small = SMALL if "regression" not in code else {"scenes": SMALL["scenes"]}
     _write_files(folder)
 
-    def with_few(make: Any) -> Any:
+    def with_few(make):
         return lambda name, **arguments: make(name, **{**arguments, **small})
 
     os.chdir(folder)
@@ -120,7 +118,7 @@ _FIRST, *_OTHERS = (*WITH_CODE, *TUTORIALS)
 
 
 @pytest.mark.parametrize("page", [_FIRST, *(pytest.param(page) for page in _OTHERS)], ids=_name)
-def test_code_runs_as_printed(page: Path, tmp_path: Path, forkserver: Any) -> None:
+def test_code_runs_as_printed(page, tmp_path, forkserver):
     code = page.read_text() if page.suffix == ".py" else "\n".join(_blocks(page, "python"))
     for printed, short in (
         (r"STEPS = [\d_]+", "STEPS = 64"),
@@ -136,7 +134,7 @@ def test_code_runs_as_printed(page: Path, tmp_path: Path, forkserver: Any) -> No
         pool.submit(_run, code, tmp_path).result()
 
 
-def _commands(page: Path, pattern: str) -> Iterator[list[str]]:
+def _commands(page, pattern):
     """The words after `ae-env` of every command that the pattern finds, without comments."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     for line in re.findall(pattern, text, re.MULTILINE):
@@ -145,7 +143,7 @@ def _commands(page: Path, pattern: str) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_commands_parse(page: Path) -> None:
-    group: Any = typer.main.get_command(app)
+    group = typer.main.get_command(app)
     with group.make_context("ae-env", ["scorers"]) as context:
         for words in _commands(page, r"^ *ae-env (.+)$"):
             name, command, rest = group.resolve_command(context, words)
@@ -163,7 +161,7 @@ def test_the_scorer_computes_what_it_says_and_is_used_as_printed(ae_env, tmp_pat
     pictures[0, :, 10:30, 10:20] = 0.8  # half of the middle: standard deviation 0.4
     pictures[1, :, :10] = 1.0  # outside of the middle
     scorer = make_scorer("my_scorer.py:CentreContrast").parts["CentreContrast"]
-    scores = scorer(pictures, None)  # type: ignore[arg-type]
+    scores = scorer(pictures, None)
     torch.testing.assert_close(scores, torch.tensor([0.8, 0.0]), atol=1e-3, rtol=0.0)
     use = _blocks(SCORER_PAGE, "python")[1]
     assert "resolution=64" in use
@@ -200,9 +198,9 @@ def _build(folder: Path) -> tuple[str, set[str]]:
     # But for `viewcode`: 40 pages of the packages' own text, of which nothing is tested here.
     used = {"extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]}
     warnings, folders = io.StringIO(), (ROOT / "docs", ROOT / "docs", folder, folder / "doctrees")
-    more: dict[str, Any] = {"confoverrides": {**used, "smartquotes": False}, "status": None}
+    more = {"confoverrides": {**used, "smartquotes": False}, "status": None}
     site = Sphinx(*folders, "html", **more, warning=warnings)
-    builder: Any = site.builder
+    builder = site.builder
     builder.search = False  # which wants to see all pages
     site.build(filenames=[site.env.doc2path(name) for name in WRITTEN])
     images = set[str]()
@@ -212,7 +210,7 @@ def _build(folder: Path) -> tuple[str, set[str]]:
     return warnings.getvalue(), images
 
 
-def test_the_site(tmp_path: Path, forkserver: Any) -> None:
+def test_the_site(tmp_path, forkserver):
     with ProcessPoolExecutor(1, mp_context=forkserver) as pool:
         warnings, images = pool.submit(_build, tmp_path).result()
     assert warnings == ""

@@ -84,7 +84,7 @@ def nearest_recorded(scene: Scene, grid: ExposureGrid) -> np.ndarray:
     """
     assert scene.allowed is not None
     there = np.flatnonzero(scene.allowed)
-    states = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid.states])
+    states = grid.apex
     controls = np.abs(states[:, None] - states[there]).sum(axis=-1)
     exposure = np.abs(grid.ev100[:, None] - grid.ev100[there])
     # A tenth of a stop of exposure is worth more than any distance of the controls.

@@ -279,9 +279,9 @@ def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
     with open_picture(file.path) as picture:
         if picture.mode.startswith(("I", "F")):
             raise ValueError(f"it must have 8 bits a sample, not mode {picture.mode!r}")
-        rgb = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+        rgb = np.array(ImageOps.exif_transpose(picture).convert("RGB"))
     assert camera is not None
-    data = develop_inverse(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None])[0]
+    data = develop_inverse(torch.from_numpy(rgb).permute(2, 0, 1)[None])[0]
     return RawImage(data, file.settings, camera)
 
 

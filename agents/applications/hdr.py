@@ -73,9 +73,6 @@ def hdr_picture(
         stops: The bracket reaches from -`stops` to +`stops` [EV], in [0.05, 10].
         step: Between its pictures [EV], in [0.05, `stops`].
         simulator: What reduces noise; by default ``CameraSimulator.from_pretrained()``.
-
-    Raises:
-        ValueError: If an argument is out of its range.
     """
     exposures = bracket_exposures(stops, step)
     simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
@@ -157,10 +154,7 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
     Args:
         pictures: N >= 2 pictures (3, H, W) float32 in [0, 1], sRGB, or a function that yields
             them, always the same ones, called several times: a bracket of large pictures need
-            not be held at once.
-
-    Raises:
-        ValueError: If there are fewer than 2 pictures.
+            not be held at once. Fewer than 2 are a `ValueError`.
     """
     every = pictures if callable(pictures) else lambda: iter(pictures)
     means = torch.tensor([float(_luma(picture).mean()) for picture in every()])

@@ -183,7 +183,7 @@ def _read_map(path: Path, layer: str | None) -> np.ndarray:
                     # Indices into a palette would look like a map.
                     values = np.asarray(picture.convert() if picture.mode == "P" else picture)
             case ".npy":
-                values = np.asarray(np.load(path, allow_pickle=False))
+                values = np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
             case ".exr":
                 kinds = ("Z",), ("DEPTH",), ("V",), ("Y",), ("R",)
                 values = read_exr(path, kinds, layer, outside=math.nan)[0][0]

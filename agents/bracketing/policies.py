@@ -11,8 +11,9 @@ import copy
 import itertools
 from functools import lru_cache
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,17 +21,14 @@ from scipy.special import ndtri
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import LOG_FLOOR, SATURATED, WORST_EV, merge
-from ae_env.observation import decode_observation, decode_sensors, decode_settings
+from ae_env.observation import decode_observation, decode_sensors
 from ae_env.tasks import FRAME_GAP
+from agents.metering.reading import frame_states
 from agents.policy import Bools, BracketLimits, Floats, Ints, Observations, Policy, PolicyContext
-from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
+from agents.rollouts import RolloutPlan, checked_states, choose, errors_of, scenes_of
 from simulator.camera import CameraProfile
 from simulator.radiance.light import WHITE_SIGNAL
 from simulator.utils.checks import check_flag, check_number
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
 
 #: Centres of the bins of log2 luminance, relative to the EV100 of the viewfinder's frame.
 BINS = np.arange(-16.0, 16.0, 0.5)
@@ -176,18 +174,12 @@ class Bracketing(Policy):
     def observe(self, observations: Observations) -> None:
         """Keeps the frames of `observations`."""
         self.check_reset(observations)
-        aperture, time, speed = decode_settings(observations["settings"])
-        ev100 = aperture + time - (speed - 5.0)
-        # Nominal settings are rounded, so the state is the nearest one of this ISO.
-        grid = self.context.grid
-        isos = np.log2(np.array([s.iso for s in grid]) / 3.125)
-        apart = np.abs(grid.ev100 - ev100[:, None]) + 10 * np.abs(isos - speed[:, None])
-        states = apart.argmin(axis=1)
+        states = frame_states(observations, self.context.grid)
         for i, frames in enumerate(self._frames):
             if not self._done[i]:
                 frames.append((int(states[i]), observations["raw"][i].copy()))
         new = np.isnan(self._reference)
-        self._reference[new] = grid.ev100[states[new]]
+        self._reference[new] = self.context.grid.ev100[states[new]]
 
     def taken(self, camera: int) -> Ints:
         """States of the frames that a camera has taken, without the viewfinder's."""
@@ -426,8 +418,7 @@ def run_brackets(
         seconds, decisions = 0.0, 0
         while running.any():
             begun = perf_counter()
-            with errors_of(name, "act"):
-                chosen = policy.act(observations, masks)
+            chosen = choose(name, policy, observations, masks, info)
             seconds, decisions = seconds + perf_counter() - begun, decisions + envs.num_envs
             # A state that no longer fits is allowed, and ends the episode.
             actions = checked_states(name, chosen, np.ones_like(masks))

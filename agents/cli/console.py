@@ -5,7 +5,6 @@ Help must come at once: no module of a command imports anything heavy, see `main
 
 from __future__ import annotations
 
-import io
 import os
 import shlex
 import sys
@@ -50,8 +49,7 @@ Weights = Annotated[
     ),
 ]
 Depth = Annotated[
-    str,
-    Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens."),
+    str, Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens.")
 ]
 Cache = Annotated[bool, Option(help="Cache the outputs of the networks between runs.")]
 Tolerance = Annotated[
@@ -116,15 +114,6 @@ def print_files(files: Mapping[str, Path]) -> None:
     """Prints the files that were written."""
     for name, path in files.items():
         print_line(f"wrote {name}: {path}")
-
-
-def save_picture(path: Path, picture: Any) -> Path:
-    """Writes a PIL image as PNG."""
-    from simulator.utils.files import write_atomically
-
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return write_atomically(path, buffer.getvalue())
 
 
 def command_line() -> str:

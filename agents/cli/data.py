@@ -220,29 +220,24 @@ def warm_up() -> None:
 
     Example: `ae-env warm-up`
     """
-    logging.getLogger("simulator.utils.compute").setLevel(logging.ERROR)  # it proposes this command
-    with progress_bars() as progress, progress("warming up") as task:
-        for done, (name, arguments) in enumerate(_CASES):
-            task(done, len(_CASES) + 1, ", ".join([name, *map(str, arguments.values())]))
-            _play(name, arguments)
-        task(len(_CASES), len(_CASES) + 1, "raw files and the viewer")
-        _use_rest()
-        task(len(_CASES) + 1, len(_CASES) + 1)
-    console.terminal.print("try next: ae-env quickstart")
-
-
-def _play(name: str, arguments: dict[str, Any]) -> None:
-    """Draws the scenes of an environment and plays some steps."""
     import gymnasium as gym
     import numpy as np
 
     from agents.rollouts import scenes_of
 
-    with closing(gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)) as envs:
-        scenes_of(envs)  # draws every one
-        envs.reset(seed=0)
-        for _ in range(4):
-            envs.step(np.arange(16))
+    logging.getLogger("simulator.utils.compute").setLevel(logging.ERROR)  # it proposes this command
+    with progress_bars() as progress, progress("warming up") as task:
+        for done, (name, arguments) in enumerate(_CASES):
+            task(done, len(_CASES) + 1, ", ".join([name, *map(str, arguments.values())]))
+            with closing(gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)) as envs:
+                scenes_of(envs)  # draws every one
+                envs.reset(seed=0)
+                for _ in range(4):
+                    envs.step(np.arange(16))
+        task(len(_CASES), len(_CASES) + 1, "raw files and the viewer")
+        _use_rest()
+        task(len(_CASES) + 1, len(_CASES) + 1)
+    console.terminal.print("try next: ae-env quickstart")
 
 
 def _use_rest() -> None:

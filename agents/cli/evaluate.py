@@ -34,9 +34,6 @@ Preset = Annotated[
         "_bracket), or a .yaml file of one's own."
     ),
 ]
-Environment = Annotated[
-    str | None, Option(help="Environment: a preset of configs/env, or a .yaml file.")
-]
 Scenes = Annotated[
     str | None,
     Option(
@@ -44,50 +41,44 @@ Scenes = Annotated[
         "'recorded:FOLDER' (with what its files do not say: 'recorded:FOLDER?iso=100')."
     ),
 ]
-Split = Annotated[str | None, Option(help="train, test (default) or all.")]
-Grid = Annotated[str | None, Option(help="default, third_stop, video or bracket.")]
-Scorer = Annotated[str | None, Option(help="The scorer of the states: balanced...")]
-Lighting = Annotated[str | None, Option(help="static (default), step, ramp, sine, tunnel...")]
-Delay = Annotated[
-    int | None, Option(help="Frames from a decision to its frame; 0 by default.", min=0)
-]
-Observation = Annotated[str | None, Option(help="uint8 (default), statistics...")]
-Sensors = Annotated[bool | None, Option(help="Whether speed and defocus are observed (yes).")]
-Resolution = Annotated[int | None, Option(help="Packed pixels a side; 64 by default.")]
-EpisodeCount = Annotated[
-    int | None, Option(help="Episodes per scene and start: so many seeds.", min=1)
-]
-Frames = Annotated[int | None, Option(help="Frames per episode.", min=1)]
-Append = Annotated[Path | None, Option(help="Benchmark table (CSV) to add the results to.")]
-Author = Annotated[str, Option(help="For --append: who made the policy.")]
-FirstSeed = Annotated[int | None, Option(help="Seed of everything random.", min=0)]
-Workers = Annotated[
-    int | None, Option(help="Processes; by default one per core if it pays.", min=1)
-]
 
 
 def evaluate(
     context: typer.Context,
     policy: console.Policies = None,
     preset: Preset = None,
-    env: Environment = None,
+    env: Annotated[
+        str | None, Option(help="Environment: a preset of configs/env, or a .yaml file.")
+    ] = None,
     scenes: Scenes = None,
     on_error: console.OnError = "stop",
-    split: Split = None,
-    grid: Grid = None,
-    scorer: Scorer = None,
-    lighting: Lighting = None,
-    delay: Delay = None,
-    observation: Observation = None,
-    sensors: Sensors = None,
-    resolution: Resolution = None,
-    episodes: EpisodeCount = None,
-    frames: Frames = None,
+    split: Annotated[str | None, Option(help="train, test (default) or all.")] = None,
+    grid: Annotated[str | None, Option(help="default, third_stop, video or bracket.")] = None,
+    scorer: Annotated[str | None, Option(help="The scorer of the states: balanced...")] = None,
+    lighting: Annotated[
+        str | None, Option(help="static (default), step, ramp, sine, tunnel...")
+    ] = None,
+    delay: Annotated[
+        int | None, Option(help="Frames from a decision to its frame; 0 by default.", min=0)
+    ] = None,
+    observation: Annotated[str | None, Option(help="uint8 (default), statistics...")] = None,
+    sensors: Annotated[
+        bool | None, Option(help="Whether speed and defocus are observed (yes).")
+    ] = None,
+    resolution: Annotated[int | None, Option(help="Packed pixels a side; 64 by default.")] = None,
+    episodes: Annotated[
+        int | None, Option(help="Episodes per scene and start: so many seeds.", min=1)
+    ] = None,
+    frames: Annotated[int | None, Option(help="Frames per episode.", min=1)] = None,
     out: console.Folder = Path("evaluation"),
-    append: Append = None,
-    author: Author = "",
-    seed: FirstSeed = None,
-    workers: Workers = None,
+    append: Annotated[
+        Path | None, Option(help="Benchmark table (CSV) to add the results to.")
+    ] = None,
+    author: Annotated[str, Option(help="For --append: who made the policy.")] = "",
+    seed: Annotated[int | None, Option(help="Seed of everything random.", min=0)] = None,
+    workers: Annotated[
+        int | None, Option(help="Processes; by default one per core if it pays.", min=1)
+    ] = None,
     device: console.Device = "cpu",
     trust: console.Trust = False,
 ) -> None:

@@ -30,6 +30,7 @@ from agents.cli.show import film, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 from simulator import __version__
+from simulator.utils.checks import check_word
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
@@ -64,8 +65,7 @@ def bench(
         Option(help="Of throughput: another checkout or commit, timed in turns with this."),
     ] = None,
     weights: Annotated[
-        Path | None,
-        Option(help="Of paper: measure these weights, and train nothing."),
+        Path | None, Option(help="Of paper: measure these weights, and train nothing.")
     ] = None,
     part: Annotated[
         str | None, Option(help="Of transfer: agents or tables; by default both.")
@@ -75,8 +75,6 @@ def bench(
 
     Example: `ae-env bench throughput --quick --out /tmp/results`
     """
-    from simulator.utils.checks import check_word
-
     name = name.replace("-", "_")
     check_word("name", name, BENCHMARKS)
     given = {"against": against, "folder": folder, "weights": weights, "part": part}
@@ -106,8 +104,6 @@ _TAKES = {
 
 def _check_options(name: str, **options: Any) -> None:
     """Raises a `ValueError` if a benchmark takes no such option, or not its value."""
-    from simulator.utils.checks import check_word
-
     for option, value in options.items():
         if name not in _TAKES[option]:
             rule = f"is for {' and '.join(_TAKES[option])} only"

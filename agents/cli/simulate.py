@@ -12,6 +12,8 @@ from typer import Option
 
 from agents.cli import console
 from agents.cli.console import check_outputs, print_files, print_line, progress_bars
+from simulator.utils.checks import check_number, check_word
+from simulator.utils.files import write_picture
 
 if TYPE_CHECKING:
     import numpy as np
@@ -132,7 +134,7 @@ def sweep(
             networks = SceneNetworks(weights, cache=cache)
             resized = networks.resized if depth == "unknown" else Scene.resized
             scene = networks.denoised(resized(scene, size))
-        console.save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
+        write_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
         task(1, 1)
     files = {"contact sheet": sheet}
     if dngs:
@@ -157,8 +159,7 @@ DepthMap = Annotated[
     ),
 ]
 DepthKindName = Annotated[
-    str | None,
-    Option(help="distance (default), or disparity: larger numbers are nearer."),
+    str | None, Option(help="distance (default), or disparity: larger numbers are nearer.")
 ]
 DepthScale = Annotated[
     float | None,
@@ -211,7 +212,6 @@ def refocus(
 
     from agents.applications import refocus as applied
     from simulator.raw.develop import as_recorded
-    from simulator.utils.checks import check_number
 
     f_number = console.parse_f_number(aperture)
     for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale}
@@ -253,7 +253,6 @@ def _lens(
 ) -> Lens:
     """The lens that the options and the file describe."""
     from simulator import Lens
-    from simulator.utils.checks import check_number
 
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length
     more = " mm; the file does not say it" if millimetres is None else " mm"
@@ -327,7 +326,6 @@ def hdr(
 def make_simulator(weights: str, device: str, cache: bool, depth: str = "far") -> CameraSimulator:
     """The simulator that the options describe; checks `depth`, which may need networks."""
     from simulator import CameraSimulator
-    from simulator.utils.checks import check_word
 
     check_word("depth", depth, ("far", "unknown"))
     device = console.torch_device(device)
@@ -371,4 +369,4 @@ def _write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
     aspect = raw.metadata.get("pixel_aspect", 1.0)
     if aspect != 1.0:
         print_line(f"pixels are {aspect:g} times as wide as high: the PNG is stretched")
-    return console.save_picture(path, upright_picture(raw, srgb))
+    return write_picture(path, upright_picture(raw, srgb))

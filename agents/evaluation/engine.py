@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import astuple, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.options import EnvOptions
+from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
@@ -35,13 +36,14 @@ from agents.evaluation.evaluation_plan import (
 )
 from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
 from agents.metering.reading import linear_signal, signal_codes
-from agents.policy import Policy, PolicyContext
+from agents.policy import Ints, Policy, PolicyContext
 from agents.policy_names import make_policy, training_seeds
 from agents.rollouts import (
     EpisodeBatch,
     RolloutPlan,
     action_masks,
     checked_states,
+    choose,
     errors_of,
     expected_scores,
     fitting_arguments,
@@ -49,11 +51,7 @@ from agents.rollouts import (
 )
 from simulator.utils.checks import check_integer, check_number
 
-if TYPE_CHECKING:
-    from ae_env.scenes import Scene
-
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
-Ints = NDArray[np.int64]
 Arrays = dict[str, NDArray[Any]]
 #: Called with work done, work in all, and what is being done.
 Progress = Callable[[int, int, str], None]
@@ -81,8 +79,7 @@ def evaluate(
 ) -> EvaluationResult:
     """Run every policy over the same episodes, from starts that are drawn.
 
-    Frames are counted after each action. Scores are always the expected scores q, whatever the
-    environment's reward.
+    Scores are always the expected scores q, whatever the environment's reward.
 
     Args:
         policies: By name in the tables; a list holds the same agent from several training seeds.
@@ -90,15 +87,13 @@ def evaluate(
             ``{"scenes": "bundled", "split": "test", "resolution": 64}``.
         episodes_per_scene: Episodes of each scene, each with its own start, motion and defocus:
             those of the seeds `seed`, `seed` + 1 and so on.
-        frames: Actions per episode.
-        seed: Decides the episodes.
+        frames: Actions per episode; a frame is counted after each.
         batch: Episodes at a time, at most.
         other_scorers: Names of scorers that no policy was trained on; states that were chosen in
             some of the scenes are also rated by these.
         progress: Called with frames done, frames in all, and the name of the policy.
 
     Raises:
-        ValueError: If an argument is out of range.
         UserCodeError: If a policy raises (the cause is chained), or returns something else than
             allowed states.
     """
@@ -378,7 +373,6 @@ class EvaluationRun:
             hard=np.array([bool(s.hard) for s in scenes]),
             start_states=next(iter(tracks.values())).arrays["start_states"][0],
             tracks={name: Track.of_seeds(own) for name, own in of_policy.items()},
-            seed=self.plan.seeds[0],
             delays=self.plan.options(condition).delays,
             plan=self.plan,
             scenes=scenes,
@@ -397,14 +391,10 @@ def fit_policies(
     batch: int = BATCH,
     progress: Progress | None = None,
 ) -> None:
-    """Call `fit` of every policy that has one, on the training split.
+    """Call `fit` of every policy that has one, on the training split of an environment.
 
-    Args:
-        policies: By name; changed in place.
-        env_options: Arguments of the environment; `split` is set to ``"train"``.
-        seed: Decides the training episodes.
-        batch: Episodes at a time.
-        progress: Called before and after each fit.
+    `env_options` are its arguments, `seed` decides the episodes, of which `batch` run at a time;
+    `progress` is called before and after each fit.
     """
     learners = [(name, policy) for name, policy in policies.items() if _learns(policy)]
     if not learners:
@@ -450,13 +440,9 @@ def run_batch(
     seen: dict[str, list[NDArray[Any]]] = {}
     seconds = []
     for frame in range(frames):
-        extra: dict[str, Any] = {}
-        if getattr(policy, "privileged", False):
-            known = {} if oracle is None else _oracle_info(base, oracle, frame)
-            extra = {"info": {**info, **known}}
+        told = info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}
         begin = time.perf_counter()
-        with errors_of(name, "act"):
-            actions = policy.act(observations, masks, **extra)
+        actions = choose(name, policy, observations, masks, told)
         seconds.append(time.perf_counter() - begin)
         observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
         masks = action_masks(envs)  # the next frame of a sequence is another scene
@@ -509,7 +495,6 @@ def other_scores(result: EvaluationResult) -> dict[str, dict[str, float]]:
     averaged over frames, then training seeds, episodes of a source group, and source groups.
     """
     plan = result.plan
-    assert plan is not None
     pairs = len(result.scene_ids) // len(plan.starts)  # of scenes and seeds
     count = pairs // len(plan.seeds)
     scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first

@@ -7,22 +7,20 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions, checked_delay
+from ae_env.scenes import Scene
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.utils.user_files import find_preset
 from agents.rollouts import RolloutPlan
 from simulator.utils.checks import check_integer, check_word, did_you_mean
 from simulator.utils.config_file import Configuration, load_yaml
-
-if TYPE_CHECKING:
-    from ae_env.grid import ExposureGrid
-    from ae_env.scenes import Scene
 
 #: Where an episode may begin; see `start_state`.
 STARTS = ("dark", "middle", "bright", "random")
@@ -79,7 +77,6 @@ class EvaluationPlan(Configuration):
             are those of the conditions.
         scene_ids: Scenes to use, in this order; empty for all of the split.
         max_scenes: Use at most so many scenes, source groups in turn; None for all.
-        conditions: By name.
         delays: Each condition is run with each of these delays; except for the first, it is called
             ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
         starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from agents.policy import Floats
 
 RESAMPLES = 10_000
 #: Coverage of the intervals.
@@ -55,7 +54,6 @@ def score_interval(
     Args:
         gains: ``q - q_random`` per training seed and source group, ``(K, G)`` or ``(G,)``.
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
-        resamples: Number of resamples.
         seed: Seed of the resampling; policies compared under one seed see the same groups.
     """
     nothing = np.zeros((1, len(span)))

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ae_env.scenes import Scene
 from ae_env.scorers.registry import scorer_fingerprint
 from agents.evaluation.engine import (
     Arrays,
@@ -43,9 +44,6 @@ from agents.policy_names import (
 )
 from simulator.utils.cache import Store, cache_key
 from simulator.utils.files import sibling
-
-if TYPE_CHECKING:
-    from ae_env.scenes import Scene
 
 #: About the time of a frame's score table in static and in changing light, of a frame of a policy,
 #: and of a policy's `fit` [ms]: only the order of the work and the progress bar depend on it.
@@ -235,18 +233,13 @@ def run_plan(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> dict[str, EvaluationResult]:
-    """Runs a plan, or the part of it that is left.
+    """Runs a plan, or the part of it that `folder` does not hold yet; the results by condition.
 
     Args:
-        plan: The plan, with its policies.
-        folder: Folder of finished parts.
         scenes: Those of the plan where they are loaded already.
         workers: Processes; None for one per core where the work is enough to pay for them.
         device: Torch device of a learnt agent's network.
         progress: Called with work done, work in all, and what is being done.
-
-    Returns:
-        The results by condition.
 
     Raises:
         ValueError: If a policy, a scorer or a scene is unknown, or a policy does not fit the

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.metering.programs import SAME_EV
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from agents.policy import Bools, Floats, Ints
 
 #: A state counts as right if its q is this near to the best.
 NEAR_BEST = 0.01
@@ -37,12 +35,12 @@ def score_of(scores: Floats, states: Ints) -> Floats:
     return np.take_along_axis(table, np.broadcast_to(states, shape)[..., None], axis=-1)[..., 0]
 
 
-def oracle_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
+def oracle_score(scores: Floats, allowed: Bools) -> Floats:
     """Best q among the allowed states, ``(..., T)``."""
     return np.where(allowed, scores, -np.inf).max(axis=-1)
 
 
-def random_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
+def random_score(scores: Floats, allowed: Bools) -> Floats:
     """Exact mean q of a uniform draw from the allowed states, ``(..., T)``.
 
     >>> random_score(np.array([0.0, 1.0, 0.5]), np.array([True, False, True])).tolist()
@@ -51,9 +49,7 @@ def random_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
     return np.where(allowed, scores, 0.0).sum(axis=-1) / allowed.sum(axis=-1)
 
 
-def regret_given_ev(
-    scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bool_]
-) -> Floats:
+def regret_given_ev(scores: Floats, states: Ints, ev100: Floats, allowed: Bools) -> Floats:
     """How much better the best split of the *chosen* EV would have scored, ``(..., T)``.
 
     Best q among the allowed states whose EV100 is that of the chosen one (within 1/6 EV), minus q
@@ -63,7 +59,7 @@ def regret_given_ev(
     return oracle_score(scores, same & allowed) - score_of(scores, states)
 
 
-def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bool_]) -> Floats:
+def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: Bools) -> Floats:
     """Distance in EV to the nearest allowed state whose q is within 0.01 of the best, ``(..., T)``.
 
     Zero wherever the brightness is right, however it is split.
@@ -163,7 +159,7 @@ def reversals(evs: Floats) -> Ints:
     return (heading[..., :-1] * steps[..., 1:] < 0).sum(axis=-1)
 
 
-def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
+def flicker(image_means: Floats, static: Bools) -> Floats:
     """Mean absolute change of the mean linear signal, in [0, 1], (..., T), in the same light.
 
     `static` (..., T - 1) says whether the light is that of the frame before; if never, it is 0.

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene
 from agents.evaluation import metrics
+from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.evaluation.intervals import (
     RANK_COLUMNS,
     RESAMPLES,
@@ -19,17 +22,11 @@ from agents.evaluation.intervals import (
     rank,
     score_interval,
 )
+from agents.policy import Bools, Floats, Ints
 from agents.policy_names import is_metering
 from simulator.optics.motion import Movement
 from simulator.utils.checks import check_word
 
-if TYPE_CHECKING:
-    from ae_env.grid import ExposureGrid
-    from ae_env.scenes import Scene
-    from agents.evaluation.evaluation_plan import EvaluationPlan
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 #: By condition.
 Results = Mapping[str, "EvaluationResult"]
 
@@ -116,11 +113,9 @@ class EvaluationResult:
         start_states: State of the reset frame; empty for brackets, as `scores` and `allowed`.
         scores: q of every state, ``(E, T, S)``.
         allowed: Action masks of every frame, ``(E, T, S)``.
-        seed: The plan's first seed.
         delays: Frames between a decision and the frame that has its ISO, its exposure time and
             its aperture.
-        plan: The plan that the condition belongs to; None where a result was put together by hand,
-            as everything below.
+        plan: The plan that the condition belongs to.
         speed: Image speed of each episode [frame heights per second], ``(E,)``.
         defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
         movement: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
@@ -132,14 +127,13 @@ class EvaluationResult:
     scene_ids: NDArray[Any]
     groups: NDArray[Any]
     kinds: NDArray[Any]
-    hard: NDArray[np.bool_]
+    hard: Bools
     start_states: Ints
     scores: Floats
-    allowed: NDArray[np.bool_]
+    allowed: Bools
     tracks: dict[str, Track]
-    seed: int
+    plan: EvaluationPlan
     delays: tuple[int, int, int] = (0, 0, 0)
-    plan: EvaluationPlan | None = None
     scenes: Sequence[Scene] = ()
     speed: Floats | None = None
     defocus: Floats | None = None
@@ -149,7 +143,7 @@ class EvaluationResult:
     @property
     def measure(self) -> str:
         """``"score"`` of frames, or ``"quality"`` of brackets: the metric that decides."""
-        return "score" if self.plan is None else self.plan.measure
+        return self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
         """Arguments of `ae_env.scorers.captures.prepare_scene` that blur depends on."""
@@ -201,11 +195,6 @@ class EvaluationResult:
     def _metrics(self) -> dict[str, dict[str, NDArray[Any]]]:
         return {policy: self._measured(policy) for policy in self.tracks}
 
-    @cached_property
-    def settling(self) -> Ints:
-        """Frame from which an episode's convergence counts, ``(E,)``; see `metrics.settling`."""
-        return metrics.settling(self.scores)
-
     def _measured(self, policy: str) -> dict[str, NDArray[Any]]:
         arrays = self.tracks[policy].arrays
         if self.measure == "quality":
@@ -213,7 +202,8 @@ class EvaluationResult:
         states, ev100, allowed = self.tracks[policy].states, self.grid.ev100, self.allowed
         score = metrics.score_of(self.scores, states).mean(axis=-1)
         errors = metrics.ev_error(self.scores, states, ev100, allowed)
-        frames, converged = metrics.frames_to_converge(errors, since=self.settling)
+        settled = metrics.settling(self.scores)
+        frames, converged = metrics.frames_to_converge(errors, since=settled)
         start = np.broadcast_to(self.start_states[:, None], (*states.shape[:-1], 1))
         evs = ev100[np.concatenate([start, states], axis=-1)]
         static = np.all(self.scores[:, 1:] == self.scores[:, :-1], axis=-1)  # (E, T - 1)
@@ -226,8 +216,8 @@ class EvaluationResult:
             "ev_error": errors,
             "frames_to_converge": frames,
             "converged": converged,
-            "frames_to_settle": metrics.frames_to_settle(evs, since=self.settling),
-            "overshoot": metrics.overshoot(evs, since=self.settling),
+            "frames_to_settle": metrics.frames_to_settle(evs, since=settled),
+            "overshoot": metrics.overshoot(evs, since=settled),
             "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
             "reversals": metrics.reversals(evs),
             "flicker": metrics.flicker(arrays["image_mean"], static),
@@ -241,12 +231,12 @@ class EvaluationResult:
         """Parts that have scenes: always ``"all"``, and both others or neither."""
         return PARTS if self.hard.any() and not self.hard.all() else PARTS[:1]
 
-    def part(self, name: str) -> NDArray[np.bool_]:
+    def part(self, name: str) -> Bools:
         """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
         check_word("part", name, PARTS)
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
-    def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
+    def mean(self, policy: str, key: str, episodes: Bools | None = None) -> float:
         """Mean of a metric over a source group's episodes, then over groups and seeds; of the
         `episodes` that are True, ``(E,)``, or of all.
         """
@@ -254,9 +244,7 @@ class EvaluationResult:
         values = self.episode_metrics(policy)[key][:, members]
         return float(metrics.group_means(values, self.groups[members]).mean())
 
-    def group_gains(
-        self, policy: str, part: str | NDArray[np.bool_] = "all"
-    ) -> tuple[Floats, Floats]:
+    def group_gains(self, policy: str, part: str | Bools = "all") -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
         Of the episodes of `part`, a name or a mask ``(E,)``.
@@ -267,7 +255,7 @@ class EvaluationResult:
         groups = self.groups[members]
         return metrics.group_means(gains, groups), metrics.group_means(span, groups)
 
-    def normalised(self, policy: str, part: str | NDArray[np.bool_] = "all") -> float:
+    def normalised(self, policy: str, part: str | Bools = "all") -> float:
         """Normalised score of a policy over its training seeds; arguments as of `group_gains`."""
         gains, span = self.group_gains(policy, part)
         return float(gains.mean(axis=0).sum() / span.sum())
@@ -278,17 +266,14 @@ class EvaluationResult:
 
 def as_results(results: EvaluationResult | Results) -> Results:
     """Results by condition, of a single one too."""
-    if not isinstance(results, EvaluationResult):
-        return results
-    plan = results.plan
-    return {"static" if plan is None else plan.static_condition: results}
+    if isinstance(results, EvaluationResult):
+        return {results.plan.static_condition: results}
+    return results
 
 
 def static_condition(results: Results) -> str:
     """Name of the condition of unchanging light without delay; of the first where there is none."""
-    first = next(iter(results))
-    plan = results[first].plan
-    return first if plan is None else plan.static_condition
+    return next(iter(results.values())).plan.static_condition
 
 
 def result_rows(
@@ -304,7 +289,6 @@ def result_rows(
     `EvaluationResult.parts`), every other one a row with its own name.
 
     Args:
-        results: The result of one condition, or results by condition.
         source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
         split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
         resamples: Bootstrap resamples of the interval.
@@ -316,7 +300,7 @@ def result_rows(
     results = as_results(results)
     static, rows = static_condition(results), []
     for name, result in results.items():
-        environment = {} if result.plan is None else result.plan.environment
+        environment = result.plan.environment
         scenes = environment.get("scenes", "bundled")
         if not isinstance(scenes, str):  # those that have no name
             scenes = str(scenes) if isinstance(scenes, Mapping) else f"{len(scenes)} scenes"
@@ -344,7 +328,7 @@ def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> di
     weights = np.broadcast_to(share[None, :, None], errors.shape) / (seeds * frames)
     return {
         "num_groups": interval.num_groups,
-        "seed": result.seed,
+        "seed": result.plan.seeds[0],
         "mean_score": result.mean(policy, "score", members),
         "normalised_score": interval.value,
         "ci95": interval.pair,
@@ -366,9 +350,8 @@ def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     to the best policy over all budgets; the other metrics are means.
     """
     names, rows = ranking.policy.tolist(), []
-    plan = next(iter(results.values())).plan
-    assert plan is not None
-    for budget, result in zip(plan.budgets or (), results.values(), strict=True):
+    budgets = next(iter(results.values())).plan.budgets or ()
+    for budget, result in zip(budgets, results.values(), strict=True):
         best = result.group_gains(names[0])[0]
         for policy in names:
             gains, span = result.group_gains(policy)

@@ -182,9 +182,7 @@ def _spread(shares: torch.Tensor, luminance: torch.Tensor) -> torch.Tensor:
 
 def _apex_table(grid: ExposureGrid) -> torch.Tensor:
     """EV100, Av, Tv and Sv of every state, (S, 4)."""
-    apex = [[s.aperture_value, s.time_value, s.speed_value] for s in grid]
-    ev100 = torch.tensor(grid.ev100, dtype=torch.float32)[:, None]
-    return torch.cat([ev100, torch.tensor(apex)], dim=1)
+    return torch.from_numpy(np.column_stack([grid.ev100, grid.apex])).float()
 
 
 class StateHead(nn.Module):
@@ -273,9 +271,7 @@ class MeterHistory:
 
     def __init__(self, context: PolicyContext, num_envs: int, frames: int) -> None:
         self._meter = make_meter("average", context.camera)
-        states = context.grid.states
-        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
-        self._apex = encode_settings(apex)
+        self._apex = encode_settings(context.grid.apex)
         self._frames = np.full((num_envs, frames, NUMBERS), np.nan)
         self._action = np.full((num_envs, 3), np.nan)
 

@@ -44,17 +44,10 @@ def save_agent(
     context: PolicyContext | None,
     training: dict[str, Any],
 ) -> None:
-    """Writes ``path.safetensors``, the state of `module`, and ``path.json``.
+    """Writes ``path.safetensors``, the state of `module`, and ``path.json``, which describes it.
 
-    Args:
-        path: File name, with or without one of the two endings.
-        kind: ``"regression"``, ``"ppo"`` or ``"forecaster"``.
-        width: Hidden features of the network.
-        context: That it was trained for; None if for any.
-        training: JSON values that identify the training.
-
-    Raises:
-        ValueError: If the weights are not finite; nothing is written then.
+    `context` is that it was trained for, None if for any, and `training` are JSON values that
+    identify the training. Weights that are not finite are a `ValueError`, and nothing is written.
     """
     tensors: dict[str, Tensor] = {}
     aliases: dict[str, str] = {}  # SB3's policies hold one features extractor under three names
@@ -117,9 +110,7 @@ def describe_context(context: PolicyContext) -> dict[str, Any]:
         "observation": str(raw.dtype),
         "resolution": list(raw.shape or ()),
         "sensors": context.has_sensors,
-        "isos": list(context.grid.isos),
-        "exposure_times": list(context.grid.exposure_times),
-        "f_numbers": list(context.grid.f_numbers),
+        **{name: list(getattr(context.grid, name)) for name in _GRID},
     }
 
 
@@ -150,14 +141,12 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
 class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
-    Args:
-        context: The camera.
-        weights: File that a training wrote; or give `network`, one in memory.
-        device: Torch device for `weights`.
+    Either `weights` are given, a file that a training wrote, for the torch `device`; or `network`,
+    one in memory.
 
     Raises:
-        ValueError: Unless one of `weights` and `network` is given, and was trained for such an
-            observation and for a grid whose ranges hold that of the context.
+        ValueError: Unless the network was trained for such an observation, and for a grid whose
+            ranges hold that of the context.
     """
 
     #: The name of this kind of agent in its files.

@@ -9,9 +9,12 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import gymnasium as gym
 import numpy as np
+import pandas as pd
 from pydantic import Field, ValidationError, model_validator
 
+from ae_env.options import EnvOptions
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.networks import Progress, Session
 from agents.learning.policy_file import load_agent, save_agent
@@ -23,8 +26,6 @@ from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
 if TYPE_CHECKING:
-    import gymnasium as gym
-
     from agents.learning.ppo import PPOTraining
 
     Hyperparameters = RegressionTraining | PPOTraining | ForecasterTraining
@@ -54,8 +55,6 @@ class AgentConfig(Configuration):
 
     @model_validator(mode="after")
     def _check(self) -> AgentConfig:
-        from ae_env.options import EnvOptions
-
         hyperparameters: Any = self.hyperparameters()
         if self.agent == "forecaster":
             for name in sorted(self.model_fields_set - {"agent", "training"}):
@@ -165,8 +164,6 @@ def train_agent(
 
 
 def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
-    import gymnasium as gym
-
     options = {**config.environment, "autoreset_mode": "SAME_STEP"}
     if config.max_episode_steps is not None:
         options["max_episode_steps"] = config.max_episode_steps
@@ -215,10 +212,9 @@ class LearningCurve:
         means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
         self._rows.append({"frames": done, **means})
         self._recent = []
-        lines = [["frames", *values]]
-        for row in self._rows:
-            lines.append([str(int(row["frames"])), *(f"{row[name]:.6g}" for name in values)])
-        write_atomically(self.path, "".join(",".join(line) + "\n" for line in lines))
+        frame = pd.DataFrame(self._rows, columns=["frames", *values]).astype({"frames": int})
+        text = frame.to_csv(index=False, float_format="%.6g", na_rep="nan", lineterminator="\n")
+        write_atomically(self.path, text)
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:

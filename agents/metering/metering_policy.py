@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,10 +20,6 @@ from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyConte
 from agents.policy_names import PROGRAMS
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.utils.checks import check_word
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
 
 #: Meters whose reading is the most exposure that may be given: no state above it is chosen.
 CEILING_METERS = ("highlight_weighted",)
@@ -45,7 +42,6 @@ class MeteringPolicy(Policy):
     """A light meter and a program that splits its EV between ISO, shutter and aperture.
 
     Args:
-        context: The camera.
         meter: One of `agents.policy_names.METERS`, such as ``"average"``.
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
@@ -60,9 +56,6 @@ class MeteringPolicy(Policy):
             first frame that has all of the decision (an alpha-beta filter); ``"model"``, of a tuned
             program: the trend is rolled through the delay of each control, and the state is taken
             that promises most (`Foresight`).
-
-    Raises:
-        ValueError: If an argument is unknown, out of range or of another program.
     """
 
     def __init__(

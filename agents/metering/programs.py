@@ -51,11 +51,7 @@ _ABOVE_CEILING_EV = 100.0
 
 @dataclass(frozen=True)
 class ProgramOptions:
-    """The options that every metering policy takes, see `MeteringPolicy`.
-
-    Raises:
-        ValueError: If one is out of range.
-    """
+    """The options that every metering policy takes, checked; see `MeteringPolicy`."""
 
     compensation: float = 0.0
     damping: float = 0.0

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.observation import PEDESTAL, decode_observation, decode_settings
-from agents.policy import Bools, Floats, Observations
+from ae_env.grid import ExposureGrid
+from ae_env.observation import PEDESTAL, decode_observation, decode_settings, encode_array
+from agents.policy import Bools, Floats, Ints, Observations
 from simulator.camera import CameraProfile
 
 #: The planes that carry luminance.
@@ -59,15 +61,9 @@ class Reading:
     black: Bools
 
 
-class Meter(Protocol):
-    """A light meter for a batch of cameras."""
-
-    def __call__(self, observations: Observations, estimate: Floats | None = None) -> Reading:
-        """Meter the frames in hand of N cameras.
-
-        A meter that improves step by step on the `estimate` that the controller holds, EV100
-        ``(N,)``, NaN in the first frame, continues there. The others ignore it.
-        """
+#: A light meter: a function of the observations of N cameras and, optionally, the EV100 ``(N,)``
+#: that the controller holds, NaN in the first frame; one that goes step by step continues there.
+Meter = Callable[..., Reading]
 
 
 def frame_ev100(observations: Observations) -> Floats:
@@ -79,6 +75,12 @@ def frame_ev100(observations: Observations) -> Floats:
         np.asarray(v, dtype=np.float64) for v in decode_settings(observations["settings"])
     )
     return np.round(3.0 * aperture) / 3.0 + time - (speed - 5.0)
+
+
+def frame_states(observations: Observations, grid: ExposureGrid) -> Ints:
+    """State of `grid` that is nearest to the (nominal) settings of each frame, ``(N,)``."""
+    shown = np.stack(decode_settings(observations["settings"]), axis=1)
+    return np.asarray(np.abs(shown[:, None] - grid.apex).sum(axis=2).argmin(axis=1))
 
 
 def linear_signal(
@@ -104,9 +106,7 @@ def signal_codes(
     """The 8-bit codes of observed frames, from any kind of observation; see `linear_signal`."""
     if raw.dtype == np.uint8:
         return raw[:, planes]
-    signal = linear_signal(raw, camera, planes).clip(-PEDESTAL, 1.0)
-    codes = (CODES - 1.0) * np.sqrt((signal + PEDESTAL) / (1.0 + PEDESTAL))
-    return np.asarray(np.rint(codes).astype(np.uint8))
+    return encode_array(linear_signal(raw, camera, planes))
 
 
 def mean_reading(mean: Floats, saturated: Floats, ev: Floats) -> Reading:

@@ -119,7 +119,8 @@ class LibcameraAgc:
         self.ladder, self.compensation = ladder, compensation
         self.max_exposure_time = np.inf if max_exposure_time is None else max_exposure_time
         self.exposure_time, self.gain, self.flicker_period = exposure_time, gain, flicker_period
-        self._filter = ExposureFilter(num_cameras, speed, startup_frames)
+        self.speed, self.startup_frames = speed, startup_frames
+        self._filtered, self._frames = np.full(num_cameras, np.nan), 0
 
     def update(
         self, zones: Floats, histogram: Floats, exposure: Floats, lux: Floats | float = DEFAULT_LUX
@@ -144,9 +145,24 @@ class LibcameraAgc:
         time = self.ladder.shutter[-1] if self.exposure_time is None else self.exposure_time
         gain = self.ladder.gain[-1] if self.gain is None else self.gain
         most = min(time, self.max_exposure_time) * gain
-        filtered = self._filter.update(np.minimum(exposure * factor, most))
+        self._follow(np.minimum(exposure * factor, most))
         reduce = (wanted > FAST_REDUCE) & (factor < np.sqrt(wanted))
-        return filtered * np.where(reduce, FAST_REDUCE, 1.0)
+        return self._filtered * np.where(reduce, FAST_REDUCE, 1.0)
+
+    def _follow(self, target: Floats) -> None:
+        """Moves the filtered exposure by `speed` of the (linear) distance to `target`, ``(N,)``.
+
+        By the square root of it within 20 % of the target, not at all within 2 %, and all of the
+        way in the first frames.
+        """
+        self._frames += 1
+        old = self._filtered
+        near = (old < (1.0 + NEAR) * target) & (old > (1.0 - NEAR) * target)
+        speed = np.where(near, np.sqrt(self.speed), self.speed)
+        moved = speed * target + (1.0 - speed) * old
+        stable = (old * (1.0 - STABLE) < target) & (old * (1.0 + STABLE) > target)
+        begins = np.isnan(old) | (self._frames <= self.startup_frames)
+        self._filtered = np.where(begins, target, np.where(stable, old, moved))
 
     def split(self, exposure: Floats) -> tuple[Floats, Floats]:
         """Exposure time [s] and gain of `exposure` [s], ``(N,)`` each, by the ladder.
@@ -169,40 +185,6 @@ class LibcameraAgc:
             whole = np.where(periods > 0, periods * self.flicker_period, time)
             time, gain = whole, np.minimum(gain * time / whole, max(self.ladder.gain))
         return time, gain
-
-
-class ExposureFilter:
-    """The AGC's filter: a continuous exposure that goes a part of the way at every frame.
-
-    That is `speed` of the (linear) distance; the square root of it within 20 % of the target,
-    nothing within 2 %; all of the way in the first `startup_frames`.
-
-    >>> follow = ExposureFilter(1, startup_frames=0)
-    >>> [round(float(follow.update(np.array([x]))[0]), 3) for x in (1.0, 16.0, 16.0)]
-    [1.0, 4.0, 6.4]
-    """
-
-    def __init__(
-        self, num_cameras: int, speed: float = SPEED, startup_frames: int = STARTUP_FRAMES
-    ) -> None:
-        self.exposure = np.full(num_cameras, np.nan)
-        self.speed, self.startup_frames = speed, startup_frames
-        self._frames = 0
-
-    def update(self, target: Floats) -> Floats:
-        """Take in the target of a frame, ``(N,)``; returns the exposures."""
-        self._frames += 1
-        old = self.exposure
-        if self._frames <= self.startup_frames:
-            new = target.copy()
-        else:
-            near = (old < (1.0 + NEAR) * target) & (old > (1.0 - NEAR) * target)
-            speed = np.where(near, np.sqrt(self.speed), self.speed)
-            new = speed * target + (1.0 - speed) * old
-            stable = (old * (1.0 - STABLE) < target) & (old * (1.0 + STABLE) > target)
-            new = np.where(np.isnan(old), target, np.where(stable, old, new))
-        self.exposure = new
-        return new.copy()
 
 
 def zone_factor(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
@@ -259,7 +241,6 @@ class RpiAgc(Policy):
     """The Raspberry Pi's AGC (`LibcameraAgc`): the state of the grid that is nearest to it.
 
     Args:
-        context: The camera.
         program: ``"P"``: the ladder, at an aperture of `f_number`; ``"A"``: the same, and no other
             aperture; ``"S"``: shutter by hand, the gain follows, and the aperture where the gain
             alone comes less near to the EV; ``"M"``: aperture and shutter by hand.
@@ -274,9 +255,6 @@ class RpiAgc(Policy):
             are whole periods, and the gain makes up for it (P and A). None: lamps are steady.
         speed: Share of the distance to the target that the filter goes per frame, in (0, 1].
         startup_frames: Frames of an episode in which it goes all of the way.
-
-    Raises:
-        ValueError: If an argument is unknown, out of range or of another program.
     """
 
     def __init__(

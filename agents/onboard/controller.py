@@ -48,12 +48,7 @@ class ExposureState(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What `Controller.decide` says.
-
-    Args:
-        state: The next exposure.
-        reason: Why it is the last one still; empty where it was chosen from the frame.
-    """
+    """The next exposure, and the reason why it is still the last one; empty where it is not."""
 
     state: ExposureState
     reason: str = ""
@@ -105,25 +100,18 @@ class Controller:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
             raise ValueError(f"{given} is damaged: its {where}: {first['msg']}") from None
-        self._shapes = {"raw": self.card.frame_shape, "settings": (3,)}
+        self.states = [ExposureState(*state) for state in self.card.states]
+        self.num_states = len(self.states)
+        #: Shape of a camera's frame: planes R, G1, G2, B, and their height and width.
+        self.frame_shape = self.card.frame_shape
+        self._shapes = {"raw": self.frame_shape, "settings": (3,)}
         if self.card.sensors:
             self._shapes["sensors"] = (2,)
         inputs = {node.name: tuple(node.shape[1:]) for node in self._session.get_inputs()}
         if inputs != self._shapes or self._session.get_outputs()[0].shape[1] != self.num_states:
             raise ValueError(f"{given} is damaged: its network takes {inputs}, not {self._shapes}")
-        self.states = [ExposureState(*state) for state in self.card.states]
         self._encoded = np.stack([self.encode_settings(state) for state in self.states])
         self.reset(num_cameras)
-
-    @property
-    def num_states(self) -> int:
-        """How many states there are to choose from, S."""
-        return len(self.card.states)
-
-    @property
-    def frame_shape(self) -> tuple[int, int, int]:
-        """Shape of a camera's frame: planes R, G1, G2, B, and their height and width."""
-        return self.card.frame_shape
 
     def reset(self, num_cameras: int = 1) -> None:
         """Forgets the frames so far."""

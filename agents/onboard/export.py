@@ -71,7 +71,6 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
     Args:
         policy: A `RegressionPolicy` without foresight, or a `PPOPolicy` without a history, that
             looks at pixels.
-        path: The ``.onnx`` file.
 
     Raises:
         ImportError: If the extra ``onnx`` is not installed.

@@ -7,24 +7,21 @@ import io
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from filelock import FileLock
 from numpy.typing import NDArray
+from torch import Tensor
 
+from ae_env.scenes import Scene
 from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import WITH_FILE, split_class, split_options
 from agents.report.evaluation import fill
 from simulator.utils.files import machine, versions, write_atomically
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from ae_env.scenes import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -176,26 +173,20 @@ def append_rows(
     # Through text, so that a table says the same whether its rows are new or read from the file.
     text = found.reindex(columns=COLUMNS).to_csv(index=False, float_format="%.4f")
     table.parent.mkdir(parents=True, exist_ok=True)
+    new, page = _parse(text), page_of(table)
     with FileLock(table.with_name(f".{table.name}.lock")):
-        return _merged(table, plan, _parse(text))
-
-
-def _merged(table: Path, plan: EvaluationPlan, found: pd.DataFrame) -> dict[str, Path]:
-    known = _read_own(table, plan)
-    both = pd.concat([known, found])
-    replaced = known.merge(found[_KEY].astype(str), on=_KEY)
-    for row in replaced.itertuples():
-        logger.warning("%s: replaced the row of %r by %r", table, row.policy, row.author)
-    both = both.drop_duplicates(_KEY, keep="last")
-    order = both.task.map(_TASKS.index)
-    both = both.assign(order=order, value=-both.score.astype(float))
-    both = both.sort_values(["order", "value"], kind="stable")[list(COLUMNS)]
-    page = page_of(table)
-    content = both.to_csv(index=False, lineterminator="\n")
-    return {
-        table.name: write_atomically(table, content),
-        page.name: write_atomically(page, table_page(plan, both, table)),
-    }
+        known = _read_own(table, plan)
+        for row in known.merge(new[_KEY], on=_KEY).itertuples():
+            logger.warning("%s: replaced the row of %r by %r", table, row.policy, row.author)
+        both = pd.concat([known, new]).drop_duplicates(_KEY, keep="last")
+        order, value = both.task.map(_TASKS.index), -both.score.astype(float)
+        both = both.assign(order=order, value=value).sort_values(["order", "value"], kind="stable")
+        both = both[list(COLUMNS)]
+        content = both.to_csv(index=False, lineterminator="\n")
+        return {
+            table.name: write_atomically(table, content),
+            page.name: write_atomically(page, table_page(plan, both, table)),
+        }
 
 
 def _read_own(table: Path, plan: EvaluationPlan) -> pd.DataFrame:

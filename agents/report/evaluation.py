@@ -92,7 +92,6 @@ def to_markdown(
     """A Markdown table with a line for each row; columns but the first are aligned to the right.
 
     Args:
-        rows: The rows.
         columns: Content of the cells by heading. Texts of a row are shown as they are, whatever
             they mean to Markdown; the result of a function is Markdown.
         missing: Text of a cell a value of which is missing, None or NaN. Where it is empty, columns
@@ -208,7 +207,7 @@ def write_report(
     extra_meta: Mapping[str, Any] | None = None,
     resamples: int = RESAMPLES,
 ) -> dict[str, Path]:
-    """Write everything that an evaluation shows into `out`.
+    """Write everything that an evaluation shows into `out`; returns the files by name.
 
     Those are ``results.json`` and ``report.md``; of frames also ``scenes.csv``, ``metrics.csv``,
     ``report.html`` and pictures: ``scores.png``, ``ev_error.png``, ``cost.png`` where decisions of
@@ -218,22 +217,16 @@ def write_report(
         results: The return value of `evaluate` or `run_plan`.
         out: Folder, made where missing.
         command: The command line that repeats the evaluation.
-        source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
-        split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
+        source, split, resamples: See `result_rows`.
         next_commands: Command lines for the reader to try next.
         extra_meta: Further entries of the JSON's ``meta``, such as training seeds.
-        resamples: Bootstrap resamples.
-
-    Returns:
-        The files by name.
     """
     folder, results = Path(out), as_results(results)
     result = results[static_condition(results)]
     ranking = overall_ranking(results, resamples=resamples)
     if result.measure == "quality":
         rows = bracket_rows(results, ranking)
-        assert result.plan is not None
-        meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
+        meta = result_meta(command, result.plan.seeds[0]) | {"plan": result.plan.protocol()}
         scenes = repr(result.plan.environment.get("scenes", "bundled"))
         apart = pd.Series(map(_difference, rows.to_best, rows.to_best_ci95))
         compared = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
@@ -244,8 +237,7 @@ def write_report(
         }
     rows = result_rows(results, source=source, split=split, resamples=resamples)
     meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
-    title = f"{rows.source[0]}, {rows.split[0]} split"
-    title = title if result.plan is None else result.plan.name
+    title = result.plan.name
     ends = pd.DataFrame([pair or (None, None) for pair in rows.ci95])
     table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
     columns = [name for name in ROW_COLUMNS if name != "ci95"]
@@ -301,16 +293,13 @@ def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
 
 def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
-    best, described, differences = best_meter(result), None, []
-    if result.plan is not None:
-        described = result.plan.describe()
-        protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
-        described["sha256"] = digest(protocol)
+    best, described, differences = best_meter(result), result.plan.describe(), []
+    protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
     if best is not None:
         differences = _records(difference_rows(result, best, resamples=resamples))
     return {
-        **result_meta(command, result.seed),
-        "plan": described,
+        **result_meta(command, result.plan.seeds[0]),
+        "plan": described | {"sha256": digest(protocol)},
         "episodes": len(result.scene_ids),
         "scenes": len(set(result.scene_ids.tolist())),
         "frames": result.scores.shape[1],
@@ -349,7 +338,6 @@ def _report(
         static=static,
         plan=plan,
         row=rows.iloc[0],
-        seed=result.seed,
         training_seeds=rows.training_seeds.max(),
         ranking=[
             row | {"best": _change(row["to_best"]), "next": _change(row["to_next"])}
@@ -366,7 +354,7 @@ def _report(
         histogram=_histogram_rows(meta["oracle_histogram"]),
         run=[
             {"condition": name, "lighting": str(one.lighting), "delay": str(one.delay)}
-            for name, one in (plan.all_conditions.items() if plan else ())
+            for name, one in plan.all_conditions.items()
         ],
         **more,
     )
@@ -424,15 +412,11 @@ def _histogram_rows(histogram: Mapping[str, Mapping[str, float]]) -> list[dict[s
         "exposure_time": format_exposure_time,
         "f_number": "f/{:g}".format,
     }
-    return [
-        {
-            "control": name.replace("_", " "),
-            "share": ", ".join(
-                f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()
-            ),
-        }
-        for name, own in histogram.items()
-    ]
+    rows = []
+    for name, own in histogram.items():
+        shares = (f"{labels[name](float(value))}: {share:.0%}" for value, share in own.items())
+        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
+    return rows
 
 
 def fill(template: str, **values: Any) -> str:

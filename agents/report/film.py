@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from agents.rollouts import errors_of
-from simulator.utils.files import write_atomically
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
-    from agents.policy import Policy
+from agents.policy import Policy
+from agents.rollouts import choose, errors_of
+from simulator.utils.files import write_picture
 
 #: Size of a picture, height of the chart below it and of the title above [pixel].
 PICTURE, CHART, TITLE, GAP = 192, 64, 34, 8
@@ -62,9 +58,7 @@ def record(
     found = Recording(name)
     for frame in range(frames + 1):
         if frame:
-            with errors_of(name, "act"):
-                extra = {"info": info} if getattr(policy, "privileged", False) else {}
-                actions = policy.act(observations, base.action_masks(), **extra)
+            actions = choose(name, policy, observations, base.action_masks(), info)
             observations, _, _, _, info = envs.step(actions)
         pictures: Any = envs.render()
         found.pictures.append(pictures[0])
@@ -94,10 +88,9 @@ def write_film(
         images.append(image.quantize(COLOURS, dither=Image.Dither.NONE))
         if progress is not None:
             progress(frame + 1, total)
-    content = io.BytesIO()
-    more: dict[str, Any] = {"append_images": images[1:], "duration": 1000 // FRAME_RATE}
-    images[0].save(content, format="GIF", save_all=True, loop=0, optimize=True, **more)
-    return write_atomically(path, content.getvalue())
+    timing = {"loop": 0, "duration": 1000 // FRAME_RATE}
+    animation = {"save_all": True, "append_images": images[1:], "optimize": True}
+    return write_picture(path, images[0], **animation, **timing)
 
 
 def _panel(recording: Recording, frame: int) -> Image.Image:

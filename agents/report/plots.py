@@ -12,7 +12,7 @@ from PIL import Image
 
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
-from simulator.utils.files import write_atomically
+from simulator.utils.files import write_picture
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -179,7 +179,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
     """
     from ae_env.rendering import MAX_SHEET_STATES, contact_sheet
 
-    if result.plan is None or not result.scenes or len(result.grid) > MAX_SHEET_STATES:
+    if not result.scenes or len(result.grid) > MAX_SHEET_STATES:
         return {}
     kinds = result.kinds.tolist()
     episode = next((kinds.index(kind) for kind in _KINDS if kind in kinds), 0)
@@ -197,9 +197,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
             **result.moves(episode),
         )
         name = "contact_sheet.webp" if k == 0 else f"contact_sheet_{k + 1}.webp"
-        stream = io.BytesIO()
-        picture.save(stream, format="WEBP", quality=_QUALITY)
-        files[name] = write_atomically(folder / name, stream.getvalue())
+        files[name] = write_picture(folder / name, picture, quality=_QUALITY)
     return files
 
 
@@ -231,7 +229,5 @@ def _write(path: Path, figure: Figure) -> Path:
 
 def write_palette_png(path: Path, picture: Image.Image) -> Path:
     """Write a picture as PNG of 256 colours: a third of the bytes, no visible loss."""
-    stream = io.BytesIO()
     indexed = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    indexed.save(stream, format="PNG", optimize=True)
-    return write_atomically(path, stream.getvalue())
+    return write_picture(path, indexed, optimize=True)

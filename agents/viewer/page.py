@@ -20,7 +20,7 @@ from nicegui import app, run, ui
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage
 from agents.viewer.one_raw_page import OneRawPage
-from agents.viewer.tab import complain
+from agents.viewer.tab import complain, loading
 from agents.viewer.viewed_scene import Library, ViewedScene
 from simulator import CameraSimulator
 from simulator.camera_simulator import Depth
@@ -95,11 +95,10 @@ def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
 async def show_page(options: Options) -> None:
     """Puts the page together, for one tab of the browser, and opens the first scene."""
     ui.add_css(_STYLE.read_text())
-    page = Page(options)
     client = ui.context.client
     await client.connected()
-    if not client.is_deleted:  # of a page that nobody ever looked at
-        await page.open(options.library.first)
+    if not client.is_deleted:  # a page that nobody looks at costs nothing
+        await Page(options).open(options.library.first)
 
 
 class Page:
@@ -126,7 +125,7 @@ class Page:
                 on_rejected=lambda: ui.notify(most, type="negative"),
             ).classes("hidden")
             pick = partial(upload.run_method, "pickFiles")
-            ui.button("Open raw", icon="upload", on_click=pick).props("dense")
+            self._open = ui.button("Open raw", icon="upload", on_click=pick).props("dense")
             self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")
         with ui.tabs().props("dense align=left") as tabs:
             for name in _TABS:
@@ -205,14 +204,15 @@ class Page:
         if stored > _MOST_STORED:
             complain(f"More than {_MOST_STORED // 10**9} GB are open: close other tabs first.")
             return
-        path = Path(tempfile.mkdtemp(dir=self._folder), name)
-        try:
-            await event.file.save(path)
-            own = await run.io_bound(self._library.add, path, name)
-        except (ValueError, OSError) as error:
-            path.unlink(missing_ok=True)
-            complain(error)
-            return
+        own = None
+        with loading(self._open):
+            path = Path(tempfile.mkdtemp(dir=self._folder), name)
+            try:
+                await event.file.save(path)
+                own = await run.io_bound(self._library.add, path, name)
+            finally:
+                if own is None:
+                    shutil.rmtree(path.parent, ignore_errors=True)
         if own is not None:
             await self.open(own)
 

@@ -45,8 +45,8 @@ class Tab:
 
     async def download(self, button: ui.button, name: str, write: Callable[[Path], object]) -> None:
         """Sends the browser the file called `name` that `write` writes to a path."""
-        path = Path(tempfile.mkdtemp(dir=self.folder), name)
         with loading(button):
+            path = Path(tempfile.mkdtemp(dir=self.folder), name)
             await run.io_bound(write, path)
             ui.download.file(path)
 
@@ -74,7 +74,8 @@ def loading(
 
 def complain(error: Exception | str) -> None:
     """Shows an error as a notice."""
-    ui.notify(" ".join(str(error).split()), type="negative", multi_line=True, timeout=10_000)
+    text = " ".join(str(error).split()).encode(errors="replace").decode()  # names of files, too
+    ui.notify(text, type="negative", multi_line=True, timeout=10_000)
 
 
 class Stage:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import chain, count
@@ -84,14 +84,20 @@ class Library:
     def add(self, path: Path, name: str) -> str:
         """Adds the raw at `path`; returns the name it got, `name` with a number where taken."""
         _read_raw(path, name)
-        numbered = (f"{name} ({number})" for number in count(2))
-        own = next(text for text in chain([name], numbered) if text not in self.readers)
+        own = _free_name(name, self.readers)
         self.readers[own] = partial(_read_raw, path, name)
         return own
 
     def open(self, name: str) -> OpenedScene:
         """The scene called `name`."""
         return self.readers[name]()
+
+
+def _free_name(name: str, taken: Container[str]) -> str:
+    """`name` as it can be shown, with a number where it is taken."""
+    name = name.encode(errors="surrogateescape").decode(errors="replace")
+    numbered = (f"{name} ({number})" for number in count(2))
+    return next(text for text in chain([name], numbered) if text not in taken)
 
 
 @lru_cache(maxsize=_KEPT)
@@ -115,11 +121,10 @@ def find_scenes(what: str) -> Library:
         readers: dict[str, Callable[[], OpenedScene]] = {}
         for path in files:
             if path.suffix.lower() in RADIANCE_SUFFIXES:
-                readers |= _loaded(str(path))
+                readers |= _loaded(str(path), readers)
             else:
                 own = path != base and path.is_relative_to(base)
-                name = str(path.relative_to(base)) if own else path.name
-                name = name.encode(errors="surrogateescape").decode(errors="replace")  # to be shown
+                name = _free_name(str(path.relative_to(base)) if own else path.name, readers)
                 readers[name] = partial(_read_raw, path, name)
         return Library(readers, _first_readable(what, readers))
     try:
@@ -153,10 +158,11 @@ def _first_readable(what: str, readers: Mapping[str, Callable[[], OpenedScene]])
     raise ValueError(f"`what` (={what!r}) must hold a raw that can be read, but none can: {named}")
 
 
-def _loaded(spec: str) -> dict[str, Callable[[], OpenedScene]]:
+def _loaded(spec: str, taken: Container[str] = ()) -> dict[str, Callable[[], OpenedScene]]:
     """The scenes that `load_scenes` makes of `spec`, by id."""
     scenes = load_scenes(spec, "all", camera=get_camera(CAMERA), resolution=None)
-    return {scene.scene_id: partial(OpenedScene, scene) for scene in scenes}
+    named = {_free_name(scene.scene_id, taken): scene for scene in scenes}
+    return {name: partial(OpenedScene, replace(s, scene_id=name)) for name, s in named.items()}
 
 
 def _bundled() -> dict[str, Callable[[], OpenedScene]]:

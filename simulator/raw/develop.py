@@ -145,8 +145,12 @@ def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
     """
     if pictures.is_floating_point():
         return _decoded(pictures.float())[:, [0, 1, 1, 2]]
-    light = _decoded(torch.arange(256, dtype=torch.float64) / 255.0).float()
-    return light.to(pictures.device)[pictures.long()][:, [0, 1, 1, 2]]
+    light = _decoded(torch.arange(256, dtype=torch.float64) / 255.0).float().to(pictures.device)
+    size, (height, width) = len(pictures), pictures.shape[2:]
+    raws = light.new_empty(size, 4, height, width)
+    for plane, source in enumerate((0, 1, 1, 2)):  # a large picture's indices take much memory
+        raws[:, plane] = light[pictures[:, source].long()]
+    return raws
 
 
 def upright(picture: np.ndarray, raw: RawImage) -> np.ndarray:

@@ -100,7 +100,7 @@ class PackedCapture:
         A `ValueError` unless it is a finite (4, H, W) array of floating-point numbers.
         """
         try:
-            red, green_1, blue, green_2 = np.load(self.file, allow_pickle=False)
+            red, green_1, blue, green_2 = np.load(self.file, mmap_mode="r", allow_pickle=False)
             planes = torch.from_numpy(np.stack([red, green_1, green_2, blue]))
         except (ValueError, TypeError, EOFError) as error:
             rule = "must be a whole .npy file of numbers, (4, H, W): R, G1, B, G2"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import re
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -17,10 +17,12 @@ from simulator.utils.checks import did_you_mean
 
 #: Most bytes of a YAML file.
 MAX_BYTES = 2**20
+#: Most values of a YAML file, those of an alias counted wherever it stands.
+MAX_VALUES = 2**18
 #: Environment variable: folders whose YAML files may name Python code, or ``all``.
 TRUST_VARIABLE = "AE_ENV_TRUST"
-#: A class or function of a file or module, with options behind it or not.
-_CODE = re.compile(r"(?P<head>.+\.py|[A-Za-z_]\w*(\.[A-Za-z_]\w*)*):[A-Za-z_][\w.]*(\?.*)?|.+\.py")
+#: A package that stands before the names of its metrics, of which none is code.
+_METRICS = "pyiqa"
 
 #: Words for pydantic's errors that name Python types.
 _PLAIN = {
@@ -68,8 +70,8 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
     folder; `name` is the argument that gave the path, for error messages.
 
     Raises:
-        ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or not YAML, gives
-            an entry twice, or names Python code.
+        ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or `MAX_VALUES`
+            or not YAML, gives an entry twice, or names Python code.
     """
     file = Path(path).expanduser()
     cause: Exception | None = None
@@ -80,10 +82,10 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
             fault = f"must not be larger than {MAX_BYTES} bytes"
         else:
             content = yaml.load(file.read_text(encoding="utf-8"), _Loader)
-            code = None if _is_trusted(file) else next(filter(_names_code, _texts(content)), None)
-            if code is None:
+            named = list(filter(_names_code, _texts(content)))
+            if not named or _is_trusted(file):
                 return content
-            fault = f"it names Python code ({code!r}), which would run: read both, then give "
+            fault = f"it names Python code ({named[0]!r}), which would run: read both, then give "
             fault += f"--trust, or name the folder in {TRUST_VARIABLE}"
     except OSError as error:
         fault, cause = f"cannot be read: {error.strerror}", error
@@ -103,25 +105,29 @@ def _is_trusted(file: Path) -> bool:
 
 
 def _texts(content: Any) -> Iterator[str]:
-    """All texts of a YAML file, keys among them."""
-    if isinstance(content, str):
-        yield content
-    elif isinstance(content, dict):
-        for pair in content.items():
-            yield from _texts(list(pair))
-    elif isinstance(content, list):
-        for value in content:
-            yield from _texts(value)
+    """All texts of a YAML file, keys among them; an error for more than `MAX_VALUES` values."""
+    waiting, count = [content], 0
+    while waiting:
+        value, count = waiting.pop(), count + 1
+        if count > MAX_VALUES:
+            raise ValueError(f"its aliases stand for more than {MAX_VALUES} values")
+        if isinstance(value, bytes):  # of `!!binary`; pydantic takes them as text
+            value = value.decode(errors="replace")
+        if isinstance(value, str):
+            yield value
+        elif isinstance(value, Iterable):
+            waiting.extend(chain(*value.items()) if isinstance(value, dict) else value)
 
 
 def _names_code(text: str) -> bool:
-    """Whether a text names a Python file, or a class or function of a module that there is."""
-    found = _CODE.fullmatch(text)
-    if found is None:
-        return False
-    head = found["head"] or text
+    """Whether a text names a Python file, or anything of a module that there is."""
+    text = text.strip()
+    head, colon, _ = text.partition(":")
+    top = head.partition(".")[0]  # to look for a submodule would run its parent
+    if ".py:" in text or text.endswith(".py"):
+        return True
     try:
-        return head.endswith(".py") or "." in head or importlib.util.find_spec(head) is not None
+        return bool(colon and top and find_spec(top)) and head != _METRICS
     except ValueError:  # such as `__main__`
         return True
 
@@ -133,14 +139,27 @@ class _GivenTwice(Exception):
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, which by itself takes the last of two entries of one name."""
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._flat: set[int] = set()  # mappings that have the entries of what they merge
+        self._entries = 0
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        if id(node) in self._flat:
+            return
+        self._flat.add(id(node))
         seen: set[tuple[str, str]] = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if (key.tag, key.value) in seen:
+        for key, value in node.value:
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
                 line = key.start_mark.line + 1
                 raise _GivenTwice(f"the entry {key.value!r} is given twice, again in line {line}")
-            seen.add((key.tag, key.value))
-        return super().construct_mapping(node, deep)
+            seen.add((key.tag, str(key.value)))
+            if key.tag == "tag:yaml.org,2002:merge" and isinstance(value, yaml.SequenceNode):
+                raise ValueError("`<<` merges one mapping, not a list of them")
+        super().flatten_mapping(node)
+        self._entries += len(node.value)
+        if self._entries > MAX_VALUES:
+            raise ValueError(f"it merges more than {MAX_VALUES} entries")
 
 
 def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import datetime
 import functools
 import importlib.metadata
+import io
 import json
 import operator
 import os
 import platform
 import secrets
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,8 +35,9 @@ RAW_SUFFIXES = (
     *(".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
     ".x3f",
 )
-#: Endings of developed pictures.
+#: Endings of developed pictures, and Pillow's formats of those; of others it runs programs (EPS).
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+_PICTURE_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
 #: Most pixels that a raw or a radiance map may claim: more than any camera with a Bayer array has.
 MAX_PIXELS = 2**28
@@ -88,7 +90,7 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
 
 
 @contextmanager
-def open_picture(path: Path, formats: list[str] | None = None) -> Iterator[Image.Image]:
+def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Iterator[Image.Image]:
     """A developed picture, of `formats` of Pillow only; pixels are decoded when they are asked for.
 
     Raises:
@@ -99,7 +101,7 @@ def open_picture(path: Path, formats: list[str] | None = None) -> Iterator[Image
     from PIL import Image
 
     try:
-        with Image.open(path, formats=formats) as picture:
+        with Image.open(path, formats=list(formats)) as picture:
             if picture.width * picture.height > MAX_PICTURE_PIXELS:
                 size = f"{picture.width} x {picture.height} pixels"
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")
@@ -142,6 +144,13 @@ def write_atomically(
         with suppress(OSError):  # after the renaming there is none
             temporary.unlink()
     return path
+
+
+def write_picture(path: Path, picture: Image.Image, **options: Any) -> Path:
+    """Write a picture of Pillow atomically, in the format that the ending of `path` names."""
+    content = io.BytesIO()
+    picture.save(content, path.suffix[1:].upper(), **options)
+    return write_atomically(path, content.getvalue())
 
 
 def sibling(path: str | Path, suffix: str) -> Path:

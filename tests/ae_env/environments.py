@@ -1,25 +1,24 @@
 """Small environments, one and many, and the comparison of what they show."""
 
 import functools
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 ID = "ae_env/AutoExposure-v0"
-SMALL: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
+SMALL = {"scenes": "bundled:small", "resolution": 36}
 
 
-def make_env(task: str = ID, **arguments: Any) -> gym.Env:
+def make_env(task=ID, **arguments):
     return gym.make(f"ae_env:{task}", **{**SMALL, **arguments})
 
 
-def make_envs(num_envs: int = 3, task: str = ID, **arguments: Any) -> gym.vector.VectorEnv:
+def make_envs(num_envs=3, task=ID, **arguments):
     return gym.make_vec(f"ae_env:{task}", num_envs=num_envs, **{**SMALL, **arguments})
 
 
-def rollout(seed: int, **arguments: Any) -> list[Any]:
+def rollout(seed, **arguments):
     """Eight steps of an episode, and the beginning of the next."""
     env = make_env(**arguments)
     frames = [env.reset(seed=seed)]
@@ -27,7 +26,7 @@ def rollout(seed: int, **arguments: Any) -> list[Any]:
     return [*frames, env.reset()]
 
 
-def assert_equal(first: Any, second: Any, where: str = "", **tolerance: float) -> None:
+def assert_equal(first, second, where="", **tolerance):
     """Equal values in equal shapes, whatever the order of the keys."""
     assert type(first) is type(second), where
     if isinstance(first, dict):
@@ -45,7 +44,7 @@ def assert_equal(first: Any, second: Any, where: str = "", **tolerance: float) -
         assert first == second, where
 
 
-def assert_same(first: Any, second: Any, where: str = "") -> None:
+def assert_same(first, second, where=""):
     """As `assert_equal`, but for the last digits of scores (float64).
 
     The exponentials of the last pixels of a batch are rounded differently: up to 15 of them move
@@ -54,11 +53,11 @@ def assert_same(first: Any, second: Any, where: str = "") -> None:
     assert_equal(first, second, where, rtol=1e-8, atol=1e-12)
 
 
-def named(envs: Any, results: tuple[Any, ...]) -> tuple[Any, ...]:
+def named(envs, results):
     """What `envs` returned, with names in its info as single environments have them."""
     tables = {"scene_id": envs.unwrapped.scene_ids, "modules": envs.unwrapped.module_names}
 
-    def names(info: dict[str, Any]) -> dict[str, Any]:
+    def names(info):
         info = {k: names(v) if isinstance(v, dict) else v for k, v in info.items()}
         for key, table in tables.items():
             if key in info:
@@ -69,7 +68,7 @@ def named(envs: Any, results: tuple[Any, ...]) -> tuple[Any, ...]:
     return (*results[:-1], names(results[-1]))
 
 
-def check_parity(seed: int, steps: int, mode: str = "SAME_STEP", **arguments: Any) -> None:
+def check_parity(seed, steps, mode="SAME_STEP", **arguments):
     """The native vector environment shows what single ones show, out of step with each other."""
     make = functools.partial(make_env, **arguments)
     envs = make_envs(autoreset_mode=mode, **arguments)

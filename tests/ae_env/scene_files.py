@@ -5,15 +5,13 @@ The grids are photographed by the reference camera and written in the three layo
 
 import csv
 import functools
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
 from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes import load_scenes
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 from simulator.raw.develop import develop
 from simulator.reference.reference_camera import ReferenceCamera
@@ -23,15 +21,13 @@ from tests.simulator.training.scenes import scene
 GRID = ExposureGrid((100, 1600), (1 / 1000, 1 / 125), (4, 8))
 
 
-def load(
-    spec: object, split: str = "all", resolution: int | None = 16, **options: object
-) -> list[Scene]:
+def load(spec, split="all", resolution=16, **options):
     """Scenes of `spec`, which is a path where there are `options`."""
     camera, spec = get_camera("nikon_z6"), {"path": spec, **options} if options else spec
     return load_scenes(spec, split, camera=camera, resolution=resolution)
 
 
-def write_hdr(path: Path, seed: int = 0, image: np.ndarray | None = None) -> None:
+def write_hdr(path, seed=0, image=None):
     """`image` (H, W, 3), or a random one, as a Radiance file; its folder is made."""
     cv2 = pytest.importorskip("cv2")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,7 +36,7 @@ def write_hdr(path: Path, seed: int = 0, image: np.ndarray | None = None) -> Non
     path.write_bytes(cv2.imencode(".hdr", image[..., ::-1].astype(np.float32))[1].tobytes())
 
 
-def write_exr(path: Path, image: np.ndarray, compression: str = "ZIP") -> None:
+def write_exr(path, image, compression="ZIP"):
     """`image` (H, W, 3) or, grey, (H, W) as OpenEXR."""
     openexr = pytest.importorskip("OpenEXR")
     header = {"compression": getattr(openexr, f"{compression}_COMPRESSION")}
@@ -59,9 +55,7 @@ def capture(settings: CameraSettings, seed: int = 0, size: int = 40) -> RawImage
     return RawImage(sample, settings, camera)
 
 
-def write_picture(
-    path: Path, settings: CameraSettings, seed: int = 0, *, exif: Sequence[str] = ()
-) -> None:
+def write_picture(path, settings, seed=0, *, exif=()):
     """The developed capture as a JPEG or PNG; of its settings, those named stand in its EXIF."""
     rgb = develop(capture(settings, seed).data[None].clamp(0.0, 1.0))[0]
     picture = Image.fromarray((rgb * 255.0).round().byte().permute(1, 2, 0).numpy())
@@ -76,14 +70,14 @@ def write_picture(
     picture.save(path, exif=stated)
 
 
-def write_raws(folder: Path, grid: Sequence[CameraSettings] = tuple(GRID), seed: int = 0) -> None:
+def write_raws(folder, grid=tuple(GRID), seed=0):
     """One scene: a DNG for each state, which its EXIF states."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, settings in enumerate(grid):
         write_dng(folder / f"IMG_{number:04d}.dng", capture(settings, seed))
 
 
-def write_states(folder: Path, seeds: Sequence[int] = (0, 1), grid: ExposureGrid = GRID) -> None:
+def write_states(folder, seeds=(0, 1), grid=GRID):
     """As ImageNet-ES: ``l1/param_3/CLASS/PICTURE.JPEG``, and its table of the states."""
     names = {seed: f"n{seed:08d}/val_{seed}.JPEG" for seed in seeds}
     rows = []
@@ -96,9 +90,7 @@ def write_states(folder: Path, seeds: Sequence[int] = (0, 1), grid: ExposureGrid
         csv.writer(stream).writerows([["", "idx", "iso", "ss", "aperture"], *rows])
 
 
-def write_video(
-    folder: Path, frames: int = 3, times: Sequence[str] = ("1-1000s", "1-250s", "1-60s")
-) -> None:
+def write_video(folder, frames=3, times=("1-1000s", "1-250s", "1-60s")):
     """Stacks of video: ``SCENE/frame_0002/1-60s.png`` at ISO 400 and f/4, every frame another."""
     for frame in range(frames):
         for time in times:

@@ -1,14 +1,12 @@
 """Pictures and captures that the tests of the scorers share."""
 
-from typing import Any
-
 import numpy as np
 import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
-from ae_env.scorers.captures import Captures, describe_captures
-from simulator import CameraSettings, get_camera, incident_ev100
+from ae_env.scorers.captures import describe_captures
+from simulator import get_camera, incident_ev100
 
 CAMERA = get_camera("nikon_z6")
 GRID = ExposureGrid.default()
@@ -23,7 +21,7 @@ def random_pictures(count: int = 5, height: int = 23, width: int = 17, seed: int
     return torch.from_numpy(frames.clip(0.0, 1.0).astype(np.float32))
 
 
-def make_scene(light: np.ndarray, illuminance: float | None = 1000.0, **fields: Any) -> Scene:
+def make_scene(light, illuminance=1000.0, **fields):
     """`light` (4, H, W) as the incident-light exposure records it."""
     return Scene.from_array(
         torch.from_numpy(light.astype(np.float32)),
@@ -34,19 +32,12 @@ def make_scene(light: np.ndarray, illuminance: float | None = 1000.0, **fields: 
     )
 
 
-def random_scene(**fields: Any) -> Scene:
+def random_scene(**fields):
     light = 0.12 * np.exp(np.random.default_rng(0).normal(0.0, 1.2, (4, 40, 40)))
     return make_scene(light, **fields)
 
 
-def make_captures(
-    scenes: Scene | list[Scene],
-    states: list[CameraSettings],
-    speed: float = 0.0,
-    defocus: float = 0.0,
-    gain: float = 1.0,
-    row_gain: np.ndarray | None = None,
-) -> Captures:
+def make_captures(scenes, states, speed=0.0, defocus=0.0, gain=1.0, row_gain=None):
     """One capture of each state, all of one scene or each of its own."""
     ones = np.ones(len(states))
     scenes = [scenes] * len(states) if isinstance(scenes, Scene) else scenes
@@ -54,22 +45,20 @@ def make_captures(
     return describe_captures(scenes, states, CAMERA, **blur, gain=gain * ones, row_gain=row_gain)
 
 
-def captures_of(light: np.ndarray, states: list[CameraSettings]) -> Captures:
+def captures_of(light, states):
     """Captures of `light` (4, H, W), which is what ISO 100, f/4, 1/64 s records."""
     return make_captures(make_scene(light, 2560.0), states)
 
 
-def mean_signal(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+def mean_signal(images, captures):
     return images.mean(dim=(1, 2, 3))
 
 
 class Own:
     """A scorer that is a function of its images and captures."""
 
-    def __init__(
-        self, function: Any = mean_signal, domain: str = "raw", depends_on: str = "image"
-    ) -> None:
+    def __init__(self, function=mean_signal, domain="raw", depends_on="image") -> None:
         self.function, self.domain, self.depends_on = function, domain, depends_on
 
-    def __call__(self, images: torch.Tensor, captures: Captures) -> Any:
+    def __call__(self, images, captures):
         return self.function(images, captures)

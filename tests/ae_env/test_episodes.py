@@ -5,7 +5,6 @@ import math
 import pickle
 import signal
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +14,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NumpyToTorch
 
 from ae_env.observation import encode_observation
-from ae_env.scenes import Scene
 from ae_env.scenes.load import _LOADED
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures, prepare_scene
@@ -28,7 +26,7 @@ from tests.ae_env.environments import assert_equal, assert_same, check_parity, m
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
 
-def _frames(env: Any) -> list[tuple[np.ndarray, ...]]:
+def _frames(env):
     rng = np.random.default_rng(0)
     shown = [env.reset(seed=3)]
     shown += [env.step(rng.integers(64, size=3))[::4] for _ in range(10)]
@@ -55,7 +53,7 @@ def test_rows_of_the_read_noise_show_where_asked_for() -> None:
 @pytest.mark.parametrize("noise", ["bank", "exact"])
 @pytest.mark.parametrize("tolerance", [0.0, 0.1])
 @pytest.mark.parametrize("lighting", ["static", "sine"])
-def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lighting: str) -> None:
+def test_frames_are_those_of_the_simulator(noise, tolerance, lighting):
     """Light of `PreparedScene`, noise from the bank or drawn, step by step in float64."""
     envs = make_envs(noise=noise, tolerance=tolerance, lighting=lighting, observation="dn")
     core = envs.core
@@ -92,7 +90,7 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
 def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
     seen: list[torch.Tensor] = []
 
-    def watch(images: torch.Tensor, captures: Any) -> torch.Tensor:
+    def watch(images, captures):
         seen.append(images.clone())
         return torch.full((len(images),), 0.5)
 
@@ -106,15 +104,6 @@ def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
     assert torch.equal(first[bright], codes[bright])
 
 
-@pytest.mark.parametrize("noise", ["bank", "exact", False])
-def test_frames_do_not_depend_on_the_number_of_threads(noise: Any) -> None:
-    frames = []
-    for number in (1, 2):
-        torch.set_num_threads(number)
-        frames.append(_frames(make_envs(noise=noise)))
-    assert_equal(*frames)
-
-
 def test_white_is_1_whatever_the_black_level() -> None:
     """In float32 (1023 - 103.34) / (1023 - 103.34) is 1.0000001."""
     camera = replace(CAMERA, black_level=(103.34,) * 4, white_level=1023.0)
@@ -126,7 +115,7 @@ def test_white_is_1_whatever_the_black_level() -> None:
 
 
 @pytest.mark.parametrize("arguments", [{"motion": "none", "depth": "far"}, {}])
-def test_expected_rewards_are_those_of_the_running_episodes(arguments: dict[str, Any]) -> None:
+def test_expected_rewards_are_those_of_the_running_episodes(arguments):
     arguments = {"autoreset_mode": "SAME_STEP", "reward": "expected", **arguments}
     envs = make_envs(8, max_episode_steps=2, **arguments)
     core, rng = envs.core, np.random.default_rng(0)
@@ -147,7 +136,7 @@ def test_expected_rewards_are_those_of_the_running_episodes(arguments: dict[str,
 @pytest.mark.parametrize(
     "given", [{"motion": 0.5, "depth": 2.0, "delay": 1}, {"task": "ae_env/ExposureBracket-v0"}]
 )
-def test_a_copy_goes_on_like_the_original(given: Any, copied: Any) -> None:
+def test_a_copy_goes_on_like_the_original(given, copied):
     envs = make_envs(3, **given)
     envs.reset(seed=0)
     envs.step(np.array([0, 1, 6]))
@@ -158,7 +147,7 @@ def test_a_copy_goes_on_like_the_original(given: Any, copied: Any) -> None:
     assert len(pickle.dumps(envs)) < 0.5 * light  # no scenes that have a name
 
 
-def _scene(allowed: Any, scene_id: str = "holes") -> Scene:
+def _scene(allowed, scene_id="holes"):
     return make_scene(np.full((4, 40, 40), 0.12), 640.0, scene_id=scene_id, allowed=allowed)
 
 
@@ -192,12 +181,12 @@ def test_forbidden_states_are_masked_never_best_and_never_drawn() -> None:
 LED = {"kind": "flicker", "frequency": 250.0, "duty": 0.3, "frame_rate": 24.0}
 
 
-def _grey() -> Scene:
+def _grey():
     light = 0.05 + 0.3 * np.random.default_rng(0).random((4, 40, 40), np.float32)
     return make_scene(light, 640.0, scene_id="grey", box_factor=4)
 
 
-def _env(**arguments: Any) -> Any:
+def _env(**arguments):
     given = {"scenes": [_grey()], "resolution": 40, "motion": "none", "depth": "far"}
     return make_env(**{**given, **arguments}).unwrapped
 
@@ -209,7 +198,7 @@ def _env(**arguments: Any) -> Any:
         (LED, lambda phase: PulsedLamp(250.0, 0.3, phase)),
     ],
 )
-def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any) -> None:
+def test_frames_are_those_of_the_reference_camera(lighting, make_lamp):
     env, scene = _env(lighting=lighting, noise=False, observation="linear"), _grey()
     reference = ReferenceCamera(CAMERA, box_factor=4)
     native = scene.light.repeat_interleave(4, 1).repeat_interleave(4, 2)
@@ -225,7 +214,7 @@ def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any)
 
 
 @pytest.mark.parametrize("scorer", ["balanced", {"balanced": 0.7, "banding": 0.3}])
-def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> None:
+def test_scores_of_all_states_have_their_own_exposures_light(scorer):
     given = {"with_oracle": True, "motion": 0.05, "depth": 0.5, "noise": False}
     env = _env(lighting=LED, scorer=scorer, reward="expected", **given)
     env.reset(seed=0)
@@ -258,7 +247,7 @@ BANDED["lighting"] = {"kind": "flicker", "frequency": 500, "duty": 0.2}
         *(("SAME_STEP", extra) for extra in ({"noise": "exact"}, BANDED)),
     ],
 )
-def test_parity_with_sync_vector_env(mode: str, extra: dict[str, Any]) -> None:
+def test_parity_with_sync_vector_env(mode, extra):
     check_parity(11, 9, mode, max_episode_steps=3, **extra)
 
 

@@ -115,9 +115,7 @@ def test_exposure_values_by_hand_and_the_nearest_state() -> None:
         assert grid.nearest(target) == np.flatnonzero(distance < distance.min() + 1e-9)[0]
     with pytest.raises(ValueError, match="`ev100`"):
         grid.nearest(float("nan"))
-
-
-def test_axes_are_any_numbers() -> None:
+    # Axes are any numbers.
     lists = ([100, 200], [0.125, 0.25], [2.0, 4.0])
     wanted = ExposureGrid(*map(tuple, lists))
     for make in (torch.tensor, np.array, iter, dict.fromkeys):

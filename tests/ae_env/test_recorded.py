@@ -5,7 +5,6 @@ import pickle
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,15 +20,9 @@ from ae_env.scenes.load import _LOADED
 from simulator import CameraSettings, exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
 from simulator.reference.reference_camera import ReferenceCamera
+from tests.ae_env import scene_files
 from tests.ae_env.environments import ID, check_parity, make_env
-from tests.ae_env.scene_files import (
-    GRID,
-    capture,
-    write_picture,
-    write_raws,
-    write_states,
-    write_video,
-)
+from tests.ae_env.scene_files import GRID, capture, write_picture, write_raws, write_states
 from tests.simulator.training.scenes import scene as reference_scene
 
 CAMERA = get_camera("nikon_z6")
@@ -158,7 +151,7 @@ def link(path: Path) -> None:
         (only_one_state, "1 of 1 captures in the grid, .*param_3"),
     ],
 )
-def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil: Any, message: str) -> None:
+def test_bad_files_get_one_line_that_names_them(tmp_path, spoil, message):
     write_states(tmp_path)
     if spoil:
         spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
@@ -241,7 +234,7 @@ def test_imagenet_es_and_video_stacks(tmp_path: Path) -> None:
     assert recorded.recorded_grid(files) == grid
     by_folder = {f.path.parts[-3]: f.settings for f in files}
     assert by_folder == {f"param_{i + 1}": s for i, s in enumerate(grid)}
-    write_video(tmp_path / "video", frames=11, times=("1-1000s", "1-60s"))
+    scene_files.write_video(tmp_path / "video", frames=11, times=("1-1000s", "1-60s"))
     scenes = load({"recorded": tmp_path / "video", "iso": 400, "f_number": 4})
     assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]
     assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
@@ -264,13 +257,13 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def video(tmp_path_factory):
     folder = tmp_path_factory.mktemp("video")
-    write_video(folder)
+    scene_files.write_video(folder)
     return {"recorded": str(folder), "iso": 400, "f_number": 4}
 
 
-def arguments(scenes: Any, **more: Any) -> dict[str, Any]:
+def arguments(scenes, **more):
     spec = f"recorded:{scenes}" if isinstance(scenes, Path) else scenes
     return {"scenes": spec, "split": "test", **more}
 
@@ -297,7 +290,7 @@ def test_every_observation_is_the_capture(raws: Path) -> None:
 
 
 def test_states_without_a_capture_are_masked_and_never_shown(raws: Path) -> None:
-    base: Any = make_env(**arguments(raws)).unwrapped
+    base = make_env(**arguments(raws)).unwrapped
     assert base.action_space.n == len(GRID)
     for seed in range(8):  # no episode starts there
         _, info = base.reset(seed=seed, options={"scene": "b"})
@@ -313,7 +306,7 @@ def test_states_without_a_capture_are_masked_and_never_shown(raws: Path) -> None
     _, info = base.reset(seed=0, options={"scene": "b", "state": 5})
     assert info["state"] == 3
     # Of the 64 states those at f/4 and f/8 with ISO 100 or 1600 and 1/1000 or 1/125 s were taken.
-    named: Any = make_env(**arguments(raws, grid="default")).unwrapped
+    named = make_env(**arguments(raws, grid="default")).unwrapped
     assert named.action_space.n == 64
     (whole,) = (scene for scene in named.scenes if scene.scene_id == "a")
     assert whole.allowed.sum() == 8
@@ -328,7 +321,7 @@ def test_the_nearest_capture_is_nearest_in_exposure_first() -> None:
     assert nearest_recorded(scene, grid).tolist() == [0, 1, 1, 3, 4, 3]
 
 
-def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str, Any]) -> None:
+def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video):
     env = make_env(**arguments(video))
     _, info = env.reset(seed=0, options={"scene": "street", "state": 0})
     shown = [info["scene_id"]]
@@ -345,7 +338,7 @@ def test_frames_of_a_video_follow_each_other_whatever_is_chosen(video: dict[str,
 def test_the_table_is_what_stepping_gives(raws: Path) -> None:
     for scorer in ("balanced", {"entropy": 0.5, "noise": 0.5}):
         env = make_env(**arguments(raws, scorer=scorer, with_oracle=True))
-        base: Any = env.unwrapped
+        base = env.unwrapped
         env.reset(seed=0, options={"scene": "b"})
         rewards = np.full(len(GRID), -1.0)
         for state in np.flatnonzero(base.action_masks()):
@@ -357,7 +350,7 @@ def test_the_table_is_what_stepping_gives(raws: Path) -> None:
         assert info["oracle_state"] == rewards.argmax()
 
 
-def test_many_and_pickled_copies_show_the_same(raws: Path, video: dict[str, Any]) -> None:
+def test_many_and_pickled_copies_show_the_same(raws, video):
     for scenes in (raws, video):
         given = arguments(scenes, with_oracle=True, costs={"flicker": 1.0})
         check_parity(0, 4, max_episode_steps=3, **given)
@@ -373,7 +366,6 @@ def test_a_changed_folder_is_read_again(tmp_path: Path) -> None:
     assert len(make_env(**arguments(tmp_path)).unwrapped.scenes) == 1
     (tmp_path / "a" / "IMG_0007.dng").unlink()
     scene = make_env(**arguments(tmp_path)).unwrapped.scenes[0]
-    assert scene.allowed is not None
     assert not scene.allowed[7]
 
 
@@ -386,7 +378,7 @@ REAL = {"motion": 0.3, "depth": 1.0, "lighting": "step", "noise": "exact", "sour
 
 
 @pytest.mark.parametrize(("name", "value"), [*REAL.items(), ("noise", False)])
-def test_nothing_of_real_captures_can_be_simulated(raws: Path, name: str, value: Any) -> None:
+def test_nothing_of_real_captures_can_be_simulated(raws, name, value):
     with pytest.raises(ValueError, match=rf"`{name}` .* must be .* for recorded"):
         make_env(**arguments(raws, **{name: value}))
     scenes = load_scenes(f"recorded:{raws}", "all", camera=CAMERA, resolution=36)

@@ -1,8 +1,6 @@
 """A camera, a grid and synthetic frames for the policies' tests."""
 
 import functools
-from collections.abc import Callable
-from typing import Any
 
 import gymnasium as gym
 import matplotlib
@@ -28,10 +26,10 @@ def context() -> PolicyContext:
 
 
 @pytest.fixture(scope="session")
-def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
+def photograph(context):
     """Frames of scenes (light relative to a grey card at its own EV) taken at grid states."""
 
-    def take(light: np.ndarray, scene_ev: float, states: Any, speed=0.0, defocus=0.1) -> dict:
+    def take(light, scene_ev, states, speed=0.0, defocus=0.1):
         states = np.atleast_1d(states)
         # Independent of the code under test: x = 0.12 * light * 2^(scene EV - state EV).
         gain = 2.0 ** (scene_ev - context.grid.ev100[states])
@@ -55,5 +53,5 @@ def coarse_plots() -> None:
 
 
 @pytest.fixture(scope="session")
-def make_tiny_envs() -> Callable[..., gym.vector.VectorEnv]:
+def make_tiny_envs():
     return functools.partial(make_envs, num_envs=4, autoreset_mode="SAME_STEP")

@@ -11,7 +11,6 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -65,9 +64,7 @@ V1 = ("--preset", "ae_bench_v1")
 UNKNOWN = ("--policy", "matrx:P", "--scenes", "text.dng")
 FILES = {
     "text.dng": "not a raw\n",
-    "bad.py": "def (:\n",
     "own.py": OWN,
-    "script.py": "import sys\nsys.exit(0)\n",
     "agent.yaml": "agent: ppo\n",
 }
 BASE = """\
@@ -145,17 +142,13 @@ print("loaded", *sys.modules)
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
         ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
-        ((*PLAIN, "--depth", "near"), "`depth` (='near') must be one of"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", *UNKNOWN), "`policy` (='matrx:P') must"),  # before scenes are read
         (("film", *UNKNOWN), "`policy` (='matrx:P') must"),
         (("record", *UNKNOWN, "-o", "ae_env/b-v0"), "`policy` (='matrx:P') must"),
-        (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
-        (("evaluate", "--policy", "script.py:Mine"), "script.py cannot be loaded: SystemExit: 0"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
@@ -164,7 +157,6 @@ print("loaded", *sys.modules)
         (("bench", "transfer", "--part", "table"), "`part` (='table')"),
         (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
         (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
-        (("evaluate", "--policy", "random", "--seed", 2**32), "`seeds` (=4294967296) must"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
         (("evaluate", "--preset", "standrad"), "did you mean 'standard'"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
@@ -318,7 +310,7 @@ def _draw(folder: Path) -> None:
     find_scenes("bundled:small")
 
 
-def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, forkserver: Any) -> None:
+def test_nothing_is_compiled_or_drawn_afterwards(dng, forkserver):
     """Commands use the kernels of the warm-up, at its types, all of which are kept on disk.
 
     So the kernels may come from the cache of all tests: none has to be compiled for this."""
@@ -547,7 +539,7 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     assert json.loads((folder / "results.json").read_text())["rows"] == rows
 
 
-def check_files(out: Path) -> dict[str, Any]:
+def check_files(out):
     names = {"scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png", "ev_error.png"}
     names |= {"cost.png", "contact_sheet.webp", "contact_sheet_2.webp"}
     assert {path.name for path in out.iterdir() if path.stat().st_size > 200} >= names
@@ -580,9 +572,8 @@ def test_quickstart_on_bundled_scenes_then_on_ones_own(ae_env, raw, tmp_path, mo
 
     # Few raws have no training split; the agents are there already.
     monkeypatch.setattr("agents.learning.workers.ProcessPoolExecutor", None)
-    monkeypatch.setattr(
-        "agents.rollouts.training_arguments", lambda _: ({"scenes": "bundled:small"}, True)
-    )
+    bundled = ({"scenes": "bundled:small"}, True)
+    monkeypatch.setattr("agents.rollouts.training_arguments", lambda _: bundled)
     mine = tmp_path / "my raws"
     mine.mkdir()
     for i in range(2):
@@ -656,8 +647,7 @@ def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     assert code == 0
     assert f"regression:{out}" in text
     # A forecaster is evaluated on video.
-    (tmp_path / "tiny.yaml").write_text(
-        "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n"
-    )
+    text = "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n"
+    (tmp_path / "tiny.yaml").write_text(text)
     _, text, _ = ae_env("train", "tiny.yaml", "--out", "a")
     assert "next: ae-env evaluate --preset video --policy 'regression:video?foresight=a'" in text

@@ -5,7 +5,6 @@ import os
 import runpy
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import gymnasium as gym
@@ -30,7 +29,7 @@ every_task = pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
     ("algorithm", "policy"), [(PPO, "MultiInputPolicy"), (RecurrentPPO, "MultiInputLstmPolicy")]
 )
-def test_stable_baselines(task: str, algorithm: Any, policy: str) -> None:
+def test_stable_baselines(task, algorithm, policy):
     env = gym.make(task, **SMALL)
     agent = algorithm(policy, env, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu")
     assert agent.learn(32).num_timesteps == 32
@@ -92,7 +91,7 @@ def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         observations, _ = envs.reset(seed=0)
         for _ in range(3):
             observations, *_ = envs.step(policy.act(observations))
-        memories.append(policy.memory)  # type: ignore[attr-defined]
+        memories.append(policy.memory)
     first, again = np.array(memories)
     np.testing.assert_array_equal(first, again)
     assert np.abs(first).max() > 0.0
@@ -174,7 +173,7 @@ def test_recorded_grids_are_trained_for_on_their_own_states(tmp_path: Path) -> N
 
 
 def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(ae_env, tmp_path, monkeypatch):
-    few: tuple[dict[str, Any], bool] = ({"scenes": "bundled:small", "grid": STATES}, True)
+    few = ({"scenes": "bundled:small", "grid": STATES}, True)
     monkeypatch.setattr("agents.rollouts.training_arguments", lambda *_: few)
     write_raws(tmp_path / "grid" / "a")
     (tmp_path / "env.yaml").write_text("{scenes: 'recorded:grid', split: train, resolution: 36}")

@@ -11,29 +11,25 @@ import pytest
 import torch
 
 import agents
-from agents import evaluate
+from agents import evaluate, policy_names
 from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
 from agents.evaluation.jobs import named_content
 from agents.foresight import POINTS, Foresight, TrendTracker
 from agents.metering.reading import Reading
 from agents.policy import PolicyContext
-from agents.policy_names import (
-    METERS,
-    PRETRAINED,
-    PROGRAMS,
-    list_policies,
-    make_policy,
-    split_options,
-    training_seeds,
-)
+from agents.policy_names import make_policy, training_seeds
 from agents.rollouts import make_envs
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 
 def test_every_listed_name_makes_a_policy(context):
     assert all(getattr(agents, name).__doc__ for name in agents.__all__)
-    names = list_policies()
-    assert len(names) == len(set(names)) == 8 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
+    names = policy_names.list_policies()
+    assert (
+        len(names)
+        == len(set(names))
+        == 8 + len(policy_names.METERS) * len(policy_names.PROGRAMS) + 4
+    )  # and rpi_agc
     learnt = {"ppo", "regression", "ppo:video", "regression:video"}
     assert learnt < set(names)
     for name in set(names) - learnt:  # they come at one resolution, below
@@ -59,7 +55,7 @@ def test_every_listed_name_makes_a_policy(context):
         ("spot?compensation=.nan", r"`compensation` \(=nan\)"),
         *(("spot?damping=1", r"`damping` \(=1\)"), ("spot:A?iso=100", "`iso`")),
         ("ppo:runs/ppo-*", "`training_seeds`"),
-        (f"ppo:{PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
+        (f"ppo:{policy_names.PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
         ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\)"),
         (f"recorded:{Path(__file__).parent}", "`path`"),  # holds no raw
         ("spot?damping=[1]", r"'damping' \(='\[1\]'\)"),
@@ -84,7 +80,7 @@ def test_options_in_a_name(context):
     assert make_policy("spot?compensation=+2/3", context).options.compensation == 2 / 3
     assert make_policy("rpi_agc:M?iso=400&mode=long", context).options.iso == 400.0
     assert make_policy("average:A", context, f_number=4).options.f_number == 4.0
-    found = split_options("spot?a=1e9999999&b=-inf&c=1 / 2&d=1/0&e=1e-3")[1]
+    found = policy_names.split_options("spot?a=1e9999999&b=-inf&c=1 / 2&d=1/0&e=1e-3")[1]
     assert found == {"a": np.inf, "b": -np.inf, "c": 0.5, "d": "1/0", "e": 0.001}
     assert training_seeds("ppo:?a=1") == training_seeds("ppo?a=1")
     assert make_policy("spot:", context).program == "P"
@@ -302,7 +298,7 @@ def test_scores_are_averaged_over_what_the_light_may_be(context, photograph):
     np.testing.assert_allclose(found, 25.0 + 4.0 * np.pi / 2, rtol=1e-4)
 
 
-def test_a_steady_ramp_is_foreseen_and_a_rest_after_it_too():
+def test_a_trend_foresees_ramps_and_rests_and_follows_jumps_at_once():
     tracker = TrendTracker(1, (-2.0, 18.0), alpha=0.5, beta=0.3, damping=1.0)
     light = np.concatenate([np.arange(40) * 0.25, np.full(40, 9.75)])
     for ev in light[:40]:
@@ -311,9 +307,7 @@ def test_a_steady_ramp_is_foreseen_and_a_rest_after_it_too():
     for ev in light[40:]:
         tracker.update(_reading(ev), np.zeros(1))
     assert tracker.ahead(3)[0] == pytest.approx(9.75, abs=1e-3)
-
-
-def test_a_trend_follows_jumps_at_once_and_clipped_frames_only_where_they_contradict():
+    # Clipped frames count only where they contradict.
     tracker = TrendTracker(3, (0.0, 16.0))
     for _ in range(3):
         tracker.update(_reading([8.0, 8.0, 8.0]), np.zeros(3))

@@ -3,8 +3,6 @@
 import os
 import signal
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ FILES = 6
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Raws of ever more light, one of which is none."""
     path = tmp_path_factory.mktemp("raws")
     camera, noise = get_camera("nikon_z6"), torch.Generator().manual_seed(0)
@@ -31,24 +29,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def make(folder: Path, out: Path, **options: Any) -> ShardPlan:
+def make(folder, out, **options):
     out.mkdir(exist_ok=True)
-    given: dict[str, Any] = {"per_shard": 2, "resolution": 36, "weights": "none", "captures": True}
+    given = {"per_shard": 2, "resolution": 36, "weights": "none", "captures": True}
     return ShardPlan.of(str(folder), out, **(given | options))
 
 
-def contents(out: Path) -> dict[str, bytes]:
+def contents(out):
     return {path.name: path.read_bytes() for path in sorted(out.glob("*-0*"))}
 
 
 @pytest.fixture(scope="module")
-def done(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("local")
     run(make(folder, out), "local", lambda *_: None)
     return out
 
 
-def test_every_state_of_every_scene_is_in_the_tables(done: Path) -> None:
+def test_every_state_of_every_scene_is_in_the_tables(done):
     table = pq.read_table(done / "tables-00000.parquet").to_pydict()
     assert table["file"] == ["night-0.dng"] * 64 + ["night-1.dng"] * 64
     assert table["state"] == [*range(64), *range(64)]
@@ -77,7 +75,7 @@ def test_a_file_that_cannot_be_read_is_on_the_side(folder, done, tmp_path):
     assert pq.read_table(plan.table(3)).num_rows == 0
 
 
-def test_a_run_continues_with_the_shards_that_are_missing(folder: Path, done: Path) -> None:
+def test_a_run_continues_with_the_shards_that_are_missing(folder, done):
     plan = make(folder, done)
     whole = contents(done)
     plan.table(1).unlink()

@@ -38,13 +38,11 @@ def test_a_seed_gives_the_same_picture_alone_in_a_batch_and_in_another_order(pla
     frozen = augment(given.requires_grad_(), [3, 1, 4, 15])
     assert torch.equal(frozen, together)
     assert not frozen.requires_grad
-
-
-def test_the_number_of_threads_does_not_matter() -> None:
+    # The number of threads does not matter.
     found = []
     for count in (1, 3):
         torch.set_num_threads(count)
-        found.append(ExposureAugmentation()(pictures(1, 200), [7]))
+        found.append(ExposureAugmentation()(pictures(1, 200, planes), [7]))
     assert torch.equal(*found)
 
 

@@ -57,10 +57,8 @@ def test_the_part_and_layer_with_the_colours_is_the_picture(tmp_path):
 
 def test_colours_are_converted_by_the_chromaticities_of_the_file(tmp_path):
     """XYZ by the matrix of IEC 61966-2-1; the same in Radiance's two ways to say it."""
-    to_xyz = np.array(
-        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    )
-    xyz = (IMAGE @ to_xyz.T).astype(np.float32)
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    xyz = (IMAGE @ np.transpose(to_xyz)).astype(np.float32)
     primaries = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
     path = write(tmp_path / "a.exr", part("a", channels(xyz), chromaticities=primaries))
     assert_image(read_radiance(path), rtol=2e-3, atol=2e-3)
@@ -113,7 +111,6 @@ def test_radiance_files_of_every_orientation_and_header(tmp_path):
         ("#?RADIANCE\nPIXASPECT=2.0\n\n-Y 6 +X 10\n", "not square"),
         ("#?RADIANCE\nPRIMARIES=1 2 3\n\n-Y 6 +X 10\n", "PRIMARIES"),
         ("#?RADIANCE\n\n-Y 6 +Y 10\n", "no resolution"),
-        ("#?RADIANCE\n\n-Y 7 +X 10\n", "not complete"),
     ):
         path.write_bytes(head.encode() + rgbe(IMAGE))
         with pytest.raises(ValueError, match=f"a.hdr.*{words}"):

@@ -2,8 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -128,7 +126,7 @@ def test_resized_averages_what_the_networks_found() -> None:
         (lambda: simulate_source_raw(random_scene(nlf=CAMERA.nlf(400))), "`scene`"),
     ],
 )
-def test_what_is_wrong_with_a_scene_is_named(make: Any, words: str) -> None:
+def test_what_is_wrong_with_a_scene_is_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -178,7 +176,7 @@ MINE = my_scenes("all", None)
 NONE = {"path": "no/such/folder"}
 
 
-def test_scenes_from_lists_attributes_and_small_folders(tmp_path: Path) -> None:
+def test_scenes_from_lists_attributes_and_small_folders(tmp_path):
     for split in ("train", "test", "all"):
         assert [s.scene_id for s in load(MINE, split)] == ["all"]
         assert [s.scene_id for s in load(f"{__name__}:MINE", split)] == ["all"]
@@ -231,11 +229,11 @@ DIAMETER = BLUR_FACTOR * math.sqrt(FOUND**2 - DEAD_ZONE**2)
 NOISY = CameraSettings(6400, 1 / 1024, 8)
 
 
-def save_networks(folder: Path, *, even: bool) -> tuple[str, Any]:
+def save_networks(folder, *, even):
     """Untrained networks whose defocus map is around `FOUND`, or the same everywhere."""
     torch.manual_seed(3)
     modules = build_modules("compact")
-    tail: Any = modules["aperture"].network.tail
+    tail = modules["aperture"].network.tail
     with torch.no_grad():
         tail.bias.fill_(math.log(FOUND + 0.3))
         if even:
@@ -258,7 +256,7 @@ def noisy_scene() -> Scene:
     return Scene.from_array(data, NOISY, CAMERA, scene_id="noisy", nlf=nlf)
 
 
-def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
+def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path):
     """The weights named here cannot be read: whoever loads them fails."""
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(b"no weights")
@@ -293,7 +291,7 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
             np.testing.assert_allclose(raw, sharp, atol=1 / CAMERA.span[0])
 
 
-def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:
+def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path):
     """Only the middle of a large frame is looked at, with what the networks see around it."""
     file, modules = save_networks(tmp_path, even=False)
     light = 0.3 * torch.rand((4, 252, 244), generator=torch.Generator().manual_seed(1))

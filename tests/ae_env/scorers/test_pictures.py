@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from itertools import pairwise
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -32,15 +31,8 @@ from ae_env.utils.user_files import UserCodeError
 from benchmarks import defects as benchmark
 from simulator import CameraSettings, NoiseLevelFunction, incident_ev100
 from simulator.raw.develop import srgb_encode
-from tests.ae_env.scorer_images import (
-    CAMERA,
-    GRID,
-    captures_of,
-    make_captures,
-    make_scene,
-    random_pictures,
-    random_scene,
-)
+from tests.ae_env import scorer_images
+from tests.ae_env.scorer_images import CAMERA, GRID, captures_of, make_captures, random_pictures
 
 
 def _levels(count: int = 3, height: int = 40, width: int = 60) -> np.ndarray:
@@ -217,9 +209,8 @@ def test_entropy_is_that_of_the_grey_levels() -> None:
 def rendered() -> dict[str, torch.Tensor]:
     """Pictures (L, 3, H, W) of a photograph with each defect at its severities."""
     picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
-    scene = Scene.from_radiance(
-        measures.srgb_decode(picture), CAMERA, scene_id="astronaut"
-    ).resized(128)
+    light = measures.srgb_decode(picture)
+    scene = Scene.from_radiance(light, CAMERA, scene_id="astronaut").resized(128)
     generator = torch.Generator().manual_seed(3)
     return {name: benchmark.render(scene, name, generator) for name in DEFECTS}
 
@@ -322,7 +313,7 @@ def test_colour_is_the_published_difference_and_structure_that_of_even_lightness
 
 
 def test_what_a_camera_does_costs():
-    scorer, scene = make_scorer("fidelity"), random_scene(illuminance=1000.0)
+    scorer, scene = make_scorer("fidelity"), scorer_images.random_scene(illuminance=1000.0)
     state = CameraSettings(100, 2.0 ** -(math.log2(1000 / 2.5) - 4), 4)
     captures = make_captures(scene, [state] * 5)
     (ideal,) = reference_pictures(captures, [0])
@@ -343,7 +334,7 @@ needs_opencv = pytest.mark.skipif(find_spec("cv2") is None, reason="needs the ex
 
 
 def _scene(light: np.ndarray, name: str = "test") -> Scene:
-    return make_scene(np.repeat(light[None], 4, axis=0), scene_id=name)
+    return scorer_images.make_scene(np.repeat(light[None], 4, axis=0), scene_id=name)
 
 
 def _camera_man(size: int = 128) -> np.ndarray:
@@ -482,7 +473,7 @@ def test_a_converted_file_scores_as_keras_does(tmp_path, monkeypatch):
         assert 0.0 < float(score) < 1.0
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path):
     with h5py.File(tmp_path / "other.hdf5", "w") as file:
         file["conv1_bn/conv1_bn/gamma:0"] = np.zeros(64)
     with pytest.raises(ValueError, match="gamma:0"):
@@ -503,9 +494,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
-def write_network(
-    path: Path, batch: int | str = "batch", size: int | str = "side", *, softmax: bool = False
-) -> Path:
+def write_network(path, batch="batch", size="side", *, softmax=False):
     """Three classes: the logits are the means of red, green and blue."""
     onnx = pytest.importorskip("onnx")
     node, info = onnx.helper.make_node, onnx.helper.make_tensor_value_info
@@ -566,7 +555,7 @@ def test_a_callable_sees_normalised_squares() -> None:
     np.testing.assert_allclose(own(images, None).numpy(), expected, rtol=1e-4)
 
 
-def test_what_is_no_classifier_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_classifier_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
     with pytest.raises(ValueError, match=r"AE_ENV_CLASSIFIER=FILE"):
         make_scorer("classifier")

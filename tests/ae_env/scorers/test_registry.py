@@ -4,8 +4,6 @@ import dataclasses
 import math
 import sys
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -24,16 +22,9 @@ from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
 from ae_env.utils.user_files import UserCodeError
 from simulator import NoiseLevelFunction
+from tests.ae_env import scorer_images
 from tests.ae_env.environments import SMALL
-from tests.ae_env.scorer_images import (
-    CAMERA,
-    GRID,
-    Own,
-    make_captures,
-    mean_signal,
-    random_pictures,
-    random_scene,
-)
+from tests.ae_env.scorer_images import CAMERA, GRID, Own, make_captures, mean_signal, random_scene
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 MINE = '''
@@ -52,7 +43,7 @@ class Level:
 '''
 
 
-def _install(folder: Path, name: str, module: str, entries: str) -> None:
+def _install(folder, name, module, entries):
     """A package as pip leaves it: its module, and metadata with entry points."""
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir(parents=True)
@@ -92,7 +83,7 @@ def test_a_real_entry_point_works_and_is_listed_beside_broken_ones(tmp_path, mon
 
 
 def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    facts: dict[str, tuple[Any, ...]] = {"musiq": ("NR", False, "~0, ~100")}
+    facts = {"musiq": ("NR", False, "~0, ~100")}
     facts |= {"niqe": ("NR", True, "-50.0, 150"), "lpips": ("FR", True, "0, 1")}
     facts |= {"open": ("NR", True, "0, inf"), "old": ("NR", None, None)}
 
@@ -145,7 +136,7 @@ def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> Non
         (3, "name, a mapping of weights or a callable"),
     ],
 )
-def test_bad_scorers_are_refused(spec: Any, message: str) -> None:
+def test_bad_scorers_are_refused(spec, message):
     with pytest.raises(ValueError, match=message):
         make_scorer(spec)
 
@@ -158,7 +149,7 @@ class Constant:
         if version is not None:
             self.version = version
 
-    def __call__(self, images: Any, captures: Captures) -> torch.Tensor:
+    def __call__(self, images, captures):
         return torch.full((len(captures),), self.value)
 
 
@@ -182,7 +173,7 @@ IMAGE_SCORERS += ["blind_noise", *(f"analytic_{defect}" for defect in DEFECTS)]
 def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
     scorer = make_scorer(name).parts[name]
     channels = 3 if scorer.domain == "srgb" else 4
-    pictures = random_pictures()[:, :channels].contiguous()
+    pictures = scorer_images.random_pictures()[:, :channels].contiguous()
     before = pictures.clone()
     scores = scorer(pictures, None)
     assert torch.equal(pictures, before)
@@ -193,7 +184,7 @@ def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
     for height, width in ((1, 1), (1, 7), (2, 2), (3, 1), (5, 9), (13, 11), (36, 36)):
         extremes = torch.zeros(3, channels, height, width)
         extremes[1] = 1.0
-        extremes[2] = random_pictures(1, height, width)[:, :channels]
+        extremes[2] = scorer_images.random_pictures(1, height, width)[:, :channels]
         values = scorer(extremes, None)
         assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
 
@@ -207,9 +198,8 @@ def test_scores_are_shares_and_the_oracle_has_the_highest(light, reference, grid
     if float((light[1:3] > 0).double().mean()) <= 0.2:
         illuminance = illuminance or 640.0  # no exposure is right for a black frame
     nlf = CAMERA.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
-    scene = Scene.from_array(
-        light, reference, CAMERA, scene_id="any", nlf=nlf, illuminance=illuminance
-    )
+    known = {"scene_id": "any", "nlf": nlf, "illuminance": illuminance}
+    scene = Scene.from_array(light, reference, CAMERA, **known)
     for name in [row.name for row in describe_scorers() if not row.needs]:
         tables = ScoreTables(grid, CAMERA, make_scorer(name))
         table = tables.table(scene, speed=speed, defocus=defocus, gain=gain)
@@ -250,12 +240,12 @@ def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for(
         make_scorer(Own())(None, captures)
 
 
-def test_a_slow_scorer_is_named_once(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_scorer_is_named_once(caplog, monkeypatch):
     captures, clock = make_captures(random_scene(), [GRID[20]]), [100.0]
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     for name, seconds in (("quick", 4.9), ("slow", 5.1), ("slow", 5.1)):
 
-        def rate(images: torch.Tensor, _: Any, seconds: float = seconds) -> torch.Tensor:
+        def rate(images, _, seconds=seconds):
             clock[0] += seconds
             return mean_signal(images, captures)
 
@@ -280,7 +270,7 @@ def test_a_scorer_that_raises_is_named_with_its_cause(depends_on: str) -> None:
     ],
     ids=repr,
 )
-def test_rubbish_is_refused(returned: Any) -> None:
+def test_rubbish_is_refused(returned):
     env = AutoExposureEnv(scorer=Own(lambda *_: returned), **SMALL)
     with pytest.raises(UserCodeError, match=r"scorer 'Own' returned "):
         env.reset(seed=0)
@@ -292,7 +282,7 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
         images.numpy()[:] = 0.0  # past torch's own counting
         return images.new_zeros(len(images))
 
-    def step(scorer: Any) -> Any:
+    def step(scorer):
         envs = AutoExposureVectorEnv(3, scorer=scorer, observation=observation, **SMALL)
         envs.reset(seed=0)
         return envs.step(np.array([3, 20, 40]))
@@ -310,7 +300,7 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
 @pytest.mark.parametrize("name", TENSORS)
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
 def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
-    def write(images: Any, captures: Captures) -> torch.Tensor:
+    def write(images, captures):
         getattr(captures, name)[0] *= 0.5
         return torch.zeros(len(captures))
 
@@ -323,7 +313,7 @@ def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
-def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind: Any) -> None:
+def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind):
     highlights = np.exp(-1.0 / 0.15) * (1.0 - np.array([0.0, 1e-16, 1e-15, 1e-12, 1e-9]))
     assert (-0.15 * np.log(highlights) > 1.0).any()  # else this shows nothing
     scores = dict.fromkeys(("brightness", "shadows", "noise", "sharpness"), np.ones(5))
@@ -339,7 +329,7 @@ def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind: Any) -> N
 @pytest.mark.parametrize("part", ["noise", "own"])
 def test_a_combination_of_ones_own_is_checked(total: float, part: str) -> None:
     class Mine(CompositeScorer):
-        def combine(self, scores: Any) -> Any:
+        def combine(self, scores):
             return scores[part] * 0.0 + total
 
     parts = {"noise": make_scorer("noise"), "own": Own()}

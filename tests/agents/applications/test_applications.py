@@ -11,15 +11,9 @@ from PIL import Image
 from agents.applications import hdr
 from agents.applications.hdr import expose_and_develop, fuse, linear_rgb, write_exr
 from agents.applications.refocus import read_depth, refocus
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    Lens,
-    NoiseLevelFunction,
-    RawImage,
-    get_camera,
-    render_srgb,
-)
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.thin_lens import Lens
 
 NO_NOISE = NoiseLevelFunction((1e-12,) * 4, (1e-12,) * 4)
 #: Pixel pitch such that packed pixels are 10 um.
@@ -142,6 +136,9 @@ def test_bad_maps(tmp_path) -> None:
     (tmp_path / "text.exr").write_text("no picture")
     np.save(tmp_path / "pickle.npy", np.array([print], object), allow_pickle=True)
     np.save(tmp_path / "three.npy", np.ones((2, 2, 2)))
+    lie = {"descr": "<f8", "fortran_order": False, "shape": (2**20, 2**22)}  # 32 TB
+    with (tmp_path / "lie.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, lie)
     names = {"missing.png", *(path.name for path in tmp_path.iterdir())}
     for name in names if importlib.util.find_spec("OpenEXR") else names - {"text.exr"}:
         with pytest.raises(ValueError, match=rf"`depth` \(='.*{name}'"):
@@ -161,7 +158,7 @@ def test_pictures_that_are_alike_fuse_to_themselves() -> None:
         fuse([picture])
 
 
-def test_flat_pictures_weigh_as_the_formula_says() -> None:
+def test_pictures_weigh_as_the_formula_says() -> None:
     # Lee et al. 2018: w1 = exp(-(Y - (1 - m))^2 / (2 s^2)), s = 0.75 (m[n + 1] - m[n - 1]), twice
     # the only distance at the ends; all of a flat picture has one brightness, so w2 is the same.
     means = [0.1, 0.5, 0.7]
@@ -171,8 +168,7 @@ def test_flat_pictures_weigh_as_the_formula_says() -> None:
     fused = fuse([torch.full((3, 40, 50), mean) for mean in means])
     np.testing.assert_allclose(fused.numpy(), expected, atol=2e-4)
 
-
-def test_rare_brightnesses_weigh_more() -> None:
+    # Rare brightnesses weigh more.
     luma = torch.full((10, 10), 0.2)
     luma[0, :5] = 0.4
     # Private: nothing shows the weights of a picture alone.
@@ -197,12 +193,15 @@ def test_a_large_flat_patch_stays_flat() -> None:
     assert abs(float(row[500:524].mean() - row[330:360].mean())) < 0.03
 
 
-def test_bracket_exposures() -> None:
+def test_bracket_exposures_each_of_which_the_sensor_clips() -> None:
     assert len(hdr.bracket_exposures()) == 17
     np.testing.assert_allclose(hdr.bracket_exposures(1.0, 0.3), 0.3 * np.arange(-3, 4))
     for stops, step in ((0.0, 0.5), (11.0, 0.5), (1.0, 2.0), (1.0, 0.0)):
         with pytest.raises(ValueError, match=r"`(stops|step)`"):
             hdr.bracket_exposures(stops, step)
+    half, eighth = (RawImage(torch.full((4, 8, 8), v), SETTINGS, CAMERA) for v in (0.5, 0.125))
+    assert expose_and_develop(half, 2.0).min() == 1.0
+    assert expose_and_develop(half, -2.0).equal(expose_and_develop(eighth))
 
 
 def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
@@ -216,12 +215,6 @@ def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
         contrast = [float(p[1, 20:-20, columns].std()) for p in (single, picture.fused)]
         assert contrast[1] > least * contrast[0]
     assert picture.fused[1, :, 168:216].mean() > picture.fused[1, :, 40:88].mean()
-
-
-def test_the_sensor_clips_each_picture() -> None:
-    half, eighth = (RawImage(torch.full((4, 8, 8), v), SETTINGS, CAMERA) for v in (0.5, 0.125))
-    assert expose_and_develop(half, 2.0).min() == 1.0
-    assert expose_and_develop(half, -2.0).equal(expose_and_develop(eighth))
 
 
 def test_radiance_as_an_exr(tmp_path) -> None:

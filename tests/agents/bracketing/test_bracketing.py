@@ -3,7 +3,6 @@
 import functools
 import itertools
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -74,9 +73,9 @@ def test_expected_errors_are_those_of_merged_frames() -> None:
             error = log_error(*merged, truth, torch.tensor([2.0**floor]))
             deviation = float(error.std()) / math.sqrt(error.numel())
             # Five standard errors; eleven quantiles cut the tails of the noise off by 4 %.
-            assert float(error.mean()) == pytest.approx(
-                float(expected[place]), abs=5 * deviation + 0.05 * float(expected[place]) + 1e-4
-            )
+            wanted = float(expected[place])
+            bound = 5 * deviation + 0.05 * wanted + 1e-4
+            assert float(error.mean()) == pytest.approx(wanted, abs=bound)
 
 
 def test_fixed_steps_around_the_metered_state() -> None:
@@ -96,7 +95,7 @@ def test_hasinoff_takes_the_largest_ratio_in_the_worst_light() -> None:
     """A scene of two lights, 12 stops apart: over all schedules, tried one by one."""
     envs = make_envs(1)
     context = PolicyContext.from_envs(envs)
-    policy: Any = make_policy("bracket:hasinoff?headroom=0&longest=1/4", context)
+    policy = make_policy("bracket:hasinoff?headroom=0&longest=1/4", context)
     policy.reset(1)
     policy._range = lambda camera: (1.0, 13.0)  # log2 of the luminances
     policy._reference[0] = 8.0
@@ -173,7 +172,7 @@ def test_mistakes_are_named(context: PolicyContext) -> None:
     schedule.reset(4)
     with pytest.raises(ValueError, match="fit"):
         schedule.act(make_envs(4).reset(seed=0)[0])
-    policy: Any = Policy(context)
+    policy = Policy(context)
     policy.act = lambda observations, masks=None: np.full(4, 999)
     with pytest.raises(UserCodeError, match=r"'mine': state 999 is not in \[0, 25\)"):
         run_brackets(policy, make_envs(4), name="mine")

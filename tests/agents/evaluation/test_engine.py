@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from ae_env import UserCodeError
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from agents import Policy, evaluate, fit_policies, make_policy
-from agents.evaluation import engine
+from agents.evaluation import engine, metrics
 from agents.evaluation import evaluation_plan as plans
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
 from agents.evaluation.jobs import named_content, run_plan
@@ -267,7 +266,7 @@ JOBS = JOBS.changed(policies=("matrix:P", "random", "oracle"))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("parts")
 
 
@@ -283,8 +282,8 @@ def test_the_oracle_is_right_in_every_frame_but_the_one_of_the_step(results):
     regret = step.scores.max(-1) - q  # (E, T)
     assert np.abs(np.delete(regret, 2, axis=1)).max() < 1e-6  # frame 3 has index 2
     assert regret[:, 2].mean() > 0.05
-    assert (step.settling == 3).all()
-    assert (static.settling == 0).all()
+    assert (metrics.settling(step.scores) == 3).all()
+    assert (metrics.settling(static.scores) == 0).all()
     assert (step.episode_metrics("oracle")["frames_to_converge"] == 1).all()
     late = results["step+4/late"]
     assert late.episode_metrics("oracle")["frames_to_converge"].max() == 2
@@ -296,7 +295,7 @@ def test_the_oracle_is_right_in_every_frame_but_the_one_of_the_step(results):
         np.testing.assert_array_equal(track.states[0][:, 0], late.start_states)
 
 
-def _arrays(folder: Path) -> dict[str, bytes]:
+def _arrays(folder):
     """Arrays of the parts in a folder; the times that they took differ."""
     files = {file.relative_to(folder): load_file(file) for file in folder.rglob("*.safetensors")}
     return {f"{f} {name}": a.tobytes() for f, own in files.items() for name, a in own.items()}

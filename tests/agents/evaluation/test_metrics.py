@@ -130,16 +130,14 @@ def test_ev_error_percentiles_and_share_of_a_known_trajectory():
     assert (errors <= metrics.THIRD_EV).mean() == pytest.approx(0.7)
 
 
-def test_flicker_counts_frames_of_the_same_light_only():
+def test_flicker_counts_frames_of_the_same_light_and_jumps_all():
     means = np.array([[0.1, 0.2, 0.2, 0.5], [0.0, 0.0, 0.0, 0.0]])
     np.testing.assert_allclose(metrics.flicker(means, np.array([True])), [0.4 / 3, 0.0])
     static = np.array([[True, True, False], [False, False, False]])
     np.testing.assert_allclose(metrics.flicker(means, static), [0.05, 0.0])
     once = metrics.flicker(np.stack([means, means]), np.array([False, False, True]))
     np.testing.assert_allclose(once, [[0.3, 0.0]] * 2)
-
-
-def test_jumps_are_the_mean_change_of_successive_frames():
+    # Jumps are the mean change of successive frames.
     means = np.array([[0.1, 0.3, 0.2], [0.5, 0.5, 0.5]])
     np.testing.assert_allclose(metrics.jump(means), [0.15, 0.0])
     assert metrics.jump(means[0]) == pytest.approx(0.15)

@@ -1,6 +1,11 @@
-"""PPO and regression: they learn, the seed decides, a stopped training goes on; their files."""
+"""PPO and regression: they learn, resume and act; their files, configurations and workers."""
 
+import importlib.util
 import json
+import multiprocessing
+import os
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,14 +13,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import yaml
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning import regression
+from agents.learning import regression, training, workers
 from agents.learning.networks import Session
 from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.ppo import PPOTraining, train_ppo
 from agents.learning.regression import RegressionPolicy, RegressionTraining, train_regression
+from agents.learning.training import LearningCurve, load_curve
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from simulator.utils.files import sibling
@@ -73,7 +80,6 @@ def test_a_stopped_training_goes_on(train, training, stopped_at, done, make_tiny
     network = train(make_tiny_envs(), training, session)
     assert seen == list(range(done + 4, 97 if train is train_ppo else 49, 4))
     end = session.store(training, dict).load()
-    assert end is not None
     name, steps = ("policy", 24) if train is train_ppo else ("network", 12)
     assert all(torch.equal(v, end[name][key]) for key, v in network.state_dict().items())
     # Adam goes on counting, so its moments were restored.
@@ -272,3 +278,187 @@ def test_a_finer_grid_gives_known_states_their_values(name: str, context: Policy
         known = found[:, [grid.states.index(s) for s in shared]]
         values.append(known - known[:, :1])  # logits are known up to their norm
     torch.testing.assert_close(*values, rtol=1e-5, atol=1e-5)
+
+
+# -- configurations, workers and learning curves ---------------------------------------------------
+
+
+CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
+ENVIRONMENT = {"scenes": "bundled:small", "resolution": 36}
+HYPERPARAMETERS = {
+    "regression": {"frames": 24, "width": 8},
+    "ppo": {"total_timesteps": 32, "n_steps": 4, "batch_size": 8, "n_epochs": 1, "width": 8},
+}
+
+
+def tiny(agent="regression", **changes):
+    own = {"environment": ENVIRONMENT, "training": HYPERPARAMETERS[agent] | changes}
+    return training.AgentConfig(agent=agent, num_envs=4, **own)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_shipped_configs(path: Path) -> None:
+    config, text = training.load_config(path), yaml.safe_load(path.read_text())
+    assert text["training"].items() <= config.hyperparameters().model_dump().items()
+    assert config.environment["split"] == "train"
+    assert config.with_seed(7).hyperparameters().seed == 7
+    assert json.loads(json.dumps(config.card())) == config.card()
+    with pytest.raises(ValueError, match="seed"):
+        config.with_seed(-1)
+    with pytest.raises(ValueError, match="JSON"):
+        training.AgentConfig(agent="regression", environment={"scenes": Path("raws")})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("agent: dqn", r"agent \(='dqn'\)"),
+        ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\).*`n_steps`"),
+        ("agent: ppo\ntraining: {batch_size: 100}", r"`batch_size` \(=100\)"),
+        ("agent: ppo\nenvironment: {resolutoin: 64}", "`resolutoin`.*`resolution`"),
+        ("agent: ppo\nenvironment: {scorer: balnced}", "environment: .*balnced"),
+        ("agent: ppo\nenvironment: {observation: linear}", "`observation`.*'statistics'"),
+        ("agent: regression\nenvironment: {delay: .inf}", "environment: .*`delay`"),
+        ("agent: forecaster\ntraining: {mixed: 2}", r"training.mixed \(=2\)"),
+        ("agent: forecaster\nenvironment: {split: train}", "`environment`"),
+        ("agent: forecaster\nnum_envs: 3", "`num_envs`"),
+    ],
+)
+def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"^.*mine\.yaml.*{message}.*\Z"):  # one line
+        training.load_config(path)
+
+
+@pytest.mark.parametrize("agent", ["regression", "ppo"])
+def test_trained_once_and_a_failed_save_loses_nothing(agent: str, tmp_path: Path) -> None:
+    config, out = tiny(agent), tmp_path / "runs" / f"{agent}-0.1"
+    log = tmp_path / "log" if importlib.util.find_spec("tensorboard") else None
+    blocked = sibling(out, ".json")
+    blocked.mkdir(parents=True)  # so that the agent cannot be written
+    calls: list[int] = []
+    with pytest.raises(OSError, match="json"):
+        training.train_agent(config, out, progress=lambda n, *_: calls.append(n), tensorboard=log)
+    assert calls[-1] == {"regression": 24, "ppo": 32}[agent]
+    if log is not None:
+        assert next(log.glob("events*")).stat().st_size > 200
+    blocked.rmdir()
+    assert not training.is_trained(config, out)
+    for _ in range(2):  # saved, and then known
+        training.train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
+        assert training.is_trained(config, out)
+    names = {path.name for path in out.parent.iterdir()}  # no checkpoint is left
+    assert names == {f"{agent}-0.1{ending}" for ending in (".csv", ".json", ".safetensors")}
+    # Another training, or a damaged file, is not taken for this one.
+    assert not training.is_trained(config.with_seed(1), out)
+    assert not training.is_trained(tiny(agent, width=9), out)
+    blocked.write_text("[]")
+    assert not training.is_trained(config, out)
+
+
+@pytest.mark.usefixtures("quick_spawn")
+def test_an_interrupted_call_ends_its_workers_and_keeps_what_is_trained(tmp_path: Path) -> None:
+    configs = {"0": tiny(), "1": tiny(frames=24_000)}  # the second is stopped long before its end
+    todo = [training.TrainingJob(name, own, tmp_path / name) for name, own in configs.items()]
+    seen: list[int] = []
+
+    def report(name, done, *_):
+        if name == "1":
+            raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
+        seen.append(done)
+
+    others = set(multiprocessing.active_children())
+    with pytest.raises(KeyboardInterrupt):
+        training.train_in_parallel(todo, workers=1, progress=report)
+    assert seen == [*range(4, 25, 4)]
+    assert [training.is_trained(job.config, job.out) for job in todo] == [True, False]
+    for process in set(multiprocessing.active_children()) - others:
+        process.join(60)
+        assert not process.is_alive()
+
+
+def _share(job: int) -> None:
+    workers.send_progress(job, torch.get_num_threads())
+    if job == 2:
+        raise ValueError("job 2 has failed")
+
+
+@pytest.mark.usefixtures("quick_spawn")
+def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "core_count", lambda: 6)
+    seen: list[tuple[object, ...]] = []
+    with pytest.raises(ValueError, match="job 2 has failed"):
+        workers.run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
+    assert (2, 3) in seen
+
+
+def _never_end(job: int) -> None:
+    workers.send_progress(job)
+    time.sleep(600)
+
+
+def _wait_for_ever(pipe):
+    contexts = {"spawn": multiprocessing.get_context("fork")}  # its workers have the pipe, too
+    multiprocessing.get_context = contexts.__getitem__
+    workers.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
+
+
+def test_workers_do_not_outlive_a_killed_parent(forkserver):
+    here, there = forkserver.Pipe()
+    parent = forkserver.Process(target=_wait_for_ever, args=(there,))
+    parent.start()
+    there.close()
+    assert {here.recv(), here.recv()} == {0, 1}
+    parent.kill()
+    parent.join()
+    assert here.poll(30), "they work on for nobody"
+    with pytest.raises(EOFError):  # nobody holds the other end
+        here.recv()
+
+
+def test_a_curve_has_means_over_parts_and_a_training_that_resumes_repeats_no_frames(tmp_path):
+    path = tmp_path / "agent.csv"
+
+    def report(name: str, values: dict[int, float]) -> dict[str, list[float]]:
+        curve = LearningCurve(path)
+        for done, value in values.items():
+            curve(done, 1000, {name: value})
+        return load_curve(path)
+
+    found = report("mse", {done: done for done in range(1, 1001)})  # a row every 5 frames
+    assert found == {"frames": list(range(5, 1001, 5)), "mse": list(range(3, 1000, 5))}
+    path.unlink()
+    report("mse", dict.fromkeys((200, 400, 600, 800), 1))
+    # Its checkpoint was written after 500 frames.
+    found = report("mse", dict.fromkeys((600, 800, 1000), 2))
+    assert found == {"frames": [200, 400, 600, 800, 1000], "mse": [1, 1, 2, 2, 2]}
+    # Another training of the same name.
+    assert report("reward", {1000: 3}) == {"frames": [1000], "reward": [3]}
+
+
+@pytest.mark.parametrize("text", ["name,price\ntable,12\n", "", "frames,mse\n1\n", "\x00"])
+def test_a_file_of_something_else_is_not_replaced(text: str, tmp_path: Path) -> None:
+    (tmp_path / "agent.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"agent.csv is not a learning curve"):
+        LearningCurve(tmp_path / "agent.csv")
+    assert (tmp_path / "agent.csv").read_text() == text
+
+
+def test_a_terminated_command_goes_on(ae_env, tmp_path: Path, monkeypatch) -> None:
+    """SIGTERM in its step 4, as Ctrl-C: a checkpoint and the curve so far are kept."""
+    config, out, seen, curve = tiny(), tmp_path / "agent", [], LearningCurve.__call__
+    (tmp_path / "mine.yaml").write_text(json.dumps(config.model_dump(mode="json")))
+
+    def report(self, done, *values):
+        curve(self, done, *values)
+        if done == 16:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LearningCurve, "__call__", report)
+        assert ae_env("train", "mine.yaml", "--out", out)[0] == 143
+    assert {p.name for p in tmp_path.iterdir()} == {"mine.yaml", "agent.checkpoint", "agent.csv"}
+    training.train_agent(config, out, progress=lambda done, *_: seen.append(done))
+    assert seen == [20, 24]
+    assert training.is_trained(config, out)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from ae_env.grid import ExposureGrid
@@ -195,7 +195,7 @@ def test_cameras_do_not_see_each_other_and_trainings_are_averaged():
     np.testing.assert_allclose(spread**2, squared[1:2], rtol=1e-3)
 
 
-def assert_same_rollout(ours: VecEnv, theirs: VecEnv, steps: int) -> None:
+def assert_same_rollout(ours, theirs, steps):
     rng = np.random.default_rng(1)
     assert_equal(dict(ours.reset()), dict(theirs.reset()), "reset")
     assert_equal(ours.reset_infos[1], theirs.reset_infos[1], "reset info")

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,12 +31,12 @@ def context() -> PolicyContext:
 
 
 @pytest.fixture(scope="module", params=["regression", "ppo"])
-def exported(request: pytest.FixtureRequest, context: PolicyContext, tmp_path_factory: Any) -> Any:
+def exported(request, context, tmp_path_factory):
     policy = make_policy(request.param, context)
     return policy, export_agent(policy, tmp_path_factory.mktemp("onnx") / "agent.onnx")
 
 
-def test_decisions_of_whole_episodes_are_those_of_torch(exported: Any) -> None:
+def test_decisions_of_whole_episodes_are_those_of_torch(exported):
     """In light that jumps, so that the memory is kept and forgotten; a batch is not frozen."""
     policy, file = exported
     for num_envs, stops in ((1, 4), (9, -2)):
@@ -53,7 +52,7 @@ def test_decisions_of_whole_episodes_are_those_of_torch(exported: Any) -> None:
             shown, *_ = envs.step(actions)
 
 
-def test_it_needs_no_torch(exported: Any) -> None:
+def test_it_needs_no_torch(exported):
     code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r}); import numpy as np;"
         f"from agents.onboard.controller import Controller; c = Controller({str(exported[1])!r});"
@@ -62,7 +61,7 @@ def test_it_needs_no_torch(exported: Any) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-def test_frames_and_settings_are_encoded_as_the_environment_does(exported: Any) -> None:
+def test_frames_and_settings_are_encoded_as_the_environment_does(exported):
     controller = Controller(exported[1])
     planes = np.random.default_rng(0).uniform(-0.01, 1.0, (4, 64, 64)).astype(np.float32)
     wanted = encode_observation(torch.from_numpy(planes)).numpy()
@@ -77,7 +76,7 @@ def test_frames_and_settings_are_encoded_as_the_environment_does(exported: Any) 
 
 
 @pytest.mark.parametrize("left_justified", [False, True])  # as on a Raspberry Pi 5
-def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any, left_justified) -> None:
+def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported, left_justified):
     """After each jump of 5 EV it settles, at the aperture that it has, where little is clipped."""
     loop, simulated = (
         SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / f"{name}.py")))
@@ -87,7 +86,7 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any, left_
     scenes = load_scenes("bundled:small", "test", camera=body, resolution=64)
     scene = next(scene for scene in scenes if scene.kind == "indoor")
     gains = [2.0 ** (5 * (i >= 20) - 5 * (i >= 40)) for i in range(60)]
-    options: Any = {"gains": gains, "dropped": (5, 6, 21, 43), "left_justified": left_justified}
+    options = {"gains": gains, "dropped": (5, 6, 21, 43), "left_justified": left_justified}
     camera = simulated.SimulatedCamera(scene, body, 4.0, delay=2, **options)
     steps = list(loop.run(camera, Controller(exported[1]), 56, 4.0))
     assert {(decision.state.f_number, decision.held) for _, decision in steps} == {(4.0, False)}
@@ -114,7 +113,7 @@ def test_order_and_padding_of_a_raw_stream_are_those_of_its_configuration() -> N
         example.planes_of(array, {"format": "SRGGB12_CSI2P", "size": (4, 2)}, [4096] * 4)
 
 
-def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported: Any) -> None:
+def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):
     """As if that frame had never been: of a frame, a gyro, a focus drive, one camera of two."""
     planes, camera = np.full((4, 64, 64), 0.3, np.float32), Controller(exported[1])
     state = camera.states[37]
@@ -141,7 +140,7 @@ def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported: Any) -> N
     assert again[0] == again[1] == chosen[0]
 
 
-def test_a_damaged_card_is_named(exported: Any, tmp_path: Path) -> None:
+def test_a_damaged_card_is_named(exported, tmp_path):
     onnx = pytest.importorskip("onnx")
     model = onnx.load(str(exported[1]))
     (entry,) = (entry for entry in model.metadata_props if entry.key == "ae_env")

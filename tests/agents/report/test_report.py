@@ -54,7 +54,8 @@ def made_result(groups: int = 20) -> EvaluationResult:
     kinds, starts = np.where(hard, "snow", "photograph"), np.zeros(episodes, np.int64)
     named = {"scene_ids": ids, "groups": groups, "kinds": kinds, "hard": hard, "tracks": tracks}
     named |= {"scores": scores, "allowed": np.ones(scores.shape, bool)}
-    return EvaluationResult(grid, **named, start_states=starts, seed=11)
+    plan = EvaluationPlan(name="made", starts=("random",), seeds=(11,))
+    return EvaluationResult(grid, **named, start_states=starts, plan=plan)
 
 
 def made_brackets(groups: list[str] | None = None, **quality: np.ndarray) -> EvaluationResult:
@@ -69,7 +70,7 @@ def made_brackets(groups: list[str] | None = None, **quality: np.ndarray) -> Eva
     empty |= {"scores": np.zeros((count, 0, 0)), "allowed": np.zeros((count, 0, 0), bool)}
     plan = EvaluationPlan(budgets=(0.1, 0.2), task="bracket", hash="h")
     named = {"scene_ids": names, "groups": names, "kinds": names, "tracks": tracks, "plan": plan}
-    return EvaluationResult(grid=ExposureGrid.from_spec("bracket"), **named, **empty, seed=0)
+    return EvaluationResult(grid=ExposureGrid.from_spec("bracket"), **named, **empty)
 
 
 def test_rows_have_the_values_of_their_episodes():

@@ -1,7 +1,5 @@
 """What is shown of a scene, and the page in a real Chromium: what a user does with it."""
 
-from __future__ import annotations
-
 import io
 import math
 import multiprocessing
@@ -12,7 +10,6 @@ import signal
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -109,8 +106,11 @@ def test_a_folder_opens_at_its_first_readable_raw_and_few_are_kept(tmp_path):
         find_scenes(str(tmp_path))
     for i in range(1, 7):
         write_dng(tmp_path / f"{i}.dng", RawImage(torch.full((4, 8, 8), 0.1), SETTINGS, CAMERA))
+    for byte in (b"\xfe", b"\xff"):  # no UTF-8, and shown alike
+        shutil.copy(tmp_path / "1.dng", os.fsencode(tmp_path) + b"/" + byte + b".dng")
     library = find_scenes(str(tmp_path))
     assert library.first == "1.dng"
+    assert list(library.readers)[-2:] == ["\ufffd.dng", "\ufffd.dng (2)"]
     assert list(library.readers)[:2] == ["00.dng", "01.dng"]
     for i in range(1, 7):
         library.open(f"{i}.dng")
@@ -176,7 +176,7 @@ def test_only_wider_f_numbers_than_the_raw_s_are_offered():
         assert wider_f_numbers(raw) == wider[len(wider) - offered :]
 
 
-def _view(log: Path) -> None:
+def _view(log):
     """Runs as `ae-env view`."""
     from agents.cli.main import main
 
@@ -262,9 +262,8 @@ def picture(page):
 
 
 def assert_another_picture(page, source):
-    page.wait_for_function(
-        "s => document.querySelector('.stage img').src.indexOf(s) < 0", arg=source
-    )
+    changed = "s => document.querySelector('.stage img').src.indexOf(s) < 0"
+    page.wait_for_function(changed, arg=source)
 
 
 def slider(page, name):

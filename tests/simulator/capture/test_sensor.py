@@ -14,20 +14,12 @@ from scipy.stats import norm
 
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera, list_cameras
+from simulator.capture import sensor
 from simulator.capture.blurred_light import BlurredLight
 from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import (
-    Transitions,
-    clip_and_quantise,
-    exposed_light,
-    exposure_table,
-    frame_normals,
-    noise_keys,
-    record,
-    record_stepwise,
-)
+from simulator.capture.sensor import Transitions, clip_and_quantise, noise_keys, record
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise
@@ -38,12 +30,13 @@ AREA = {4: 1 / 16, 5.6: 1 / 32, 8: 1 / 64, 11: 1 / 128}  # exact stops of the ma
 Z6 = get_camera("nikon_z6")
 BLACK, WHITE, SPAN = 1008.0, 15520.0, 14512.0
 ZERO = NoiseLevelFunction.zero()
+STILL = Exposure(1.0, ZERO, ZERO)
 ROWS, COLUMNS = 32, 128  # pixels of one flat patch
 
 
 def sensor_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     lights = BlurredLight(light, ZERO, None)
-    return exposed_light(lights.blurred(exposure), exposure)
+    return sensor.exposed_light(lights.blurred(exposure), exposure)
 
 
 def exposure_of(settings: CameraSettings) -> float:
@@ -137,7 +130,7 @@ def test_digital_numbers_are_rounded_once() -> None:
 
 def test_limits_of_light_and_signal() -> None:
     light = torch.tensor([3e6, -3e6, 3e9, -3e9]).expand(4, 1, 4).contiguous()
-    assert sensor_light(light, Exposure(1.0, ZERO, ZERO))[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
+    assert sensor_light(light, STILL)[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
     for extents, limit in (({}, 3e3), ({"motion_px": 1e-3}, 1e3), ({"defocus_px": 1e-3}, 1e3)):
         dark = sensor_light(light, Exposure(1e-6, ZERO, ZERO, **extents))[0, 0]
         expected = [3.0, -3.0, limit, -limit]  # white at every exposure
@@ -239,8 +232,8 @@ def test_the_averaged_table_has_what_a_blur_leaves_in_the_mean() -> None:
 
 
 def test_recording_nothing_and_on_other_devices() -> None:
-    assert record(Transitions([], exposure_table([])), Z6).shape == (0, 2)
-    light, table = torch.empty(4, 2, 3, device="meta"), exposure_table([Exposure(1, ZERO, ZERO)])
+    assert record(Transitions([], sensor.exposure_table([])), Z6).shape == (0, 2)
+    light, table = torch.empty(4, 2, 3, device="meta"), sensor.exposure_table([STILL])
     signals, keys = torch.empty(1, 4, 2, 3, device="meta"), np.zeros(1, np.uint64)
     counts = record(Transitions([light], table), Z6, keys=keys, signals=signals)
     assert counts.tolist() == [[0, 0]]
@@ -250,7 +243,7 @@ def test_balance_where_there_is_no_noise() -> None:
     """A clean source lacks all of it; over a target without any, the excess is finite."""
     light = torch.full((4, 4, 4), 0.5)
     assert noise_balance(light, Exposure(1.0, ZERO, Z6.nlf(100))) == (0.0, True)
-    assert noise_balance(light, Exposure(1.0, ZERO, ZERO)) == (0.0, False)
+    assert noise_balance(light, STILL) == (0.0, False)
     light[:, 0], shot = 0.0, NoiseLevelFunction((1e-4,) * 4, (0.0,) * 4)  # rows of 0 / 0
     assert noise_balance(light, Exposure(1.0, shot, ZERO)) == (1e24, False)
 
@@ -303,11 +296,11 @@ def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
         remaining_variance=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
     )
     keys = noise_keys(5, 3)
-    normals = torch.from_numpy(frame_normals(int(keys[0]), (4, *size), kind))
+    normals = torch.from_numpy(sensor.frame_normals(int(keys[0]), (4, *size), kind))
     exact = reference(light, exposure, normals)
     transitions, frames = Transitions.of([light], [exposure]), torch.empty(2, 4, *size)
     counts = record(transitions, Z6, keys=keys, noise=kind, signals=frames[:1], count=True)
-    record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, frames[1:])
+    sensor.record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, frames[1:])
     for frame in frames:
         numbers = in_numbers(frame)
         assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 of 14 bits: 0.001
@@ -330,7 +323,7 @@ def test_every_digital_number_is_written_exactly(body: CameraProfile) -> None:
     kinds = {"codes": np.uint8, "numbers": np.uint16}
     outputs = {name: np.empty((1, 4, len(numbers)), kind) for name, kind in kinds.items()}
     signals = torch.empty(1, 4, len(numbers))
-    table = exposure_table([Exposure(1.0, ZERO, ZERO)])
+    table = sensor.exposure_table([STILL])
     transition = Transitions([light[:, None]], table)
     counts = record(transition, body, **outputs, signals=signals, count=True)
     quantised = clip_and_quantise(light[:, None], body)[:, 0]

@@ -1,10 +1,8 @@
 """Networks of the released layout in plain torch layers, written down without our code."""
 
-from typing import Any
-
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import nn
 
 
 class ExposureNet(nn.Module):
@@ -44,17 +42,16 @@ class UNet(nn.Module):
         self.up3, self.up4 = level(256, 64), level(128, 64)
         self.outc = Holder("conv", nn.Conv2d(64, 4, 1))
 
-    def forward(self, x: Tensor) -> Tensor:
-        m: Any = self
-        skips = [m.inc.conv.conv(x)]
-        for down in (m.down1, m.down2, m.down3, m.down4):
+    def forward(self, x):
+        skips = [self.inc.conv.conv(x)]
+        for down in (self.down1, self.down2, self.down3, self.down4):
             pool, double = down.mpconv
             skips.append(double.conv(pool(skips[-1])))
         x = skips.pop()
-        for up in (m.up1, m.up2, m.up3, m.up4):
+        for up in (self.up1, self.up2, self.up3, self.up4):
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
             x = up.conv.conv(torch.cat([skips.pop(), x], dim=1))
-        return m.outc.conv(x)
+        return self.outc.conv(x)
 
 
 class Norm(nn.Module):
@@ -66,7 +63,7 @@ class Norm(nn.Module):
             self.style.linear.weight.mul_(0.02)
             self.style.linear.bias[:channels] = 1.0
 
-    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+    def forward(self, x, p):
         scale, shift = self.style.linear(p)[:, :, None, None].chunk(2, dim=1)
         return scale * self.norm(x) + shift
 
@@ -77,7 +74,7 @@ class conv_block(nn.Module):
         self.conv1, self.norm1 = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(outputs)
         self.conv2, self.norm2 = nn.Conv2d(outputs, outputs, 3, padding=1), Norm(outputs)
 
-    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+    def forward(self, x, p):
         x = self.norm1(self.conv1(x), p).relu()
         return self.norm2(self.conv2(x), p).relu()
 
@@ -88,7 +85,7 @@ class up_conv(nn.Module):
         self.up = nn.Upsample(scale_factor=2)
         self.conv, self.norm = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(outputs)
 
-    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+    def forward(self, x, p):
         return self.norm(self.conv(self.up(x)), p).relu()
 
 
@@ -102,13 +99,12 @@ class Attention_block(nn.Module):
         self.conv_down = nn.Conv2d(inner, inner // 4, 1, bias=False)
         self.conv_up = nn.Conv2d(inner // 4, width, 1, bias=False)
 
-    def forward(self, g: Tensor, x: Tensor, p: Tensor) -> Tensor:
-        m: Any = self
-        joint = (m.W_g_norm1(m.W_g_conv1(g), p) + m.W_x_norm1(m.W_x_conv1(x), p)).relu()
-        place = m.psi_norm(m.psi_conv(joint), p).sigmoid()
-        mean = m.W_g_norm2(m.W_g_conv2(g), p) + m.W_x_norm2(m.W_x_conv2(x), p)
+    def forward(self, g, x, p):
+        joint = (self.W_g_norm1(self.W_g_conv1(g), p) + self.W_x_norm1(self.W_x_conv1(x), p)).relu()
+        place = self.psi_norm(self.psi_conv(joint), p).sigmoid()
+        mean = self.W_g_norm2(self.W_g_conv2(g), p) + self.W_x_norm2(self.W_x_conv2(x), p)
         mean = F.adaptive_avg_pool2d(mean, 1)
-        return x * place * m.conv_up(m.conv_down(mean).relu()).sigmoid()
+        return x * place * self.conv_up(self.conv_down(mean).relu()).sigmoid()
 
 
 class AttenUnet_style(nn.Module):
@@ -124,18 +120,17 @@ class AttenUnet_style(nn.Module):
             setattr(self, f"Up_conv{level}", conv_block(2 * width, width))
         self.Conv = nn.Conv2d(32, 4, 1)
 
-    def forward(self, image: Tensor, p: Tensor) -> Tensor:
-        m: Any = self
+    def forward(self, image, p):
         planes = p[:, :, None, None].expand(-1, -1, *image.shape[2:])
-        skips = [m.Conv1(torch.cat([image, planes], dim=1), p)]
-        for level in (m.Conv2, m.Conv3, m.Conv4, m.Conv5):
+        skips = [self.Conv1(torch.cat([image, planes], dim=1), p)]
+        for level in (self.Conv2, self.Conv3, self.Conv4, self.Conv5):
             skips.append(level(F.max_pool2d(skips[-1], 2), p))
         x = skips.pop()
         for level in (5, 4, 3, 2):
-            x = getattr(m, f"Up{level}")(x, p)
-            skip = getattr(m, f"Att{level}")(x, skips.pop(), p)
-            x = getattr(m, f"Up_conv{level}")(torch.cat([skip, x], dim=1), p)
-        return m.Conv(x)
+            x = getattr(self, f"Up{level}")(x, p)
+            skip = getattr(self, f"Att{level}")(x, skips.pop(), p)
+            x = getattr(self, f"Up_conv{level}")(torch.cat([skip, x], dim=1), p)
+        return self.Conv(x)
 
 
 def make_released(seed: int = 0) -> dict[str, nn.Module]:
@@ -146,7 +141,6 @@ def make_released(seed: int = 0) -> dict[str, nn.Module]:
         made = {"exp_model": ExposureNet(), "unet_model": UNet(), "ap_model": AttenUnet_style()}
     for norm in (m for m in made["unet_model"].modules() if isinstance(m, nn.BatchNorm2d)):
         for tensor in (norm.running_mean, norm.running_var, norm.weight, norm.bias):
-            assert tensor is not None
             tensor.data.copy_(0.5 + torch.rand(tensor.shape, generator=generator))
         norm.num_batches_tracked.fill_(7)
     return {name: module.eval() for name, module in made.items()}

@@ -8,21 +8,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
-from torch import Tensor, nn
+from torch import nn
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import get_camera
-from simulator.networks import aperture_module
+from simulator.networks import aperture_module, noise_module
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
-from simulator.networks.noise_module import (
-    SIZES,
-    Denoiser,
-    NoiseModule,
-    Preset,
-    Stabiliser,
-    smoothed,
-    variance_map,
-)
+from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Stabiliser
 from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
@@ -69,7 +61,7 @@ def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None
 # -- the aperture ----------------------------------------------------------------------------------
 
 
-def picture(*size: int) -> Tensor:
+def picture(*size):
     values = np.random.default_rng(0).random((2, 4, *size), dtype=np.float32)
     return torch.from_numpy(values) * 5.0
 
@@ -224,7 +216,7 @@ SHOT, READ = torch.tensor([NLF.shot]), torch.tensor([NLF.read])
 
 def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> None:
     module, image = NoiseModule("paper"), 0.06 * normal(1, 4, 16, 18, dtype=torch.float32)
-    given: list[tuple[Tensor, ...]] = []
+    given = []
     module.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
     assert torch.equal(module(image, SHOT, READ), image + module.network(*given[0]))
     seen, deviation = given[0][0].split(4, dim=1)
@@ -233,7 +225,7 @@ def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> N
     expected = np.sqrt(read + shot * image.double().numpy()[0].clip(min=0))
     np.testing.assert_allclose(deviation[0].numpy(), expected, rtol=1e-5)
     smooth = uniform_filter(image.double().numpy(), (1, 1, 5, 5), mode="nearest")
-    np.testing.assert_allclose(smoothed(image).numpy(), smooth, atol=1e-6)
+    np.testing.assert_allclose(noise_module.smoothed(image).numpy(), smooth, atol=1e-6)
 
 
 def test_operations_by_hand() -> None:
@@ -248,7 +240,7 @@ def test_operations_by_hand() -> None:
 
 
 @pytest.mark.parametrize("preset", ["nano", "paper"])
-def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> None:
+def test_the_gate_is_each_images_own_and_changes_no_other(preset):
     module = NoiseModule(preset).eval().requires_grad_(False)
     torch.nn.init.normal_(module.network.tail.weight)
     image = (0.06 * normal(1, 4, 16, 18, dtype=torch.float32)).expand(3, -1, -1, -1)
@@ -258,7 +250,7 @@ def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> Non
     for i in (0, 2):
         inputs = image[i : i + 1], factor[i] * SHOT, factor[i] * READ
         if preset == "paper":
-            level = variance_map(*inputs).sqrt()
+            level = noise_module.variance_map(*inputs).sqrt()
             expected = inputs[0] + module.network(torch.cat([inputs[0], level], dim=1))
         else:
             expected = module.network(*inputs)
@@ -270,7 +262,7 @@ def stabiliser(shot: float, read: float) -> Stabiliser:
     return Stabiliser.of(torch.full((1, 4), shot), torch.full((1, 4), read))
 
 
-def flat_field(level: float = 0.2, side: int = 64, seed: int = 0) -> Tensor:
+def flat_field(level=0.2, side=64, seed=0):
     """A flat field with the noise of the Z6 at ISO 6400, drawn by NumPy, (1, 4, side, side)."""
     rng, shape = np.random.default_rng(seed), (1, 4, side, side)
     shot, read = (np.array(v)[:, None, None] for v in (NLF.shot, NLF.read))
@@ -348,10 +340,8 @@ def test_the_mean_stays_whatever_is_taken(level: float, side: int) -> None:
     assert float(kept.abs().max()) < 1e-4
     assert float(trained.max()) < -0.7
     wide = flat_field(level, 512)[..., :side, :]
-    wrong = torch.where(
-        torch.arange(512) < 256, level - 0.8 * sigma[..., None], level + 0.8 * sigma[..., None]
-    )
-    wrong = wrong[:, :, None].expand_as(wide)
+    sides = torch.where(torch.arange(512) < 256, -0.8, 0.8) * sigma[..., None]
+    wrong = (level + sides)[:, :, None].expand_as(wide)
     error = (made.corrected(wrong, wide, SHOT, READ) - wide) / sigma[..., None, None]
     for part in (error[..., :180], error[..., -180:]):
         assert float(part.mean(dim=(2, 3)).abs().max()) < 0.05
@@ -415,10 +405,10 @@ def test_against_a_transcription() -> None:
         nn.init.normal_(parameter, std=0.3)
     parameters = net.parameters()
 
-    def convolved(x: Tensor) -> Tensor:
+    def convolved(x):
         return F.conv2d(F.pad(x, (1, 1, 1, 1), "replicate"), next(parameters), next(parameters))
 
-    def level(x: Tensor) -> Tensor:
+    def level(x):
         return F.leaky_relu(convolved(F.leaky_relu(convolved(x), 0.2)), 0.2)
 
     fine = level(image := normal(1, 8, 6, 4))

@@ -7,14 +7,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import nn
 
-from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, get_camera
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks import weights
 from simulator.networks.network_cache import NetworkCache
 from simulator.networks.noise_module import variance_map
@@ -77,11 +76,11 @@ def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
         *(({"preset": p}, re.escape(f"got {p!r}")) for p in ("huge", None, ["compact"])),
     ],
 )
-def test_damaged_cards(saved: Path, card: str | dict[str, Any], message: str) -> None:
+def test_damaged_cards(saved, card, message):
     path = beside(saved, ".json")
-    path.write_text(
-        card if isinstance(card, str) else json.dumps({**json.loads(path.read_text()), **card})
-    )
+    if not isinstance(card, str):
+        card = json.dumps({**json.loads(path.read_text()), **card})
+    path.write_text(card)
     with pytest.raises(ValueError, match=message):
         load_modules(saved)
 
@@ -129,12 +128,10 @@ def test_shipped_weights_load_by_name(saved, monkeypatch, tmp_path_factory):
         assert simulator.noise is simulator.noises[-1]
         assert simulator.aperture is not None
         nano = simulator.noises[0].residual
-        assert nano is not None
         assert nano.to_card() == residual
     assert simulators[1].noise.residual is None
-    with pytest.raises(
-        ValueError, match=r"one of \['compact', 'nano'\] .* did you mean 'compact'\?"
-    ):
+    message = r"one of \['compact', 'nano'\] .* did you mean 'compact'\?"
+    with pytest.raises(ValueError, match=message):
         load_modules("compcat")
     with pytest.raises(ValueError) as caught:
         load_modules("zzz")
@@ -156,7 +153,7 @@ def counted(simulator: CameraSimulator) -> list[int]:
     runs: list[int] = []
     networks = simulator.noise.network.tail, simulator.aperture.network
 
-    def count(_module: Any, _inputs: Any, output: torch.Tensor) -> None:
+    def count(_module, _inputs, output):
         if output.shape[-2:] != (32, 32):  # there operations are counted
             runs.append(1)
 
@@ -170,14 +167,14 @@ def _raw() -> RawImage:
     return RawImage(light, SOURCE, CAMERA)
 
 
-def _simulator(**options: Any) -> CameraSimulator:
+def _simulator(**options):
     torch.manual_seed(0)
     made = CameraSimulator("nano", device="cpu", **options)
     torch.nn.init.normal_(made.noise.network.tail.weight)
     return made
 
 
-def _denoised(simulator: CameraSimulator, source: RawImage | PreparedScene) -> torch.Tensor:
+def _denoised(simulator, source):
     (found,) = simulator.prepare(source).denoised_lights
     return found.light
 
@@ -189,7 +186,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("depth", ["far", "unknown"])
-def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path, depth: Any) -> None:
+def test_what_is_found_again_is_the_same_bit_by_bit(folder, depth):
     raw = _raw()
     made = _simulator(cache=None).prepare(raw, depth=depth)
     keeper, later = _simulator(cache="disk"), _simulator(cache="disk")
@@ -219,7 +216,7 @@ def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["memory", "disk"])
-def test_everything_that_changes_the_result_is_seen(where: Any, folder: Path) -> None:
+def test_everything_that_changes_the_result_is_seen(where, folder):
     simulator, raw = _simulator(cache=where), _raw()
     runs = counted(simulator)
     brighter = raw.data.clone()
@@ -290,7 +287,6 @@ def converted(released: dict[str, nn.Module], tmp_path_factory: pytest.TempPathF
         held = nn.DataParallel(module) if name == "unet_model" else module
         torch.save({"model": held, "iteration": 544000}, folder / name)
     script = re.search(r"needs the authors' files -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
-    assert script is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         exec(script[1], {})
@@ -313,7 +309,7 @@ def test_parameters_are_as_many_as_published(ncs: nn.ModuleDict) -> None:
     assert ncs["exposure"].b.tolist() == pytest.approx([0.001, 0.002, 0.004, 0.003])
 
 
-def close(ours: Tensor, theirs: Tensor, tolerance: float = 1e-5) -> None:
+def close(ours, theirs, tolerance=1e-5):
     assert float(theirs.std()) > 1e-3
     torch.testing.assert_close(ours, theirs, rtol=0, atol=tolerance * float(theirs.abs().max()))
 
@@ -344,7 +340,7 @@ def test_the_full_run_is_that_of_the_released_demo(converted: Path, released) ->
     raw = RawImage(data, CameraSettings(400, 1 / 64, 11.0), camera)
     target = CameraSettings(100, 1 / 64, 4.0)
     stages = simulator.stages(raw, target, seed=3)
-    shown: list[Tensor] = []
+    shown = []
     network = simulator.noise.network
     with network.register_forward_hook(lambda _, inputs, __: shown.append(inputs[0])):
         simulator.stages(raw, target)

@@ -20,27 +20,13 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
+from simulator.capture import sensor
 from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import Layout, PreparedScene
-from simulator.capture.sensor import (
-    Transitions,
-    exposure_table,
-    frame_normals,
-    missing_variance,
-    noise_bank,
-    noise_keys,
-    record,
-    single_normals,
-    sweep_keys,
-)
+from simulator.capture.sensor import exposure_table, missing_variance, noise_keys, record
+from simulator.noise import noise_level_function as nlfs
 from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, philox
-from simulator.noise.noise_level_function import (
-    NoiseLevelFunction,
-    ReadNoise,
-    averaged_shape,
-    noise_variance,
-    tukey_lambda,
-)
+from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
 from simulator.optics.discs import disc_kernel
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
@@ -147,7 +133,7 @@ def test_draws_are_quantiles_of_variance_one(shape: float) -> None:
     z = np.array([-4.0, -1.5, 0.0, 0.3, 2.0])
     deviation = math.sqrt(moment(shape, 2))
     expected = [quantile(norm.cdf(x), shape) / deviation for x in z]
-    drawn = tukey_lambda(torch.from_numpy(z), shape).numpy()
+    drawn = nlfs.tukey_lambda(torch.from_numpy(z), shape).numpy()
     np.testing.assert_allclose(drawn, expected, rtol=1e-6, atol=1e-12)
     pixels = ReadNoise(0.0, shape).pixel_part(torch.tensor(4.0), torch.from_numpy(z))
     np.testing.assert_allclose(pixels, 2.0 * drawn)  # one pixel, no rows
@@ -158,7 +144,8 @@ def test_draws_are_quantiles_of_variance_one(shape: float) -> None:
 )
 def test_kurtosis_falls_with_the_number_of_averaged_pixels(shape: float, k: int) -> None:
     """Cumulants of a mean of n independent draws: the fourth falls as n^3, the variance as n."""
-    assert kurtosis(averaged_shape(shape, k)) == pytest.approx(kurtosis(shape) / k**2, abs=2e-3)
+    averaged = nlfs.averaged_shape(shape, k)
+    assert kurtosis(averaged) == pytest.approx(kurtosis(shape) / k**2, abs=2e-3)
 
 
 def camera(row: float = ROW, shape: float = -0.05) -> CameraProfile:
@@ -237,12 +224,11 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     assert torch.equal(*drawn)
     simulated = CameraSimulator().simulate(scenes[0], BASE, seed=3, noise="sensor").data
     assert torch.equal(simulated, scenes[0].expose([BASE], seed=3, noise="sensor")[0])
-    transitions = Transitions.of([light], [scenes[0].exposure(BASE)])
+    transitions = sensor.Transitions.of([light], [scenes[0].exposure(BASE)])
     signals, numbers = torch.empty(1, 4, 9, 70), np.empty((1, 4, 9, 70), np.uint16)
     given = {"keys": np.array([7], np.uint64), "read_noise": [ReadNoise(ROW, -0.05)]}
-    ((low, high),) = record(
-        transitions, known, signals=signals, numbers=numbers, count=True, **given
-    )
+    both = {"signals": signals, "numbers": numbers}
+    ((low, high),) = record(transitions, known, **both, count=True, **given)
     np.testing.assert_array_equal(numbers, np.rint(signals.numpy() * SPAN + 3000))
     assert (low, high) == ((signals <= 2**-10).sum(), (signals >= 1 - 1e-6).sum())
     assert record(transitions, known, count=True, **given).tolist() == [[low, high]]
@@ -290,13 +276,19 @@ def key_of(seed: int, *numbers: float) -> int:
     return key
 
 
-of_sweep = functools.partial(sweep_keys, states=[])
+of_sweep = functools.partial(sensor.sweep_keys, states=[])
 
 
-def test_keys_are_those_of_splitmix64() -> None:
+def test_keys_are_those_of_splitmix64_and_of_each_setting_of_a_sweep() -> None:
     """The first two outputs that its authors publish for the seed 1234567."""
     keys = noise_keys(np.array([1234567, 1234567 + STEP], np.uint64))
     assert keys.tolist() == [6457827717110365317, 3203168211198807973]
+    given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
+    states = [CameraSettings(*values) for values in given]
+    for seed in (7, np.int64(8), MASK):  # the last is the largest
+        keys = sensor.sweep_keys(seed, states)
+        assert keys.tolist() == [key_of(int(seed), *values) for values in given]
+    assert len(sensor.sweep_keys(7, [])) == 0
 
 
 @given(st.integers(0, MASK), st.lists(st.floats(allow_nan=False), max_size=4), st.integers(2, 40))
@@ -309,15 +301,6 @@ def test_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: 
     assert noise_keys(seed, *numbers, last).tolist() == [key_of(seed, *numbers, x) for x in last]
 
 
-def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
-    given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
-    states = [CameraSettings(*values) for values in given]
-    for seed in (7, np.int64(8), MASK):  # the last is the largest
-        keys = sweep_keys(seed, states)
-        assert keys.tolist() == [key_of(int(seed), *values) for values in given]
-    assert len(sweep_keys(7, [])) == 0
-
-
 def test_bad_seeds_are_named() -> None:
     makes = of_sweep, noise_generator, noise_keys
     bad = [*itertools.product(makes, (-1, 1.5, "1", None)), (of_sweep, 2**64)]
@@ -327,7 +310,7 @@ def test_bad_seeds_are_named() -> None:
 
 
 def test_the_bank_is_every_quantile_once_in_a_fixed_order() -> None:
-    bank = noise_bank()
+    bank = sensor.noise_bank()
     assert (bank.shape, bank.dtype, bank.flags.writeable) == ((2**20 + 256,), np.float32, False)
     np.testing.assert_array_equal(bank[2**20 :], bank[:256])
     quantiles = stats.norm.ppf((np.arange(2**20) + 0.5) / 2**20)
@@ -337,9 +320,9 @@ def test_the_bank_is_every_quantile_once_in_a_fixed_order() -> None:
 
 @pytest.mark.parametrize("shape", [(2, 3, 200), (4, 1, 1)])
 def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, int]) -> None:
-    key, bank = key_of(5, 2.0), noise_bank()
+    key, bank = key_of(5, 2.0), sensor.noise_bank()
     size, turn = shape[1] * shape[2], 0
-    for plane in frame_normals(key, shape, "bank").reshape(shape[0], size):
+    for plane in sensor.frame_normals(key, shape, "bank").reshape(shape[0], size):
         for start in range(0, size, 256):
             turn += 1
             word = mixed(key + turn * STEP & MASK)
@@ -347,7 +330,7 @@ def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, in
             np.testing.assert_array_equal(plane[start : start + 256], values * (-1) ** (word >> 63))
     words = [mixed((key ^ 0x5851F42D4C957F2D) + turn * STEP & MASK) for turn in (1, 2, 3)]
     expected = [float(bank[word % 2**20]) * (-1) ** (word >> 63) for word in words]
-    assert single_normals(np.array([key], np.uint64), 3).tolist() == [expected]
+    assert sensor.single_normals(np.array([key], np.uint64), 3).tolist() == [expected]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ of the aperture, each of which sees two planes through its own pinhole.
 import importlib.util
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 
@@ -19,29 +19,10 @@ from scipy import ndimage
 from scipy.integrate import quad
 from scipy.ndimage import correlate
 
-from simulator.optics import motion
-from simulator.optics.discs import (
-    DIAMETERS,
-    Blur,
-    DiscBank,
-    blur_many,
-    box_mean,
-    disc_blur,
-    disc_kernel,
-    kernel_energy,
-    remaining_variance,
-)
+from simulator.optics import discs, motion
+from simulator.optics.discs import DIAMETERS, Blur, DiscBank, blur_many, disc_blur, disc_kernel
 from simulator.optics.flicker_integral import Flash, Lamp, MainsLamp, PulsedLamp
-from simulator.optics.motion import (
-    Movement,
-    Path,
-    Taps,
-    motion_blur,
-    motion_kernel,
-    path_blur,
-    path_blur_apart,
-    path_taps,
-)
+from simulator.optics.motion import Movement, Path, motion_blur, path_blur, path_taps
 from simulator.optics.thin_lens import Lens, defocus
 
 
@@ -53,12 +34,6 @@ def test_circle_of_confusion_follows_from_similar_triangles(focus, depth):
     expected = (0.05 / 2.8) * (v_focus - v) / v
     found = Lens(0.05, focus).circle_of_confusion(depth, 2.8)
     assert found == pytest.approx(expected, rel=1e-12, abs=1e-18)
-
-
-def test_blur_too_small_to_see_leaves_every_bit():
-    light = torch.rand(4, 9, 13, generator=torch.Generator().manual_seed(0))
-    ripple = 0.1 * torch.rand(9, 13, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(defocus(light, ripple - 0.05), light)
 
 
 @pytest.mark.parametrize("case", ["step", "ramp", "through_focus", "stairs", "noise", "islands"])
@@ -97,12 +72,16 @@ def test_sharp_foreground_is_untouched_by_a_bright_blurred_background():
     found = defocus(light, torch.from_numpy(np.where(near, 0.0, 13.0)))
     assert torch.equal(found[:, :, :30], light[:, :, :30])
     assert float(found[:, :, 30:].min()) > 50.0  # nor does the dark foreground spill over
+    # Blur that is too small to see leaves every bit.
+    light = torch.rand(4, 9, 13, generator=torch.Generator().manual_seed(0))
+    ripple = 0.1 * torch.rand(9, 13, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(defocus(light, ripple - 0.05), light)
 
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def light_of_planes(hides: np.ndarray, near: Sequence, far: Sequence) -> np.ndarray:
+def light_of_planes(hides, near, far):
     """Each plane's texture at its own rows and columns."""
     nearer = 0.5 + 0.3 * np.sin(near[0] * 0.9) * np.cos(near[1] * 0.7)
     farther = 3.0 + 1.5 * np.sin(far[0] * 0.25 + 1.0) + 0.5 * np.cos(far[1] * 0.25)
@@ -164,7 +143,7 @@ def _velocity(path: Path) -> np.ndarray:
     return np.stack([x + path.drift_x, y + path.drift_y])
 
 
-def _dense(taps: Taps) -> np.ndarray:
+def _dense(taps: motion.Taps) -> np.ndarray:
     """The taps as an odd kernel that `scipy.ndimage.correlate` takes."""
     reach = int(max(np.abs(taps.rows).max(), np.abs(taps.columns).max()))
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
@@ -213,7 +192,7 @@ def _apart(light: torch.Tensor, mask: np.ndarray, path: Path, own: Path) -> torc
     behind = torch.arange(mask.size).reshape(mask.shape)
     subject, taps = torch.from_numpy(mask), [path_taps(p, *mask.shape) for p in (path, own)]
     behind[subject] = behind[~subject][0]
-    return path_blur_apart(light, subject[None].float(), behind, *taps)
+    return motion.path_blur_apart(light, subject[None].float(), behind, *taps)
 
 
 def test_a_moving_subject_keeps_its_light_and_has_no_dark_fringe() -> None:
@@ -331,7 +310,7 @@ def lamp(*shape: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("extent", EXTENTS)
 def test_second_moments_are_those_of_uniform_motion_and_of_a_uniform_disc(extent):
-    streak, disc = motion_kernel(extent), disc_kernel(extent)
+    streak, disc = motion.motion_kernel(extent), disc_kernel(extent)
     # A disc's to a hundredth of a pixel: a tenth is where a blur begins to matter to any score.
     assert disc.shape == (len(disc),) * 2
     for weights, share, error in ((streak, 12, 1e-6), (disc.sum(0), 16, 0), (disc.sum(1), 16, 0)):
@@ -354,7 +333,7 @@ def test_application_is_scipys_convolution(extent, shape):
     """Direct and Fourier sums of discs, running sums of streaks, streaks longer than the row.
 
     Those in float32 are kernels for the CPU; torch's sums serve other types and devices."""
-    blurs = {motion_blur: motion_kernel(extent)[None]}
+    blurs = {motion_blur: motion.motion_kernel(extent)[None]}
     blurs |= {disc_blur: disc_kernel(extent)} if extent < 100 else {}
     for blur, weights in blurs.items():
         kernel = weights.reshape(*[1] * (len(shape) - 2), *weights.shape)
@@ -368,14 +347,14 @@ def test_application_is_scipys_convolution(extent, shape):
 
 
 @pytest.mark.parametrize(
-    ("motion", "defocus"), [(0, 0), (3.0, 0), (0, 4.0), (7.5, 2.5), (0.4, 14), (5000.3, 4.0)]
+    ("extent", "diameter"), [(0, 0), (3.0, 0), (0, 4.0), (7.5, 2.5), (0.4, 14), (5000.3, 4.0)]
 )
-def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(motion, defocus):
+def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(extent, diameter):
     """Averaging independent pixels multiplies the variance by the sum of squared weights."""
-    disc, streak = disc_kernel(defocus), motion_kernel(motion)
+    disc, streak = disc_kernel(diameter), motion.motion_kernel(extent)
     response = np.stack([np.convolve(row, streak) for row in disc])
-    rel = 1e-6 if motion < 4096 else 1e-3  # of a longer one only the main term is computed
-    assert kernel_energy(motion, defocus) == pytest.approx((response**2).sum(), rel=rel)
+    rel = 1e-6 if extent < 4096 else 1e-3  # of a longer one only the main term is computed
+    assert discs.kernel_energy(extent, diameter) == pytest.approx((response**2).sum(), rel=rel)
 
 
 def test_outputs_and_no_or_bad_extents():
@@ -413,8 +392,8 @@ def test_light_beyond_the_limit_is_clipped_first(extent):
 def test_many_images_are_scipys_correlation(threads, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     blurs = []
-    discs, streaks = (48.0, 0.0, 3.3, 8.0, 1e-4, 2.0, 0.7), (5.0, 5.0, 0.0, 17.0, 1e-7, 90.0, 0.4)
-    for extents in zip(discs, streaks, strict=True):
+    wide, long = (48.0, 0.0, 3.3, 8.0, 1e-4, 2.0, 0.7), (5.0, 5.0, 0.0, 17.0, 1e-7, 90.0, 0.4)
+    for extents in zip(wide, long, strict=True):
         outputs = [torch.empty(4, 21, 40) if each else None for each in extents]
         blurs.append(Blur(torch.rand(4, 21, 40), extents[0], outputs[0], extents[1], outputs[1]))
     blur_many(blurs)
@@ -424,7 +403,7 @@ def test_many_images_are_scipys_correlation(threads, monkeypatch):
         wanted = ndimage.correlate(light.double().numpy(), weights, mode="nearest")
         if defocused is not None:
             np.testing.assert_allclose(defocused, wanted, rtol=rtol)
-        wanted = ndimage.correlate1d(wanted, motion_kernel(extent), mode="nearest")
+        wanted = ndimage.correlate1d(wanted, motion.motion_kernel(extent), mode="nearest")
         if moved is not None:
             np.testing.assert_allclose(moved, wanted, rtol=2 * rtol)
     blur_many([])
@@ -451,7 +430,8 @@ def test_box_mean_is_scipys_uniform_filter(window, size):
     image = uniform(2, 3, *size)
     sides = (1, 1, window, window)
     expected = ndimage.uniform_filter(image.double().numpy(), sides, mode="nearest")
-    np.testing.assert_allclose(box_mean(image, window).numpy(), expected, rtol=2e-6, atol=1e-6)
+    found = discs.box_mean(image, window).numpy()
+    np.testing.assert_allclose(found, expected, rtol=2e-6, atol=1e-6)
 
 
 def blurred(image: torch.Tensor, diameter: float) -> torch.Tensor:
@@ -478,7 +458,7 @@ def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter):
         assert marginal @ offsets**2 == pytest.approx(moment, rel=2e-3, abs=2e-4)
         assert marginal @ offsets == pytest.approx(0.0, abs=1e-5)
     # Of white noise the sum of squared weights is left.
-    left = remaining_variance(torch.tensor([[[0.0], [diameter]]]))
+    left = discs.remaining_variance(torch.tensor([[[0.0], [diameter]]]))
     assert left.flatten().tolist() == pytest.approx([1.0, (spread**2).sum()], rel=1e-4)
 
 
@@ -487,7 +467,6 @@ def test_gradient_is_finite_everywhere_and_right():
     values = torch.tensor([0.0, 1e-9, 0.7, 1.3, 4.0, 32.0, 50.0])
     diameter = values.repeat(16, 3)[:, :16].clone().requires_grad_()
     DiscBank(image).blurred(diameter).square().sum().backward()
-    assert diameter.grad is not None
     assert image.grad is None
     assert bool(diameter.grad.isfinite().all())
     assert bool((diameter.grad[:, 0] == 0).all())  # d(diameter^2) is 0 there

@@ -6,7 +6,6 @@ import struct
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,20 +30,13 @@ MATRIX = (0.9943, -0.3269, -0.0839, -0.5323, 1.3269, 0.2259, -0.1198, 0.2083, 0.
 CODE = tifffile.TIFF.EXIF_TAGS  # of a tag's name
 
 
-def fractions(values: Any) -> tuple[int, ...]:
+def fractions(values):
     return tuple(part for v in np.ravel(values) for part in (round(v * 10000), 10000))
 
 
-def write_sample_dng(
-    path: Path,
-    mosaic: np.ndarray = MOSAIC,
-    *,
-    black: tuple[int, ...] = (64,),
-    photometric: int = 32803,
-    **changes: tuple[str, Any],
-) -> Path:
+def write_sample_dng(path, mosaic=MOSAIC, *, black=(64,), photometric=32803, **changes):
     """A DNG by tifffile, not by the code under test; `changes` are types and values of tags."""
-    tags: dict[str, tuple[str, Any]] = {"Make": ("s", "Test"), "Model": ("s", "Sensor")}
+    tags = {"Make": ("s", "Test"), "Model": ("s", "Sensor")}
     tags |= {"UniqueCameraModel": ("s", "Test Sensor"), "DNGVersion": ("B", (1, 4, 0, 0))}
     tags |= {"DNGBackwardVersion": ("B", (1, 1, 0, 0)), "WhiteLevel": ("I", (4095,))}
     tags |= {"ColorMatrix1": ("2i", fractions(MATRIX)), "AsShotNeutral": ("2I", (1, 2, 1, 1, 2, 3))}
@@ -247,7 +239,7 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path):
         read_raw(path)
 
 
-def patch(path: Path, name: str, form: str, *values: Any) -> None:
+def patch(path, name, form, *values):
     """Overwrites a tag's value; with the form ``count``, how many values it claims to have."""
     content = bytearray(path.read_bytes())
     code = re.escape(struct.pack("<H", CODE[name]))

@@ -14,15 +14,8 @@ from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
-from simulator.reference import sequences
-from simulator.reference.reference_camera import (
-    BodyError,
-    ReferenceCamera,
-    ReferenceScene,
-    average_planes,
-    lens_blur,
-    sample_mosaic,
-)
+from simulator.reference import reference_camera, sequences
+from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Sequence, select_pairs
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise
@@ -87,7 +80,7 @@ def test_photosites_averages_and_marked_stops_in_the_blur():
     for sharp in (scene(light), scene(light, torch.full((7, 5), 2.0)), far):
         assert torch.equal(camera.blurred_light(sharp, 4.0), light)
     fine = torch.rand(3, 16, 16)  # through the lens, and sampled by the mosaic
-    expected = sample_mosaic(lens_blur(fine), BayerPattern.GBRG)
+    expected = reference_camera.sample_mosaic(reference_camera.lens_blur(fine), BayerPattern.GBRG)
     camera = ReferenceCamera(replace(sensor(1e-4, 1e-8), cfa=BayerPattern.GBRG))
     torch.testing.assert_close(camera.blurred_light(scene(fine), 4.0), expected)
 
@@ -144,9 +137,9 @@ def test_rounding_and_box_average_in_the_variance_and_without_noise():
     for averaged in (even.record(half, 100.0, torch.Generator()), even.clip(half, 100.0)):
         torch.testing.assert_close(averaged, flat(0.6, 2))
     planes = torch.rand(4, 13, 17, generator=torch.Generator().manual_seed(0))
-    assert average_planes(planes, 1) is planes
+    assert reference_camera.average_planes(planes, 1) is planes
     expected = planes[:, :12, :15].reshape(4, 4, 3, 5, 3).mean(dim=(2, 4))
-    torch.testing.assert_close(average_planes(planes, 3), expected)
+    torch.testing.assert_close(reference_camera.average_planes(planes, 3), expected)
     camera = ReferenceCamera(sensor(0.0, 0.0, span=1000.0))
     signal = torch.tensor([-1.0, -0.2, -0.0012, 0.1234, 0.9996, 7.0]).expand(4, 1, 6)
     found = camera.record(signal, 100.0, torch.Generator()) * 1000
@@ -274,7 +267,7 @@ def test_the_lens_is_scipys_gaussian(sigma: float) -> None:
     light = np.random.default_rng(0).random((3, 21, 34), dtype=np.float32)
     reach = max(1, int(np.ceil(3 * sigma)))
     expected = gaussian_filter(light, (0, sigma, sigma), mode="nearest", radius=(0, reach, reach))
-    found = lens_blur(torch.from_numpy(light), sigma).numpy()
+    found = reference_camera.lens_blur(torch.from_numpy(light), sigma).numpy()
     np.testing.assert_allclose(found, expected if sigma else light, atol=2e-7)
 
 
@@ -282,7 +275,7 @@ def test_the_lens_is_scipys_gaussian(sigma: float) -> None:
 def test_planes_are_sampled_by_their_colour_and_place(cfa: BayerPattern) -> None:
     """By the letters of the pattern; G1 is on red's rows, G2 on blue's; odd sides are cut."""
     light, red, blue = torch.rand(3, 7, 9), cfa.name.index("R"), cfa.name.index("B")
-    planes = sample_mosaic(light, cfa)
+    planes = reference_camera.sample_mosaic(light, cfa)
     for plane, at in zip(planes, (red, red ^ 1, blue ^ 1, blue), strict=True):
         assert torch.equal(plane, light["RGB".index(cfa.name[at]), at // 2 : 6 : 2, at % 2 : 8 : 2])
 

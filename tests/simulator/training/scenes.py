@@ -1,7 +1,5 @@
 """Tiny scenes to train on, and a small dataset of them in the layout of the paper's."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
@@ -15,12 +13,8 @@ LUX = 640.0
 REFERENCE = CameraSettings(100, 1 / 16, 4)
 
 #: All expose a white card to 0.17 to 0.66 of sensor white.
-SETTINGS = (
-    CameraSettings(100, 1 / 16, 8),
-    CameraSettings(1600, 1 / 256, 8),
-    CameraSettings(400, 1 / 64, 5.6),
-    CameraSettings(200, 1 / 8, 16),
-)
+SETTINGS = ((100, 1 / 16, 8), (1600, 1 / 256, 8), (400, 1 / 64, 5.6), (200, 1 / 8, 16))
+SETTINGS = tuple(CameraSettings(*values) for values in SETTINGS)
 
 
 def scene(name: str = "a", *, size: int = 32, depth: bool = True, seed: int = 0) -> ReferenceScene:
@@ -40,7 +34,7 @@ def scene(name: str = "a", *, size: int = 32, depth: bool = True, seed: int = 0)
     )
 
 
-def write_dataset(folder: Path, *, sequences: int = 3, size: int = 32) -> Path:
+def write_dataset(folder, *, sequences=3, size=32):
     """Writes ``scene_NNN/NAME.npy`` and a table beside them."""
     camera = packed_camera("nikon_z6")
     body = ReferenceCamera(camera, body=BodyError.draw(camera, 1))

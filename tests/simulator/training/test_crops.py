@@ -2,33 +2,26 @@
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from simulator import CameraSettings, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE, ApertureModule
 from simulator.networks.exposure_module import ExposureModule
-from simulator.networks.noise_module import NoiseModule, Preset
+from simulator.networks.noise_module import NoiseModule
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DiscBank
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
+from simulator.training import crops as crops_module
 from simulator.training import losses
-from simulator.training.crops import (
-    Batch,
-    DetailCrops,
-    DetailPicture,
-    NoiseBatch,
-    ReferencePairs,
-    draw_sequences,
-)
+from simulator.training.crops import Batch, DetailCrops, DetailPicture, NoiseBatch, ReferencePairs
 from tests.simulator.training.scenes import REFERENCE, scene
 
 Z6, CANON = get_camera("nikon_z6"), get_camera("canon_70d")
@@ -50,7 +43,8 @@ def test_batches_and_sequences_are_those_of_their_seed_and_index():
         assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
     torch.manual_seed(77)
     assert all(map(torch.equal, batches[1], pairs().batch(1, 4, 16)))  # the first that it draws
-    first, again, other = (draw_sequences([scene(), scene()], Z6, seed) for seed in (0, 0, 1))
+    draw = partial(crops_module.draw_sequences, [scene(), scene()], Z6)
+    first, again, other = (draw(seed) for seed in (0, 0, 1))
     assert [s.settings for s in first] == [s.settings for s in again]
     assert first[1].settings != first[0].settings != other[0].settings
     with pytest.raises(ValueError, match="`sequences`"):
@@ -213,11 +207,11 @@ SHOT, READ = 4e-4, 1e-6
 class Fixed(nn.Module):
     """A network whose output is known; one parameter, so that it can be trained."""
 
-    def __init__(self, output: Callable[..., Tensor]) -> None:
+    def __init__(self, output):
         super().__init__()
         self.output, self.shift = output, nn.Parameter(torch.zeros(()))
 
-    def forward(self, *given: Tensor) -> Tensor:
+    def forward(self, *given):
         return self.output(*given) + self.shift
 
 
@@ -239,7 +233,7 @@ def batch(level: float = 0.2, ratio: float = 2.0, noise: bool = True) -> Batch:
     )
 
 
-def denoiser(output: Callable[..., Tensor], preset: Preset = "nano") -> NoiseModule:
+def denoiser(output, preset="nano"):
     made = NoiseModule(preset)
     made.network = Fixed(output)
     return made
@@ -310,7 +304,7 @@ def test_black_and_blown_out_batches_teach_finite_gradients(level, preset):
         assert_finite(losses.NoiseLoss(module)(data), module)
 
 
-def assert_finite(values: dict[str, Tensor], module: nn.Module) -> None:
+def assert_finite(values, module):
     values["loss"].backward()
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
     assert all(bool(value.isfinite().all()) for value in (*values.values(), *gradients))
@@ -324,7 +318,7 @@ def opened(data: Batch) -> Batch:
     return data._replace(source=texture, target=target, ratio=torch.ones(2))
 
 
-def aperture_loss(log_blur: Callable[..., Tensor]) -> losses.ApertureLoss:
+def aperture_loss(log_blur):
     module = ApertureModule("compact")
     module.network.forward = Fixed(log_blur).forward
     return losses.ApertureLoss(ExposureModule(), denoiser(lambda image, *_: image), module)

@@ -8,13 +8,12 @@ import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch import Tensor, nn
+from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
@@ -22,7 +21,7 @@ from simulator import get_camera
 from simulator.capture.statistics import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceCamera
 from simulator.training import trainer
 from simulator.training.crops import DetailCrops, DetailPicture, ReferencePairs, draw_sequences
 from simulator.training.trainer import SimulatorConfig, StageConfig, make_accelerator, validate
@@ -32,14 +31,14 @@ from tests.simulator.training.scenes import scene
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
 
 
-def config(preset: str = "compact", **changes: Any) -> SimulatorConfig:
+def config(preset="compact", **changes):
     names = {"compact": ("noise", "exposure", "aperture"), "nano": ("noise",), "large": ("noise",)}
     names = names.get(preset, ("baseline",))
     values = {"preset": preset, "scenes": {"size": 32}, **dict.fromkeys(names, STAGE), **changes}
     return SimulatorConfig.model_validate(values)
 
 
-def scenes(config: SimulatorConfig, split: str) -> list[ReferenceScene]:
+def scenes(config, split):
     first = {"train": 0, "validation": 10}[split]
     return [scene(f"{split}-deep", seed=first), scene(f"{split}-flat", seed=first + 1, depth=False)]
 
@@ -81,7 +80,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def card_of(file: Path) -> dict[str, Any]:
+def card_of(file):
     return json.loads(file.with_suffix(".json").read_text())
 
 
@@ -152,7 +151,7 @@ def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing():
     seen: list[float] = []
 
     class Mean(nn.Module):
-        def forward(self, batch: Any) -> dict[str, torch.Tensor]:
+        def forward(self, batch):
             seen.append(float(batch.source.mean()))
             value = torch.tensor(float(len(seen)))
             return {"loss": value, "gain_db": value / (len(seen) != 3)}
@@ -212,7 +211,7 @@ class Loss(nn.Module):
         return {"loss": value, "undefined": value.detach() * math.nan}
 
 
-def run(file: Path, watch: Watch, **budget: float) -> tuple[Loss, dict[str, Any]]:
+def run(file, watch, **budget):
     loss, stage = Loss(), StageConfig(batch=3, crop=16, learning_rate=0.05, **budget)
     accelerator = make_accelerator(config("pc"), "cpu", None)
     options = {"checkpoint": file, "identity": "one"}
@@ -315,18 +314,18 @@ def test_a_later_stage_does_not_change_what_an_earlier_one_is():
 class Known(NoiseModule):
     """Leaves a share of the noise's deviation on a flat field, and shifts it by another."""
 
-    def __init__(self, left: float, shift: Any) -> None:
+    def __init__(self, left, shift):
         super().__init__("nano")
         self.left, self.shift, self.calls = left, shift, 0
 
-    def forward(self, noisy: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+    def forward(self, noisy, shot, read):
         mean = noisy.mean(dim=(0, 2, 3), keepdim=True).expand_as(noisy)
         sigma = variance_map(mean, shot, read).sqrt()
         self.calls += 1
         return mean + self.left * (noisy - mean) + self.shift(self.calls) * sigma
 
 
-def calibrated(left: float, shift: Any) -> Residual:
+def calibrated(left, shift):
     picture = DetailPicture("a", "a", "mosaic", torch.full((4, 64, 64), 0.5))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("simulator.training.trainer._SIDE", 32)
