@@ -49,14 +49,15 @@ _POSITIONS = ("StripOffsets", "StripByteCounts", "TileOffsets", "TileByteCounts"
 #: The tags that are read, by name. Others (maker notes, previews, XMP) are passed over.
 _NAMES = (
     *("ImageWidth", "ImageLength", "BitsPerSample", "Compression", "PhotometricInterpretation"),
-    *("Make", "Model", "Orientation", "SamplesPerPixel", "Software", *_POSITIONS),
-    *("CFAPattern", "CFAPlaneColor", "LinearizationTable", "WhiteLevel", "ActiveArea"),
+    *("Make", "Model", "Orientation", "SamplesPerPixel", "Software", "RowsPerStrip"),
+    *(*_POSITIONS, "CFAPattern", "CFAPlaneColor", "LinearizationTable", "WhiteLevel", "ActiveArea"),
     *("BlackLevelRepeatDim", "BlackLevel", "BlackLevelDeltaH", "BlackLevelDeltaV"),
     *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),
     *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
     *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
-    *("PhotographicSensitivity", "DefaultScale", "BaselineExposure", *OPCODES),
+    *("PhotographicSensitivity", "DefaultScale", "BaselineExposure", *OPCODES, "DNGVersion"),
+    *("UniqueCameraModel", "CFALayout", "SampleFormat"),
 )
 _NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
@@ -204,8 +205,11 @@ def is_raw_container(stream: BinaryIO) -> bool:
 def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple[str, str]:
     """Make and model as the camera recorded them; ``("", "")`` where the file does not say."""
     for tags in directories:
-        if "Model" in tags:
+        if tags.get("Model", ("",))[0]:
             return str(tags.get("Make", ("",))[0]), str(tags["Model"][0])
+    unique = str((first(directories, "UniqueCameraModel") or ("",))[0])  # all that a DNG must say
+    if unique:
+        return unique.split()[0], unique
     head = _read_at(stream, 0, 2**16)
     if head[_CIFF[0]] == _CIFF[1]:
         return _ciff_identity(stream, struct.unpack_from("<I", head, 2)[0])
@@ -307,7 +311,7 @@ def read_colour_matrix(
 
     AnalogBalance and CameraCalibration are multiplied in (DNG specification 1.4, chapter 6).
     """
-    chosen = None
+    chosen, letters = None, plane_letters(directories)
     for number in "12":
         values = first_numbers(directories, f"ColorMatrix{number}")
         calibration = first_numbers(directories, f"CameraCalibration{number}")
@@ -320,10 +324,17 @@ def read_colour_matrix(
         if len(balance) == 3:
             matrix = np.array(balance, np.float64)[:, None] * matrix
         if abs(np.linalg.det(matrix)) > 1e-6:
-            chosen = tuple(tuple(float(v) for v in row) for row in matrix)
+            rows = matrix[[letters.index(letter) for letter in "RGB"]]
+            chosen = tuple(tuple(float(v) for v in row) for row in rows)
             if first(directories, f"CalibrationIlluminant{number}") == (D65,):
                 break
     return chosen  # type: ignore[return-value]
+
+
+def plane_letters(directories: Sequence[Directory]) -> str:
+    """Letters of the colour planes of a DNG, by which its tags are ordered; "RGB" of all others."""
+    colours = first_numbers(directories, "CFAPlaneColor")
+    return "".join("RGB"[int(c)] for c in colours) if sorted(colours) == [0, 1, 2] else "RGB"
 
 
 def read_noise_profile(directories: Sequence[Directory]) -> NoiseLevelFunction | None:
@@ -333,15 +344,14 @@ def read_noise_profile(directories: Sequence[Directory]) -> NoiseLevelFunction |
     CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
     (DNG specification 1.4).
     """
-    values = first_numbers(directories, "NoiseProfile")
-    colours = first_numbers(directories, "CFAPlaneColor") or (0, 1, 2)
+    values, letters = first_numbers(directories, "NoiseProfile"), plane_letters(directories)
     if len(values) == 2:
-        values = tuple(values) * len(colours)
-    if len(values) != 2 * len(colours) or sorted(colours) != [0, 1, 2]:
+        values = tuple(values) * 3
+    if len(values) != 6:
         return None
     if any(abs(v) > VARIANCE_LIMIT for v in values) or any(v < 0 for v in values[::2]):
         return None
-    pairs = [2 * tuple(colours).index(colour) for colour in (0, 1, 1, 2)]
+    pairs = [2 * letters.index(letter) for letter in "RGGB"]
     return NoiseLevelFunction(
         shot=tuple(float(values[i]) for i in pairs),  # type: ignore[arg-type]
         read=tuple(max(0.0, float(values[i + 1])) for i in pairs),  # type: ignore[arg-type]
@@ -357,7 +367,8 @@ def read_black_level(
     The pixels' own differences are None where there are none. The level of a pixel is that of the
     tile, which begins at the corner of the ActiveArea, plus BlackLevelDeltaV of its row, plus
     BlackLevelDeltaH of its column (DNG specification 1.4). Four values without a
-    BlackLevelRepeatDim are a tile of 2 x 2: several writers of DNGs leave it out.
+    BlackLevelRepeatDim are a tile of 2 x 2 (several writers of DNGs leave it out), one value is
+    that of all pixels whatever the tile.
 
     Args:
         tags: Of the directory that describes the mosaic.
@@ -369,7 +380,7 @@ def read_black_level(
         None where the file does not say, or says what cannot be.
     """
     values = numbers(tags, "BlackLevel")
-    rows, columns = tags.get("BlackLevelRepeatDim", (2, 2) if len(values) == 4 else (1, 1))[:2]
+    rows, columns = tags.get("BlackLevelRepeatDim", (2, 2))[:2] if len(values) > 1 else (1, 1)
     corner = numbers(tags, "ActiveArea")[:2] or (0, 0)
     if len(values) != rows * columns or not values or min(values) < 0 or len(corner) != 2:
         return None

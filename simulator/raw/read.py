@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import os
@@ -29,6 +30,7 @@ from simulator.raw.metadata import (
     missing_bytes,
     normalised_model,
     numbers,
+    plane_letters,
     read_black_level,
     read_colour_matrix,
     read_directories,
@@ -46,6 +48,8 @@ logger = logging.getLogger(__name__)
 _WHITE_TOLERANCE = 2.0
 #: PhotometricInterpretation of a raw, and of a DNG that is demosaicked already.
 COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
+#: SampleFormat of a DNG of floating-point numbers.
+_FLOATING_POINT = 3
 #: Compression of DNGs that LibRaw decodes: none, lossless JPEG, deflate; and GoPro's.
 _COMPRESSIONS, _VC5 = (1, 7, 8), 9
 _LETTERS = {0: "R", 1: "G", 2: "B"}
@@ -251,6 +255,20 @@ def _check_structure(directories: Sequence[Directory], known_kind: bool, size: i
         if min(height, width) < 1 or not pixels:
             found = f"{height:g} x {width:g} pixels at {tags.get('StripOffsets', 'no position')}"
             raise RawFileError(f"must hold an image, but names {found}: it is damaged")
+        if tags.get("CFALayout", (1,)) != (1,):
+            raise RawFileError("must be a Bayer raw, but its CFALayout says staggered pixels")
+        if first(directories, "DNGVersion") and _has_gaps(tags, width):
+            rule = "must have its strips one after another, the only order that LibRaw knows"
+            raise RawFileError(f"{rule}; convert it to a DNG of one strip")
+
+
+def _has_gaps(tags: Directory, width: float) -> bool:
+    """Whether the uncompressed strips of a directory do not follow each other without a gap."""
+    strips = numbers(tags, "StripOffsets")
+    rows, bits = (sum(numbers(tags, name)) for name in ("RowsPerStrip", "BitsPerSample"))
+    size = rows * math.ceil(width * bits / 8)
+    apart = any(end - begin != size for begin, end in itertools.pairwise(strips))
+    return apart and tags.get("Compression") == (1,)
 
 
 def _settings(
@@ -468,22 +486,27 @@ def _from_libraw(
         raise RawFileError(
             "must be a Bayer raw, but has every colour at every pixel (linear or Foveon)"
         )
-    indices = _tile_indices(raw)
-    cfa = BayerPattern("".join(raw.color_desc.decode()[i] for i in indices))
+    indices = _tile_indices(raw, _letters(raw, directories))
+    cfa = BayerPattern("".join(_letters(raw, directories)[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
     black = [float(raw.black_level_per_channel[i]) for i in order]
     mosaic, white = raw.raw_image_visible, float(raw.white_level)
     if min(mosaic.shape) < 2:
         raise RawFileError("must hold an image, but is empty")
+    height, width = (n // 2 * 2 for n in mosaic.shape)
+    mosaic, tags = mosaic[:height, :width], _mosaic_directory(directories)
     # LibRaw drops the fraction, all but the mean of a pixel's own level, and the phase where it
     # moves an odd margin to an even one.
     margins = sizes.top_margin, sizes.left_margin
-    stated = read_black_level(_mosaic_directory(directories), cfa, margins, mosaic.shape)
+    stated = read_black_level(tags, cfa, margins, mosaic.shape)
     if stated is not None:
-        black, own = list(stated[0]), stated[1]
+        scale = 1.0
+        if tags.get("SampleFormat") == (_FLOATING_POINT,):  # of which LibRaw makes whole numbers
+            scale = white / next(iter(numbers(tags, "WhiteLevel")), 1.0)
+        black, own = [scale * level for level in stated[0]], stated[1]
         if own is not None:  # what is white stays white
-            mosaic = np.where(mosaic < white, mosaic - own, mosaic)
-    white_balance, source = _white_balance(raw)
+            mosaic = np.where(mosaic < white, mosaic - scale * own, mosaic)
+    white_balance, source = _white_balance(raw, directories)
     matrix, matrix_source = _colour_matrix(raw, directories)
     moment = raw.other.timestamp
     known = moment is not None and moment.timestamp() > 0
@@ -506,7 +529,13 @@ def _from_libraw(
     )
 
 
-def _tile_indices(raw: rawpy.RawPy) -> list[int]:
+def _letters(raw: rawpy.RawPy, directories: Sequence[Directory]) -> str:
+    """Letters of LibRaw's colour indices, which are the planes of a DNG, in any order."""
+    letters = plane_letters(directories)
+    return raw.color_desc.decode() if letters == "RGB" else letters + letters[1]
+
+
+def _tile_indices(raw: rawpy.RawPy, description: str) -> list[int]:
     """LibRaw's colour indices of the 2 x 2 tile at the origin of the visible area."""
     try:
         pattern = raw.raw_pattern
@@ -516,7 +545,6 @@ def _tile_indices(raw: rawpy.RawPy) -> list[int]:
     if shape == (6, 6):
         raise RawFileError("must be a Bayer raw, but has Fujifilm's X-Trans array")
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
-    description = raw.color_desc.decode()
     if shape == (2, 2):
         # The visible area may begin on an odd row or column: ask there, not at the sensor's corner.
         indices = [int(raw.raw_color(top + r, left + c)) for r in (0, 1) for c in (0, 1)]
@@ -528,11 +556,13 @@ def _tile_indices(raw: rawpy.RawPy) -> list[int]:
     raise RawFileError(f"must be a Bayer raw (R, G, B in a 2 x 2 tile), but is {array}")
 
 
-def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
+def _white_balance(
+    raw: rawpy.RawPy, directories: Sequence[Directory]
+) -> tuple[tuple[float, float, float], str]:
     """Gains of R, G, B with green 1: the camera's, else LibRaw's daylight ones, else neutral."""
     known = {"camera": raw.camera_whitebalance, "daylight": raw.daylight_whitebalance}
     for source, gains in known.items():
-        red, green, blue = gains[:3]
+        red, green, blue = (gains[plane_letters(directories).index(letter)] for letter in "RGB")
         if all(np.isfinite(g) and g > 0 for g in (red, green, blue)):
             return (red / green, 1.0, blue / green), source
     return (1.0, 1.0, 1.0), "none"
@@ -564,10 +594,13 @@ def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> 
     }
     found = {name: float(f"{value:.7g}") for name, value in found.items()}  # it has float32
     for setting, name in _TAGS.items():  # phones write no EXIF directory, where LibRaw looks
-        for stated in first_numbers(directories, name)[:1]:
-            if not found[setting] or math.isclose(found[setting], stated, rel_tol=1e-6):
-                found[setting] = float(stated)
-    if found["iso"] == 65535:  # it does not fit EXIF's 16 bits
+        stated = next((v for v in first_numbers(directories, name) if v > 0), 0.0)
+        # LibRaw has float32, and the lower 16 bits of an ISO that is written with 32.
+        same = math.isclose(found[setting], stated, rel_tol=1e-6)
+        cut = setting == "iso" and found[setting] == stated % 2**16
+        if stated and (not found[setting] or same or cut):
+            found[setting] = float(stated)
+    if found["iso"] in (0, 65535):  # none, or it does not fit EXIF's 16 bits
         more = (first_numbers(directories, name) for name in LONG_ISO)
         found["iso"] = next((v[0] for v in more if v and v[0] > 0), found["iso"])
     known = {k: float(v) for k, v in found.items() if math.isfinite(v) and v > 0}
@@ -608,10 +641,13 @@ def _extra(
 
 
 def _mosaic_directory(directories: Sequence[Directory]) -> Directory:
-    """The directory that describes the colour filter array; empty where there is none."""
-    return next(
-        (d for d in directories if d.get("PhotometricInterpretation") == (COLOUR_FILTER_ARRAY,)), {}
-    )
+    """The directory of the colour filter array; empty where there is none.
+
+    Of several it is that of the largest, as in LibRaw: the others are previews.
+    """
+    kinds = [d for d in directories if d.get("PhotometricInterpretation") == (COLOUR_FILTER_ARRAY,)]
+    sides = ("ImageLength", "ImageWidth")
+    return max(kinds, key=lambda d: math.prod(sum(numbers(d, n)) for n in sides), default={})
 
 
 def _white_level(
