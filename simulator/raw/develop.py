@@ -369,9 +369,9 @@ def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
     a lamp or the sky is brighter than the sensor can tell: all planes clip at the same number, but
     the white of the scene is another number in each, so a clipped lamp that is darkened as it was
     recorded turns pink. There a clipped plane takes the mean level (value times white balance gain)
-    of the pixel's measured planes, so that the pixel is neutral, or where every plane is clipped 1.2
-    to 2 times the highest of all, the more, the more pixels around are so. Its spread is that of
-    what nobody measured: highlights lie anywhere above white, with a median of about twice that.
+    of the pixel's measured planes, so that the pixel is neutral; where all are clipped, 1.2 to 2
+    times the highest, the more, the more pixels around are so. Its spread is that of what nobody
+    measured: highlights lie anywhere above white, with a median of about twice that.
 
     Pixels that are not `saturated`, (H, W), are left out; `raw.data` itself is returned where no
     sample has to be raised.
