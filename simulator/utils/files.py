@@ -46,9 +46,9 @@ MAX_PIXELS_PER_BYTE = 1024
 #: The same for a radiance map; a flat one in OpenEXR's DWAB compression has over 3000.
 MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 
-#: Most pixels of a developed picture; a black one may have a thousand pixels a byte, so its length
-#: tells nothing.
-MAX_PICTURE_PIXELS = 2**26
+#: Most pixels of a developed picture, and most of one with more than 256 pixels a byte, as a black
+#: one has: decoded, they take some 1 GB.
+MAX_PICTURE_PIXELS, MAX_FLAT_PIXELS = 2**26, 2**24
 
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
@@ -95,8 +95,8 @@ def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Itera
 
     Raises:
         ValueError: Here and within, naming the file, if it is missing (a link that leads nowhere),
-            no whole picture, larger than `MAX_PICTURE_PIXELS`, or has colours of more than 8 bits,
-            of which Pillow reads the upper 8.
+            no whole picture, larger than `MAX_PICTURE_PIXELS` or `MAX_FLAT_PIXELS`, or has colours
+            of more than 8 bits, of which Pillow reads the upper 8.
     """
     from PIL import Image
 
@@ -105,6 +105,10 @@ def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Itera
             if picture.width * picture.height > MAX_PICTURE_PIXELS:
                 size = f"{picture.width} x {picture.height} pixels"
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")
+            if picture.width * picture.height > MAX_FLAT_PIXELS:
+                length = path.stat().st_size
+                if reason := refuse_bomb(picture.height, picture.width, length, per_byte=256):
+                    raise ValueError(f"it {reason}")
             tiles = getattr(picture, "tile", ())
             if len(picture.getbands()) > 1 and any(";16" in str(tile[3]) for tile in tiles):
                 raise ValueError("it has colours of 16 bits: save it with 8, or give raws")
