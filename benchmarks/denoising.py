@@ -2,14 +2,15 @@
 
 One crop of every source of the test split of `simulator.training.scenes`: views into radiance maps,
 photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
-every method; the gain is that of the PSNR over the noisy input. One thread.
+every method; the gain is that of the PSNR over the noisy input. One thread. Clipped views into maps
+go the whole way of a user's raw besides, the estimate of what is clipped included.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from time import perf_counter
@@ -23,17 +24,21 @@ from torch import Tensor
 
 from benchmarks.fidelity.models import trained_noise_modules
 from benchmarks.harness import Part, Report, Row, benchmark, interval, pivot, table
-from simulator import CameraProfile, get_camera
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
+from simulator.networks.noise_module import SIZES
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance.reading import read_radiance
 from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
 from simulator.training.crops import DetailPicture
-from simulator.training.scenes import detail_pictures
+from simulator.training.scenes import Split, detail_pictures, radiance_files
 from simulator.utils.files import data_folder
 
 #: Sources are photographed by both cameras in turn.
 CAMERAS = ("nikon_z6", "canon_70d")
 ISOS, LEVELS = (400, 1600, 6400, 16000), (0, -3, -6)
+#: Of views with highlights; at level 0 the brightest 5 % of samples begin at half of white.
+BRIGHT_ISOS, BRIGHT_LEVELS = (1600, 6400), (0, -1, -2, -4)
 #: Side of a crop [packed pixel], and sources measured by one part.
 SIZE, _AT_ONCE = 128, 4
 #: A recorded mosaic is a case where the noise that is added has this many times its own variance.
@@ -46,19 +51,6 @@ REFERENCE = "BM3D"
 Denoiser = Callable[[Tensor, NoiseLevelFunction], Tensor]
 
 
-@dataclass(frozen=True)
-class Case:
-    """One photograph of one crop."""
-
-    source: str
-    kind: str
-    camera: CameraProfile
-    iso: int
-    level: int
-    light: Tensor
-    noisy: Tensor
-
-
 def sources() -> list[DetailPicture]:
     found: dict[str, DetailPicture] = {}
     for picture in detail_pictures("test", data=data_folder(), drawn=0):
@@ -67,8 +59,8 @@ def sources() -> list[DetailPicture]:
     return [found[group] for group in sorted(found)]
 
 
-def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
-    """The photographs of a crop of `picture`, the `number`-th source."""
+def cases(number: int, picture: DetailPicture, seed: int) -> list[tuple[Row, Any, Tensor, Tensor]]:
+    """Facts, noise, light up to white and record of a crop of `picture`, the `number`-th source."""
     rng = np.random.default_rng([zlib.crc32(picture.name.encode()), seed])
     mosaic = picture.light.shape[0] == 4
     side = SIZE if mosaic else 2 * SIZE
@@ -88,47 +80,75 @@ def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
             continue
         exposed = light * scale
         noisy = reference.record(exposed, iso, noise_generator(seed, number, iso, float(level)))
-        clean = exposed.clamp(max=1.0)
-        made.append(Case(picture.name, picture.kind, camera, iso, level, clean, noisy))
+        row: Row = {"source": picture.name, "kind": picture.kind, "camera": camera.name}
+        row |= {"iso": iso, "ev": level}
+        made.append((row, added, exposed.clamp(max=1.0), noisy))
     return made
 
 
-def networks() -> dict[str, Denoiser]:
-    @torch.no_grad()
-    def denoise(module: Any, raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
-        shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
-        result: Tensor = module(raw[None], shot, read)[0]
-        return result
+@torch.no_grad()
+def _by_network(module: Any, raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
+    shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
+    result: Tensor = module(raw[None], shot, read)[0]
+    return result
 
-    return {name: partial(denoise, module) for name, module in trained_noise_modules().items()}
+
+def networks() -> dict[str, Denoiser]:
+    return {name: partial(_by_network, module) for name, module in trained_noise_modules().items()}
 
 
 def classical() -> dict[str, Denoiser]:
-    planes = {"VST + NLM": non_local_means, REFERENCE: bm3d_planes}
-    return {name: behind_anscombe(denoise) for name, denoise in planes.items()}
+    found = {"VST + NLM": non_local_means, REFERENCE: bm3d_planes}
+    return {name: behind_anscombe(denoise) for name, denoise in found.items()}
 
 
 def measure(methods: str, first: int, seed: int, quick: bool) -> list[Row]:
     known, rows = {"networks": networks, "classical": classical}[methods](), []
     chosen = list(enumerate(sources()))[first : first + (1 if quick else _AT_ONCE)]
     every = [case for number, picture in chosen for case in cases(number, picture, seed)]
-    for case in every[::3] if quick else every:
-        before, green = _error(case.noisy, case.light), case.light[1] - case.light[2]
+    for about, nlf, light, noisy in every[::3] if quick else every:
+        before, green = _error(noisy, light), light[1] - light[2]
         for name, denoise in known.items():
             begun = perf_counter()
-            clean = denoise(case.noisy, case.camera.nlf(case.iso))
-            ms = 1e3 * (perf_counter() - begun)
-            row: Row = {"part": "cases", "method": name, "milliseconds": ms}
-            row |= {"source": case.source, "kind": case.kind, "camera": case.camera.name}
-            gain = 10.0 * np.log10(before / max(_error(clean, case.light), 1e-30))
+            clean = denoise(noisy, nlf)
+            row: Row = {"part": "cases", "method": name, **about}
+            row["milliseconds"] = 1e3 * (perf_counter() - begun)
+            row["gain_db"] = 10.0 * math.log10(before / max(_error(clean, light), 1e-30))
             kept = float(((clean[1] - clean[2]) * green).sum() / green.square().sum())
-            row |= {"iso": case.iso, "ev": case.level, "gain_db": float(gain)}
             rows.append(row | {"green_kept": kept})
     return rows
 
 
-def _error(image: Tensor, truth: Tensor) -> float:
-    return float((image.clamp(max=1.0).double() - truth.double()).square().mean())
+def measure_highlights(seed: int, quick: bool, split: Split = "test") -> list[Row]:
+    """Light of raws of maps, estimated above white and denoised, against light that never clips."""
+    data, rows = data_folder(), []
+    simulators = {k: CameraSimulator.from_pretrained(k, device="cpu") for k in SIZES}
+    files = [] if data is None else list(radiance_files(data, split))
+    for number, (path, _) in enumerate(files[:2] if quick else files):
+        light = torch.from_numpy(read_radiance(path))
+        if min(light.shape[1:]) < 2 * SIZE:
+            continue
+        rng = np.random.default_rng([zlib.crc32(path.stem.encode()), seed])
+        top, left = (int(rng.integers(n - 2 * SIZE + 1)) for n in light.shape[1:])
+        light = sample_mosaic(lens_blur(light[:, top : top + 2 * SIZE, left : left + 2 * SIZE]))
+        camera, white = get_camera(CAMERAS[number % 2]), max(2 * float(light.quantile(0.95)), 1e-9)
+        for iso, level in product(BRIGHT_ISOS, BRIGHT_LEVELS):
+            true, noise = light * (2.0**level / white), noise_generator(seed, number, iso, level)
+            noisy = ReferenceCamera(camera).record(true, iso, noise)
+            raw = RawImage(noisy, CameraSettings(iso, 1 / 60, 4), camera)
+            made = {k: s.prepare(raw) for k, s in simulators.items()}
+            found = {k: p.denoised_lights[-1].light for k, p in made.items()}
+            found = {"the estimate alone": next(iter(made.values())).light, **found}
+            for (name, clean), most in product(found.items(), (1.0, math.inf)):
+                errors = [_error(x, true.clamp(max=most), most) for x in (noisy, clean)]
+                row: Row = {"part": "highlights", "method": name, "source": path.stem, "iso": iso}
+                row |= {"ev": level, "light": "above white" if most > 1 else "up to white"}
+                rows.append(row | {"gain_db": 10.0 * math.log10(errors[0] / errors[1])})
+    return rows
+
+
+def _error(image: Tensor, truth: Tensor, most: float = 1.0) -> float:
+    return float((image.clamp(max=most).double() - truth.double()).square().mean())
 
 
 # -- classical methods ----------------------------------------------------------------------------
@@ -151,12 +171,7 @@ def _planes(nlf: NoiseLevelFunction) -> tuple[Tensor, Tensor]:
 
 
 def anscombe(raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
-    """Generalised Anscombe transform of a raw (4, H, W): its noise has a deviation of about 1.
-
-    >>> nlf = NoiseLevelFunction((1e-3,) * 4, (0.0,) * 4)
-    >>> round(float(anscombe(torch.full((4, 1, 1), 0.1), nlf)[0]), 3)
-    20.037
-    """
+    """Generalised Anscombe transform of a raw (4, H, W): its noise has a deviation of about 1."""
     shot, read = _planes(nlf)
     return 2.0 * (raw / shot + 0.375 + read / shot.square()).clamp(min=0.0).sqrt()
 
@@ -198,30 +213,47 @@ def parts(seed: int, quick: bool) -> list[Part]:
     return [
         Part(f"{methods} {first}", measure, {"methods": methods, "first": first}, threads=1)
         for methods, first in product(("networks", "classical"), starts)
-    ]
+    ] + [Part("highlights", measure_highlights, threads=1)]
 
 
-_COLUMNS = """method = {method} | gain [dB] = {gain_db:.2f} |
-10th percentile = {gain_db_10_percent:.2f} | worst = {gain_db_worst:.2f} |
-to BM3D [dB] = {to_bm3d_db:+.2f} ({ci95:+.2f}) | green difference kept = {green_kept:.2f} |
-ms = {milliseconds:.1f}"""
+#: Beside every mean.
+_GAINS = """gain [dB] = {gain_db:.2f} | worst = {worst:.2f} | below 0 = {below:.1%} |
+below -0.1 dB = {clearly_below:.1%}"""
+_COLUMNS = f"""method = {{method}} | {_GAINS} | 10th percentile = {{gain_db_10_percent:.2f}} |
+to BM3D [dB] = {{to_bm3d_db:+.2f}} ({{ci95:+.2f}}) | green difference kept = {{green_kept:.2f}} |
+ms = {{milliseconds:.1f}}"""
+
+
+def gains_of(cases: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Mean gain, worst case and shares that lose, of each group."""
+    gains = cases.groupby(by, sort=False)["gain_db"]
+    found = gains.agg(gain_db="mean", worst="min", cases="size")
+    for name, limit in (("below", 0.0), ("clearly_below", -0.1)):
+        lost = cases["gain_db"].lt(limit)
+        found[name] = lost.groupby([cases[key] for key in by], sort=False).mean()
+    return found.reset_index()
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     rows = [row for own in results.values() for row in own]
-    cases, summary = pd.DataFrame(rows), []
-    by_source = cases.pivot_table("gain_db", "source", "method")
-    for name, own in cases.groupby("method", sort=False):
-        differences, gains = (by_source[name] - by_source[REFERENCE]).to_numpy(), own["gain_db"]
-        row: Row = {"part": "summary", "method": name, "cases": len(own), "gain_db": gains.mean()}
-        row |= {"gain_db_10_percent": gains.quantile(0.1), "gain_db_worst": gains.min()}
+    every = pd.DataFrame(rows)
+    cases, bright = every[every["part"] == "cases"], every[every["part"] == "highlights"]
+    by_source, summary = cases.pivot_table("gain_db", "source", "method"), []
+    for row in gains_of(cases, ["method"]).to_dict("records"):
+        own = cases[cases["method"] == row["method"]]
+        differences = (by_source[row["method"]] - by_source[REFERENCE]).to_numpy()
+        row |= {"part": "summary", "gain_db_10_percent": own["gain_db"].quantile(0.1)}
         row |= {"to_bm3d_db": differences.mean(), "ci95": interval(differences)}
         summary.append(row | own[["green_kept", "milliseconds"]].median().to_dict())
-    means = cases.groupby(["iso", "ev", "method"], sort=False)["gain_db"].mean().reset_index()
+    means = gains_of(cases, ["iso", "ev", "method"])
     means = means.sort_values(["iso", "ev"], ascending=[True, False], kind="stable")
     line, group = "method = {method}", "ISO {iso:.0f}, EV {ev:.0f}"
+    shown = gains_of(bright, ["method", "light"]).to_dict("records")
     tables = {"methods": table(summary, _COLUMNS)}
-    tables["by_iso"] = pivot(means.to_dict("records"), line, group, "{gain_db:.2f}")
+    contents = "{gain_db:.2f} ({worst:.2f}, {below:.0%})"
+    tables["by_iso"] = pivot(means.to_dict("records"), line, group, contents)
+    columns = f"method = {{method}} | light counts = {{light}} | cases = {{cases}} | {_GAINS}"
+    tables["highlights"] = table(shown, columns)
     return Report([*summary, *rows], tables, meta={"sources": len(by_source)})
 
 
