@@ -107,8 +107,8 @@ def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Itera
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")
             if picture.width * picture.height > MAX_FLAT_PIXELS:
                 length = path.stat().st_size
-                if reason := refuse_bomb(picture.height, picture.width, length, per_byte=256):
-                    raise ValueError(f"it {reason}")
+                if claim := refuse_bomb(picture.height, picture.width, length, per_byte=256):
+                    raise ValueError(f"it {claim}")
             tiles = getattr(picture, "tile", ())
             if len(picture.getbands()) > 1 and any(";16" in str(tile[3]) for tile in tiles):
                 raise ValueError("it has colours of 16 bits: save it with 8, or give raws")
