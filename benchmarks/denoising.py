@@ -137,8 +137,8 @@ def measure_highlights(seed: int, quick: bool, split: Split = "test") -> list[Ro
             noisy = ReferenceCamera(camera).record(true, iso, noise)
             raw = RawImage(noisy, CameraSettings(iso, 1 / 60, 4), camera)
             made = {k: s.prepare(raw) for k, s in simulators.items()}
-            found = {k: p.denoised_lights[-1].light for k, p in made.items()}
-            found = {"the estimate alone": next(iter(made.values())).light, **found}
+            found = {"the estimate alone": made["large"].light}
+            found |= {k: p.denoised_lights[-1].light for k, p in made.items()}
             for (name, clean), most in product(found.items(), (1.0, math.inf)):
                 errors = [_error(x, true.clamp(max=most), most) for x in (noisy, clean)]
                 row: Row = {"part": "highlights", "method": name, "source": path.stem, "iso": iso}

@@ -115,8 +115,7 @@ def _merged(captures: Sequence[Tensor], exposures: Sequence[float], raw: RawImag
     shot, read = (torch.tensor(v)[:, None, None] for v in (raw.noise.shot, raw.noise.read))
     total, weights = torch.zeros_like(captures[0]), torch.zeros_like(captures[0])
     for capture, ev in zip(captures, exposures, strict=True):
-        ratio = 2.0**ev
-        variance = shot * capture.clamp(min=0.0) + read
+        ratio, variance = 2.0**ev, shot * capture.clamp(min=0.0) + read
         weight = torch.where(capture < 0.99, ratio**2 / variance, 0.0)
         total, weights = total + weight * capture / ratio, weights + weight
     darkest = captures[0] / 2.0 ** exposures[0]

@@ -9,7 +9,6 @@ training that was stopped continues. Published numbers are of another split of t
 
 from __future__ import annotations
 
-import hashlib
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -91,15 +90,8 @@ def parts(
             wrong = f"`weights` (={str(weights)!r}) must be of all three modules"
             raise ValueError(f"{wrong}, not {preset!r}")
         names = [str(weights.resolve())]
-    given = [
-        {"name": n, "folder": str(folder.resolve())} for n in dict.fromkeys((*names, "compact"))
-    ]
-    return [Part(own["name"], measure, own, timeout=LONGEST) for own in given]
-
-
-def _digest(folder: Path) -> str:
-    tables = (path.read_bytes() for path in sorted(folder.rglob(paper_dataset.PARAMETERS)))
-    return hashlib.sha256(b"".join(tables)).hexdigest()
+    own = [{"name": n, "folder": str(folder.resolve())} for n in dict.fromkeys([*names, "compact"])]
+    return [Part(given["name"], measure, given, timeout=LONGEST) for given in own]
 
 
 def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
@@ -136,7 +128,8 @@ def trained(
     if quick:
         changes |= dict.fromkeys(config.stages(), QUICK_STAGE)
     config = SimulatorConfig.model_validate({**config.card(), **changes})
-    key = zlib.crc32(repr((config.card(), _digest(folder))).encode())
+    tables = [path.read_bytes() for path in sorted(folder.rglob(paper_dataset.PARAMETERS))]
+    key = zlib.crc32(repr((config.card(), tables)).encode())
     path = WEIGHTS / f"{name}-{key:08x}" / name
     if path.with_suffix(".safetensors").is_file():
         return path.with_suffix(".safetensors")

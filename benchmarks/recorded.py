@@ -184,8 +184,7 @@ def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -
     nlf = scene.camera.nlf(grid[state].iso).scaled(1.0 / scene.box_factor**2)
     shot, read = (torch.tensor(v)[:, None] for v in (nlf.shot, nlf.read))
     variance = (shot * signal.clamp(min=0.0) + read) * (signal < 1.0)
-    noise = (2.0 * variance).sqrt()
-    return psnr(noise, torch.zeros_like(noise))
+    return psnr((2.0 * variance).sqrt(), torch.zeros_like(variance))
 
 
 # -- the report -----------------------------------------------------------------------------------

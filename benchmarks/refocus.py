@@ -69,8 +69,8 @@ def _edges(reference: ReferenceCamera, scene: ReferenceScene) -> Tensor:
     steps = torch.zeros_like(diameter)
     steps[1:] = diameter.diff(dim=0).abs()
     steps[:, 1:] = torch.maximum(steps[:, 1:], diameter.diff(dim=1).abs())
-    window = 2 * EDGE_MARGIN + 1
-    return F.max_pool2d((steps > EDGE_STEP).double()[None], window, 1, EDGE_MARGIN)[0] > 0
+    edges = (steps > EDGE_STEP).double()[None]
+    return F.max_pool2d(edges, 2 * EDGE_MARGIN + 1, 1, EDGE_MARGIN)[0] > 0
 
 
 def _methods(

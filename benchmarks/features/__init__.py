@@ -321,16 +321,13 @@ def measure(seed: int, body: int, quick: bool) -> list[Row]:
     torch.set_num_threads(1)
     limit, steps = (QUICK_SOURCES, training.QUICK_STEPS) if quick else (None, training.STEPS)
     trained = {arm: training.train(arm, seed, steps, limit) for arm in training.AUGMENTATIONS}
-    found = _judged({arm: model.detect for arm, (model, _) in trained.items()}, body, quick)
+    taken = conditions(*((QUICK_GAPS, QUICK_ISOS) if quick else ()))
+    pairs = held_out_pairs("test", taken, body, limit)
+    found = judge({arm: model.detect for arm, (model, _) in trained.items()}, pairs)
     return [
         {"arm": arm, "seed": seed, "steps": steps, "seconds": seconds, "test": found[arm]}
         for arm, (_, seconds) in trained.items()
     ]
-
-
-def _judged(detects: dict[str, Detect], body: int, quick: bool) -> dict[str, list[Row]]:
-    taken = conditions(*((QUICK_GAPS, QUICK_ISOS) if quick else ()))
-    return judge(detects, held_out_pairs("test", taken, body, QUICK_SOURCES if quick else None))
 
 
 def measure_time(seed: int) -> list[Row]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from ae_env.scorers.measures import srgb_decode
@@ -25,7 +25,7 @@ from simulator.augment import ExposureAugmentation, sample_seeds
 from simulator.radiance.reading import read_radiance
 from simulator.raw.develop import GREY_CARD_SIGNAL, srgb_encode
 from simulator.training.scenes import Split, photograph_pictures, radiance_files, recorded_mosaics
-from simulator.utils.files import data_folder
+from simulator.utils.files import data_folder, write_atomically
 
 # -- pictures, and pairs of views of them with a known homography ---------------------------------
 
@@ -348,11 +348,9 @@ def _fit(
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
     state = {name: value.contiguous() for name, value in model.state_dict().items()}
-    save_file({**state, "seconds": torch.tensor(time.perf_counter() - begun)}, partial)
-    partial.replace(path)
+    state["seconds"] = torch.tensor(time.perf_counter() - begun)
+    write_atomically(path, save(state))
 
 
 @functools.cache

@@ -29,11 +29,7 @@ CROP = 72
 #: light [EV] of input and target. Times are rounded to whole stops.
 CASES: dict[str, tuple[dict[str, tuple[float, float]], Any, Any]] = {
     "low light": ({"Desk": (0.75, 0.45), "chelsea": (0.4, 0.5)}, (6400, 4, -1.5), (800, 4, 1.5)),
-    "high light": (
-        {"warehouse-090": (0.35, 0.7), "grass": (0.5, 0.5)},
-        (1600, 8, -2.0),
-        (100, 4, 0.0),
-    ),
+    "high light": ({"warehouse-090": (0.35, 0.7), "grass": (0.5, 0.5)}, (1600, 8, -2), (100, 4, 0)),
     "close shot": ({"motorcycle-front": (0.25, 0.72)}, (800, 11, 0.0), (100, 4, 0.0)),
 }
 
