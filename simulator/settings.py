@@ -137,6 +137,9 @@ def sensor_signal(luminance: float, settings: CameraSettings) -> float:
     """Signal, 1.0 at sensor white, of a surface of `luminance` [cd/m^2].
 
     Saturation-based speed of ISO 12232 (H = 0.65 L t / N^2, H_sat = 78 / ISO).
+
+    >>> sensor_signal(1.2, CameraSettings(100, 1.0, 1.0))  # 0.65 * 1.2 = 78 / 100
+    1.0
     """
     return luminance * 100.0 * 2.0**settings.log2_exposure / SATURATION_CONSTANT
 
