@@ -208,7 +208,6 @@ class _Analytic:
     defect: str
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         return 1.0 - severity(self.defect, images).abs_()
 
 

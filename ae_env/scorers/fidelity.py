@@ -50,7 +50,6 @@ class Fidelity:
     version = 1
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         first, which = distinct_references(captures)
         ideal = [_lab(picture) for picture in reference_pictures(captures, first)]
         scores = [
@@ -160,7 +159,6 @@ class Keypoints(_OrbScorer):
     """
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         height, width = images.shape[2:]
         orb = _detector(height, width)
         counts = [len(orb.detect(picture, None)) for picture in _luma_bytes(images)]
@@ -180,7 +178,6 @@ class Matches(_OrbScorer):
     """
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         cv2 = opencv()
         height, width = images.shape[2:]
         orb = _detector(height, width, MOST_MATCHED)

@@ -200,7 +200,6 @@ class Nima:
         _network(self.file, self.digest)  # raises now, not at the first score
 
     def __call__(self, images: Tensor, captures: Captures) -> Tensor:
-        """Scores (B,)."""
         return (mean_rating(_network(self.file, self.digest), images) - 1.0) / (RATINGS - 1.0)
 
 
@@ -432,7 +431,6 @@ class PyiqaMetric:
         self.lower_better = bool(getattr(self._metric, "lower_better", False))
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         with torch.no_grad():
             values = torch.as_tensor(self._metric(images)).double().reshape(len(images))
         share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)

@@ -276,7 +276,6 @@ class Shim:
     domain: Domain = "srgb"
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         return shim_gradient(luma_of(images))
 
 
@@ -291,7 +290,6 @@ class Zhang:
     half = 256.0
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         gradient = zhang_gradient(luma_of(images))
         return gradient / (gradient + self.half)
 
@@ -305,7 +303,6 @@ class Shin:
     domain: Domain = "srgb"
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         metric = shin_metric(luma_of(images))
         return 0.5 + 0.5 * metric / (1.0 + metric.abs())
 
@@ -324,7 +321,6 @@ class SignalToNoise:
     ceiling_db = 50.0
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         shot = torch.tensor([n.shot for n in captures.nlf])[:, :, None, None]
         read = torch.tensor([n.read for n in captures.nlf])[:, :, None, None]
         light = captures.light.clamp(min=0.0)
@@ -345,7 +341,6 @@ class BlindNoise:
     half = 10.0
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         return 1.0 / (1.0 + immerkaer_sigma(luma_of(images)) / self.half)
 
 
@@ -365,7 +360,6 @@ class MidGrey:
     target = 0.18
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         ratio = luminance_of(images).mean(dim=(1, 2), dtype=torch.float64) / self.target
         return torch.minimum(ratio, 1.0 / ratio.clamp(min=1e-30))
 
@@ -385,7 +379,6 @@ class Clipping:
     black = 2.0**-9
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
 
         def kept(part: torch.Tensor) -> torch.Tensor:
             samples = part.flatten(1)
@@ -412,7 +405,6 @@ class DynamicRange:
     percentiles = (0.01, 0.99)
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         shot = torch.tensor([0.5 * (n.shot[1] + n.shot[2]) for n in captures.nlf]).double()
         read = torch.tensor([0.5 * (n.read[1] + n.read[2]) for n in captures.nlf]).double()
         floor = (0.5 * (shot + (shot**2 + 4.0 * read).sqrt())).clamp_(2.0**-40, 1.0)
@@ -438,7 +430,6 @@ class WellExposedness:
     sigma = 0.2
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         squares = (images - self.centre).square_().sum(dim=1)  # of the product: a sum of exponents
         weights = squares.mul_(-0.5 / self.sigma**2).exp_()
         return weights.mean(dim=(1, 2), dtype=torch.float64)
@@ -450,5 +441,4 @@ class Entropy:
     domain: Domain = "srgb"
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         return histogram_entropy(luma_of(images)) / 8.0

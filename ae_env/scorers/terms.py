@@ -238,7 +238,6 @@ class Brightness:
     reads_pixels = False
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         error = captures.proper_ev - captures.ev100
         if captures.row_gain is None:
             return torch.exp(1.0 - torch.sqrt(1.0 + error**2))
@@ -259,7 +258,6 @@ class Banding:
     scale = 0.1
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         if captures.row_gain is None:
             return torch.ones(len(captures), dtype=torch.float64)
         stops = captures.row_gain.clamp(min=2.0**-64).log2()  # dark between pulses
@@ -292,7 +290,6 @@ class Highlights:
     scale = 0.15
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         blown = recorded_signal(images).amax(dim=1) >= 1.0
         return torch.exp(-blown.double().mean(dim=(1, 2)) / self.scale)
 
@@ -309,7 +306,6 @@ class Shadows:
     width = 0.5
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         dark = self.shares(recorded_signal(images))
         return torch.exp(-dark.mean(dim=(1, 2, 3), dtype=torch.float64) / self.scale)
 
@@ -332,7 +328,6 @@ class Noise:
     half_snr = 18.0
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         signal = recorded_signal(images)
         shares = self.shares(signal, captures.noise_variance(signal))
         return shares.mean(dim=(1, 2, 3), dtype=torch.float64)
@@ -354,7 +349,6 @@ class Sharpness:
     reads_pixels = False
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
         blur = captures.blur_px if captures.pixel_blur is None else captures.pixel_blur
         return self.of(blur, captures.frame_height)
 

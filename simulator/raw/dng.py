@@ -35,7 +35,7 @@ D65 = 21
 #: EXIF orientation for LibRaw's flip codes.
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 #: What a developer is to do with the pixels of a DNG, gain maps of the lens among it; passed on.
-OPCODES = ("OpcodeList1", "OpcodeList2", "OpcodeList3")
+OPCODES: tuple[str, ...] = ("OpcodeList1", "OpcodeList2", "OpcodeList3")
 #: Colour matrix of a raw whose camera has none: its R, G, B are taken as linear sRGB primaries
 #: (XYZ to sRGB, D65, IEC 61966-2-1).
 DEFAULT_COLOUR_MATRIX = (

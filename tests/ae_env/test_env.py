@@ -448,11 +448,11 @@ def test_spec_round_trips_and_in_process_arguments_say_so() -> None:
 
 
 def test_public_names_resolve_and_import_is_light() -> None:
-    assert set(dir(ae_env)) == {*ae_env.__all__, "__version__"}
+    assert dir(ae_env) == sorted(ae_env.__all__)
     assert all(getattr(ae_env, name).__doc__ for name in ae_env.__all__)
     lightings = {kind.__name__ for kind in ae_env.lighting.KINDS.values()}
     assert {*ae_env.wrappers.__all__} | lightings <= {*ae_env.__all__}
-    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+    with pytest.raises(AttributeError, match="nonsense"):
         _ = ae_env.nonsense
     code = (
         "import sys, simulator; assert not {'torch', 'numpy'} & set(sys.modules);"

@@ -297,5 +297,5 @@ def test_public_names_are_all_there_is() -> None:
     assert dir(simulator) == sorted(simulator.__all__)
     for name in simulator.__all__:
         assert getattr(simulator, name).__name__ == name
-    with pytest.raises(AttributeError, match="module 'simulator' has no attribute 'Raw'"):
+    with pytest.raises(AttributeError, match="Raw"):
         simulator.Raw  # noqa: B018

@@ -1,0 +1,13 @@
+from .evaluation.engine import evaluate as evaluate
+from .evaluation.engine import fit_policies as fit_policies
+from .evaluation.evaluation_plan import EvaluationPlan as EvaluationPlan
+from .evaluation.evaluation_plan import load_plan as load_plan
+from .evaluation.jobs import run_plan as run_plan
+from .evaluation.result import EvaluationResult as EvaluationResult
+from .evaluation.result import result_rows as result_rows
+from .metering.metering_policy import MeteringPolicy as MeteringPolicy
+from .policy import Policy as Policy
+from .policy import PolicyContext as PolicyContext
+from .policy_names import list_policies as list_policies
+from .policy_names import make_policy as make_policy
+from .report.evaluation import write_report as write_report
