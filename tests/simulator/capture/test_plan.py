@@ -110,6 +110,15 @@ def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
     assert without.excess_noise == pytest.approx(float(((given - wanted) / wanted).mean()))
 
 
+def test_only_pixels_with_too_much_noise_count_as_excess() -> None:
+    """At 0 the source has 4 times the target's variance, at 0.5 a twelfth of it."""
+    light = torch.zeros(4, 2, 2)
+    light[:, 1] = 0.5
+    source, target = (NoiseLevelFunction((a,) * 4, (b,) * 4) for a, b in ((0, 4e-6), (1e-4, 1e-6)))
+    plan = PreparedScene(light, SOURCE, Z6.with_nlf(1600, target), source).plan(SOURCE)
+    assert plan.excess_noise == pytest.approx((3 + 0) / 2, rel=1e-5)
+
+
 def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Per sample: 2 + 4 + 2 (1 + 3^2) + 6 + 14 + 6, for a disc of 3.5 pixel; and the network's."""
     monkeypatch.setattr(plan_module, "seconds_per_operation", lambda: 1e-9)
@@ -389,7 +398,7 @@ def test_unknown_depth_and_iso_add_to_the_error_only_where_they_play_a_part() ->
     changed = source.expected(OPENER).double() - LIGHT
     shot, read = (np.array(v)[:, None, None] for v in (Z6.nlf(1600).shot, Z6.nlf(1600).read))
     relative = math.sqrt((changed.numpy() ** 2 / (read + shot * LIGHT.numpy())).mean())
-    assert 0.1 * relative < source.plan(OPENER).errors["unknown depth"] < relative
+    assert 0.59 * relative < source.plan(OPENER).errors["unknown depth"] < relative
     lazy = MapApertureBlur(LIGHT, lambda: pytest.fail("it ran"), 8.0)  # the same aperture
     assert replace(source, aperture_blur=lazy).plan(CLEANER).errors["unknown depth"] == 0.0
     smaller = CameraSettings(100, 1, 16)  # would show sharp what is blurred in the source
