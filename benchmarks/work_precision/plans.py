@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -38,7 +38,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from simulator.training.scenes import Split, reference_scenes
+from simulator.training.scenes import Split, map_scenes, radiance_files, reference_scenes
 from simulator.utils.files import data_folder
 
 #: Height and width [packed pixel].
@@ -61,6 +61,8 @@ _SETS: dict[Size, tuple[dict[str, int], int, int]] = {
     (512, 768): ({"depth": 1}, 2, 768),
 }
 _ALL_GROUPS = 32
+#: Folder of radiance maps that only bounds are calibrated and tested on.
+_FURTHER = "hdri_more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +122,7 @@ def trials(size: Size) -> tuple[Trial, ...]:
 def all_trials(split: Split = "test") -> tuple[Trial, ...]:
     """All scenes of a split, 128 x 128, with sources of different ISO."""
     kinds = _scenes((128, 128), _ALL_GROUPS, 256, split)
+    kinds["radiance"] += _further_maps(split)
     return _in_turn(kinds, {kind: len(own) for kind, own in kinds.items()})
 
 
@@ -154,6 +157,16 @@ def _scenes(
             kinds[known].append(cropped(scene, *size))
     kinds["radiance"] = list({s.group: s for s in kinds["radiance"]}.values())  # one view each
     return kinds
+
+
+def _further_maps(split: Split) -> Iterator[ReferenceScene]:
+    """Views into maps that no network was trained on: those of its split, too, calibrate bounds."""
+    splits: tuple[Split, ...] = (split,) if split == "test" else ("train", "validation")
+    if (data := data_folder()) is not None:
+        for path, group in (
+            found for s in splits for found in radiance_files(data, s, (_FURTHER,))
+        ):
+            yield from map_scenes(path, group, get_camera(CAMERA), 128)
 
 
 # -- the plan -------------------------------------------------------------------------------------
