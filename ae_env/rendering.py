@@ -123,9 +123,12 @@ def contact_sheet(
     tables = ScoreTables(grid, camera, make_scorer(scorer))
     moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
     table = tables.table(scene, **moves)
-    frames: Iterable[torch.Tensor] | None = scene.recorded
-    if frames is None:
+    frames: Iterable[torch.Tensor]
+    if scene.recorded is None:
         frames = prepare_scene(scene, camera, **moves).stream(grid.states, seed=seed)
+    else:  # black where there is none
+        frames = scene.recorded[scene.frame_of_state]
+        frames = (f * float(a) for f, a in zip(frames, scene.allowed, strict=True))
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, moves, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)

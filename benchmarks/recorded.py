@@ -123,11 +123,11 @@ def _compared(
     """A row for each method, of one scene's captures and what is simulated from one of them."""
     assert scene.recorded is not None
     assert scene.allowed is not None
-    real, allowed, camera = scene.recorded, scene.allowed, scene.camera
+    real, there, camera = scene.recorded[scene.frame_of_state], scene.allowed, scene.camera
     # Of the recorded states the one whose mean of green is nearest to a right exposure's.
     means = real[:, 1:3].mean(dim=(1, 2, 3)).numpy()
-    source = int(np.where(allowed, np.abs(means - MEAN_SIGNAL), np.inf).argmin())
-    others = [s for s in np.flatnonzero(allowed).tolist() if s != source]
+    source = int(np.where(there, np.abs(means - MEAN_SIGNAL), np.inf).argmin())
+    others = [s for s in np.flatnonzero(there).tolist() if s != source]
     look: Any = {"white_balance": scene.white_balance, "box_factor": scene.box_factor}
     raw = RawImage(real[source], grid[source], camera, **look)
     light = Scene.from_raw(raw, scene_id=scene.scene_id)  # what one capture tells
@@ -146,7 +146,7 @@ def _compared(
 
     for method, call in (("simulated", simulate), ("scaled", scale)):
         frames, milliseconds = call(), 1e3 * median_seconds(call, least=0.0)
-        expected, q = frames, tables.table(replace(light, recorded=frames, allowed=allowed))
+        expected, q = frames, tables.table(replace(light, recorded=frames[there], allowed=there))
         if method == "simulated":
             expected = clipped(clean.prepared.expected_sweep(grid.states), camera)
             q = tables.table(clean)
@@ -170,7 +170,7 @@ def _compared(
         row: Row = {"method": method, "states": len(others) + 1, "source_state": str(grid[source])}
         row |= {"known_share": float(known.float().mean()), **frame.median()}
         row["score_error"] = float(np.sqrt(np.mean((q.mean - true.mean)[others] ** 2)))
-        best = int(np.where(allowed, q.mean, -np.inf).argmax())
+        best = int(np.where(there, q.mean, -np.inf).argmax())
         row["oracle_regret"] = float(true.mean[true.oracle] - true.mean[best])
         row |= {"same_oracle": best == true.oracle, "ms_per_state": milliseconds / len(grid)}
         row["psnr_by_stops"] = by_stops["psnr_db"].to_dict()
@@ -180,7 +180,7 @@ def _compared(
 def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -> float:
     """PSNR of two captures of the same light, each with the camera's noise [dB]."""
     assert scene.recorded is not None
-    signal = scene.recorded[state][:, mask]
+    signal = scene.recorded[scene.frame_of_state[state]][:, mask]
     nlf = scene.camera.nlf(grid[state].iso).scaled(1.0 / scene.box_factor**2)
     shot, read = (torch.tensor(v)[:, None] for v in (nlf.shot, nlf.read))
     variance = (shot * signal.clamp(min=0.0) + read) * (signal < 1.0)

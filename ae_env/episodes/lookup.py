@@ -57,8 +57,8 @@ class LookupBatch:
         **outputs: np.ndarray,
     ) -> FrameStatistics:
         """Copies frames to the outputs; see `CaptureBatch.record`."""
-        frames_of: Any = [self._scenes[scene].recorded for scene in indices.tolist()]
-        shown = np.stack([f[s].numpy() for f, s in zip(frames_of, states.tolist(), strict=True)])
+        pairs: Any = [(self._scenes[i], s) for i, s in zip(indices, states, strict=True)]
+        shown = np.stack([one.recorded[one.frame_of_state[s]].numpy() for one, s in pairs])
         digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
         if "codes" in outputs:
             encode_observation(torch.from_numpy(shown), out=torch.from_numpy(outputs["codes"]))

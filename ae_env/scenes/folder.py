@@ -101,7 +101,8 @@ class FolderOptions:
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
         given |= {"illuminance": lux}
         if not _is_raw(path):
-            given |= {"ev100": self.ev100, "layer": self.layer if path.suffix == ".exr" else None}
+            has_layers = path.suffix.lower() == ".exr"
+            given |= {"ev100": self.ev100, "layer": self.layer if has_layers else None}
         return {name: value for name, value in given.items() if value is not None}
 
 

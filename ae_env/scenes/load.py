@@ -257,8 +257,9 @@ def environment_scenes(
             found = [simulate_source_raw(s) if s.noise_free else s for s in found]
         scenes = SceneSet(_prepare(scene, networks, finds_defocus, noise) for scene in found)
     if key is not None:
-        held = [t.nbytes for t in (scenes[0].light, scenes[0].recorded) if t is not None]
-        _LOADED.put(key, scenes, len(scenes) * sum(held))
+        held = len(scenes) * scenes[0].light.nbytes
+        captures = [] if recorded is None else [scene.recorded for scene in scenes]
+        _LOADED.put(key, scenes, held + sum(t.nbytes for t in captures if t is not None))
     return scenes
 
 

@@ -35,8 +35,8 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import MEAN_SIGNAL
 from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
-from simulator.raw.read import read_raw, read_settings
-from simulator.settings import CameraSettings, exposure_ratio
+from simulator.raw.read import marks_stops, read_raw, read_settings
+from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
 from simulator.utils.checks import check_key, check_number
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, open_picture
 
@@ -238,16 +238,14 @@ def merged_scene(
         )
         frames[state] = resize(capture)
     merged, allowed = _merged(list(frames.values())), np.zeros(len(grid), bool)
-    recorded = torch.zeros(len(grid), *merged.light.shape)
-    for state, frame in frames.items():
-        recorded[state], allowed[state] = frame.light, True
+    allowed[[*frames]] = True
     return replace(
         merged,
         scene_id=name,
         group=name,
         kind=KEY,
         source=f"{len(frames)} recorded captures",
-        recorded=recorded,
+        recorded=torch.stack([frames[state].light for state in sorted(frames)]),
         allowed=allowed,
     )
 
@@ -459,7 +457,8 @@ def _in_file(path: Path) -> dict[str, float]:
         return read_settings(path)
     try:
         with open_picture(path) as picture:
-            tags = picture.getexif().get_ifd(ExifTags.IFD.Exif)
+            exif = picture.getexif()
+            make, tags = str(exif.get(ExifTags.Base.Make, "")), exif.get_ifd(ExifTags.IFD.Exif)
     except ValueError:
         if not path.exists():  # a link that leads nowhere
             raise
@@ -467,7 +466,10 @@ def _in_file(path: Path) -> dict[str, float]:
     names = (ExifTags.Base.ISOSpeedRatings, ExifTags.Base.ExposureTime, ExifTags.Base.FNumber)
     values = {what: tags.get(tag) for what, tag in zip(_SETTINGS, names, strict=True)}
     numbers = {n: v[0] if isinstance(v, tuple) else v for n, v in values.items() if v}
-    return {name: float(value) for name, value in numbers.items() if float(value) > 0}
+    found = {name: float(value) for name, value in numbers.items() if float(value) > 0}
+    if "exposure_time" in found and marks_stops(make, numbers["exposure_time"]):
+        found["exposure_time"] = snap_exposure_time(found["exposure_time"])
+    return found
 
 
 def recorded_grid(files: Sequence[RecordedFile]) -> ExposureGrid:

@@ -67,9 +67,9 @@ class Scene:
         sampled: Whether each plane was sampled at its own place, as a sensor does. False: the four
             share their places, G1 equals G2, as in every bundled scene; averaged by a large
             `box_factor` there is hardly a difference.
-        recorded: (S, 4, H, W) float32, the real capture of each state of the grid, white is 1; zero
-            where `allowed` is False. With it nothing is simulated: environments show these frames,
-            and `light` is what they tell together. None where captures are simulated.
+        recorded: (R, 4, H, W) float32, the real captures of the states that are `allowed`, in their
+            order, white is 1. With it nothing is simulated: environments show these frames, and
+            `light` is what they tell together. None where captures are simulated.
         sequence: Video that it is a frame of; empty for a still scene.
         allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
             them; None for every state of any grid.
@@ -139,10 +139,17 @@ class Scene:
     def content(self) -> str:
         """Digest of the light, of the networks' results for it, and of its layout."""
         tensors = {"light": self.light, "denoised": self.denoised, "defocus_map": self.defocus_map}
-        tensors["recorded"] = self.recorded
+        if self.recorded is not None:
+            tensors |= {"recorded": self.recorded, "allowed": torch.tensor(self.allowed)}
         if self.layout is not None:
             tensors |= {"layout": self.layout.defocus, "subject": self.layout.subject}
         return content_digest({name: t for name, t in tensors.items() if t is not None})
+
+    @cached_property
+    def frame_of_state(self) -> np.ndarray:
+        """(S,) int64, which of `recorded` is a state's; any of them where it is not `allowed`."""
+        assert self.allowed is not None
+        return np.maximum(np.cumsum(self.allowed) - 1, 0)
 
     @cached_property
     def _statistics(self) -> LightStatistics:
@@ -392,8 +399,8 @@ def _checked(scene: Scene) -> Scene:
     frames = scene.recorded
     if allowed is not None and (allowed.dtype != np.bool_ or allowed.ndim != 1 or not any(allowed)):
         raise ValueError("`allowed` must be bool, (S,), and allow a state")
-    if frames is not None and (allowed is None or frames.shape != (len(allowed), 4, *size)):
-        raise ValueError("`recorded` must be (S, 4, H, W) with one frame for each of `allowed`")
+    if frames is not None and (allowed is None or frames.shape != (allowed.sum(), 4, *size)):
+        raise ValueError("`recorded` must be (R, 4, H, W), one frame for each state of `allowed`")
     return replace(
         scene,
         white_balance=gains,

@@ -156,15 +156,15 @@ class ScoreTables:
         assert allowed is not None
         terms, count = self.term_scores, len(self.states)
         for part in slices(count, CHUNK):
-            states = np.arange(count)[part]
+            states, shown = np.arange(count)[part], frames[scene.frame_of_state[part]]
             captures = terms.captures.describe(scene, prepared, part)
             found: dict[str, np.ndarray] = {}
             if terms.parts:
-                codes = encode_observation(frames[part]).numpy()
+                codes = encode_observation(shown).numpy()
                 means = terms.measured(codes, states, np.zeros((len(states), 2, 4)))
                 found = terms.score(means, captures)
             if not terms.closed_form:
-                found |= terms.torch_scores(frames[part].clamp(0.0, 1.0), captures, "image")
+                found |= terms.torch_scores(shown.clamp(0.0, 1.0), captures, "image")
             for name, values in found.items():
                 parts.setdefault(name, np.zeros(count))[part] = values
         mean = np.where(allowed, self.scorer.totals(parts), 0.0)

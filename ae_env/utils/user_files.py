@@ -43,9 +43,12 @@ def load_attribute(name: str, argument: str) -> Any:
     `argument` is how errors begin, such as ``"`scenes` (='my.module:scenes')"``.
 
     Raises:
-        ValueError: If the module cannot be imported (the cause is chained), or lacks the name.
+        ValueError: If the module cannot be imported (the cause is chained), or lacks the name;
+            nothing is imported unless each part of the name is a Python identifier.
     """
     module_name, _, attribute = name.partition(":")
+    if not all(part.isidentifier() for part in attribute.split(".")):
+        raise ValueError(f"{argument} must be 'package.module:name'")
     try:
         value: Any = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a user's module may raise anything
@@ -63,8 +66,9 @@ def load_attribute(name: str, argument: str) -> Any:
 def load_from_file(path: str, name: str, argument: str, example: str = "MyClass") -> Any:
     """The object that a Python file calls `name`, a class or a function.
 
-    The file is run once, and again after it has changed. It may import modules beside it, as a
-    script may; files in different folders may have helpers of the same name. A relative `path` is
+    The file is run once, and again after it has changed. It may import modules beside it at its
+    top, not later in a function; files in different folders may have helpers of the same name, of
+    which each gets its own. A relative `path` is
     looked for in the current folder, ``~`` is the home.
 
     Args:

@@ -121,6 +121,7 @@ def check_append(
             has rows of another hash, no policy gets a row, two would get the same one, or a row
             without an author would be replaced.
     """
+    table = _followed(table)
     if plan.task not in _TASKS:
         raise _refusal(table, f"takes no rows of {plan.name}, which AE-Bench v2 has superseded")
     rows, page = _read_own(table, plan), page_of(table)
@@ -131,7 +132,6 @@ def check_append(
     if not policies:
         raise _refusal(table, "gets no row: privileged policies, such as 'oracle', are not ranked")
     seen: dict[str, str] = {}
-    known = rows[_KEY].apply(tuple, axis=1).tolist()
     for policy in policies:
         name = row_name(policy)
         if name in seen:
@@ -140,11 +140,20 @@ def check_append(
                 f"{table}: rename a file"
             )
         seen[name] = policy
-        if not author.strip() and (plan.task, name, plan.observation, "") in known:
-            raise ValueError(
-                f"`author` (={author!r}) must be given: {table} has a row of {name!r} without an "
-                "author, which may be another's"
-            )
+        _check_author(table, (plan.task, name, plan.observation), author, rows)
+
+
+def _followed(table: Path) -> Path:
+    """The file that a link names: it has one lock, and the link stays."""
+    return table.resolve() if table.is_symlink() else table
+
+
+def _check_author(table: Path, row: tuple[str, ...], author: str, known: pd.DataFrame) -> None:
+    if not author.strip() and (*row, "") in known[_KEY].apply(tuple, axis=1).tolist():
+        raise ValueError(
+            f"`author` (={author!r}) must be given: {table} has a row of {row[1]!r} without an "
+            "author, which may be another's"
+        )
 
 
 def _refusal(table: Path, text: str) -> ValueError:
@@ -172,10 +181,13 @@ def append_rows(
     )
     # Through text, so that a table says the same whether its rows are new or read from the file.
     text = found.reindex(columns=COLUMNS).to_csv(index=False, float_format="%.4f")
+    table = _followed(table)
     table.parent.mkdir(parents=True, exist_ok=True)
     new, page = _parse(text), page_of(table)
     with FileLock(table.with_name(f".{table.name}.lock")):
         known = _read_own(table, plan)
+        for name in new.policy:  # whoever began at the same time may have added it meanwhile
+            _check_author(table, (plan.task, name, plan.observation), author, known)
         for row in known.merge(new[_KEY], on=_KEY).itertuples():
             logger.warning("%s: replaced the row of %r by %r", table, row.policy, row.author)
         both = pd.concat([known, new]).drop_duplicates(_KEY, keep="last")

@@ -7,6 +7,7 @@ containers (CRW, CR3, RAF, MRW) only make and model are read; LibRaw reads their
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import logging
 import math
@@ -84,14 +85,11 @@ def read_directories(stream: BinaryIO) -> list[Directory]:
     # up a whole directory for one damaged tag.
     file = SimpleNamespace(tiff=form, filehandle=tifffile.FileHandle(stream, offset=0))
     found: list[Directory] = []
-    pending, seen, room = [start] if magic in _MAGIC else [], set[int](), _MAX_VALUES
+    queue, known, room = [start] if magic in _MAGIC else [], {start}, _MAX_VALUES
     with _silent_tifffile():
-        while pending and len(seen) < _MAX_DIRECTORIES:
-            offset = pending.pop(0)
-            if offset in seen:
-                continue
-            seen.add(offset)
+        for offset in itertools.islice(queue, _MAX_DIRECTORIES):  # grows while it is read
             tags: Directory = {}
+            followers: list[Any] = []
             entries, following = _read_entries(file, offset)
             for at, entry in entries.items():
                 code, _, count = struct.unpack_from(f"{form.byteorder}HHI", entry)
@@ -101,13 +99,16 @@ def read_directories(stream: BinaryIO) -> list[Directory]:
                 with suppress(Exception):  # of a damaged tag, tifffile may raise anything
                     tag = tifffile.TiffTag.fromfile(file, offset=at, header=entry)  # type: ignore[arg-type]
                     if code == _EXIF:
-                        pending.append(tag.valueoffset)
+                        followers.append(tag.valueoffset)
                     elif code == _SUB_DIRECTORIES:
-                        pending += _values(tag)
+                        followers += _values(tag)
                     else:
                         tags[_NAME_OF_CODE[code]] = _values(tag)
             found += [tags] if tags else []
-            pending.append(following)
+            for at in (*followers, following):
+                if isinstance(at, int) and 8 <= at < 2**32 and at not in known:
+                    known.add(at)
+                    queue.append(at)
     return found
 
 
@@ -271,7 +272,8 @@ def normalised_model(make: str, model: str) -> str:
 
 #: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
 LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
-_EXPOSURE = {"iso": LONG_ISO[0], "exposure_time": "ExposureTime", "f_number": "FNumber"}
+_EXPOSURE = {"iso": ("PhotographicSensitivity", LONG_ISO[0])}
+_EXPOSURE |= {"exposure_time": ("ExposureTime",), "f_number": ("FNumber",)}
 #: Beyond these a file is damaged.
 _MAX_BOX_FACTOR, _LARGEST_FACTOR = 4096, 1000.0
 
@@ -291,12 +293,14 @@ def read_own_record(directories: Sequence[Directory]) -> OwnRecord | None:
         box_factor, source = int(fields["box_factor"]), str(fields["colour_matrix_source"])
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
-    for key, name in _EXPOSURE.items():
-        stated = getattr(settings, key)
-        value = next(iter(first_numbers(directories, name)), stated)
+    recorded = settings
+    for key, name in ((key, name) for key, names in _EXPOSURE.items() for name in names):
+        stated = getattr(recorded, key)
         written, rounding = stated, 1e-6 * stated
-        if key == "iso":  # whole, and at least 1
-            written, rounding = max(1.0, stated), 0.5
+        if key == "iso":  # whole, at least 1, and in the older tag at most what 16 bits hold
+            largest = 65535.0 if name == _EXPOSURE[key][0] else math.inf
+            written, rounding = min(max(1.0, stated), largest), 0.5
+        value = next(iter(first_numbers(directories, name)), written)
         if abs(value - written) > rounding:
             with suppress(ValueError):
                 changed: Any = {key: float(value)}
@@ -398,8 +402,9 @@ def read_black_level(
                 return None
             level = level + deltas[axis]
     planes = [level[row::2, column::2] for row, column in cfa.offsets]
-    means = [float(plane.mean()) for plane in planes]
-    if all(np.ptp(plane) == 0.0 for plane in planes):
+    # A level below 0, of negative deltas, is the pixels' own.
+    means = [max(0.0, float(plane.mean())) for plane in planes]
+    if all(np.ptp(plane) == 0.0 <= plane.min() for plane in planes):
         return tuple(means), None  # type: ignore[return-value]
     own = np.empty(shape, np.float32)
     for (row, column), plane, mean in zip(cfa.offsets, planes, means, strict=True):

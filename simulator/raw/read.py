@@ -217,15 +217,30 @@ def _read(
             "nlf_source": source,
             "white_balance_source": decoded.white_balance_source,
             **decoded.extra,
-            **_passed_on(directories, packed.shape[1:]),
+            **_passed_on(path, directories, decoded.origin, packed.shape[1:]),
         },
     )
 
 
-def _passed_on(directories: Sequence[Directory], size: Sequence[int]) -> dict[str, Any]:
-    """Metadata of a DNG for other developers, which `write_dng` passes on."""
+def _passed_on(
+    path: Path, directories: Sequence[Directory], origin: tuple[int, int], size: Sequence[int]
+) -> dict[str, Any]:
+    """Metadata of a DNG for other developers, which `write_dng` passes on.
+
+    Positions in the first opcode list are those of the file's array, in the others those of its
+    ActiveArea: lists go along where the packed frame of this `size` at `origin` is all of that.
+    """
     tags, baseline = _mosaic_directory(directories), first_numbers(directories, "BaselineExposure")
-    lists = {name: tags[name][0] for name in OPCODES if isinstance(tags.get(name, (0,))[0], bytes)}
+    sides = [next(iter(numbers(tags, name)), 0) for name in ("ImageLength", "ImageWidth")]
+    frame, whole = (*origin, *size), (0, 0, *sides)
+    lists: dict[str, bytes] = {}
+    for name in (name for name in OPCODES if isinstance(tags.get(name, (0,))[0], bytes)):
+        area = whole if name == OPCODES[0] else numbers(tags, "ActiveArea") or whole
+        top, left, bottom, right = area if len(area) == 4 else whole
+        if frame == (top, left, (bottom - top) // 2, (right - left) // 2):
+            lists[name] = tags[name][0]
+        else:
+            logger.warning("%s: its %s is of another frame, and is left out", path.name, name)
     found: dict[str, Any] = {"opcodes": (tuple(size), lists)} if lists else {}
     if baseline and 0.0 < abs(baseline[0]) < _LARGEST_BASELINE:
         found["baseline_exposure"] = float(baseline[0])
@@ -394,6 +409,7 @@ class _Decoded:
     colour_matrix_source: str
     exposure: dict[str, float]  # the settings that the file's tags state
     extra: dict[str, Any]
+    origin: tuple[int, int] = (0, 0)  # row and column of the file's array where it begins
 
 
 def _decode_own_dng(
@@ -490,7 +506,7 @@ def _from_libraw(
     cfa = BayerPattern("".join(_letters(raw, directories)[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
     black = [float(raw.black_level_per_channel[i]) for i in order]
-    mosaic, white = raw.raw_image_visible, float(raw.white_level)
+    mosaic, libraw_white = raw.raw_image_visible, float(raw.white_level)
     if min(mosaic.shape) < 2:
         raise RawFileError("must hold an image, but is empty")
     height, width = (n // 2 * 2 for n in mosaic.shape)
@@ -498,14 +514,16 @@ def _from_libraw(
     # LibRaw drops the fraction, all but the mean of a pixel's own level, and the phase where it
     # moves an odd margin to an even one.
     margins = sizes.top_margin, sizes.left_margin
-    stated = read_black_level(tags, cfa, margins, mosaic.shape)
+    stated, own = read_black_level(tags, cfa, margins, mosaic.shape), None
     if stated is not None:
         scale = 1.0
         if tags.get("SampleFormat") == (_FLOATING_POINT,):  # of which LibRaw makes whole numbers
-            scale = white / next(iter(numbers(tags, "WhiteLevel")), 1.0)
+            scale = libraw_white / next(iter(numbers(tags, "WhiteLevel")), 1.0)
         black, own = [scale * level for level in stated[0]], stated[1]
-        if own is not None:  # what is white stays white
-            mosaic = np.where(mosaic < white, mosaic - scale * own, mosaic)
+    white = _white_level(path, libraw_white, black, directories, mosaic)
+    if own is not None:  # what is white stays white, and only that is
+        corrected = np.minimum(mosaic - scale * own, white - 1.0)
+        mosaic = np.where(mosaic < white, corrected, mosaic)
     white_balance, source = _white_balance(raw, directories)
     matrix, matrix_source = _colour_matrix(raw, directories)
     moment = raw.other.timestamp
@@ -514,7 +532,7 @@ def _from_libraw(
         mosaic=mosaic,
         cfa=cfa,
         black_level=tuple(black),  # type: ignore[arg-type]
-        white_level=_white_level(path, white, black, directories, mosaic),
+        white_level=white,
         white_balance=white_balance,
         white_balance_source=source,
         colour_matrix=matrix,
@@ -526,6 +544,7 @@ def _from_libraw(
             raw.other.focal_length,
             sizes.pixel_aspect,
         ),
+        origin=margins,
     )
 
 
@@ -604,12 +623,16 @@ def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> 
         more = (first_numbers(directories, name) for name in LONG_ISO)
         found["iso"] = next((v[0] for v in more if v and v[0] > 0), found["iso"])
     known = {k: float(v) for k, v in found.items() if math.isfinite(v) and v > 0}
-    marks_stops = bool(_STOP_MARKING.intersection(make.lower().split()[:1]))
-    for recorded in first_numbers(directories, "ExposureTime"):
-        marks_stops &= getattr(recorded, "denominator", 1) < _MEASURED
-    if marks_stops and "exposure_time" in known:
+    recorded = (*first_numbers(directories, "ExposureTime"), known.get("exposure_time"))[0]
+    if marks_stops(make, recorded) and "exposure_time" in known:
         known["exposure_time"] = snap_exposure_time(known["exposure_time"])
     return known
+
+
+def marks_stops(make: str, recorded: object) -> bool:
+    """Whether a `recorded` exposure time, a rational or a number, is the stop that is marked."""
+    measured = getattr(recorded, "denominator", 1) >= _MEASURED
+    return bool(_STOP_MARKING.intersection(make.lower().split()[:1])) and not measured
 
 
 def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileError:

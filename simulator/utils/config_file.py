@@ -120,14 +120,18 @@ def _texts(content: Any) -> Iterator[str]:
 
 
 def _names_code(text: str) -> bool:
-    """Whether a text names a Python file, or anything of a module that there is."""
+    """Whether a text names a Python file, or anything of a module that there is.
+
+    Nothing that loads code takes a name behind a space or a slash (``time: tunnel``).
+    """
     text = text.strip()
-    head, colon, _ = text.partition(":")
+    head, colon, tail = text.partition(":")
     top = head.partition(".")[0]  # to look for a submodule would run its parent
     if ".py:" in text or text.endswith(".py"):
         return True
     try:
-        return bool(colon and top and find_spec(top)) and head != _METRICS
+        named = colon and top and not tail[:1].isspace() and tail[:1] != "/"
+        return bool(named and find_spec(top)) and head != _METRICS
     except ValueError:  # such as `__main__`
         return True
 

@@ -50,6 +50,8 @@ MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 #: one has: decoded, they take some 1 GB.
 MAX_PICTURE_PIXELS, MAX_FLAT_PIXELS = 2**26, 2**24
 
+_BITS_PER_SAMPLE = 258
+
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
 
@@ -109,8 +111,9 @@ def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Itera
                 length = path.stat().st_size
                 if claim := refuse_bomb(picture.height, picture.width, length, per_byte=256):
                     raise ValueError(f"it {claim}")
-            tiles = getattr(picture, "tile", ())
-            if len(picture.getbands()) > 1 and any(";16" in str(tile[3]) for tile in tiles):
+            bits = getattr(picture, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,))  # of a TIFF
+            deep = max(bits) > 8 or any(";16" in str(t[3]) for t in getattr(picture, "tile", ()))
+            if len(picture.getbands()) > 1 and deep:
                 raise ValueError("it has colours of 16 bits: save it with 8, or give raws")
             yield picture
     except (OSError, SyntaxError, EOFError, ValueError, Image.DecompressionBombError) as error:

@@ -374,6 +374,13 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     with ThreadPoolExecutor(6) as pool:  # each reads, adds and renames
         list(pool.map(lambda name: ae_bench.append_rows(table, plan, again, author=name), authors))
     assert set(authors) < set(ae_bench.read_table(table).author)
+    ae_bench.append_rows(table, plan, again, author="")
+    with pytest.raises(ValueError, match="`author`"):  # of who began before that was there
+        ae_bench.append_rows(table, plan, again, author="")
+    (link := tmp_path / "link.csv").symlink_to(table)
+    ae_bench.append_rows(link, plan, again, author="by link")
+    assert link.is_symlink()
+    assert "by link" in set(ae_bench.read_table(table).author)
 
 
 def test_rows_of_brackets_by_hand(tmp_path):

@@ -3,6 +3,7 @@ import os
 import re
 import shutil
 import struct
+import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -107,6 +108,33 @@ def test_gain_maps_and_baseline_go_along(tmp_path):
             assert bytes(tags[name].value) == bytes(values)
     with tifffile.TiffFile(tmp_path / "c.dng") as file:  # positions would be wrong
         assert not set(maps) & {tag.name for tag in file.pages[0].tags}
+
+
+def test_opcode_lists_of_another_frame_are_left_out(tmp_path, caplog):
+    tags = {"StripOffsets": (8,), "ImageLength": (64,), "ImageWidth": (96,)}
+    tags |= {"PhotometricInterpretation": (32803,), "OpcodeList1": (b"1",), "OpcodeList3": (b"3",)}
+    for area, origin, left in (
+        ((0, 0, 64, 96), (0, 0), ["OpcodeList1", "OpcodeList3"]),
+        ((0, 0, 63, 95), (0, 0), ["OpcodeList3"]),
+        ((2, 4, 64, 96), (2, 4), ["OpcodeList3"]),  # bad pixels are those of the whole sensor
+        ((1, 1, 63, 95), (2, 2), []),  # as LibRaw begins an odd area
+    ):
+        size = (area[2] - origin[0]) // 2, (area[3] - origin[1]) // 2
+        found = read_module._passed_on(tmp_path, [tags | {"ActiveArea": area}], origin, size)
+        assert list(found.get("opcodes", (0, {}))[1]) == left
+    assert "OpcodeList3 is of another frame" in caplog.text
+
+
+def test_a_pixels_own_black_level_makes_nothing_white_and_may_be_negative(tmp_path):
+    deltas = {"BlackLevelDeltaH": ("2i", (20, 1) * 48 + (-20, 1) * 48)}
+    path, given = tmp_path / "a.dng", {"settings": SETTINGS, "nlf": NLF}
+    raw = read_raw(write_sample_dng(path, MOSAIC * 0 + 4090, **deltas), **given)
+    wanted = {(4090 - 20 - 64) / (4095 - 64), (4094 - 64) / (4095 - 64)}  # 4095 is white
+    assert sorted(raw.data.unique().tolist()) == pytest.approx(sorted(wanted))
+    assert not raw.saturated.any()
+    deltas = {"BlackLevelDeltaV": ("2i", (-1, 10) * 64)}
+    raw = read_raw(write_sample_dng(path, black=(0,), **deltas), **given)
+    np.testing.assert_allclose(raw.data[0], (MOSAIC[::2, ::2] + 0.1) / 4095, rtol=1e-6)
 
 
 def test_levels_colour_and_metadata(tmp_path):
@@ -262,6 +290,7 @@ LARGEST = ("white_level", 65535)
         ("ExposureTime", "2I", (1, 0), EXACT),
         ("FNumber", "count", (0,), EXACT),
         ("RecommendedExposureIndex", "I", (0,), EXACT),
+        ("PhotographicSensitivity", "H", (800,), ("settings", replace(SETTINGS, iso=800))),
         ("Orientation", "H", (99,), ("flip", 0)),
         ("DateTimeOriginal", "19s", (b"9999:99:99 99:99:99",), ("datetime", None)),
         ("FocalLength", "2I", (5, 0), ("focal_length", None)),
@@ -426,6 +455,14 @@ def test_structures_that_never_end_are_left_and_a_damaged_tag_costs_no_other():
     # A directory that is its own sub-directory, EXIF directory and successor.
     loop = [(CODE[name], 4, 1, 8) for name in ("SubIFDs", "ExifTag")]
     assert read_directories(io.BytesIO(tiff(loop, following=8))) == []
+    # One place very many times, and places that are none.
+    many = tiff([(CODE["SubIFDs"], 4, 2**18 - 1, 26)]).ljust(26, b"\0") + b"\x08\0\0\0" * 2**18
+    began = time.process_time()
+    assert read_directories(io.BytesIO(many)) == []
+    assert time.process_time() - began < 2.0  # 13 where each waits for its turn
+    for kind, value in ((2, 0x00414141), (9, -5), (11, 8)):
+        content = tiff([(CODE["SubIFDs"], kind, 1 + 3 * (kind == 2), value % 2**32)])
+        assert read_directories(io.BytesIO(content)) == []
     # A chain of very many directories.
     entry = struct.pack("<HHII", CODE["Make"], 2, 4, 0x00414141)
     chain = (struct.pack("<H", 1) + entry + struct.pack("<I", 26 + 18 * i) for i in range(10**5))

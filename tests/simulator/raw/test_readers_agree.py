@@ -134,8 +134,9 @@ def test_read_raw_and_libraw_agree_with_the_specification(tmp_path):
             places = np.argwhere((tile == letter) & ((tile == "R").any(1) == (plane < 2))[:, None])
             (y, x), (high, wide) = places[0], raw.data.shape[1:]
             own, black = values[y::2, x::2][:high, :wide], level[y::2, x::2][:high, :wide]
-            left = np.where(own < file.white, own - black, own - black.mean())  # white stays white
-            expected = left / (file.white - black.mean())
+            mean, white = black.mean(), file.white  # what is white stays so, and only that is
+            left = np.where(own < white, np.minimum(own - black, white - 1 - mean), own - mean)
+            expected = left / (white - mean)
             np.testing.assert_allclose(raw.data[plane], expected, atol=1e-6, err_msg=f"{seed}")
             assert raw.camera.black_level[plane] == pytest.approx(black.mean()), seed
         found = raw.camera.cfa, raw.camera.white_level, raw.metadata["flip"], raw.camera.make

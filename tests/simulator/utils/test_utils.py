@@ -150,9 +150,9 @@ def test_a_good_file(tmp_path, monkeypatch):
     (tmp_path / "a.yaml").write_text("[1, 2.5, null]")
     assert read_yaml(tmp_path / "a.yaml") == [1, 2.5, None]
     # Names of our own are no code.
-    text = "[bundled:snow, matrix:P, 'recorded:my_grid?iso=100', ppo:video, a.dng, 'x.yaml', '1:2']"
-    (tmp_path / "a.yaml").write_text(text)
-    assert len(read_yaml(tmp_path / "a.yaml")) == 7
+    text = "[bundled:snow, matrix:P, 'recorded:my_grid?iso=100', ppo:video, a.dng, 'x.yaml', '1:2',"
+    (tmp_path / "a.yaml").write_text(text + " 'test: outdoor', 'time: tunnel', 'http://a']")
+    assert len(read_yaml(tmp_path / "a.yaml")) == 10
     for name in ("none.yaml", ".", "x" * 5000):
         with pytest.raises(ValueError, match="`preset`"):
             read_yaml(tmp_path / name, name="preset")
