@@ -128,7 +128,7 @@ def contact_sheet(
         frames = prepare_scene(scene, camera, **moves).stream(grid.states, seed=seed)
     else:  # black where there is none
         frames = scene.recorded[scene.frame_of_state]
-        frames = (f * float(a) for f, a in zip(frames, scene.allowed, strict=True))
+        frames = (f * float(a) for f, a in zip(frames, np.asarray(scene.allowed), strict=True))
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, moves, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)

@@ -90,21 +90,16 @@ def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
     files = recorded.index_recorded(tmp_path / "a", {})
     assert [f.scene for f in files] == ["a"] * 8
     assert recorded.recorded_grid(files) == GRID
+    stated = Image.Exif()
+    stated[ExifTags.Base.Make] = "Canon"  # whose cameras record the stop that is marked
+    stated.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = IFDRational(1, 60)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a" / "60.jpg", exif=stated)
+    assert recorded._in_file(tmp_path / "a" / "60.jpg") == {"exposure_time": 1 / 64}
     # Nominal and exact values are one state.
     grid = ExposureGrid((100,), (1 / 128, 1 / 64), (2.8, 5.6))
     assert recorded.state_of(CameraSettings(100, 1 / 125, 5.6569), grid) == 1
     assert recorded.state_of(CameraSettings(100, 1 / 60, 5.6), grid) is None  # 6.7 % off
     assert recorded.state_of(CameraSettings(200, 1 / 64, 5.6), grid) is None
-
-
-@pytest.mark.parametrize(("make", "seconds"), [("Canon", 1 / 64), ("Google", 1 / 60)])
-def test_pictures_of_cameras_that_mark_stops(tmp_path, make, seconds):
-    stated = Image.Exif()
-    stated[ExifTags.Base.Make] = make
-    stated.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = IFDRational(1, 60)
-    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=stated)
-    (file,) = recorded.index_recorded(tmp_path, {"iso": 100, "f_number": 4})
-    assert file.settings.exposure_time == pytest.approx(seconds, rel=1e-9)
 
 
 def test_states_without_a_capture_are_forbidden_and_said(raws, caplog) -> None:

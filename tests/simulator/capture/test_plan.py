@@ -274,13 +274,6 @@ def test_a_blur_that_runs_takes_nothing_of_the_tolerance() -> None:
     assert [step.extent for step in made] == [0.0, 10, 2, 0.0]
 
 
-def test_tolerance_0_leaves_nothing_out() -> None:
-    made = steps(0.0, Statistics(1e-9), opened_px=1.0, **disc(1e-200), **streak(1.0))
-    assert all(step.runs for step in made)
-    assert [step.error for step in made] == [1e-9] + [math.inf] * 3
-    assert not steps(0.0, Statistics(0.0))[0].runs  # a noisier target: topping up is exact
-
-
 def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
     """The paper's aperture module needs the denoised light; its own blur is not known before."""
     nlf, found = (Z6.nlf(6400), Z6.nlf(100)), Statistics(5.0, disc=0.01)

@@ -12,8 +12,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.stats import norm
 
@@ -289,16 +287,6 @@ def test_keys_are_those_of_splitmix64_and_of_each_setting_of_a_sweep() -> None:
         keys = sensor.sweep_keys(seed, states)
         assert keys.tolist() == [key_of(int(seed), *values) for values in given]
     assert len(sensor.sweep_keys(7, [])) == 0
-
-
-@given(st.integers(0, MASK), st.lists(st.floats(allow_nan=False), max_size=4), st.integers(2, 40))
-def test_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: int) -> None:
-    expected = key_of(seed, *numbers)
-    batch = noise_keys(np.full(n, seed, np.uint64), *(np.full(n, v) for v in numbers))
-    assert batch.dtype == np.uint64
-    assert batch.tolist() == [expected] * n
-    last = np.arange(float(n))
-    assert noise_keys(seed, *numbers, last).tolist() == [key_of(seed, *numbers, x) for x in last]
 
 
 def test_bad_seeds_are_named() -> None:

@@ -390,15 +390,13 @@ def test_any_light_is_developed_within_the_range(light, white_balance, tone):
         assert shown.shape == (3, 2 * light.shape[1], 2 * light.shape[2])
 
 
-@pytest.mark.parametrize("size", [(1, 5), (2, 2), (3, 7)])
-def test_render_sizes(size):
+def test_render_sizes():
     camera = CameraProfile("c", "GBRG", 0, 1023, 10)
-    raw = RawImage(torch.full((4, *size), 0.5), CameraSettings(100, 0.01, 4), camera)
+    raw = RawImage(torch.full((4, 3, 7), 0.5), CameraSettings(100, 0.01, 4), camera)
     full, half = render_srgb(raw), render_srgb(raw, "half")
-    assert (full.shape, half.shape) == ((3, 2 * size[0], 2 * size[1]), (3, *size))
-    assert full.dtype == half.dtype == torch.uint8
     # Schlick: 1.618 * .5 / (.618 * .5 + 1) = .618; sRGB .8077; 206
-    assert set(full.unique().tolist()) == set(half.unique().tolist()) == {206}
+    assert torch.equal(full, torch.full((3, 6, 14), 206, dtype=torch.uint8))
+    assert torch.equal(half, full[:, :3, :7])
     darker = render_srgb(raw, "half", exposure_ev=-1.0, tone="linear")
     assert darker.unique().tolist() == [round(255 * float(srgb(np.array(0.25))))]
 
