@@ -273,8 +273,9 @@ def normalised_model(make: str, model: str) -> str:
 #: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
 LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
 _EXPOSURE: dict[str, tuple[str, ...]] = {
-    **{"iso": ("PhotographicSensitivity", LONG_ISO[0])},
-    **{"exposure_time": ("ExposureTime",), "f_number": ("FNumber",)},
+    "iso": ("PhotographicSensitivity", LONG_ISO[0]),
+    "exposure_time": ("ExposureTime",),
+    "f_number": ("FNumber",),
 }
 #: Beyond these a file is damaged.
 _MAX_BOX_FACTOR, _LARGEST_FACTOR = 4096, 1000.0
