@@ -139,7 +139,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
+    epilog="A folder that an output names is made where it is missing. Exit status: 2 for a "
+    "mistake in an option or a file, 1 for a failure while running.",
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),

@@ -165,7 +165,6 @@ print("loaded", *sys.modules)
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--preset", "quick", "--append", "x.csv"), "`append` (='x.csv')"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
-        (("evaluate", *V1, "--append", "none/x.csv"), "there is no folder none"),
         (("evaluate", *V1, "--on-error", "skip"), "give that, too"),
         (("evaluate", "--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop'"),
         (("evaluate", "--scenes", "polyhaven", "--on-error", "skip"), "files of a folder"),
