@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
+from simulator.utils.files import MAX_PIXELS, MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +105,8 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
         import cv2
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
-    content = path.read_bytes()
+    with path.open("rb") as stream:
+        content = stream.read(5 * MAX_PIXELS)  # run lengths may make it longer than it would be
     found = re.match(rb"(#\?.*?\n)\r?\n([-+][XY] [^\n]*\n)", content[:65536], re.DOTALL)
     shown = None if found is None else _RESOLUTION.fullmatch(found[2].decode("ascii", "replace"))
     if found is None or shown is None or shown[2] == shown[5]:

@@ -43,7 +43,7 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import sibling, write_atomically
+from simulator.utils.files import refuse_bomb, sibling, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -101,6 +101,8 @@ class PackedCapture:
         """
         try:
             red, green_1, blue, green_2 = np.load(self.file, mmap_mode="r", allow_pickle=False)
+            if claim := refuse_bomb(*red.shape, red.nbytes):
+                raise ValueError(claim)
             planes = torch.from_numpy(np.stack([red, green_1, green_2, blue]))
         except (ValueError, TypeError, EOFError) as error:
             rule = "must be a whole .npy file of numbers, (4, H, W): R, G1, B, G2"
