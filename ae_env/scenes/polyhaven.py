@@ -245,7 +245,6 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
     """
     try:
         import pooch
-        from requests import RequestException
     except ImportError:
         raise ImportError("downloading scenes needs: pip install 'ae-env[hdr]'") from None
     if not url.startswith(("http://", "https://")):
@@ -270,7 +269,7 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
             fetch = partial(_fetch, size=asset.bytes)
             try:
                 fetched.append(Path(store.fetch(asset.file_name, downloader=fetch)))
-            except (RequestException, ValueError) as error:
+            except (OSError, ValueError) as error:
                 raise ConnectionError(
                     f"{store.get_url(asset.file_name)} cannot be fetched: "
                     f"{' '.join(str(error).split())}; run the command again, what is there stays"

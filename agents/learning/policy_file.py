@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ae_env.grid import ExposureGrid
 from agents.policy import Policy, PolicyContext
 from simulator.networks.weights import check_finite, read_pair, write_pair
+from simulator.utils.checks import check_type
 from simulator.utils.config_file import one_line
 from simulator.utils.files import sibling
 
@@ -161,6 +162,7 @@ class NetworkPolicy(Policy, ABC):
     ) -> None:
         super().__init__(context)
         self.name = self.kind
+        check_type("network", network, nn.Module, None)
         if (weights is None) == (network is None):
             raise ValueError("give either `weights` or `network`")
         if network is None:

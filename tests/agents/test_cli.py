@@ -141,7 +141,10 @@ print("loaded", *sys.modules)
     ("arguments", "message"),
     [
         (("simulate", "none.dng", *SIMULATE), "`path` (='none.dng') does not exist"),
+        (("simulate", "loop.dng", *SIMULATE), "`path` (='loop.dng') does not exist"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "nan"), "`shutter` (=nan)"),
+        (("score-tables", "text.dng"), "`what` (='text.dng')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
@@ -191,12 +194,13 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     write_dng(folder / "nameless.dng", nameless)
     if arguments[0] == "evaluate" and not {"--scenes", "--preset"} & {*arguments}:
         arguments = (*arguments, "--scenes", "bundled:small")
+    (folder / "loop.dng").symlink_to("loop.dng")
     before = {path.name for path in folder.iterdir()}
     code, _, error = ae_env(*arguments)
     assert (code, error[:6], error.strip().count("\n")) == (2, "error ", 0)
     assert message in error
     left = {path.name for path in folder.iterdir()} - before
-    assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
+    assert left <= {"score_tables", "quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
 def test_a_policy_that_fails(ae_env, tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def test_every_listed_name_makes_a_policy(context):
         (f"ppo:{policy_names.PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
         ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\)"),
         (f"recorded:{Path(__file__).parent}", "`path`"),  # holds no raw
+        *(("regression?network=1", "`network`"), (f"spot?iso={'1' * 4096}", "YAML scalar")),
         ("spot?damping=[1]", r"'damping' \(='\[1\]'\)"),
         ("spot?damping=0&damping=0", "'damping'.* twice"),
         ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\)"),
