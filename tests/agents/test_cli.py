@@ -157,6 +157,7 @@ print("loaded", *sys.modules)
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
+        (("train", "agent.yaml", "--tensorboard", "text.dng"), "`tensorboard` (='text.dng')"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
         (("bench", "throughput", "--part", "agents"), "`part` (='agents') is for transfer only"),
