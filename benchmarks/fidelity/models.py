@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,8 @@ def weights(name: str) -> str | Path | None:
     return path if path.is_file() else None
 
 
-def train_missing() -> None:
-    for name in (*PRESETS, *BASELINES):
+def train_missing(names: Sequence[str] = (*PRESETS, *BASELINES)) -> None:
+    for name in names:
         if weights(name) is None:
             command = [sys.executable, "-m", "benchmarks.paper_baselines", "train-simulator"]
             subprocess.run([*command, str(CONFIGS / f"{name}.yaml")], cwd=ROOT, check=True)

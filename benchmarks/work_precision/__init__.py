@@ -1,7 +1,6 @@
 """Error against run time: every method, the plan's predictions, what is left out.
 
-Needs trained weights as ``ae-env bench simulator`` does: ``compact`` comes with the package,
-``paper``, ``pc`` and ``dl`` are trained once where ``runs/simulator`` does not hold them.
+Needs the paper's networks, which are trained once where ``runs/simulator`` does not hold them.
 
 Work against precision: every scene is photographed twice; each pair of a scene and a photograph is
 a round in which all methods take their turn, in another order each time.
@@ -189,8 +188,6 @@ _COLOURS = {
     "compact": "#4477AA",
     "nano": "#88CCEE",
     "paper": "#D55E00",
-    "pc": "#009E73",
-    "dl": "#000000",
 }
 #: Methods whose PSNR is this far below the best [dB] sit at the lower end of the README's picture.
 _REACH = 6.0
@@ -308,7 +305,7 @@ def _headline(rows: list[Row]) -> Figure:
 def parts(seed: int, quick: bool) -> list[Part]:
     """Parts to measure; a full run first trains the networks that are missing."""
     if not quick:
-        train_missing()
+        train_missing(["paper"])
     found = [Part(f"precision {size[0]}", measure, {"size": size}) for size in SIZES]
     for split, shares in _SHARES.items():
         for share in range(1 if quick else shares):

@@ -12,10 +12,10 @@ from functools import partial
 from typing import Any, Literal, Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from benchmarks.denoising import Denoiser, classical
-from benchmarks.fidelity.models import baseline, load_models, weights
+from benchmarks.fidelity.models import weights
 from benchmarks.harness import recorded
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio
 from simulator.capture.decision import DEFAULT_TOLERANCE
@@ -61,7 +61,7 @@ class Method:
 
 def all_methods() -> list[Method]:
     """Every method whose weights are there; in bfloat16 where the processor computes it."""
-    bare, models = CameraSimulator(device="cpu"), load_models()
+    bare = CameraSimulator(device="cpu")
     methods = [
         Method("exposure", prepare=_Exposed),
         Method("exposure+nlf", prepare=bare.prepare),
@@ -77,13 +77,12 @@ def all_methods() -> list[Method]:
         if dtype == "float32":
             methods.append(_planned_transition(simulator("compact", dtype), DEFAULT))
         methods.append(full("large", simulator("large", dtype), dtype))
-        if "paper" in models.simulators:
+        if weights("paper") is not None:
             paper = simulator("paper", dtype)
             methods += [
                 full("paper", paper, dtype),
                 Method("paper, no repetition", dtype, prepare=partial(_PaperSweep, paper)),
             ]
-        methods += [_baseline(name, net, dtype) for name, net in models.baselines.items()]
     return methods
 
 
@@ -190,14 +189,3 @@ def full(preset: str, own: CameraSimulator, dtype: Dtype = "float32") -> Method:
         return stages.capture, stages.light
 
     return Method(f"{preset} full", dtype, shoot=shoot)
-
-
-def _baseline(name: str, network: nn.Module, dtype: Dtype) -> Method:
-    """A network that is told both settings, with the target's noise added to what it predicts."""
-
-    def shoot(raw: RawImage, settings: CameraSettings, seed: int) -> tuple[Tensor, Tensor]:
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=dtype == "bfloat16"):
-            light = baseline(network, raw, settings)
-        return _noisy(light, settings, raw, seed), light
-
-    return Method(name, dtype, shoot=shoot)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -38,7 +38,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from simulator.training.scenes import Split, reference_scenes
+from simulator.training.scenes import Split, map_scenes, radiance_files, reference_scenes
 from simulator.utils.files import data_folder
 
 #: Height and width [packed pixel].
@@ -61,6 +61,8 @@ _SETS: dict[Size, tuple[dict[str, int], int, int]] = {
     (512, 768): ({"depth": 1}, 2, 768),
 }
 _ALL_GROUPS = 32
+#: Folder of radiance maps that only bounds are calibrated and tested on.
+_FURTHER = "hdri_more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +122,7 @@ def trials(size: Size) -> tuple[Trial, ...]:
 def all_trials(split: Split = "test") -> tuple[Trial, ...]:
     """All scenes of a split, 128 x 128, with sources of different ISO."""
     kinds = _scenes((128, 128), _ALL_GROUPS, 256, split)
+    kinds["radiance"] += _further_maps(split)
     return _in_turn(kinds, {kind: len(own) for kind, own in kinds.items()})
 
 
@@ -156,6 +159,16 @@ def _scenes(
     return kinds
 
 
+def _further_maps(split: Split) -> Iterator[ReferenceScene]:
+    """Views into maps that no network was trained on: those of its split, too, calibrate bounds."""
+    splits: tuple[Split, ...] = (split,) if split == "test" else ("train", "validation")
+    if (data := data_folder()) is not None:
+        for path, group in (
+            found for s in splits for found in radiance_files(data, s, (_FURTHER,))
+        ):
+            yield from map_scenes(path, group, get_camera(CAMERA), 128)
+
+
 # -- the plan -------------------------------------------------------------------------------------
 
 #: Photographs of each scene, and fair states of it; a third as many are any others of the grid.
@@ -171,19 +184,20 @@ _WHITE = 1.0 - 1e-6
 def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list[Row]:
     """One row per scene, state and tolerance, of every `shares`-th scene from `share` on.
 
-    Every state is tried with the default tolerance, some with all of them.
+    Every state is tried with the default tolerance, some of the test split with all of them.
     """
     own, rows = simulator("large"), []
     known = trials((128, 128))[:3] if quick else all_trials(split)
+    tried = TOLERANCES if split == "test" else (DEFAULT,)
     for number, trial in list(enumerate(known))[share::shares]:
         raws = [trial.raw(seed + 100 * number + i) for i in range(DRAWS)]
-        prepared = _prepared(own, raws, trial)
+        prepared = _prepared(own, raws, trial, tried)
         for position, settings in enumerate(_states(trial, number)[:: FAIR if quick else 1]):
             truth, target = trial.mean(settings), raws[0].camera.nlf(settings.iso)
             wanted = noise_variance(truth, target)
             # White in the scene: no difference there can show.
             shows = torch.where(truth < _WHITE, wanted, torch.inf)
-            for tolerance in (DEFAULT,) if position % _EVERY else TOLERANCES:
+            for tolerance in (DEFAULT,) if position % _EVERY else tried:
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
                 light, added = (torch.stack(own) for own in zip(*pairs, strict=True))
@@ -208,17 +222,15 @@ def _states(trial: Trial, number: int) -> list[CameraSettings]:
 
 
 def _prepared(
-    own: CameraSimulator, raws: Sequence[RawImage], trial: Trial
+    own: CameraSimulator, raws: Sequence[RawImage], trial: Trial, tolerances: Sequence[float]
 ) -> dict[float, list[PreparedScene]]:
     """The photographs prepared for each tolerance; positive ones share the networks' runs."""
-    found: dict[float, list[PreparedScene]] = {}
-    for tolerance in sorted(TOLERANCES):
-        if tolerance <= TOLERANCES[1]:
-            options: dict[str, Any] = {"depth": trial.depth, "tolerance": tolerance}
-            found[tolerance] = [own.prepare(raw, **options) for raw in raws]
-        else:
-            found[tolerance] = [replace(p, tolerance=tolerance) for p in found[TOLERANCES[1]]]
-    return found
+
+    def made(tolerance: float) -> list[PreparedScene]:
+        return [own.prepare(raw, depth=trial.depth, tolerance=tolerance) for raw in raws]
+
+    shared = made(TOLERANCES[1])
+    return {t: [replace(p, tolerance=t) for p in shared] if t else made(t) for t in tolerances}
 
 
 def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Tensor, Tensor]:

@@ -247,6 +247,16 @@ class PreparedScene:
         marks = self.saturated
         return 0.0 if marks is None else int(marks.count_nonzero()) / marks.numel()
 
+    @property
+    def clipped_light(self) -> tuple[float, float]:
+        """Share of the samples that are clipped in the source, and their mean estimated light."""
+        if self.saturated is None:
+            return 0.0, 1.0
+        light = self.light[:, self.saturated]
+        light = light[light >= 1.0]
+        share = light.numel() / self.light.numel()
+        return share, float(light.double().mean()) if share else 1.0
+
     # -- what a change of settings takes ------------------------------------------------------
 
     def exposure(

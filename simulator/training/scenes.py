@@ -13,7 +13,7 @@ import json
 import logging
 import math
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -65,7 +65,9 @@ _FIXED: dict[Split, tuple[str, ...]] = {
     "validation": ("StillLife", "city"),
     "test": ("Desk", "apartment", "lab", "park", "sunset", "venice", "warehouse", "camera_box"),
 }
-#: Folders of radiance maps.
+#: Tables of source groups, each with the column that names them.
+_GROUPS = {"MANIFEST_POOL.csv": "group", "hdri_more/MANIFEST.csv": "place"}
+#: Folders of the radiance maps that networks are trained and tested on.
 _MAP_FOLDERS = ("hdri_pool", "hdri_cc0", "openexr_bsd")
 #: Shares of the source groups: training, validation; the rest tests.
 _TRAIN, _VALIDATION = 0.62, 0.70
@@ -156,9 +158,11 @@ def detail_pictures(
     return [*pictures, *_drawings(split, _DRAWN[split] if drawn is None else drawn, seed)]
 
 
-def radiance_files(data: Path, split: Split) -> Iterator[tuple[Path, str]]:
+def radiance_files(
+    data: Path, split: Split, folders: Sequence[str] = _MAP_FOLDERS
+) -> Iterator[tuple[Path, str]]:
     """Radiance maps of a split, each with its source group."""
-    for folder in _MAP_FOLDERS:
+    for folder in folders:
         yield from _files(data, folder, RADIANCE_SUFFIXES, split)
 
 
@@ -208,12 +212,14 @@ def _files(
 
 @cache
 def _groups(data: Path) -> dict[str, str]:
-    """Source group by file name, where a table beside the files states it."""
-    table = data / "MANIFEST_POOL.csv"
-    if not table.is_file():
-        return {}
-    with table.open(newline="", encoding="utf-8") as stream:
-        return {Path(r["file"]).name: r["group"] for r in csv.DictReader(stream) if r["group"]}
+    """Source group by file name, where a table of the files states it."""
+    found: dict[str, str] = {}
+    for name, column in _GROUPS.items():
+        if (data / name).is_file():
+            with (data / name).open(newline="", encoding="utf-8") as stream:
+                rows = list(csv.DictReader(stream))
+            found |= {Path(row["file"]).name: row[column] for row in rows if row[column]}
+    return found
 
 
 # -- drawn pictures -------------------------------------------------------------------------------
@@ -419,15 +425,22 @@ def _real_pictures(
     """Radiance maps and photographs of a folder of real files."""
     if not data.is_dir():
         raise FileNotFoundError(f"`data` (={str(data)!r}) must be an existing folder")
-    about: dict[str, Any]
     for path, group in radiance_files(data, split):
-        about = {"group": group, "kind": "radiance", "source": path.name}
-        for name, view in _views(path.stem, read_radiance(path)):
-            yield from _cut_out(view, camera, size, scene_id=name, **about)
+        yield from map_scenes(path, group, camera, size)
+    about: dict[str, Any]
     for photograph in photograph_pictures(data, split):
         name, view = photograph.name, _sharpened(photograph.light.numpy())
         about = {"group": photograph.group, "kind": "photograph", "source": f"photo_pool {name}"}
         about["in_focus"] = name not in _BLURRED
+        yield from _cut_out(view, camera, size, scene_id=name, **about)
+
+
+def map_scenes(
+    path: Path, group: str, camera: CameraProfile, size: int
+) -> Iterator[ReferenceScene]:
+    """Views into a radiance map, see `reference_scenes`."""
+    about: Any = {"group": group, "kind": "radiance", "source": path.name}
+    for name, view in _views(path.stem, read_radiance(path)):
         yield from _cut_out(view, camera, size, scene_id=name, **about)
 
 

@@ -15,7 +15,7 @@ from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
 from simulator.capture.decision import Exposure
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
-from simulator.capture.plan import _BOUND, _LEAST_BOUND, HIDDEN_LIGHT, KEPT_BLUR_ERROR, MISSED_BLUR
+from simulator.capture.plan import _BOUND, _LEAST_BOUND, KEPT_BLUR_ERROR, MISSED_BLUR
 from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.optics.motion import Movement
@@ -363,21 +363,25 @@ def test_each_decision_says_what_it_costs() -> None:
 
 @pytest.mark.parametrize("ratio", [2.0, 1.25, 1.0, 0.5, 1 / 64])
 def test_what_clipped_highlights_hide_by_quadrature(ratio: float) -> None:
-    """A share of light x >= 1 of density 1 / x^2, taken to be 2, in a tenth of the pixels."""
+    """Light x >= 1 of density 1 / x^2, shown as 1.5, in three planes of a tenth of the pixels."""
     target = NoiseLevelFunction((2e-4,) * 4, (1e-4,) * 4)
-    noise = 1e-4 + 2e-4 * ratio  # of what is white in the source
     camera = replace(Z6, segments=(), nlf_by_iso={100.0: target})
-    saturated = torch.zeros(10, 12, dtype=torch.bool)
+    saturated, light = torch.zeros(10, 12, dtype=torch.bool), torch.full((4, 10, 12), 0.5)
     saturated[0] = True
+    light[:, 0] = torch.tensor([0.9, 1.5, 1.5, 1.5])[:, None]  # R was measured
     settings = CameraSettings(100, 1 / 64, 8)
-    made = PreparedScene(torch.ones(4, 10, 12), settings, camera, ZERO, saturated=saturated)
+    made = PreparedScene(light, settings, camera, ZERO, saturated=saturated)
     plan = made.plan(CameraSettings(100, ratio / 64, 8))
     square = 0.0
-    if ratio < 1.0:  # x = 1 / u
-        shown = min(2.0 * ratio, 1.0)
-        square = quad(lambda u: (min(ratio / u, 1.0) - shown) ** 2, 0, 1, points=[ratio])[0]
-    error = HIDDEN_LIGHT * math.sqrt(0.1 * square / noise)
-    assert plan.errors["clipped highlights"] == pytest.approx(error, rel=1e-6)
+    if ratio < 1.0:
+        shown = min(1.5 * ratio, 1.0)
+
+        def density(x: float) -> float:
+            return (ratio * x - shown) ** 2 / (1e-4 + 2e-4 * ratio * x) / x**2
+
+        square = quad(density, 1.0, 1.0 / ratio)[0]
+    error = math.sqrt(0.075 * square)
+    assert plan.errors["clipped highlights"] == pytest.approx(error, rel=1e-5)
     leading = max(plan.errors, key=plan.errors.get)
     assert leading == ("clipped highlights" if ratio < 1.0 else "rounding")
     bound = _BOUND[leading] * math.hypot(error, plan.errors["rounding"], _LEAST_BOUND)
