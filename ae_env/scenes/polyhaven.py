@@ -230,9 +230,8 @@ def cut_values(panorama: np.ndarray) -> list[str]:
 def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None) -> list[Path]:
     """Fetches the maps that are missing or damaged into the cache, and returns their files.
 
-    A file is put in place when it is complete and its hash is the list's. No more of it is read
-    than the list says, so that all take 66 MB at most. The environment's proxy (``HTTPS_PROXY``) is
-    used.
+    A file is put in place when it is complete and its hash is the list's. No more is read than the
+    list says, 66 MB in all. The environment's proxy (``HTTPS_PROXY``) is used.
 
     Args:
         url: Folder that serves ``NAME_1k.hdr``.

@@ -84,8 +84,7 @@ def evaluate(
 ) -> None:
     """Compare policies on the same episodes; a second run resumes the first.
 
-    Without `--preset`, one condition: 2 episodes per scene of 8 frames, from states drawn at
-    random.
+    Without `--preset`, one condition: 2 episodes per scene of 8 frames, from random states.
 
     Example: `ae-env evaluate --preset quick --policy matrix:tuned --policy average`
     """

@@ -123,8 +123,7 @@ def trained_grid(card: dict[str, Any]) -> ExposureGrid:
 def check_context(card: dict[str, Any], context: PolicyContext) -> None:
     """Raises a `ValueError` that says what differs unless the agent of `card` fits `context`.
 
-    Any grid whose values lie within the trained ranges works: a state enters the networks by its
-    numbers.
+    Any grid whose values lie within the trained ranges works: states enter networks as numbers.
     """
     for name, here in describe_context(context).items():
         trained = card["context"].get(name)

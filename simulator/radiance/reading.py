@@ -48,9 +48,8 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, holds no light, is a cube map or has pixels that
-            are not square, or claims more pixels than `simulator.utils.files` allows for a file of
-            its length.
+        ValueError: If the file cannot be read, holds no light, is a cube map, has pixels that are
+            not square, or more than `simulator.utils.files` allows for a file of its length.
     """
     path = as_path(path)
     if not path.is_file():

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 #: Linear sRGB (D65) to CIE XYZ, IEC 61966-2-1:1999.
-XYZ_FROM_SRGB = (
-    (0.4124, 0.3576, 0.1805),
-    (0.2126, 0.7152, 0.0722),
-    (0.0193, 0.1192, 0.9505),
-)
+XYZ_FROM_SRGB = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))
 #: Signal of an 18 % grey card in incident-light exposure: 0.18 * 0.6635 of sensor white.
 GREY_CARD_SIGNAL = 0.18 * 0.6635
 #: Schlick's parameter that shows that card at 18 % of the display's white.
@@ -100,11 +96,7 @@ def develop(
 
 
 def render_srgb(
-    raw: RawImage,
-    demosaic: str = "malvar",
-    exposure_ev: float = 0.0,
-    *,
-    tone: str = "photographic",
+    raw: RawImage, demosaic: str = "malvar", exposure_ev: float = 0.0, *, tone: str = "photographic"
 ) -> torch.Tensor:
     """Develop one raw for looking at, with its own white balance and its camera's matrix.
 

@@ -179,8 +179,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
     """All of pydantic's complaints in one line, each with the entry that it is about.
 
-    `prefix` stands before the name of every entry; of `model` the name nearest to an unknown one is
-    proposed.
+    `prefix` stands before every entry's name; of `model` the nearest to an unknown one is proposed.
     """
     parts = []
     for item in error.errors():

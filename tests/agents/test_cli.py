@@ -144,7 +144,6 @@ print("loaded", *sys.modules)
         (("simulate", "loop.dng", *SIMULATE), "`path` (='loop.dng') does not exist"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "nan"), "`shutter` (=nan)"),
-        (("score-tables", "text.dng"), "`what` (='text.dng')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
@@ -201,7 +200,7 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     assert (code, error[:6], error.strip().count("\n")) == (2, "error ", 0)
     assert message in error
     left = {path.name for path in folder.iterdir()} - before
-    assert left <= {"score_tables", "quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
+    assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
 def test_a_policy_that_fails(ae_env, tmp_path: Path) -> None:
