@@ -14,7 +14,7 @@ from collections.abc import Callable
 from functools import partial
 from itertools import product
 from time import perf_counter
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -31,7 +31,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.reading import read_radiance
 from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
 from simulator.training.crops import DetailPicture
-from simulator.training.scenes import Split, detail_pictures, radiance_files
+from simulator.training.scenes import FURTHER_MAPS, Split, detail_pictures, radiance_files
 from simulator.utils.files import data_folder
 
 #: Sources are photographed by both cameras in turn.
@@ -124,6 +124,8 @@ def measure_highlights(seed: int, quick: bool, split: Split = "test") -> list[Ro
     data, rows = data_folder(), []
     simulators = {k: CameraSimulator.from_pretrained(k, device="cpu") for k in SIZES}
     files = [] if data is None else list(radiance_files(data, split))
+    if data is not None and split == "test":  # no network and no choice has seen these
+        files += (f for s in get_args(Split) for f in radiance_files(data, s, FURTHER_MAPS))
     for number, (path, _) in enumerate(files[:2] if quick else files):
         light = torch.from_numpy(read_radiance(path))
         if min(light.shape[1:]) < 2 * SIZE:

@@ -67,8 +67,7 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         row |= {"ms_per_state": middle, "ms_spread": (high - low) / 2}
         row |= {"ms_per_sweep": len(GRID) * middle, "psnr_db": float(np.mean(own["psnr"]))}
         row |= {"psnr_db_worst": min(own["psnr"]), "relative_rmse_worst": max(own["rmse"])}
-        for percent in (10, 90):
-            row[f"psnr_db_{percent}_percent"] = float(np.quantile(own["psnr"], percent / 100))
+        row |= {f"psnr_db_{n}_percent": float(np.percentile(own["psnr"], n)) for n in (10, 90)}
         row |= {"relative_rmse": float(np.mean(own["rmse"])), "noise_variance_floor": floor}
         row |= {"noise_variance_error": float(np.median(own["noise"] or np.nan))}
         rows.append(row | {"scenes": len(chosen), "states_per_scene": count})

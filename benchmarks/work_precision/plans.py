@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -38,7 +38,13 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from simulator.training.scenes import Split, map_scenes, radiance_files, reference_scenes
+from simulator.training.scenes import (
+    FURTHER_MAPS,
+    Split,
+    map_scenes,
+    radiance_files,
+    reference_scenes,
+)
 from simulator.utils.files import data_folder
 
 #: Height and width [packed pixel].
@@ -61,8 +67,6 @@ _SETS: dict[Size, tuple[dict[str, int], int, int]] = {
     (512, 768): ({"depth": 1}, 2, 768),
 }
 _ALL_GROUPS = 32
-#: Folder of radiance maps that only bounds are calibrated and tested on.
-_FURTHER = "hdri_more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +88,7 @@ class Trial:
 
     def mean(self, settings: CameraSettings) -> Tensor:
         """(4, H, W) the camera's record at `settings` without noise, clipped."""
-        light = self._light(settings.f_number)
-        signal = self.camera.expose(light, self.scene.reference, settings)
+        signal = self.camera.expose(self._light(settings.f_number), self.scene.reference, settings)
         return self.camera.clip(signal, settings.iso)
 
     def sample(self, settings: CameraSettings, seed: int) -> Tensor:
@@ -159,14 +162,12 @@ def _scenes(
     return kinds
 
 
-def _further_maps(split: Split) -> Iterator[ReferenceScene]:
+def _further_maps(split: Split) -> list[ReferenceScene]:
     """Views into maps that no network was trained on: those of its split, too, calibrate bounds."""
     splits: tuple[Split, ...] = (split,) if split == "test" else ("train", "validation")
-    if (data := data_folder()) is not None:
-        for path, group in (
-            found for s in splits for found in radiance_files(data, s, (_FURTHER,))
-        ):
-            yield from map_scenes(path, group, get_camera(CAMERA), 128)
+    data, camera = data_folder(), get_camera(CAMERA)
+    found = [f for s in splits for f in radiance_files(data, s, FURTHER_MAPS)] if data else []
+    return [scene for file in found for scene in map_scenes(*file, camera, 128)]
 
 
 # -- the plan -------------------------------------------------------------------------------------

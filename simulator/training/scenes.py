@@ -67,8 +67,8 @@ _FIXED: dict[Split, tuple[str, ...]] = {
 }
 #: Tables of source groups, each with the column that names them.
 _GROUPS = {"MANIFEST_POOL.csv": "group", "hdri_more/MANIFEST.csv": "place"}
-#: Folders of the radiance maps that networks are trained and tested on.
-_MAP_FOLDERS = ("hdri_pool", "hdri_cc0", "openexr_bsd")
+#: Folders of the radiance maps that networks are trained and tested on, and of further ones.
+_MAP_FOLDERS, FURTHER_MAPS = ("hdri_pool", "hdri_cc0", "openexr_bsd"), ("hdri_more",)
 #: Shares of the source groups: training, validation; the rest tests.
 _TRAIN, _VALIDATION = 0.62, 0.70
 #: Raws of known subjects: beginning of the file name by group.
