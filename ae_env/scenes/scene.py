@@ -277,7 +277,7 @@ class Scene:
         Returns:
             The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
             was averaged into it was. `defocus_map` is the root mean square, as second moments add,
-            divided by k. Of `layout` it is the mean, and the subject where that has most of a pixel.
+            divided by k. Of `layout` it is the mean; a pixel is what most of it was.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
