@@ -6,6 +6,7 @@ Every measurement is written as ``{"meta": {...}, "rows": [...]}``.
 from __future__ import annotations
 
 import datetime
+import errno
 import functools
 import importlib.metadata
 import io
@@ -73,6 +74,17 @@ def as_path(path: object) -> Path:
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise ValueError(f"`path` (={path!r}) must be a file's name: a str or a pathlib.Path")
     return Path(path)
+
+
+def read_bounded(path: Path, most: int = 2**30) -> bytes:
+    """Content of an ordinary file of at most so many bytes; an `OSError` for another one."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+    with path.open("rb") as stream:
+        content = stream.read(most + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
+    return content
 
 
 def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
