@@ -43,7 +43,13 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import refuse_bomb, sibling, write_atomically
+from simulator.utils.files import (
+    MAX_TABLE_BYTES,
+    read_bounded,
+    refuse_bomb,
+    sibling,
+    write_atomically,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -196,10 +202,11 @@ def _cells(table: Path) -> pd.DataFrame:
     how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
     try:
         with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
-            frame = pd.read_csv(table, index_col=False, **how)  # without cells beyond the columns
+            content = io.BytesIO(read_bounded(table, MAX_TABLE_BYTES))
+            frame = pd.read_csv(content, index_col=False, **how)  # no cells beyond the columns
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
-    except (pd.errors.ParserError, UnicodeError) as error:
+    except (pd.errors.ParserError, OSError, UnicodeError) as error:
         raise ValueError(f"`{table}` must be a CSV file in UTF-8: {error}") from error
     return frame.rename(columns=str.strip)
 

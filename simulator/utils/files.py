@@ -51,6 +51,8 @@ MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 #: one has: decoded, they take some 1 GB.
 MAX_PICTURE_PIXELS, MAX_FLAT_PIXELS = 2**26, 2**24
 
+#: Most bytes of a table of settings or groups.
+MAX_TABLE_BYTES = 2**26
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
 
