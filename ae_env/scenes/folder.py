@@ -66,8 +66,7 @@ class FolderOptions:
             ``f_number``, as an adapted lens or some telephones do not state them.
         on_error: What happens where a file cannot be read, or is black without `illuminance`:
             ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
-            ``"skip"`` leaves it out, and a warning in the log says how many were and why; not
-            for sequences.
+            ``"skip"``, not for sequences, leaves it out: a warning says how many were and why.
     """
 
     illuminance: float | Mapping[str, float] | None = None

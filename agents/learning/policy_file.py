@@ -141,8 +141,7 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
 class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
-    Either `weights` are given, a file that a training wrote, for the torch `device`; or `network`,
-    one in memory.
+    Give `weights`, a file that a training wrote, for the torch `device`; or `network`, in memory.
 
     Raises:
         ValueError: Unless the network was trained for such an observation, and for a grid whose

@@ -60,8 +60,7 @@ class PictureStore:
 class Options:
     """The options of `ae-env view`, which all tabs of the browser share.
 
-    `thumbnails` are JPEGs of scenes that were asked for; in `folder` lie uploads and downloads, in
-    a folder for each tab.
+    `thumbnails` are JPEGs of scenes that were asked for; `folder` has one for each tab's files.
     """
 
     library: Library

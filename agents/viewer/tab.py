@@ -41,8 +41,7 @@ def new_file(folder: Path, name: str) -> Path:
 class Tab:
     """One tab of the page, put together where it is made.
 
-    `address` gives a picture an address for the browser; files to download lie in `folder`, beside
-    those of other tabs.
+    `address` gives a picture an address for the browser; files to download lie in `folder`.
     """
 
     def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:

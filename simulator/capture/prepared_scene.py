@@ -50,8 +50,7 @@ class Layout:
     Args:
         defocus: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's
             `defocus`; 0 is the plane of focus.
-        subject: (H, W) bool, the pixels of the subject, which may move apart from the rest; None
-            for no subject.
+        subject: (H, W) bool, the subject's pixels, which may move apart from the rest, or None.
     """
 
     defocus: torch.Tensor

@@ -447,8 +447,7 @@ def map_scenes(
 def _views(name: str, image: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Other pictures as they are, and four square cuts out of a panorama's horizon, by name.
 
-    A perspective view has its edges enlarged; this band of 45 degrees is stretched by 1.41 at most,
-    sideways.
+    A perspective view has its edges enlarged; this band of 45 degrees is stretched by up to 1.41.
     """
     height, width = image.shape[1:]
     if abs(width / height - 2.0) > 0.01:
