@@ -203,12 +203,14 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
-def test_a_policy_that_fails(ae_env, tmp_path: Path) -> None:
+def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN)
     small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
     code, _, error = ae_env("evaluate", "--policy", "own.py:Raises", *small)
     assert (code, error.count("\n")) == (1, 1)
     assert re.search(r"own\.py:.*`act` raised KeyError: 'lost'", error)
+    code, _, error = ae_env("evaluate", "--policy", "random", "--scenes", "os:system")
+    assert (code, "`scenes` (='os:system') raised TypeError" in error) == (1, True)
 
 
 @pytest.mark.parametrize(
