@@ -270,7 +270,7 @@ def _read(file: Any) -> list[float]:
     rule = f"`lighting['file']` (={str(file)!r})"
     check_type("lighting['file']", file, str, Path)
     try:
-        text = read_bounded(Path(file).expanduser(), 32 * MAX_FRAMES).decode("utf-8-sig")
+        text = read_bounded(Path(file).expanduser()).decode("utf-8-sig")
         rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     except (OSError, UnicodeError, csv.Error, RuntimeError) as error:
         raise ValueError(f"{rule} cannot be read: {error}") from error

@@ -34,7 +34,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
-from simulator.utils.files import MAX_TABLE_BYTES, PICTURE_SUFFIXES, RAW_SUFFIXES, read_bounded
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, read_bounded
 
 logger = logging.getLogger(__name__)
 
@@ -430,7 +430,7 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
 def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
     """Rows and column names of a CSV file; a `ValueError` if it cannot be read."""
     try:
-        text = read_bounded(path, MAX_TABLE_BYTES).decode("utf-8-sig")
+        text = read_bounded(path).decode("utf-8-sig")
         reader = csv.DictReader(io.StringIO(text, newline=""))
         return list(reader), list(reader.fieldnames or ())
     except (csv.Error, OSError, UnicodeError) as error:

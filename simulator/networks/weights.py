@@ -95,7 +95,7 @@ def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     card_file, file = sibling(path, ".json"), sibling(path, ".safetensors")
     given = f"`weights` (={str(path)!r})"
     try:
-        content, text = read_bounded(file), read_bounded(card_file)
+        content, text = read_bounded(file, 2**30), read_bounded(card_file)
     except OSError as error:
         raise ValueError(f"{given} cannot be read: {error}") from error
     try:

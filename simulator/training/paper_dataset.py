@@ -43,13 +43,7 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import (
-    MAX_TABLE_BYTES,
-    read_bounded,
-    refuse_bomb,
-    sibling,
-    write_atomically,
-)
+from simulator.utils.files import read_bounded, refuse_bomb, sibling, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -202,7 +196,7 @@ def _cells(table: Path) -> pd.DataFrame:
     how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
     try:
         with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
-            content = io.BytesIO(read_bounded(table, MAX_TABLE_BYTES))
+            content = io.BytesIO(read_bounded(table))
             frame = pd.read_csv(content, index_col=False, **how)  # no cells beyond the columns
     except pd.errors.EmptyDataError:
         return pd.DataFrame()

@@ -51,8 +51,6 @@ MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 #: one has: decoded, they take some 1 GB.
 MAX_PICTURE_PIXELS, MAX_FLAT_PIXELS = 2**26, 2**24
 
-#: Most bytes of a table of settings or groups.
-MAX_TABLE_BYTES = 2**26
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
 
@@ -78,7 +76,7 @@ def as_path(path: object) -> Path:
     return Path(path)
 
 
-def read_bounded(path: Path, most: int = 2**30) -> bytes:
+def read_bounded(path: Path, most: int = 2**26) -> bytes:
     """Content of an ordinary file of at most so many bytes; an `OSError` for another one."""
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
