@@ -107,7 +107,7 @@ def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
 
     Args:
         light: (C, H, W) linear light as a pinhole at the centre of the lens sees it, unclipped.
-        diameter: (H, W) circle of confusion [px], smaller where nearer (`Lens.circle_of_confusion`).
+        diameter: (H, W) circle of confusion [px], smaller if nearer (`Lens.circle_of_confusion`).
 
     Returns:
         (C, H, W), the same dtype. Borders are replicated. A pixel in focus (up to 0.1 px) with
