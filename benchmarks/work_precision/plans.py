@@ -178,8 +178,6 @@ DRAWS, FAIR = 8, 12
 _EVERY = 5
 #: Standard deviations are pooled over squares of this side [pixel].
 _WINDOW = 9
-#: Light from here on is white in every capture.
-_WHITE = 1.0 - 1e-6
 
 
 def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list[Row]:
@@ -201,7 +199,7 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
                 light, added = (torch.stack(own) for own in zip(*pairs, strict=True))
                 # No difference shows in what is white in the scene and, within noise, in captures.
-                white = (truth >= _WHITE) & (light.mean(dim=0) >= 1.0 - wanted.sqrt())
+                white = (truth > 1.0 - 1e-6) & (light.mean(dim=0) >= 1.0 - wanted.sqrt())
                 shows = torch.where(white, torch.inf, wanted)
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
