@@ -77,7 +77,7 @@ def test_noise_is_the_files_own_before_the_cameras():
     averaged = RawImage(data, SETTINGS, z6, nlf=own, box_factor=4)
     assert averaged.noise.shot == pytest.approx((1e-3 / 16,) * 4)
     assert averaged.noise.read == pytest.approx((1e-6 / 16,) * 4)
-    with pytest.raises(ValueError, match="no noise calibration"):
+    with pytest.raises(ValueError, match=r"no noise calibration.*estimate_nlf"):
         _ = RawImage(data, SETTINGS, camera()).noise
 
 
@@ -198,15 +198,6 @@ def test_any_size_and_order_of_memory(path):
     raw = RawImage.from_mosaic(mosaic, CameraSettings(100, 1, 4), make_raw().camera, nlf=NLF)
     write_dng(path, replace(raw, data=raw.data.permute(2, 0, 1).contiguous().permute(1, 2, 0)))
     np.testing.assert_array_equal(tifffile.imread(path), mosaic)
-
-
-def test_bad_arguments_leave_what_is_there(tmp_path, path):
-    write_dng(path, make_raw())
-    before = path.read_bytes()
-    for target, raw, name in ((tmp_path / "a.tif", make_raw(), "path"), (path, None, "raw")):
-        with pytest.raises(ValueError, match=f"`{name}`"):
-            write_dng(target, raw)
-    assert path.read_bytes() == before
 
 
 LEVELS = (0.02, 0.1, 0.18, 0.5)
