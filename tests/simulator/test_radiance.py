@@ -1,5 +1,6 @@
 """Radiance maps: what a file says beside its pixels is followed, or refused by name."""
 
+import struct
 from itertools import product
 
 import numpy as np
@@ -47,11 +48,20 @@ def test_the_part_and_layer_with_the_colours_is_the_picture(tmp_path):
     with pytest.raises(ValueError, match="`depth`"):  # red is no distance
         read_depth(write(path, part("beauty", channels())))
     # Blender's names, small letters, and layers beside R, G, B.
-    blender = channels(layer="ViewLayer.Combined.") | {"ViewLayer.Depth.Z": DISTANCE}
+    normals = {f"ViewLayer.Normal.{name}": GREY for name in "XYZ"}
+    blender = channels(layer="ViewLayer.Combined.") | {"ViewLayer.Depth.Z": DISTANCE} | normals
     assert_image(read_radiance(write(path, part("a", blender))))
-    assert (read_depth(path, layer="ViewLayer.Depth") == 3.0).all()
+    assert (read_depth(path) == read_depth(path, layer="ViewLayer.Depth")).all()
+    assert (read_depth(path) == 3.0).all()
     small = {name.lower(): plane for name, plane in channels().items()}
     assert_image(read_radiance(write(path, part("a", small))))
+    small = {name.lower(): plane for name, plane in channels(IMAGE + 1).items()}
+    assert_image(read_radiance(write(path, part("a", channels() | small))))
+    for planes in (normals, {"U": GREY, "V": GREY}, {"Y": GREY, "RY": GREY, "BY": GREY}):
+        with pytest.raises(ValueError, match="must have"):  # neither light nor depth
+            read_depth(write(path, part("n", planes), part("beauty", channels())))
+        with pytest.raises(ValueError, match=r"must have|states primaries"):
+            read_radiance(write(path, part("n", planes, chromaticities=(float("nan"),) * 8)))
     assert_image(read_radiance(write(path, part("a", channels() | channels(IMAGE + 1, "left.")))))
 
 
@@ -66,6 +76,39 @@ def test_colours_are_converted_by_the_chromaticities_of_the_file(tmp_path):
     for head in ("FORMAT=32-bit_rle_xyze", "PRIMARIES=1 0 0 1 0 0 .333333 .333333"):
         (tmp_path / "a.hdr").write_bytes(f"#?RADIANCE\n{head}\n\n-Y 6 +X 10\n".encode() + pixels)
         assert_image(read_radiance(tmp_path / "a.hdr"), atol=0.06)  # 8 bits of mantissa
+
+
+def test_luminance_and_chroma_at_half_the_resolution(tmp_path):
+    """R = (RY + 1) Y, B = (BY + 1) Y, and Y = 0.2126 R + 0.7152 G + 0.0722 B (OpenEXR, BT.709).
+
+    The file is written by the format's description, as the module does not write such files.
+    Chroma that rises linearly is linear between its samples, too, up to the last one.
+    """
+    rise, luminance = np.add.outer(np.arange(6), np.arange(10)), IMAGE[..., 1]
+    planes = {"BY": rise / -40.0, "RY": rise / 50.0, "Y": luminance}
+    listed = (n.encode() + struct.pack("<x2i2i", 2, 0, len(n), len(n)) for n in planes)
+    window, head = struct.pack("<4i", 0, 0, 9, 5), struct.pack("<2i", 20000630, 2)
+    for name, kind, value in (
+        ("channels", "chlist", b"".join([*listed, b"\0"])),
+        ("compression", "compression", b"\0"),
+        *((name, "box2i", window) for name in ("dataWindow", "displayWindow")),
+        ("lineOrder", "lineOrder", b"\0"),
+        ("pixelAspectRatio", "float", struct.pack("<f", 1)),
+        ("screenWindowCenter", "v2f", bytes(8)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1)),
+    ):
+        head += f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
+    lines, offsets, start = b"", [], len(head) + 1 + 8 * 6
+    for y in range(6):
+        offsets.append(start + len(lines))
+        rows = [p[y, :: len(n)] for n, p in planes.items() if y % len(n) == 0]
+        content = np.concatenate(rows).astype("<f4").tobytes()
+        lines += struct.pack("<2i", y, len(content)) + content
+    path = tmp_path / "a.exr"
+    path.write_bytes(head + b"\0" + struct.pack("<6Q", *offsets) + lines)
+    r, b = (1 + planes["RY"]) * luminance, (1 + planes["BY"]) * luminance
+    expected = np.dstack([r, (luminance - 0.2126 * r - 0.0722 * b) / 0.7152, b])
+    assert_image(read_radiance(path)[:, :5, :9], expected[:5, :9], rtol=1e-3)
 
 
 def rgbe(image):
@@ -102,13 +145,14 @@ def test_radiance_files_of_every_orientation_and_header(tmp_path):
         path.write_bytes(head.encode() + rgbe(stored))
         assert_image(read_radiance(path), atol=0.02)
     # No FORMAT; CRLF; primaries that some programs write.
-    zeros = f"#?RADIANCE\nPRIMARIES={' 0' * 8}\n\n-Y 6 +X 10\n"
+    zeros = f"#?RADIANCE\nPIXASPECT=.999998\nPRIMARIES={' 0' * 8}\n\n-Y 6 +X 10\n"
     for head in ("#?RGBE\n\n-Y 6 +X 10\n", "#?RADIANCE\r\n\r\n-Y 6 +X 10\r\n", zeros):
         path.write_bytes(head.encode() + rgbe(IMAGE))
         assert_image(read_radiance(path), atol=0.02)
     for head, words in (
         ("#?RADIANCE\nFORMAT=32-bit_rle_luv\n\n-Y 6 +X 10\n", "32-bit_rle_luv"),
         ("#?RADIANCE\nPIXASPECT=2.0\n\n-Y 6 +X 10\n", "not square"),
+        ("#?RADIANCE\nPIXASPECT=?\n\n-Y 6 +X 10\n", "not square"),
         ("#?RADIANCE\nPRIMARIES=1 2 3\n\n-Y 6 +X 10\n", "PRIMARIES"),
         ("#?RADIANCE\n\n-Y 6 +Y 10\n", "no resolution"),
     ):
