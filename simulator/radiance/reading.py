@@ -120,10 +120,9 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
         name, equals, value = line.partition("=")
         if equals:
             entries[name.strip()] = value.strip()
-    try:
+    aspect = np.nan
+    with contextlib.suppress(ValueError):
         aspect = float(entries.get("PIXASPECT", 1))
-    except ValueError:
-        aspect = np.nan
     _check_aspect(aspect)
     kind = entries.get("FORMAT", "32-bit_rle_rgbe")
     if kind not in _RADIANCE_FORMATS:
@@ -227,15 +226,13 @@ def read_exr(
 
 def _interpolated(plane: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """Every pixel of a plane that has samples at every first, second, ... row and column only."""
-    for axis, (count, stored) in enumerate(zip(size, plane.shape, strict=True)):
-        if not 0 < stored <= count or count % stored:
-            raise RadianceError(f"must have channels of {size} samples, but has {plane.shape}")
-        if stored < count:
-            step = count // stored
-            nearer = np.moveaxis(plane, axis, 0)
-            further = np.concatenate([nearer[1:], nearer[-1:]])
-            rows = [nearer + np.float32(i / step) * (further - nearer) for i in range(step)]
-            plane = np.moveaxis(np.stack(rows, axis=1).reshape(count, -1), 0, axis)
+    if not plane.size or any(n % stored for n, stored in zip(size, plane.shape, strict=True)):
+        raise RadianceError(f"must have channels of {size} samples, but has {plane.shape}")
+    for axis, count in enumerate(size):
+        if plane.shape[axis] < count:
+            at = np.arange(count, dtype=np.float32) / (count // plane.shape[axis])
+            low, high = (plane.take(at.astype(int) + i, axis, mode="clip") for i in (0, 1))
+            plane = low + (high - low) * np.expand_dims(at % 1.0, 1 - axis)
     return plane
 
 

@@ -89,6 +89,36 @@ def test_what_libraw_takes_for_something_else(tmp_path):
         read_module._check_structure([apart], True, 10**6)
 
 
+def test_black_levels_that_fit_no_tile_are_refused(path):
+    """dcraw takes the first of two or three, LibRaw 0; both leave out what is beyond the tile."""
+    for dim, values in (
+        ((), (60, 68)),
+        ((), (60, 64, 68)),
+        ((2, 2), (60, 64, 68)),
+        ((2,), (9,) * 4),
+    ):
+        write_sample_dng(path, BlackLevel=("I", values), BlackLevelRepeatDim=("H", dim))
+        with pytest.raises(RawFileError, match=rf"'a.dng'.* has {len(values)} in BlackLevel"):
+            read_raw(path, settings=SETTINGS, nlf=NLF)
+    for dim, levels in (((1, 2), [60, 64, 60, 64]), ((2, 2), [60, 64, 68, 72])):
+        tags = {"BlackLevel": ("I", (60, 64, 68, 72, 1)), "BlackLevelRepeatDim": ("H", dim)}
+        path = write_sample_dng(path, **tags)
+        assert list(read_raw(path, settings=SETTINGS, nlf=NLF).camera.black_level) == levels
+
+
+def test_a_raw_without_noise_is_read_and_phones_mark_no_stops(tmp_path, caplog):
+    for level, source in ((2000, "blind estimate"), (4095, "assumed: rounding alone")):
+        path = write_sample_dng(tmp_path / f"{level}.dng", np.full_like(MOSAIC, level))
+        raw = read_raw(path, settings=SETTINGS)
+        assert raw.metadata["nlf_source"] == source
+        assert raw.noise.read == pytest.approx((1 / 12 / 4031**2,) * 4)
+        assert (f"{level}.dng: its noise cannot be told" in caplog.text) == (level == 4095)
+    for model, time in (("SM-G998B", 1 / 60), ("Galaxy S24", 1 / 60), ("NX300", 1 / 64)):
+        tags = {"Make": ("s", "samsung"), "Model": ("s", model), "ExposureTime": ("2I", (1, 60))}
+        stated = read_settings(write_sample_dng(path, **tags))
+        assert stated["exposure_time"] == pytest.approx(time)
+
+
 def test_gain_maps_and_baseline_go_along(tmp_path):
     maps = {f"OpcodeList{i}": ("B", tuple(range(i, i + 40))) for i in (1, 2, 3)}
     path = write_sample_dng(tmp_path / "a.dng", BaselineExposure=("2i", (3, 2)), **maps)
@@ -385,10 +415,14 @@ def test_a_panasonic_whose_strip_has_no_position(tmp_path):
     content += b"Panasonic".ljust(16, b"\0") + b"DMC-GF1"
     path = tmp_path / "a.rw2"
     path.write_bytes(content.ljust(1024, b"\0") + bytes([85]) * (280 * 120 * 8 // 7 + 0x4000))
-    raw = read_raw(path, settings={"exposure_time": 1 / 125, "f_number": 2.8}, nlf=NLF)
+    given = {"settings": {"exposure_time": 1 / 125, "f_number": 2.8}}
+    raw = read_raw(path, **given)  # its few levels are no clips
     with rawpy.imread(str(path)) as decoded:
         np.testing.assert_array_equal(raw.to_mosaic(), decoded.raw_image_visible.clip(0, 3986))
     assert (raw.settings.iso, raw.camera.name) == (200, "panasonic_dmc-gf1")
+    os.truncate(path, 20_000)
+    with pytest.raises(RawFileError, match=r"'a.rw2'.*names 19424 bytes beyond.*truncated"):
+        read_raw(path, **given)
 
 
 def test_identities_of_other_containers(tmp_path):
