@@ -28,12 +28,15 @@ _ID = re.compile(r"([\w-][\w/-]*[\w-]/)?[\w-]+-v\d+")
 def check_dataset_id(dataset_id: str) -> None:
     """Checks the name of a dataset that is to be written, and that the extra is installed."""
     rule = None
-    if not _ID.fullmatch(dataset_id):
-        rule = "must be a name of letters, digits, - and _, after a namespace of two or more or "
-        rule += "none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
-    elif dataset_id in _minari().list_local_datasets():
-        rule = "is there already: take a higher version, or remove it with "
-        rule += f"`minari delete {dataset_id}`"
+    try:
+        if not _ID.fullmatch(dataset_id):
+            rule = "must be a name of letters, digits, - and _, after a namespace of two or more "
+            rule += "or none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
+        elif dataset_id in _minari().list_local_datasets():
+            rule = "is there already: take a higher version, or remove it with "
+            rule += f"`minari delete {dataset_id}`"
+    except OSError as error:
+        rule = f"cannot be written to Minari's folder: {error}"
     if rule is not None:
         raise ValueError(f"`out` (={dataset_id!r}) {rule}")
 

@@ -185,7 +185,7 @@ def score_tables(
     if bad:
         print_line(f"which and why: {out}/bad-*.jsonl")
     if not scenes:
-        raise RuntimeError("none of these files could be made a scene")
+        raise ValueError(f"`what` (={what!r}): none of its files could be made a scene")
     print_files({"score tables": out / "tables-*.parquet"})
 
 

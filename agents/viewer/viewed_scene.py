@@ -111,8 +111,7 @@ def find_scenes(what: str) -> Library:
 
     Args:
         what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
-            (of a recorded grid the light that its captures tell together), or the id of a bundled
-            scene.
+            (of a recorded grid the light that its captures tell together), or a bundled scene's id.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
