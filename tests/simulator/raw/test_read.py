@@ -89,23 +89,6 @@ def test_what_libraw_takes_for_something_else(tmp_path):
         read_module._check_structure([apart], True, 10**6)
 
 
-def test_black_levels_that_fit_no_tile_are_refused(path):
-    """dcraw takes the first of two or three, LibRaw 0; both leave out what is beyond the tile."""
-    for dim, values in (
-        ((), (60, 68)),
-        ((), (60, 64, 68)),
-        ((2, 2), (60, 64, 68)),
-        ((2,), (9,) * 4),
-    ):
-        write_sample_dng(path, BlackLevel=("I", values), BlackLevelRepeatDim=("H", dim))
-        with pytest.raises(RawFileError, match=rf"'a.dng'.* has {len(values)} in BlackLevel"):
-            read_raw(path, settings=SETTINGS, nlf=NLF)
-    for dim, levels in (((1, 2), [60, 64, 60, 64]), ((2, 2), [60, 64, 68, 72])):
-        tags = {"BlackLevel": ("I", (60, 64, 68, 72, 1)), "BlackLevelRepeatDim": ("H", dim)}
-        path = write_sample_dng(path, **tags)
-        assert list(read_raw(path, settings=SETTINGS, nlf=NLF).camera.black_level) == levels
-
-
 def test_a_raw_without_noise_is_read_and_phones_mark_no_stops(tmp_path, caplog):
     for level, source in ((2000, "blind estimate"), (4095, "assumed: rounding alone")):
         path = write_sample_dng(tmp_path / f"{level}.dng", np.full_like(MOSAIC, level))
@@ -239,6 +222,9 @@ def test_what_is_no_file(given, own_dng, tmp_path):
     for path in (tmp_path / "none", tmp_path, Path(os.devnull)):
         with pytest.raises(FileNotFoundError, match="`path`"):
             read_raw(path)
+    for target, raw, name in (("a.tif", read_raw(own_dng), "path"), (own_dng, None, "raw")):
+        with pytest.raises(ValueError, match=f"`{name}`"):
+            write_dng(tmp_path / target, raw)
 
 
 @pytest.mark.parametrize(
@@ -300,6 +286,8 @@ LARGEST = ("white_level", 65535)
         ("StripOffsets", "I", (2**32 - 1,), "truncated"),
         ("CFAPattern", "4B", (9, 1, 1, 2), "CFAPattern"),
         ("BlackLevel", "I", (70_000,), "white level above its black levels"),
+        # dcraw takes the first of them, LibRaw 0.
+        *(("BlackLevel", "count", (n,), f"has {n} in BlackLevel.*exiftool") for n in (2, 3)),
         # GoPro's, which LibRaw lacks: the file is whole all the same.
         ("Compression", "H", (9,), r"LibRaw lacks its compression, 9 \(VC-5.*convert"),
         # Also in a DNG of another program:
