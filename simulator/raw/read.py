@@ -63,8 +63,6 @@ _STOP_MARKING = {
     *("kodak", "konica", "leaf", "leica", "mamiya", "minolta", "nikon", "olympus", "om"),
     *("panasonic", "pentax", "phase", "ricoh", "samsung", "seiko", "sigma", "sony"),
 }
-#: How the models of one of those makers' phones begin.
-_PHONES = ("sm-", "galaxy")
 _MEASURED = 10**6
 #: `CameraProfile.full_level` of cameras that are not built in, seen in their own files.
 _FULL_LEVELS = {"canonpowershots40": 0.92}
@@ -630,7 +628,7 @@ def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> 
     known = {k: float(v) for k, v in found.items() if math.isfinite(v) and v > 0}
     marks_stops = bool(_STOP_MARKING.intersection(make.lower().split()[:1]))
     model = str((first(directories, "Model") or ("",))[0])
-    marks_stops &= not model.lower().startswith(_PHONES)
+    marks_stops &= not model.lower().startswith(("sm-", "galaxy"))  # phones of one of them
     for recorded in first_numbers(directories, "ExposureTime"):
         marks_stops &= getattr(recorded, "denominator", 1) < _MEASURED
     if marks_stops and "exposure_time" in known:

@@ -56,7 +56,7 @@ def test_the_part_and_layer_with_the_colours_is_the_picture(tmp_path):
     assert_image(read_radiance(write(path, part("a", small))))
     small = {name.lower(): plane for name, plane in channels(IMAGE + 1).items()}
     assert_image(read_radiance(write(path, part("a", channels() | small))))
-    for planes in (normals, {"U": GREY, "V": GREY}, {"Y": GREY, "RY": GREY, "BY": GREY}):
+    for planes in (normals, dict.fromkeys("UV", GREY), dict.fromkeys(("Y", "RY", "BY"), GREY)):
         with pytest.raises(ValueError, match="must have"):  # neither light nor depth
             read_depth(write(path, part("n", planes), part("beauty", channels())))
         with pytest.raises(ValueError, match=r"must have|states primaries"):
@@ -85,7 +85,7 @@ def test_luminance_and_chroma(tmp_path):
     r, b = (1 + red) * luminance, (1 + blue) * luminance
     expected = np.dstack([r, (luminance - 0.2126 * r - 0.0722 * b) / 0.7152, b])
     assert_image(read_radiance(path), expected, rtol=1e-3)
-    # The module writes no channels of fewer pixels; a plane's are a plane between them, too.
+    # OpenEXR writes no channels of fewer pixels from Python.
     found = reading._interpolated(red[::2, ::2], (6, 10))
     np.testing.assert_allclose(found[:5, :9], red[:5, :9], rtol=1e-5)
 

@@ -190,7 +190,6 @@ def test_frames_are_the_same_alone_and_in_a_sweep_whatever_is_blurred(noise, mon
     sweep = source.expose(states, seed=4, noise=noise)
     for frame, settings in zip(sweep, states, strict=True):
         assert torch.equal(frame, source.capture(settings, 4, noise=noise)[0])
-    assert not torch.equal(sweep, source.expose(states, seed=5, noise=noise))
     monkeypatch.setattr(prepared_scene, "_TOGETHER_BYTES", 0)
     assert torch.equal(source.expose(states, seed=4, noise=noise), sweep)
 

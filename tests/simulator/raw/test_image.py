@@ -74,9 +74,6 @@ def test_noise_is_the_files_own_before_the_cameras():
     own = NoiseLevelFunction((1e-3,) * 4, (1e-6,) * 4)
     assert RawImage(data, SETTINGS, z6, nlf=own).noise == own
     assert RawImage(data.double(), SETTINGS, z6).data.dtype == torch.float32
-    averaged = RawImage(data, SETTINGS, z6, nlf=own, box_factor=4)
-    assert averaged.noise.shot == pytest.approx((1e-3 / 16,) * 4)
-    assert averaged.noise.read == pytest.approx((1e-6 / 16,) * 4)
 
 
 @pytest.mark.parametrize("rows", [1, 127, 300])
@@ -179,7 +176,6 @@ def test_tags_as_tifffile_reads_them(path):
     exif = tags["ExifTag"]
     assert (exif["ExposureTime"], exif["FNumber"]) == ((1, 60), (4, 1))
     assert exif["ISOSpeedRatings"] == exif["RecommendedExposureIndex"] == 800
-    assert exif["DateTimeOriginal"] == "2024:02:03 04:05:06"
     back = read_raw(path)
     assert known.items() <= back.metadata.items()
     assert back.camera.colour_matrix is None  # the file's is the neutral default

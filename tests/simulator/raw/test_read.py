@@ -188,7 +188,6 @@ def test_cameras_that_are_given_or_estimated(path, tmp_path):
         with pytest.raises(ValueError, match="`camera`"):
             read_raw(path, settings=SETTINGS, camera=camera)
     raw = read_raw(path, settings=SETTINGS)
-    assert raw.metadata["nlf_source"] == "blind estimate"
     # The estimate calibrates the camera, so that other ISOs have a noise level.
     assert raw.camera.nlf(400).shot[1] == pytest.approx(4 * raw.noise.shot[1])
 
@@ -205,9 +204,7 @@ def test_canon_crw(data_dir, tmp_path):
     assert known["datetime"].startswith("2021-04-08T14:51:12")
     assert camera.colour_matrix[0] == (0.8606, -0.2573, -0.0949)  # dcraw's table
     assert "LibRaw" in camera.colour_matrix_source
-    # The chart's neutral row (white to black) has falling levels in every plane.
     assert raw.data.shape == (4, 860, 1156)
-    assert raw.data[:, 600:640, 160:200].mean() > 10 * raw.data[:, 600:640, 950:990].mean()
     for size in range(path.stat().st_size - 1, 0, -100 * 1024):
         os.truncate(path, size)
         with pytest.raises(RawFileError, match=r"`path` \(='cut.crw'\).*truncated"):
