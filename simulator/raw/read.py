@@ -68,6 +68,11 @@ _MEASURED = 10**6
 _FULL_LEVELS = {"canonpowershots40": 0.92}
 _LARGEST_BASELINE = 32.0  # [EV]; beyond it a file is damaged
 _DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
+_BLACK_LEVEL_RULE = (
+    "must have a BlackLevel of as many values, 0 or more, as its BlackLevelRepeatDim says (1 or 4 "
+    "without one), and a BlackLevelDelta for each column and row, but has {found} of them; "
+    "exiftool -BlackLevel=64 writes one for all"
+)
 #: What LibRaw raises; NotImplementedError is a RuntimeError.
 _LIBRAW_ERRORS = (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError)
 
@@ -114,8 +119,8 @@ def read_raw(
             levels. By default a built-in camera of the file's make and model is used in that way,
             and for any other one a profile is made from the file.
         nlf: Noise level function of this raw. By default the file's own (DNG NoiseProfile), else
-            the camera's calibration at this ISO, else a blind estimate from the pixels;
-            ``metadata["nlf_source"]`` says which.
+            the camera's calibration at this ISO, else a blind estimate from the pixels; where they
+            do not tell, that of rounding, with a warning. ``metadata["nlf_source"]`` says which.
 
     Returns:
         The raw, with ``metadata`` keys ``path`` (file name), ``make``, ``model``, ``flip``
@@ -200,7 +205,7 @@ def _read(
             *(path.name, float(packed.max()), profile.white_level),
         )
     box_factor = own.box_factor if own is not None else 1
-    noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
+    noise, source = _noise(path, packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
         profile = profile.with_nlf(known.iso, noise)
     return RawImage(
@@ -370,6 +375,7 @@ def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None
 
 
 def _noise(
+    path: Path,
     packed: np.ndarray,
     camera: CameraProfile,
     nlf: NoiseLevelFunction | None,
@@ -387,9 +393,18 @@ def _noise(
     if camera.nlf_by_iso:
         return None, f"camera calibration ({camera.name})"
     # Clipped at black, a dark raw shows no read noise; rounding alone leaves this much.
-    rounding = NoiseLevelFunction((0.0,) * 4, tuple(1.0 / (12.0 * s**2) for s in camera.span))  # type: ignore[arg-type]
-    estimate = estimate_nlf(packed).scaled(float(box_factor**2)).at_least(rounding)
-    return estimate, "blind estimate"
+    read: Any = tuple(1.0 / (12.0 * s**2) for s in camera.span)
+    rounding = NoiseLevelFunction((0.0,) * 4, read, source="rounding alone")
+    try:
+        estimate = estimate_nlf(packed)
+    except ValueError as error:
+        logger.warning(
+            "%s: its noise cannot be told, so that of rounding alone is assumed; give `nlf`, or a "
+            "calibrated `camera`, to read_raw. The reason: %s",
+            *(path.name, error),
+        )
+        return rounding, "assumed: rounding alone"
+    return estimate.scaled(float(box_factor**2)).at_least(rounding), "blind estimate"
 
 
 # -- decoding, before the camera is known --------------------------------------------------------
@@ -518,6 +533,10 @@ def _from_libraw(
     # moves an odd margin to an even one.
     margins = sizes.top_margin, sizes.left_margin
     stated, own = read_black_level(tags, cfa, margins, mosaic.shape), None
+    if stated is None and "BlackLevel" in tags and first(directories, "DNGVersion"):
+        names = ("BlackLevel", "BlackLevelRepeatDim", "BlackLevelDeltaH", "BlackLevelDeltaV")
+        found = ", ".join(f"{len(tags[n])} in {n} {tags[n][:4]}" for n in names if n in tags)
+        raise RawFileError(_BLACK_LEVEL_RULE.format(found=found))  # LibRaw says 0
     if stated is not None:
         scale = 1.0
         if tags.get("SampleFormat") == (_FLOATING_POINT,):  # of which LibRaw makes whole numbers
@@ -627,15 +646,18 @@ def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> 
         found["iso"] = next((v[0] for v in more if v and v[0] > 0), found["iso"])
     known = {k: float(v) for k, v in found.items() if math.isfinite(v) and v > 0}
     recorded = (*first_numbers(directories, "ExposureTime"), known.get("exposure_time"))[0]
-    if marks_stops(make, recorded) and "exposure_time" in known:
+    model = str((first(directories, "Model") or ("",))[0])
+    if marks_stops(make, model, recorded) and "exposure_time" in known:
         known["exposure_time"] = snap_exposure_time(known["exposure_time"])
     return known
 
 
-def marks_stops(make: str, recorded: object) -> bool:
+def marks_stops(make: str, model: str, recorded: object) -> bool:
     """Whether a `recorded` exposure time, a rational or a number, is the stop that is marked."""
     measured = getattr(recorded, "denominator", 1) >= _MEASURED
-    return bool(_STOP_MARKING.intersection(make.lower().split()[:1])) and not measured
+    phone = model.lower().startswith(("sm-", "galaxy"))  # of a maker of cameras
+    marks = _STOP_MARKING.intersection(make.lower().split()[:1])
+    return bool(marks) and not measured and not phone
 
 
 def _unreadable(error: Exception, directories: Sequence[Directory]) -> RawFileError:

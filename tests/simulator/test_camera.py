@@ -237,6 +237,8 @@ def test_one_measurement_calibrates_a_camera() -> None:
     for iso in (0, -100, math.nan, math.inf, "100"):
         with pytest.raises(ValueError, match="`iso`"):
             camera.nlf(iso)
+    with pytest.raises(ValueError, match=r"'bench' has no noise calibration.*estimate_nlf"):
+        profile().nlf(100)
 
 
 def profile(**fields: object) -> CameraProfile:
