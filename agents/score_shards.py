@@ -28,7 +28,7 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import prepare_scene
 from ae_env.scorers.score_table import ScoreTables
 from simulator import get_camera
-from simulator.utils.files import write_atomically
+from simulator.utils.files import printable, write_atomically
 
 #: What is known of a run besides its shards.
 PLAN = "plan.json"
@@ -60,7 +60,7 @@ class ShardPlan:
     def of(cls, what: str, out: Path, **options: Any) -> ShardPlan:
         """The plan for a file, folder or glob of raws and radiance maps."""
         base, files = find_files(what)
-        names = [str(f.relative_to(base)) if f != base else f.name for f in files]
+        names = [printable(str(f.relative_to(base)) if f != base else f.name) for f in files]
         paths = tuple(str(file.resolve()) for file in files)
         return cls(paths, tuple(names), str(out.resolve()), **options)
 

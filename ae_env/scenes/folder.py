@@ -33,7 +33,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, printable
 
 logger = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def folder_scenes(
     groups = {path: named.get(path.resolve()) for path in files}
     for path in files:
         if groups[path] is None and path.parent != base:
-            groups[path] = path.parent.relative_to(base).as_posix()
+            groups[path] = printable(path.parent.relative_to(base).as_posix())
     return _read_files(spec, base, groups, options, request, hint=_HOW_TO_SKIP)
 
 
@@ -154,8 +154,8 @@ def sequence_scenes(
             "maps have no settings of their own"
         )
     _check_training_groups(spec, request.split, len(folders))
-    names = {folder: folder.relative_to(base).as_posix() for folder in folders}
-    own = base.resolve().name
+    names = {folder: printable(folder.relative_to(base).as_posix()) for folder in folders}
+    own = printable(base.resolve().name)
     if base in names and own and own not in names.values():
         names[base] = own  # else "."
     groups = {raw: names[raw.parent] for raw in sorted(raws, key=lambda p: folders.index(p.parent))}
@@ -251,7 +251,7 @@ def _read_files(
         for path, group in groups.items():
             place = places[path]
             unique = times[place.with_suffix("")] == 1
-            name = (place.with_suffix("") if unique else place).as_posix()
+            name = printable((place.with_suffix("") if unique else place).as_posix())
             try:
                 scenes += _read_file(path, name, group, options, request, shots)
             except (ValueError, OSError) as error:  # it may also have vanished since it was listed
@@ -284,7 +284,7 @@ def _read_file(
     fields = options.fields(path)
     if _is_raw(path):
         raw = read_raw(path, settings=options.settings)
-        source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
+        source = f"{printable(path.name)}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
         scene = Scene.from_raw(raw, scene_id=name, group=group or name, source=source, **fields)
         scenes = [request.sized(scene)]
     else:
@@ -314,7 +314,7 @@ def radiance_scenes(
     relative brightness. `name` begins the scene ids; `layer` is as of `read_radiance`,
     `fields` are further arguments of `Scene.from_radiance`.
     """
-    file = Path(path).name
+    file = printable(Path(path).name)
     image = read_radiance(path, layer=layer)
     if "illuminance" not in fields:
         image = near_one(image)

@@ -13,7 +13,7 @@ from typer import Option
 from agents.cli import console
 from agents.cli.console import check_outputs, print_files, print_line, progress_bars
 from simulator.utils.checks import check_number, check_word
-from simulator.utils.files import write_picture
+from simulator.utils.files import printable, write_picture
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +126,7 @@ def sweep(
     console.make_folder(out)
     sheet = out / "contact_sheet.png"
     with progress_bars() as progress, progress("contact sheet") as task:
-        scene = Scene.from_raw(source, scene_id=raw.stem)
+        scene = Scene.from_raw(source, scene_id=printable(raw.stem))
         size = min(_SHEET_SIZE, *scene.light.shape[1:])
         if weights == "none":
             scene = scene.resized(size)

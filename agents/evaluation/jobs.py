@@ -43,7 +43,7 @@ from agents.policy_names import (
     weight_files,
 )
 from simulator.utils.cache import Store, cache_key
-from simulator.utils.files import sibling
+from simulator.utils.files import printable, sibling
 
 #: About the time of a frame's score table in static and in changing light, of a frame of a policy,
 #: and of a policy's `fit` [ms]: only the order of the work and the progress bar depend on it.
@@ -299,7 +299,7 @@ def named_content(name: str) -> str:
     found = hashlib.sha256()
     for file in files:
         content = file.read_bytes() if file.is_file() else b""
-        found.update(f"{file.name}\0{len(content)}\0".encode() + content)
+        found.update(f"{printable(file.name)}\0{len(content)}\0".encode() + content)
     return found.hexdigest() if files else ""
 
 

@@ -39,7 +39,7 @@ from simulator.capture.plan import SimulationPlan
 from simulator.radiance.reading import RADIANCE_SUFFIXES
 from simulator.raw.develop import render_srgb, upright
 from simulator.utils.checks import did_you_mean
-from simulator.utils.files import RAW_SUFFIXES
+from simulator.utils.files import RAW_SUFFIXES, printable
 
 #: Camera in whose colours named scenes and radiance maps are made, as the environment's default.
 CAMERA = "nikon_z6"
@@ -95,7 +95,7 @@ class Library:
 
 def _free_name(name: str, taken: Container[str]) -> str:
     """`name` as it can be shown, with a number where it is taken."""
-    name = name.encode(errors="surrogateescape").decode(errors="replace")
+    name = printable(name)
     numbered = (f"{name} ({number})" for number in count(2))
     return next(text for text in chain([name], numbered) if text not in taken)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -182,11 +183,11 @@ def read_exr(
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with OpenEXR.File(os.fsencode(path), header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]  # it empties its own
             _refuse_lies(path, *_claimed_size(headers))
             chosen = _chosen(headers, kinds, layer)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with OpenEXR.File(os.fsencode(path), separate_channels=True) as file:
             channels = file.parts[chosen.part].channels
             planes = [np.asarray(channels[n].pixels, np.float32) for n in chosen.channels]
     except RadianceError:

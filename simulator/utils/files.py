@@ -75,6 +75,15 @@ def as_path(path: object) -> Path:
     return Path(path)
 
 
+def printable(name: str) -> str:
+    """`name` of a file as text that can be written as UTF-8: bytes that are none become escapes.
+
+    >>> printable(os.fsdecode(b"caf\\xe9.dng"))
+    'caf\\\\udce9.dng'
+    """
+    return name.encode(errors="backslashreplace").decode()
+
+
 def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
     """Why a picture must not be decoded: it claims far more pixels than `size` bytes can hold.
 
@@ -128,7 +137,7 @@ def write_atomically(
     after they are on the disk, so that a loss of power leaves the old file or the new one.
     """
     path = as_path(path)
-    content = content.encode() if isinstance(content, str) else content
+    content = printable(content).encode() if isinstance(content, str) else content
     pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
     start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
     temporary = path.parent / f".{start}.{secrets.token_hex(4)}.tmp"

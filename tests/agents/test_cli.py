@@ -507,6 +507,7 @@ def test_the_plan_of_options_of_a_preset_and_of_an_environment(preset, tmp_path)
 def test_broken_files_of_a_folder_are_skipped_when_asked(ae_env, dng, tmp_path, caplog):
     (tmp_path / "env.yaml").write_text("{simulator: null, resolution: 36}")
     (tmp_path / "IMG_2.dng").write_bytes(b"\xff\xd8\xff")
+    dng.rename(dng.with_stem(os.fsdecode(b"\xff")))
     command = ("evaluate", "--env", tmp_path / "env.yaml", "--scenes", dng.parent)
     command += ("--policy", "random", "--frames", 2, "--workers", 1)
     code, _, error = ae_env(*command)

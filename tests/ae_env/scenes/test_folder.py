@@ -1,6 +1,7 @@
 """A user's files: raws and maps with bad ones among them, groups and splits, recorded sequences."""
 
 import logging
+import os
 import struct
 from datetime import datetime, timedelta
 
@@ -369,7 +370,8 @@ def test_the_scale_of_a_map_does_not_matter(tmp_path, scale):
     for folder, factor in (("a", 1.0), ("b", scale)):
         (tmp_path / folder).mkdir()
         write_exr(tmp_path / folder / "map.exr", image * factor)
-        scenes += load_scenes(tmp_path / folder, "all", camera=CAMERA, resolution=8)
+        own = (tmp_path / folder).rename(tmp_path / os.fsdecode(folder.encode() + b"\xff"))
+        scenes += load_scenes(own, "all", camera=CAMERA, resolution=8)
     first, second = scenes
     assert second.ev100 == pytest.approx(first.ev100, abs=1e-6)
     torch.testing.assert_close(second.light, first.light, rtol=1e-5, atol=0.0)
