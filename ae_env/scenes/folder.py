@@ -100,8 +100,9 @@ class FolderOptions:
             lux = lux.get(path.name)
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
         given |= {"illuminance": lux}
-        if not _is_raw(path):
-            given |= {"ev100": self.ev100, "layer": self.layer if path.suffix == ".exr" else None}
+        if not is_raw(path):
+            layer = self.layer if path.suffix.lower() == ".exr" else None
+            given |= {"ev100": self.ev100, "layer": layer}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -146,7 +147,7 @@ def sequence_scenes(
             "would come a frame too early; cut the recording there, into two folders"
         )
     base, found = find_files(spec)
-    raws = [path for path in found if _is_raw(path)]
+    raws = [path for path in found if is_raw(path)]
     folders = list(dict.fromkeys(path.parent for path in raws))
     if not folders:
         raise ValueError(
@@ -222,8 +223,9 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
 
 
-def _is_raw(path: Path) -> bool:
-    return path.suffix.lower() in RAW_SUFFIXES
+def is_raw(path: str | Path) -> bool:
+    """Whether a file is a raw by the ending of its name."""
+    return Path(path).suffix.lower() in RAW_SUFFIXES
 
 
 def _read_files(
@@ -240,6 +242,13 @@ def _read_files(
     `groups` has the source group of each; None for the file itself, or shots that belong to it.
     `hint` ends the error of a file that cannot be read, where there are others.
     """
+    endings = {path.suffix.lower() for path in groups}
+    kinds = {"settings": RAW_SUFFIXES, "layer": (".exr",), "ev100": RADIANCE_SUFFIXES}
+    for name, known in kinds.items():
+        value = getattr(options, name)
+        if value not in (None, {}) and endings.isdisjoint(known):
+            rule = f"is for files that end in {', '.join(known[:8])}: {str(spec)!r} has none"
+            raise ValueError(f"`{name}` (={value!r}) {rule}")
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}  # of raws without a group
     skipped: list[str] = []
@@ -282,7 +291,7 @@ def _read_file(
 ) -> list[Scene]:
     """The scenes of a file; the `Shot` of a raw without a group goes into `shots`."""
     fields = options.fields(path)
-    if _is_raw(path):
+    if is_raw(path):
         raw = read_raw(path, settings=options.settings)
         source = f"{printable(path.name)}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
         scene = Scene.from_raw(raw, scene_id=name, group=group or name, source=source, **fields)
@@ -291,7 +300,7 @@ def _read_file(
         scenes = list(radiance_scenes(path, request, name=name, group=group or name, **fields))
     for scene in scenes:
         _ = scene.ev100  # raises where a frame is black and its light unknown
-    if _is_raw(path) and group is None:
+    if is_raw(path) and group is None:
         shots[name] = describe(raw)
     return scenes
 

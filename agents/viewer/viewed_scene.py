@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache, partial
 from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -101,18 +102,19 @@ def _free_name(name: str, taken: Container[str]) -> str:
 
 
 @lru_cache(maxsize=_KEPT)
-def _read_raw(path: Path, name: str) -> OpenedScene:
-    raw = read_raw(path)
+def _read_raw(path: Path, name: str, **settings: float) -> OpenedScene:
+    raw = read_raw(path, settings=settings)
     return OpenedScene(Scene.from_raw(raw, scene_id=name), raw)
 
 
-def find_scenes(what: str) -> Library:
+def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({})) -> Library:
     """The library of what ``ae-env view`` was asked to show.
 
     Args:
         what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
             (of a recorded grid the light that its captures tell together), or the id of a bundled
             scene.
+        settings: Of all raws, in place of their files'.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
@@ -125,8 +127,10 @@ def find_scenes(what: str) -> Library:
             else:
                 own = path != base and path.is_relative_to(base)
                 name = _free_name(str(path.relative_to(base)) if own else path.name, readers)
-                readers[name] = partial(_read_raw, path, name)
+                readers[name] = partial(_read_raw, path, name, **settings)
         return Library(readers, _first_readable(what, readers))
+    if settings:
+        raise ValueError(f"`what` (={what!r}) must be raws, where their settings are given")
     try:
         return Library(_loaded(what))
     except ValueError:

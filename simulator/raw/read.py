@@ -149,6 +149,8 @@ def check_settings(settings: object) -> None:
     check_type("settings", settings, CameraSettings, Mapping, None)
     for name in settings if isinstance(settings, Mapping) else ():
         check_word("settings", name, _SETTINGS)
+    if isinstance(settings, Mapping):
+        CameraSettings(**{"iso": 100.0, "exposure_time": 1.0, "f_number": 1.0, **settings})
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:

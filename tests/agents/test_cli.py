@@ -142,6 +142,9 @@ print("loaded", *sys.modules)
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`source-aperture` (=-2"),
+        (("evaluate", *UNKNOWN[:2], "--source-iso", "9"), "`source-iso` (=9.0) must be in"),
+        (("film", "--scenes", "mixed", "--source-iso", 100), "`source-iso` (=100.0) is about"),
         ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", *UNKNOWN), "`policy` (='matrx:P') must"),  # before scenes are read

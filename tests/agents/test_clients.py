@@ -155,12 +155,7 @@ def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     (folder / "other-v0").mkdir()
-    for wrong in (
-        "mine",
-        "a/mine-v0",
-        "mine-v0",
-        "other-v0",
-    ):  # namespaces have two letters or more; is there
+    for wrong in ("mine", "a/mine-v0", "mine-v0", "other-v0"):  # the last two are there
         with pytest.raises(ValueError, match=rf"`out` \(='{wrong}'\)"):
             record_dataset(policy, "random", TASK, RECORDED, wrong, episodes=1)
 
