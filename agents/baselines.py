@@ -74,8 +74,7 @@ class Oracle(Policy):
     Args:
         knows: ``"last_frame"``: the light of the frame that it has just seen, as a policy does
             that measures light without error but foresees nothing; ``"clairvoyant"``: that of the
-            frames that its decision exposes, each control's own: the ceiling that regret is
-            measured from.
+            frames that its decision exposes, each control's own: the ceiling, of regret 0.
     """
 
     privileged = True

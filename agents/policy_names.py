@@ -14,6 +14,7 @@ import yaml
 from ae_env.utils.user_files import find_attribute, load_from_file
 from agents.policy import Policy, PolicyContext
 from simulator.utils.checks import did_you_mean
+from simulator.utils.config_file import MAX_LENGTH
 
 #: Light meters: those that weigh pixels or zones, and all; the others look at the histogram or at
 #: gradients.
@@ -159,7 +160,7 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
 
 def _scalar(name: str, key: str, text: str) -> Any:
     try:
-        value = yaml.safe_load(text)
+        value = yaml.safe_load(text) if len(text) <= MAX_LENGTH else {}
     except (yaml.YAMLError, ValueError, RecursionError):
         value = {}
     if isinstance(value, str):

@@ -81,13 +81,13 @@ class ShardPlan:
 
     def begin(self) -> None:
         """Writes the plan, or raises a `ValueError` where the folder's is another."""
-        path, text = Path(self.out, PLAN), json.dumps(asdict(self), indent=1)
-        if path.exists() and path.read_text(encoding="utf-8") != text:
+        path, text = Path(self.out, PLAN), json.dumps(asdict(self), indent=1).encode()
+        if path.exists() and path.read_bytes() != text:
             raise ValueError(
                 f"`out` (={self.out!r}) holds the tables of other files or options, see {PLAN}: "
                 "give another folder, or delete that one"
             )
-        write_atomically(path, text.encode())
+        write_atomically(path, text)
 
 
 class ShardWriter:

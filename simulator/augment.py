@@ -134,8 +134,7 @@ class ExposureAugmentation:
                 any device; the steps run there, the noise is drawn on the CPU.
             seeds: (B,) integers >= 0, one for each picture (`sample_seeds`), or a generator on the
                 CPU that draws them.
-            nlf: Noise that raws have already: only what is missing is added. None takes pictures
-                as free of noise.
+            nlf: Noise that raws have already: only what is missing is added. None stands for none.
 
         Returns:
             Tensor of the shape and on the device of `images`, float32: pictures in [0, 1], raws

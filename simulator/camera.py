@@ -168,8 +168,7 @@ class CameraProfile:
     def read_noise(self, iso: float, box_factor: int = 1) -> ReadNoise:
         """Rows and tails of the read noise at `iso`, of averages of `box_factor` squared pixels.
 
-        Interpolated over log ISO inside a conversion-gain segment; that of the nearest ISO outside
-        the table.
+        Interpolated over log ISO inside a conversion-gain segment; outside the table the nearest.
 
         Raises:
             ValueError: If the profile has no such calibration or `iso` is not positive.

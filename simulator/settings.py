@@ -41,8 +41,7 @@ class CameraSettings:
             ``round(6 log2 N)``.
         effective_f_number: The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper,
             section 3.1).
-        log2_exposure: log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective
-            f-number.
+        log2_exposure: log2 of the exposure by `effective_f_number`, relative to ISO 100, 1 s, f/1.
 
     >>> CameraSettings(iso=100, exposure_time=1 / 125, f_number=16).ev100
     14.965784284662087

@@ -13,6 +13,7 @@ import numpy as np
 
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 from simulator.utils.checks import check_integer, check_key, check_number, check_type, check_word
+from simulator.utils.files import read_bounded
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
@@ -269,7 +270,7 @@ def _read(file: Any) -> list[float]:
     rule = f"`lighting['file']` (={str(file)!r})"
     check_type("lighting['file']", file, str, Path)
     try:
-        text = Path(file).expanduser().read_text(encoding="utf-8-sig")
+        text = read_bounded(Path(file).expanduser()).decode("utf-8-sig")
         rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     except (OSError, UnicodeError, csv.Error, RuntimeError) as error:
         raise ValueError(f"{rule} cannot be read: {error}") from error

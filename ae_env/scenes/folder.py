@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import glob
+import io
 import logging
 import math
 import re
@@ -33,7 +34,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, printable
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, printable, read_bounded
 
 logger = logging.getLogger(__name__)
 
@@ -65,8 +66,7 @@ class FolderOptions:
             ``f_number``, as an adapted lens or some telephones do not state them.
         on_error: What happens where a file cannot be read, or is black without `illuminance`:
             ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
-            ``"skip"`` leaves it out, and a warning in the log says how many were and why; not
-            for sequences.
+            ``"skip"``, not for sequences, leaves it out: a warning says how many were and why.
     """
 
     illuminance: float | Mapping[str, float] | None = None
@@ -439,9 +439,9 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
 def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
     """Rows and column names of a CSV file; a `ValueError` if it cannot be read."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            return list(reader), list(reader.fieldnames or ())
+        text = read_bounded(path).decode("utf-8-sig")
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        return list(reader), list(reader.fieldnames or ())
     except (csv.Error, OSError, UnicodeError) as error:
         raise ValueError(f"{str(path)!r} must be a CSV file in UTF-8: {error}") from error
 

@@ -42,7 +42,7 @@ from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
 from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest, SceneSet, Split
-from ae_env.utils.user_files import load_attribute
+from ae_env.utils.user_files import UserCodeError, load_attribute
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import CameraSimulator
 from simulator.networks.aperture_module import DEAD_ZONE
@@ -159,9 +159,13 @@ def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
         if _ATTRIBUTE.fullmatch(spec) and not ours:
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
             if callable(found):
-                names = inspect.signature(found).parameters
-                known = [n for n in ("split", "camera", "resolution") if n in names]
-                found = found(**{name: getattr(request, name) for name in known})
+                try:
+                    names = inspect.signature(found).parameters
+                    known = [n for n in ("split", "camera", "resolution") if n in names]
+                    found = found(**{name: getattr(request, name) for name in known})
+                except Exception as error:  # the user's function may raise anything
+                    rule = f"raised {type(error).__name__}: {error}"
+                    raise UserCodeError(f"`scenes` (={spec!r}) {rule}") from error
             return _sized_list(found, spec, spec, request)
         hint = did_you_mean(spec, NAMED, cutoff=0.7)
         if hint or ours:

@@ -8,8 +8,7 @@ Three layouts, told apart by where the settings stand:
   table that says what ``param_3`` is;
 - stacks of video, one folder a frame: ``SCENE/frame_0007/1-125s.png``.
 
-A table is a ``settings.csv`` or ``grid-options*.csv`` in the folder or below, with a row for each
-file or folder.
+A table is a ``settings.csv`` or ``grid-options*.csv`` in the folder or below, a row for each.
 """
 
 from __future__ import annotations

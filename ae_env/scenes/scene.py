@@ -218,8 +218,7 @@ class Scene:
         """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
 
         Its settings become the reference; `fields` are further arguments of `from_array`, such as
-        an `illuminance` that was measured. A `ValueError` if neither the raw nor its camera knows
-        the noise.
+        a measured `illuminance`. A `ValueError` if neither the raw nor its camera knows the noise.
         """
         saturated = raw.saturated
         fields |= {"scene_id": scene_id, "kind": kind, "saturated": saturated, "sampled": True}
@@ -278,8 +277,7 @@ class Scene:
         Returns:
             The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
             was averaged into it was. `defocus_map` is the root mean square, as second moments add,
-            divided by k. The defocus of `layout` is the mean, its subject where that has most of a
-            pixel.
+            divided by k. Of `layout` it is the mean; a pixel is what most of it was.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.

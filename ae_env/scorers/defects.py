@@ -82,8 +82,7 @@ def colourfulness(images: torch.Tensor) -> torch.Tensor:
 def veil(images: torch.Tensor) -> torch.Tensor:
     """Light in the darkest pixels relative to the mean: the 2nd percentile of min(R, G, B) over Y.
 
-    Linear light. Without haze a picture has some pixels that are dark in one of the channels; their
-    light is airlight.
+    Linear light. Without haze, pictures have pixels dark in one channel; their light is airlight.
 
     Source: the dark channel prior of K. He, J. Sun, X. Tang, "Single image haze removal using dark
     channel prior", CVPR 2009, without patches.

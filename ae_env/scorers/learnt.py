@@ -402,8 +402,7 @@ class PyiqaMetric:
 
     Raises:
         ImportError: If pyiqa is not installed.
-        ValueError: If pyiqa has no such metric, it needs a reference picture, or its range is
-            not finite.
+        ValueError: If pyiqa has no such metric, or it needs a reference or has no finite range.
     """
 
     domain: Domain = "srgb"

@@ -2,8 +2,7 @@
 
 Fusion after S. Lee, J. S. Park and N. I. Cho, "A multi-exposure image fusion based on the adaptive
 weights reflecting the relative pixel intensity and global gradient", ICIP 2018; blended in a
-Laplacian pyramid as by T. Mertens, J. Kautz and F. Van Reeth, "Exposure fusion", Pacific Graphics
-2007.
+Laplacian pyramid (T. Mertens, J. Kautz, F. Van Reeth, "Exposure fusion", Pacific Graphics 2007).
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from simulator.optics.thin_lens import SHARP
 from simulator.radiance.reading import read_exr
 from simulator.training.scenes import fill_from_nearest
 from simulator.utils.checks import check_number, check_word
-from simulator.utils.files import open_picture
+from simulator.utils.files import open_picture, refuse_bomb
 
 #: The numbers of a depth map: distances, or inverse distances.
 DepthKind = Literal["distance", "disparity"]
@@ -194,6 +194,8 @@ def _read_map(path: Path, layer: str | None) -> np.ndarray:
                 "the file must hold one map (H, W) of numbers: a PNG of one channel, an EXR with a "
                 "channel Z, Y or R, or an array"
             )
+        if claim := refuse_bomb(*values.shape, values.nbytes):
+            raise ValueError(f"it {claim}")
     except (OSError, SyntaxError, RuntimeError, EOFError, ValueError) as error:
         raise ValueError(f"`depth` (={str(path)!r}) cannot be read: {error}") from error
     return np.asarray(values, np.float64)

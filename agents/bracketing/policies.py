@@ -1,8 +1,7 @@
 """Bracketing policies: fixed steps around the meter's reading, Hasinoff's schedule, a planner.
 
-A schedule is up to K states, in any order. Its error in a light L follows from the noise of the
-merged frames in closed form up to one integral, so all schedules that fit into the time are rated
-at once.
+A schedule is up to K states, in any order. Its error in a light L follows from the noise of merged
+frames in closed form up to one integral, so all that fit into the time are rated at once.
 """
 
 from __future__ import annotations

@@ -257,7 +257,7 @@ def check_outputs(*read: Path | None, **files: tuple[Path | None, str]) -> None:
             continue
         rules = [] if path.suffix.lower() == suffix else [f"must end in {suffix}"]
         for i, own in enumerate(read):
-            if own is not None and path.resolve() == own.resolve():
+            if own is not None and os.path.realpath(path) == os.path.realpath(own):
                 rules.append(f"must not be {'a file that is read' if i else 'the raw itself'}")
         if rules:
             raise ValueError(f"`{name}` (={str(path)!r}) {rules[0]}")

@@ -191,7 +191,7 @@ def score_tables(
         reason = next(one["reason"] for one in made if one["bad"])
         print_line(f"which and why: {out}/bad-*.jsonl; the first is {reason}")
     if not scenes:
-        raise RuntimeError("none of these files could be made a scene")
+        raise ValueError(f"`what` (={what!r}): none of its files could be made a scene")
     print_files({"score tables": out / "tables-*.parquet"})
 
 

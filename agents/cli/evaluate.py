@@ -86,8 +86,7 @@ def evaluate(
 ) -> None:
     """Compare policies on the same episodes; a second run resumes the first.
 
-    Without `--preset`, one condition: 2 episodes per scene of 8 frames, from states drawn at
-    random.
+    Without `--preset`, one condition: 2 episodes per scene of 8 frames, from random states.
 
     Example: `ae-env evaluate --preset quick --policy matrix:tuned --policy average`
     """
@@ -99,13 +98,10 @@ def evaluate(
     device = console.torch_device(device)
     plan = make_plan(preset, env, policy or [], given)
     if append is not None:
-        rule = None if append.parent.is_dir() else f"fails: there is no folder {append.parent}"
         if plan.hash is None:
             rule = "takes the results of a benchmark only: give --preset ae_bench_v2_still, _video "
-            rule += "or _bracket"
-        if rule is not None:
-            raise ValueError(f"`append` (={str(append)!r}) {rule}")
-        console.make_folder(append.parent, name="append", file=append)
+            raise ValueError(f"`append` (={str(append)!r}) {rule}or _bracket")
+        console.make_folder(append.parent, name="append", file=append, make=False)
     elif author:
         raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
     _run(plan, out, append, author, workers, device)

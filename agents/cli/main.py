@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 from typer import Argument, Option
+from typer.core import TyperGroup
 
 from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
@@ -114,12 +115,32 @@ def _check_options(name: str, **options: Any) -> None:
         raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
 
 
+class _Commands(TyperGroup):
+    """The commands; errors of options say the value."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[:1] == ["report"]:
+            ctx.fail("No such command 'report': `ae-env evaluate` writes the report.")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            found: Any = error.__cause__  # pydantic's, of a Typer that names no value itself
+            if hasattr(found, "errors"):
+                error.message = f"{found.errors()[0]['input']!r}: {error.message}"
+            raise
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
+    epilog="A folder that an output names is made where it is missing. Exit status: 2 for a "
+    "mistake in an option or a file, 1 for a failure while running.",
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),

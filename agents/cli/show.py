@@ -83,7 +83,7 @@ def film(
     ] = "tunnels",
     scenes: Annotated[str, Option(help="Scenes to draw from.")] = "bundled",
     scene: Annotated[str | None, Option(help="Id of the scene; drawn by default.")] = None,
-    frames: Annotated[int, Option(help="Actions of the episode.", min=1)] = 64,
+    frames: Annotated[int, Option(help="Actions of the episode.", min=1, max=10_000)] = 64,
     seed: console.Seed = 0,
     out: Annotated[Path, Option(help="The animated GIF.")] = Path("film.gif"),
     source: Any = None,

@@ -57,7 +57,8 @@ def simulate(
     check_word("noise", noise, get_args(Noise))
     check_tolerance(tolerance)
     seconds, f_number = console.parse_seconds(shutter), console.parse_f_number(aperture)
-    settings = CameraSettings(iso, seconds, f_number)
+    with console.option_names(exposure_time="shutter", f_number="aperture"):
+        settings = CameraSettings(iso, seconds, f_number)
     check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
     simulator = make_simulator(weights, device, cache, depth)
     source = read_raw(raw, settings=source)

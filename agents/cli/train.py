@@ -40,6 +40,8 @@ def train(
     agent = load_config(find_config(config))
     file = sibling(out, ".json")
     console.make_folder(file.parent, file=file)
+    if tensorboard is not None:
+        console.make_folder(tensorboard, name="tensorboard", make=False)
     if seed is not None:
         agent = agent.with_seed(seed)
     with progress_bars() as progress, progress(f"training {agent.agent}") as task:

@@ -94,8 +94,7 @@ def evaluate(
         progress: Called with frames done, frames in all, and the name of the policy.
 
     Raises:
-        UserCodeError: If a policy raises (the cause is chained), or returns something else than
-            allowed states.
+        UserCodeError: If a policy raises (the cause is chained), or returns no allowed states.
     """
     check_integer("episodes_per_scene", episodes_per_scene, 1)
     check_integer("frames", frames, 1)

@@ -291,15 +291,19 @@ def named_content(name: str) -> str:
     since it may import them; data that it reads is not known.
     """
     base, options = split_options(name)
-    files = _own_files(base) or _named_files(base)
+    is_word = Path(base).expanduser().is_dir()  # such as the light `train`, beside its data
+    files = _own_files(base) or ([] if is_word else _named_files(base))
     for value in options.values():
         files += _named_files(str(value))
         if value == LEARNT:
             files += [Path(f"{file}.safetensors") for file in weight_files(FORECASTERS)]
     found = hashlib.sha256()
-    for file in files:
-        content = file.read_bytes() if file.is_file() else b""
-        found.update(f"{printable(file.name)}\0{len(content)}\0".encode() + content)
+    for file in filter(Path.is_file, files):
+        with file.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            found.update(f"{printable(file.name)}\0{size}\0".encode())
+            while piece := stream.read(2**20):
+                found.update(piece)
     return found.hexdigest() if files else ""
 
 

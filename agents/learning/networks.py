@@ -109,8 +109,7 @@ class ExposureFeatures(nn.Module):
     ) -> torch.Tensor:
         """Features (B, width) of `codes` (B, 4, H, W), the observed raw divided by 255.
 
-        `settings` (B, 3) and `sensors` (B, 2) are in [-1, 1], `history` is (B, ...), where the
-        space has them.
+        `settings` (B, 3) and `sensors` (B, 2) in [-1, 1], `history` (B, ...) if the space has them.
         """
         exposure = self._ev100(settings)[:, None, None, None]
         pooled = nn.functional.avg_pool2d(codes, self.block)  # (B, 4, ~16, ~16)
@@ -199,8 +198,7 @@ class StateHead(nn.Module):
         features: Size of the features that describe the frame.
         outputs: Values per state.
         width: Hidden units.
-        trained_on: Grid that the weights come from, on whose scale the states enter; by default
-            `grid`.
+        trained_on: Grid that the weights come from, on whose scale states enter; default: `grid`.
     """
 
     def __init__(

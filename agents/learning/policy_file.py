@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ae_env.grid import ExposureGrid
 from agents.policy import Policy, PolicyContext
 from simulator.networks.weights import check_finite, read_pair, write_pair
+from simulator.utils.checks import check_type
 from simulator.utils.config_file import one_line
 from simulator.utils.files import sibling
 
@@ -122,8 +123,7 @@ def trained_grid(card: dict[str, Any]) -> ExposureGrid:
 def check_context(card: dict[str, Any], context: PolicyContext) -> None:
     """Raises a `ValueError` that says what differs unless the agent of `card` fits `context`.
 
-    Any grid whose values lie within the trained ranges works: a state enters the networks by its
-    numbers.
+    Any grid whose values lie within the trained ranges works: states enter networks as numbers.
     """
     for name, here in describe_context(context).items():
         trained = card["context"].get(name)
@@ -141,8 +141,7 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
 class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
-    Either `weights` are given, a file that a training wrote, for the torch `device`; or `network`,
-    one in memory.
+    Give `weights`, a file that a training wrote, for the torch `device`; or `network`, in memory.
 
     Raises:
         ValueError: Unless the network was trained for such an observation, and for a grid whose
@@ -161,6 +160,7 @@ class NetworkPolicy(Policy, ABC):
     ) -> None:
         super().__init__(context)
         self.name = self.kind
+        check_type("network", network, nn.Module, None)
         if (weights is None) == (network is None):
             raise ValueError("give either `weights` or `network`")
         if network is None:

@@ -60,8 +60,7 @@ Batch = tuple[dict[str, NDArray[Any]], Floats]
 class ScoreRegressor(nn.Module):
     """Predicts the score of each state, and how certain the prediction is.
 
-    A training step leaves out a share of `dropout` of the features, and 0.4 times as many of the
-    CNN's channels.
+    A training step leaves out a share `dropout` of the features, and 0.4 of that of CNN channels.
     """
 
     def __init__(

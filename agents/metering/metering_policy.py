@@ -46,7 +46,7 @@ class MeteringPolicy(Policy):
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
         compensation: Exposure compensation [EV], positive is brighter.
-        damping: Share of the distance to the metered EV that remains after a frame, in [0, 1).
+        damping: Share of the distance to the metered EV that remains after a frame, in [0, 0.999].
         shutter_cap: Longest exposure time that may be used [s].
         f_number: Aperture that A and M keep; None: f/8.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.

@@ -37,7 +37,7 @@ USED_BY = {
 #: Ranges of the numbers among the options.
 _RANGES = {
     "compensation": (-32.0, 32.0),
-    "damping": (0.0, 1.0),
+    "damping": (0.0, 0.999),  # at 1 nothing would ever move
     "f_number": (0.1, 1000.0),
     "exposure_time": (1e-7, 1e5),
     "shutter_cap": (1e-7, 1e5),
@@ -65,8 +65,6 @@ class ProgramOptions:
             value = getattr(self, name)
             if value is not None or name not in ("shutter_cap", "iso"):
                 object.__setattr__(self, name, check_number(name, value, low, high))
-        if self.damping == 1.0:
-            raise ValueError("`damping` (=1) must be below 1: nothing would ever move")
 
 
 class StateChooser:

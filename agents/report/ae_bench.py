@@ -156,9 +156,8 @@ def append_rows(
 ) -> dict[str, Path]:
     """Adds rows of `bench_rows` to a benchmark's table, and writes its page again: files by name.
 
-    A row of the same task, policy, observation and author is replaced, which is logged; others
-    stay. The table is made where missing; one with rows of another hash is refused. Another process
-    that appends waits.
+    A row of the same task, policy, observation and author is replaced, and logged. The table is
+    made where missing, refused with rows of another hash. Another process that appends waits.
     """
     found = rows.assign(
         task=plan.task,

@@ -174,8 +174,7 @@ def _fence(text: str, least: int) -> str:
 def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
     """The page of a report, CommonMark with tables; raw HTML in it is shown as text.
 
-    `pictures`, by their names in `markdown`, are put into the page; of any other only the caption
-    is shown.
+    `pictures`, by their names in `markdown`, are put into the page; others are a caption only.
     """
     from markdown_it import MarkdownIt
 

@@ -20,15 +20,13 @@ from nicegui import app, run, ui
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage
 from agents.viewer.one_raw_page import OneRawPage
-from agents.viewer.tab import complain, loading
+from agents.viewer.tab import complain, loading, new_file
 from agents.viewer.viewed_scene import Library, ViewedScene
 from simulator import CameraSimulator
 from simulator.camera_simulator import Depth
 
 #: Largest file that is taken [byte].
 LARGEST_UPLOAD = 300_000_000
-#: Files of all tabs together, from which on no other is taken [byte].
-_MOST_STORED = 4_000_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
 _TABS = ("Exposure", "Episode", "Refocus, HDR")
@@ -62,7 +60,7 @@ class PictureStore:
 class Options:
     """The options of `ae-env view`, which all tabs of the browser share.
 
-    `thumbnails` are JPEGs of scenes that were asked for; in `folder` lie uploads and downloads.
+    `thumbnails` are JPEGs of scenes that were asked for; `folder` has one for each tab's files.
     """
 
     library: Library
@@ -71,7 +69,9 @@ class Options:
     tolerance: float
     scorer: str
     thumbnails: dict[str, bytes] = field(default_factory=dict)
-    folder: str | None = None
+    folder: tempfile.TemporaryDirectory[str] = field(
+        default_factory=lambda: tempfile.TemporaryDirectory(prefix="ae-env-view-")
+    )
     pictures: PictureStore = field(default_factory=PictureStore)
 
     def viewed(self, library: Library, name: str) -> ViewedScene:
@@ -108,7 +108,7 @@ class Page:
         self._options = options
         # Uploads belong to their tab of the browser.
         self._library = Library(options.library.readers)
-        self._folder = folder = Path(tempfile.mkdtemp(dir=options.folder))
+        self._folder = folder = Path(tempfile.mkdtemp(dir=options.folder.name))
         ui.context.client.on_delete(lambda: shutil.rmtree(folder, ignore_errors=True))
         with ui.element("header").classes("bar"):
             self._title = ui.label("ae-env view").classes("title")
@@ -196,17 +196,9 @@ class Page:
     async def _take_upload(self, event: Any) -> None:
         event.sender.reset()
         name = Path(event.file.name).name
-        folder = Path(self._options.folder or self._folder)
-        stored = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        if name in ("", ".."):
-            complain("A file without a name cannot be opened.")
-            return
-        if stored > _MOST_STORED:
-            complain(f"More than {_MOST_STORED // 10**9} GB are open: close other tabs first.")
-            return
         own = None
         with loading(self._open):
-            path = Path(tempfile.mkdtemp(dir=self._folder), name)
+            path = new_file(self._folder, name)
             try:
                 await event.file.save(path)
                 own = await run.io_bound(self._library.add, path, name)

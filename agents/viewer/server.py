@@ -7,7 +7,6 @@ import hmac
 import os
 import secrets
 import socket
-import tempfile
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -78,7 +77,12 @@ class TokenGuard:
                     headers.append("set-cookie", value)
             await send(message)
 
-        await self._app(scope, limited if scope["type"] == "http" else receive, with_cookie)
+        try:
+            await self._app(scope, limited if scope["type"] == "http" else receive, with_cookie)
+        except AttributeError:  # NiceGUI takes every entry of a form for a file
+            if "/upload/" not in scope["path"]:
+                raise
+            await PlainTextResponse("Only a file can be uploaded.", 400)(scope, receive, send)
 
     def _is_own(self, origin: str | None) -> bool:
         try:
@@ -116,12 +120,12 @@ def serve(options: Options, port: int, open_browser: bool, announce: Callable[[s
     address = f"http://{HOST}:{port}{path}"
     ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
     # Uploads and downloads are gone with the program, however its pages were left.
-    with tempfile.TemporaryDirectory(prefix="ae-env-view-") as options.folder:
+    with options.folder as folder:
 
         def served() -> None:
             announce(address)
             if open_browser:
-                webbrowser.open(_page_that_leads_to(address, Path(options.folder or "")))
+                webbrowser.open(_page_that_leads_to(address, Path(folder)))
 
         app.on_startup(lambda: background_tasks.create(_call_when_served(served, port)))
         how: dict[str, Any] = {"host": HOST, "port": port, "show": False}

@@ -112,8 +112,7 @@ def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({}))
 
     Args:
         what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
-            (of a recorded grid the light that its captures tell together), or the id of a bundled
-            scene.
+            (of a recorded grid the light that its captures tell together), or a bundled scene's id.
         settings: Of all raws, in place of their files'.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)

@@ -165,9 +165,9 @@ def _scenes(
 def _further_maps(split: Split) -> list[ReferenceScene]:
     """Views into maps that no network was trained on: those of its split, too, calibrate bounds."""
     splits: tuple[Split, ...] = (split,) if split == "test" else ("train", "validation")
-    data, camera = data_folder(), get_camera(CAMERA)
+    data = data_folder()
     found = [f for s in splits for f in radiance_files(data, s, FURTHER_MAPS)] if data else []
-    return [scene for file in found for scene in map_scenes(*file, camera, 128)]
+    return [scene for file in found for scene in map_scenes(*file, get_camera(CAMERA), 128)]
 
 
 # -- the plan -------------------------------------------------------------------------------------
@@ -178,8 +178,6 @@ DRAWS, FAIR = 8, 12
 _EVERY = 5
 #: Standard deviations are pooled over squares of this side [pixel].
 _WINDOW = 9
-#: Light from here on is white in every capture: what differs above cannot show.
-_WHITE = 1.0 - 1e-6
 
 
 def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list[Row]:
@@ -196,12 +194,13 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
         for position, settings in enumerate(_states(trial, number)[:: FAIR if quick else 1]):
             truth, target = trial.mean(settings), raws[0].camera.nlf(settings.iso)
             wanted = noise_variance(truth, target)
-            # White in the scene: no difference there can show.
-            shows = torch.where(truth < _WHITE, wanted, torch.inf)
             for tolerance in (DEFAULT,) if position % _EVERY else tried:
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
                 light, added = (torch.stack(own) for own in zip(*pairs, strict=True))
+                # No difference shows in what is white in the scene and, within noise, in captures.
+                white = (truth > 1.0 - 1e-6) & (light.mean(dim=0) >= 1.0 - wanted.sqrt())
+                shows = torch.where(white, torch.inf, wanted)
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
                 row |= {"settings": str(settings), "tolerance": tolerance}

@@ -271,15 +271,15 @@ def _hidden_highlights(
     """Error of what a `share` of the samples, clipped in the source, would show when darker.
 
     Light above white is taken to be distributed as natural highlights are, with a density that
-    falls with its square; it is shown as `estimate`. Where it is white in the capture, too, no
-    error counts.
+    falls with its square; it is shown as `estimate`. The share `ratio` of it stays white.
     """
     if not share or not 0.0 < ratio < 1.0:
         return 0.0
     light = ratio ** ((np.arange(_NODES) + 0.5) / _NODES)  # evenly spaced in its logarithm
-    noise = np.maximum(np.mean(target.shot) * light + np.mean(target.read), 1e-30)
-    square = (light - min(estimate * ratio, 1.0)) ** 2 / noise * (ratio / light)
-    return math.sqrt(-share * math.log(ratio) * float(square.mean()))
+    shown, shot, read = min(estimate * ratio, 1.0), sum(target.shot) / 4, sum(target.read) / 4
+    square = (light - shown) ** 2 / np.maximum(shot * light + read, 1e-30) * (ratio / light)
+    white = ratio * (1.0 - shown) ** 2 / max(shot + read, 1e-30)
+    return math.sqrt(share * float(white - math.log(ratio) * square.mean()))
 
 
 def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Exposure) -> float:

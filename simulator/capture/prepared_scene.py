@@ -50,8 +50,7 @@ class Layout:
     Args:
         defocus: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's
             `defocus`; 0 is the plane of focus.
-        subject: (H, W) bool, the pixels of the subject, which may move apart from the rest; None
-            for no subject.
+        subject: (H, W) bool, the subject's pixels, which may move apart from the rest, or None.
     """
 
     defocus: torch.Tensor
@@ -249,13 +248,16 @@ class PreparedScene:
 
     @property
     def clipped_light(self) -> tuple[float, float]:
-        """Share of the samples that are clipped in the source, and their mean estimated light."""
+        """Share of the samples that are clipped in the source, and their mean estimated light.
+
+        Of averages no one knows which: all of their saturated pixels count.
+        """
         if self.saturated is None:
             return 0.0, 1.0
         light = self.light[:, self.saturated]
-        light = light[light >= 1.0]
+        light = light[light >= 1.0] if self.box_factor == 1 else light
         share = light.numel() / self.light.numel()
-        return share, float(light.double().mean()) if share else 1.0
+        return share, max(float(light.double().mean()), 1.0) if share else 1.0
 
     # -- what a change of settings takes ------------------------------------------------------
 

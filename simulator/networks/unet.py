@@ -106,8 +106,7 @@ class UNet(nn.Module):
 
     Args:
         variant: ``"paper"`` or ``"ncs"``.
-        widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1; by
-            default `WIDTHS`.
+        widths: Channels of each level, finest first, two or more (ncs: five); default: `WIDTHS`.
 
     Source: Brooks et al. 2019, Unprocessing Images for Learned Raw Denoising. Two things differ
     from what its authors released: two convolutions a level, not three, and replicated borders.

@@ -20,7 +20,7 @@ from simulator.networks.aperture_module import ApertureModule, AperturePreset
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, Preset
 from simulator.utils.checks import check_type, check_word, did_you_mean
-from simulator.utils.files import sibling, write_atomically
+from simulator.utils.files import read_bounded, sibling, write_atomically
 
 
 def _untrained(preset: Any) -> nn.ModuleDict:
@@ -95,7 +95,7 @@ def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     card_file, file = sibling(path, ".json"), sibling(path, ".safetensors")
     given = f"`weights` (={str(path)!r})"
     try:
-        content, text = file.read_bytes(), card_file.read_bytes()
+        content, text = read_bounded(file, 2**30), read_bounded(card_file)
     except OSError as error:
         raise ValueError(f"{given} cannot be read: {error}") from error
     try:

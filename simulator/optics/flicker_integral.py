@@ -1,4 +1,4 @@
-"""Flickering light integrated over an exposure: mains, modulated pulses, strobes, lightning.
+"""Flickering light integrated over an exposure: mains, modulated pulses, strobes.
 
 Each lamp gives its mean light over an exposure in closed form, relative to its long-term mean, so
 that the cost does not depend on how many periods the exposure lasts and no pulse, however short, is
@@ -25,9 +25,6 @@ _RANGES = {
     "depth": (0.0, 1.0),
     "phase": (-1e9, 1e9),
     "duty": (1e-12, 1.0),
-    "at": (-_LONGEST, _LONGEST),
-    "decay": (1e-12, _LONGEST),
-    "energy": (0.0, 1e9),
 }
 
 
@@ -103,21 +100,6 @@ class PulsedLamp(Lamp):
         now = np.clip(self.duty - begin, 0.0, rest)  # of the pulse that it begins in
         later = np.clip(rest - (1.0 - begin), 0.0, self.duty)  # of the next one
         return (whole + (now + later) / self.duty) / (whole + rest)
-
-
-@dataclass(frozen=True)
-class Flash(Lamp):
-    """Steady light and one flash that decays exponentially: lightning, a photographer's strobe."""
-
-    at: float = 0.0  # when it fires [s]
-    decay: float = 50e-6  # time in which it falls to 1/e [s]: microseconds to milliseconds
-    energy: float = 1.0  # its light in all, in seconds of the steady light
-
-    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
-        since = start - self.at
-        seen = np.clip(since + time, 0.0, time) / self.decay
-        left = np.exp(-np.maximum(since, 0.0) / self.decay)
-        return 1.0 - self.energy / time * left * np.expm1(-seen)
 
 
 def _periods(

@@ -162,8 +162,7 @@ def motion_blur(
         light: (..., H, W) linear light.
         extent_px: Distance that the image moves, in pixels, >= 0.
         out: Contiguous float32 tensor on the CPU to write to, instead of a new one.
-        limit: Light beyond it, on either side of 0, is clipped before it is blurred; float32 on the
-            CPU only.
+        limit: Light beyond it, on either side of 0, is clipped before the blur; float32, CPU only.
 
     Returns:
         (..., H, W), the same dtype. The cost of long streaks hardly depends on the extent.

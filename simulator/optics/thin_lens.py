@@ -107,8 +107,7 @@ def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
 
     Args:
         light: (C, H, W) linear light as a pinhole at the centre of the lens sees it, unclipped.
-        diameter: (H, W) circle of confusion [px], signed as `Lens.circle_of_confusion`: a smaller
-            value is nearer.
+        diameter: (H, W) circle of confusion [px], smaller if nearer (`Lens.circle_of_confusion`).
 
     Returns:
         (C, H, W), the same dtype. Borders are replicated. A pixel in focus (up to 0.1 px) with

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
+from simulator.utils.files import MAX_PIXELS, MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -49,9 +49,8 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, holds no light, is a cube map or has pixels that
-            are not square, or claims more pixels than `simulator.utils.files` allows for a file of
-            its length.
+        ValueError: If the file cannot be read, holds no light, is a cube map, has pixels that are
+            not square, or more than `simulator.utils.files` allows for a file of its length.
     """
     path = as_path(path)
     if not path.is_file():
@@ -106,7 +105,8 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
         import cv2
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
-    content = path.read_bytes()
+    with path.open("rb") as stream:
+        content = stream.read(5 * MAX_PIXELS)  # run lengths may make it longer than it would be
     found = re.match(rb"(#\?.*?\n)\r?\n([-+][XY] [^\n]*\n)", content[:65536], re.DOTALL)
     shown = None if found is None else _RESOLUTION.fullmatch(found[2].decode("ascii", "replace"))
     if found is None or shown is None or shown[2] == shown[5]:

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 #: Linear sRGB (D65) to CIE XYZ, IEC 61966-2-1:1999.
-XYZ_FROM_SRGB = (
-    (0.4124, 0.3576, 0.1805),
-    (0.2126, 0.7152, 0.0722),
-    (0.0193, 0.1192, 0.9505),
-)
+XYZ_FROM_SRGB = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))
 #: Signal of an 18 % grey card in incident-light exposure: 0.18 * 0.6635 of sensor white.
 GREY_CARD_SIGNAL = 0.18 * 0.6635
 #: Schlick's parameter that shows that card at 18 % of the display's white.
@@ -41,17 +37,17 @@ _SRGB_TOE = 0.0031308
 _LARGEST_GAIN = 2.0**32  # of a plane against another: float32 holds its product with any code
 _CHUNK = 2**18  # elements
 
-#: Light of a wholly clipped pixel over the least that would clip all of its planes, amid others
-#: like it: about the median of natural highlights, which lie anywhere above it. Alone, it is less
-#: bright: measured neighbours are below white. Both, and the side of the window that tells [packed
-#: pixel], are the best of a few on maps of the training and validation splits.
-ABOVE_WHITE, _LEAST_ABOVE_WHITE, _AMID_PX = 2.0, 1.2, 17
+#: Light of a wholly clipped pixel over the least that would clip all of its planes:
+#: 1 + d (0.25 + c) + 0.8 c^4, c the share of such pixels around it, d how far below white others
+#: are in the mean: neighbours near white tell of a sky, dark ones of a lamp. The most of 192 tries
+#: that leaves no training map below white as recorded. Side of the neighbourhood [packed pixel].
+_ABOVE_WHITE, _AMID_PX = (0.25, 1.0, 0.8), 17
 #: A clipped plane is raised to this many times white at most: white balance of no light asks for
 #: more, only a damaged one.
 MOST_WHITE = 16.0
-#: Side of the neighbourhood that tells how far above white a clipped sample is [packed pixel], and
-#: within how many standard deviations of the noise its measured samples count as near white.
-_NEAR_PX, _NEAR_DEVIATIONS = 7, 3.0
+#: Sides of the neighbourhoods that tell how far above white a clipped sample is [packed pixel], and
+#: within how many standard deviations of the noise their measured samples count as near white.
+_NEAR_PX, _NEAR_DEVIATIONS = (7, 17, 41), 3.0
 
 Gains = torch.Tensor | np.ndarray | Sequence[float]
 Matrix = torch.Tensor | np.ndarray | Sequence[Sequence[float]]
@@ -100,11 +96,7 @@ def develop(
 
 
 def render_srgb(
-    raw: RawImage,
-    demosaic: str = "malvar",
-    exposure_ev: float = 0.0,
-    *,
-    tone: str = "photographic",
+    raw: RawImage, demosaic: str = "malvar", exposure_ev: float = 0.0, *, tone: str = "photographic"
 ) -> torch.Tensor:
     """Develop one raw for looking at, with its own white balance and its camera's matrix.
 
@@ -369,9 +361,10 @@ def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
     a lamp or the sky is brighter than the sensor can tell: all planes clip at the same number, but
     the white of the scene is another number in each, so a clipped lamp that is darkened as it was
     recorded turns pink. There a clipped plane takes the mean level (value times white balance gain)
-    of the pixel's measured planes, so that the pixel is neutral; where all are clipped, 1.2 to 2
-    times the highest, the more, the more pixels around are so. Its spread is that of what nobody
-    measured: highlights lie anywhere above white, with a median of about twice that.
+    of the pixel's other planes, so that the pixel is neutral; where nothing tells that of any, 1 to
+    2.25 times the highest, the more, the more pixels around are so and the darker the others are.
+    Its spread is that of what nobody measured: highlights lie anywhere above white, with a median
+    of about twice that.
 
     Pixels that are not `saturated`, (H, W), are left out; `raw.data` itself is returned where no
     sample has to be raised.
@@ -380,54 +373,75 @@ def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
     pixels is off by 0.029 in the mean (0.052 with the highest unclipped level, 0.088 as recorded),
     that of wholly clipped ones by 0.090 (0.263 as recorded).
     """
-    if not bool(saturated.any()):
+    places = saturated.nonzero()
+    if not len(places):
         return raw.data
+    margin, first, last = max(_NEAR_PX) // 2, places.amin(dim=0), places.amax(dim=0)
+    (top, left), (bottom, right) = (first - margin).clamp(min=0).tolist(), (last + margin).tolist()
+    part = np.s_[top : bottom + 1, left : right + 1]  # the rest tells nothing
+    data, saturated = raw.data[:, *part], saturated[part]
     limits = torch.tensor(
         [min(1.0 - 0.5 / span, raw.camera.full_level) for span in raw.camera.span]
     )
-    full = raw.data >= limits.to(raw.data)[:, None, None]
-    full &= saturated
-    values, clipped = raw.data[:, saturated], full[:, saturated]  # (4, N)
+    full = (data >= limits.to(data)[:, None, None]) & saturated
+    values, clipped = data[:, saturated], full[:, saturated]  # (4, N)
+    near = _clipped_by_noise(raw, data, full)[:, saturated]
     red, green, blue = raw.white_balance
     gains = torch.tensor([red, green, green, blue], dtype=torch.float64).to(values.device)[:, None]
-    levels = values * gains
-    known = (~clipped).sum(dim=0)
-    mean = levels.masked_fill(clipped, 0.0).sum(dim=0) / known.clamp(min=1)
-    amid = full.all(dim=0).float()[None]
-    for window in ((_AMID_PX, 1), (1, _AMID_PX)):
-        padding = (window[0] // 2, window[1] // 2)
-        amid = F.avg_pool2d(amid, window, 1, padding, count_include_pad=False)
-    above = _LEAST_ABOVE_WHITE + (ABOVE_WHITE - _LEAST_ABOVE_WHITE) * amid[0][saturated]
+    levels = torch.where(near > 0.0, near, values) * gains
+    unknown = clipped & (near == 0.0)
+    known = (~unknown).sum(dim=0)
+    mean = levels.masked_fill(unknown, 0.0).sum(dim=0) / known.clamp(min=1)
+    above = _above_white(data, full.all(dim=0))[saturated]
     neutral = torch.where(known > 0, mean, above * levels.amax(dim=0)) / gains
-    near = _clipped_by_noise(raw, full)[:, saturated]
-    wanted = torch.where(near > 0.0, near, neutral.float())
+    wanted = torch.where(unknown, neutral.float(), near).clamp(max=MOST_WHITE)
     raised = clipped & (wanted > values.clamp(min=1.0))
     if not bool(raised.any()):
         return raw.data
     light = raw.data.clone()
-    light[:, saturated] = torch.where(raised, wanted.clamp(max=MOST_WHITE), values)
+    light[:, *part][:, saturated] = torch.where(raised, wanted, values)
     return light
 
 
-def _clipped_by_noise(raw: RawImage, full: torch.Tensor) -> torch.Tensor:
+def _above_white(data: torch.Tensor, clipped: torch.Tensor) -> torch.Tensor:
+    """Light (H, W) of wholly `clipped` pixels over white, see `_ABOVE_WHITE`."""
+    dark, amid, both = _ABOVE_WHITE
+    measured = (1.0 - data.clamp(0.0, 1.0).mean(dim=0)).masked_fill(clipped, 0.0)
+    below, share = _around(torch.stack([measured, clipped.float()]), _AMID_PX)
+    below = below / (1.0 - share).clamp(min=0.5 / _AMID_PX**2)
+    return 1.0 + below * (dark + amid * share) + both * share**4
+
+
+def _clipped_by_noise(raw: RawImage, data: torch.Tensor, full: torch.Tensor) -> torch.Tensor:
     """Light (4, H, W) that clips as many samples as the neighbourhood shows; 0 for an edge.
 
     Of a light L the share ``Phi((L - 1) / s)`` is clipped, s the noise's standard deviation at
-    white, if the neighbourhood is as bright throughout.
+    white, if the neighbourhood is as bright throughout. Where all of it is clipped, a larger one
+    tells.
     """
+    light, unseen = torch.zeros_like(data), full
     if raw.nlf is None and not raw.camera.nlf_by_iso:
-        return torch.zeros_like(raw.data)
+        return light
     noise = raw.noise
     spread = [math.sqrt(max(s + r, 0.0)) for s, r in zip(noise.shot, noise.read, strict=True)]
-    deviation = torch.tensor(spread).to(raw.data)[:, None, None]
-    near = (raw.data >= 1.0 - _NEAR_DEVIATIONS * deviation) & ~full
+    deviation = torch.tensor(spread).to(data)[:, None, None]
+    near = (data >= 1.0 - _NEAR_DEVIATIONS * deviation) & ~full
+    for side in _NEAR_PX:
+        at_white, below, least = _around(full, side), _around(near, side), 0.5 / side**2
+        share = at_white / (at_white + below).clamp(min=least)
+        found = unseen & (below > least) & (1.0 - at_white - below < below)
+        above = (deviation * torch.special.ndtri(share)).clamp(min=0.0)
+        light = torch.where(found, 1.0 + above, light)
+        unseen = unseen & (at_white > 1.0 - least)
+        if not bool(unseen.any()):
+            break
+    return light
 
-    def around(marks: torch.Tensor) -> torch.Tensor:
-        side = _NEAR_PX
-        return F.avg_pool2d(marks.float()[None], side, 1, side // 2, count_include_pad=False)[0]
 
-    at_white, below = around(full), around(near)
-    dark = 1.0 - at_white - below
-    share = at_white / (at_white + below).clamp(min=1e-6)
-    light = (1.0 + deviation * torch.special.ndtri(share)).clamp(min=1.0)
-    return torch.where((below > 0.0) & (dark < below), light, 0.0)
+def _around(marks: torch.Tensor, side: int) -> torch.Tensor:
+    """Share of `marks` (C, H, W) in the window of `side` pixels around each pixel."""
+    shares = marks.float()
+    for window in ((side, 1), (1, side)):
+        padding = (window[0] // 2, window[1] // 2)
+        shares = F.avg_pool2d(shares, window, 1, padding, count_include_pad=False)
+    return shares

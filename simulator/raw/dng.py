@@ -78,8 +78,7 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
     averaged: the tag has one pair per colour), the white balance in AsShotNeutral and the camera's
     colour matrix; a camera without one is taken to see linear sRGB primaries
     (`DEFAULT_COLOUR_MATRIX`). Of another DNG, its opcode lists (gain maps) go along while the frame
-    has its size, and its BaselineExposure. Values are clipped to the camera's 0 .. white level and
-    rounded.
+    has its size, and its BaselineExposure. Values are rounded, from 0 to the camera's white level.
 
     Args:
         path: Where to, ending in ``.dng``. The folder is made; an existing file is replaced once

@@ -456,8 +456,11 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
     if any(len(values) != 1 for values in layout):
         return None
     height, width, start, size = (int(values[0]) for values in layout)
-    if min(height, width) < 2 or size != 2 * width * height or start + size > path.stat().st_size:
+    length = path.stat().st_size
+    if min(height, width) < 2 or size != 2 * width * height or start + size > length:
         return None
+    if bomb := refuse_bomb(height, width, length):
+        raise RawFileError(bomb)
     with path.open("rb") as stream:
         order = "<u2" if stream.read(2) == b"II" else ">u2"
         strip = np.fromfile(stream, order, width * height, offset=start - 2)

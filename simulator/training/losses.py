@@ -82,8 +82,7 @@ class NoiseLoss(nn.Module):
 class ApertureLoss(nn.Module):
     """L1 of the opened source against the target, in units of the change that opening makes.
 
-    Preset ``"compact"`` adds a loss on the logarithm of its map, without which the map collapses to
-    a constant.
+    Preset ``"compact"`` adds a loss on the logarithm of its map, which else becomes a constant.
     """
 
     def __init__(

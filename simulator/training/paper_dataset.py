@@ -43,7 +43,7 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import sibling, write_atomically
+from simulator.utils.files import read_bounded, refuse_bomb, sibling, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -101,6 +101,8 @@ class PackedCapture:
         """
         try:
             red, green_1, blue, green_2 = np.load(self.file, mmap_mode="r", allow_pickle=False)
+            if claim := refuse_bomb(*red.shape, red.nbytes):
+                raise ValueError(claim)
             planes = torch.from_numpy(np.stack([red, green_1, green_2, blue]))
         except (ValueError, TypeError, EOFError) as error:
             rule = "must be a whole .npy file of numbers, (4, H, W): R, G1, B, G2"
@@ -194,10 +196,11 @@ def _cells(table: Path) -> pd.DataFrame:
     how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
     try:
         with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
-            frame = pd.read_csv(table, index_col=False, **how)  # without cells beyond the columns
+            content = io.BytesIO(read_bounded(table))
+            frame = pd.read_csv(content, index_col=False, **how)  # no cells beyond the columns
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
-    except (pd.errors.ParserError, UnicodeError) as error:
+    except (pd.errors.ParserError, OSError, UnicodeError) as error:
         raise ValueError(f"`{table}` must be a CSV file in UTF-8: {error}") from error
     return frame.rename(columns=str.strip)
 

@@ -48,7 +48,7 @@ from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
 from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_integer, check_word
-from simulator.utils.files import open_picture, printable
+from simulator.utils.files import open_picture, printable, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -148,7 +148,10 @@ def detail_pictures(
         for path, group in _files(data, "intel_tau_small", (".png",), split):
             import cv2
 
-            frame = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            with open_picture(path, ["PNG"], bits=16):
+                frame = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+                if frame is None:
+                    raise ValueError("its pixels end too early")
             light = np.ascontiguousarray(frame[:, :, ::-1].transpose(2, 0, 1), np.float32)
             linear = torch.from_numpy(light / 65535.0)
             pictures.append(DetailPicture(printable(path.stem), group, "linear", linear))
@@ -444,8 +447,7 @@ def map_scenes(
 def _views(name: str, image: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Other pictures as they are, and four square cuts out of a panorama's horizon, by name.
 
-    A perspective view has its edges enlarged; this band of 45 degrees is stretched by 1.41 at most,
-    sideways.
+    A perspective view has its edges enlarged; this band of 45 degrees is stretched by up to 1.41.
     """
     height, width = image.shape[1:]
     if abs(width / height - 2.0) > 0.01:
@@ -570,8 +572,8 @@ def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> lis
     scenes = list(_focused("motorcycle", image, inverse, camera, source))
     folder = None if data is None else Path(data) / "depth_cones"
     if folder is not None and folder.is_dir():
-        image = tifffile.imread(folder / "left_rgb.tif").astype(np.uint8)
-        disparity = tifffile.imread(folder / "Cones_LEFT_GT.tif")
+        image = _read_tiff(folder / "left_rgb.tif").astype(np.uint8)
+        disparity = _read_tiff(folder / "Cones_LEFT_GT.tif")
         disparity = fill_from_nearest(np.where(disparity > 0, disparity, np.nan))  # 0 is "no data"
         # The 2003 sets come without calibration: that of Middlebury's 2006 sets (focal length 3740
         # pixels at full size, baseline 0.16 m) is assumed, at a quarter of the size.
@@ -579,6 +581,15 @@ def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> lis
         source = "Middlebury 2003 Cones; calibration of the 2006 set and 500 lux assumed"
         scenes += _focused("cones", image, inverse, camera, source)
     return scenes
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    """Pixels of a TIFF of floating-point numbers, whose colours Pillow does not read."""
+    with tifffile.TiffFile(path) as file:
+        page: Any = file.pages.first
+        if claim := refuse_bomb(page.imagelength, page.imagewidth, path.stat().st_size):
+            raise ValueError(f"picture {str(path)!r} cannot be read: it {claim}")
+        return np.asarray(page.asarray())
 
 
 def _focused(

@@ -121,9 +121,9 @@ class Store:
 
     A result is one safetensors file without pickles, JSON values in its header. It is written whole
     or not at all; several processes may share the folder. A damaged file, or a folder that cannot
-    be read, is logged and costs time only. Beyond `max_bytes` of all files together, if given,
-    those used longest ago are removed; several processes at once may exceed it by a sixteenth each.
-    Then a folder that cannot be written costs time only, too; else `put` raises an `OSError`.
+    be read, is logged and costs time only. Beyond `max_bytes` of all files, if given, those used
+    longest ago are removed; each of several processes may exceed it by a sixteenth. Then a folder
+    that cannot be written costs time only, too; else `put` raises an `OSError`.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int | None = None) -> None:

@@ -24,8 +24,7 @@ class Checkpoint:
     """The checkpoint of one training, written now and then while the training runs.
 
     Used as a context manager around the training loop, it also writes the state when the loop ends
-    and when Ctrl-C or SIGTERM ends it. After an error nothing is written: the state may be what
-    went wrong.
+    and when Ctrl-C or SIGTERM ends it. After an error it writes nothing: the state may be wrong.
 
     Args:
         path: The file; None writes and reads nothing.

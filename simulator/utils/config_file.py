@@ -17,8 +17,9 @@ from simulator.utils.checks import did_you_mean
 
 #: Most bytes of a YAML file.
 MAX_BYTES = 2**20
-#: Most values of a YAML file, those of an alias counted wherever it stands.
-MAX_VALUES = 2**18
+#: Most values of a YAML file, those of an alias counted wherever it stands; most of them nested,
+#: and most characters of one.
+MAX_VALUES, MAX_DEPTH, MAX_LENGTH = 2**16, 100, 2**11
 #: Environment variable: folders whose YAML files may name Python code, or ``all``.
 TRUST_VARIABLE = "AE_ENV_TRUST"
 #: A package that stands before the names of its metrics, of which none is code.
@@ -70,8 +71,8 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
     folder; `name` is the argument that gave the path, for error messages.
 
     Raises:
-        ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or `MAX_VALUES`
-            or not YAML, gives an entry twice, or names Python code.
+        ValueError: If the file is missing, unreadable, not YAML, larger than one of the bounds
+            above, gives an entry twice, or names Python code.
     """
     file = Path(path).expanduser()
     cause: Exception | None = None
@@ -81,7 +82,7 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
         elif file.stat().st_size > MAX_BYTES:
             fault = f"must not be larger than {MAX_BYTES} bytes"
         else:
-            content = yaml.load(file.read_text(encoding="utf-8"), _Loader)
+            content = _values(file.read_text(encoding="utf-8"))
             named = list(filter(_names_code, _texts(content)))
             if not named or _is_trusted(file):
                 return content
@@ -89,13 +90,26 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
             fault += f"--trust, or name the folder in {TRUST_VARIABLE}"
     except OSError as error:
         fault, cause = f"cannot be read: {error.strerror}", error
-    except _GivenTwice as error:
+    except _Fault as error:
         fault = str(error)
     except RecursionError:
         fault = "is not YAML: it is nested too deeply"
     except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
         fault, cause = f"is not YAML: {' '.join(str(error).split())}", error
     raise ValueError(f"`{name}` (={str(path)!r}): {fault}") from cause
+
+
+def _values(text: str) -> Any:
+    depth = 0
+    for count, event in enumerate(yaml.parse(text, _Loader)):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH:  # the loader in C would crash
+            raise RecursionError
+        if count > MAX_VALUES or len(getattr(event, "value", "")) > MAX_LENGTH:
+            rule = f"it holds more than {MAX_VALUES} values, or one of more than {MAX_LENGTH}"
+            raise _Fault(f"{rule} characters")
+    return yaml.load(text, _Loader)
 
 
 def _is_trusted(file: Path) -> bool:
@@ -110,7 +124,7 @@ def _texts(content: Any) -> Iterator[str]:
     while waiting:
         value, count = waiting.pop(), count + 1
         if count > MAX_VALUES:
-            raise ValueError(f"its aliases stand for more than {MAX_VALUES} values")
+            raise _Fault(f"its aliases stand for more than {MAX_VALUES} values")
         if isinstance(value, bytes):  # of `!!binary`; pydantic takes them as text
             value = value.decode(errors="replace")
         if isinstance(value, str):
@@ -132,12 +146,12 @@ def _names_code(text: str) -> bool:
         return True
 
 
-class _GivenTwice(Exception):
-    """Two entries of one name."""
+class _Fault(Exception):
+    """What is wrong with a file that is YAML."""
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, which by itself takes the last of two entries of one name."""
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """PyYAML's safe loader, in C where it has one; by itself it takes the last of two entries."""
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
@@ -152,21 +166,20 @@ class _Loader(yaml.SafeLoader):
         for key, value in node.value:
             if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
                 line = key.start_mark.line + 1
-                raise _GivenTwice(f"the entry {key.value!r} is given twice, again in line {line}")
+                raise _Fault(f"the entry {key.value!r} is given twice, again in line {line}")
             seen.add((key.tag, str(key.value)))
             if key.tag == "tag:yaml.org,2002:merge" and isinstance(value, yaml.SequenceNode):
-                raise ValueError("`<<` merges one mapping, not a list of them")
+                raise _Fault("`<<` merges one mapping, not a list of them")
         super().flatten_mapping(node)
         self._entries += len(node.value)
         if self._entries > MAX_VALUES:
-            raise ValueError(f"it merges more than {MAX_VALUES} entries")
+            raise _Fault(f"it merges more than {MAX_VALUES} entries")
 
 
 def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
     """All of pydantic's complaints in one line, each with the entry that it is about.
 
-    `prefix` stands before the name of every entry; of `model` the name nearest to an unknown one is
-    proposed.
+    `prefix` stands before every entry's name; of `model` the nearest to an unknown one is proposed.
     """
     parts = []
     for item in error.errors():

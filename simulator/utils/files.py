@@ -6,6 +6,7 @@ Every measurement is written as ``{"meta": {...}, "rows": [...]}``.
 from __future__ import annotations
 
 import datetime
+import errno
 import functools
 import importlib.metadata
 import io
@@ -84,6 +85,17 @@ def printable(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
+def read_bounded(path: Path, most: int = 2**26) -> bytes:
+    """Content of an ordinary file of at most so many bytes; an `OSError` for another one."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+    with path.open("rb") as stream:
+        content = stream.read(most + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
+    return content
+
+
 def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
     """Why a picture must not be decoded: it claims far more pixels than `size` bytes can hold.
 
@@ -99,13 +111,15 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
 
 
 @contextmanager
-def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Iterator[Image.Image]:
+def open_picture(
+    path: Path, formats: Sequence[str] = _PICTURE_FORMATS, *, bits: int = 8
+) -> Iterator[Image.Image]:
     """A developed picture, of `formats` of Pillow only; pixels are decoded when they are asked for.
 
     Raises:
         ValueError: Here and within, naming the file, if it is missing (a link that leads nowhere),
             no whole picture, larger than `MAX_PICTURE_PIXELS` or `MAX_FLAT_PIXELS`, or has colours
-            of more than 8 bits, of which Pillow reads the upper 8.
+            of more than `bits`: Pillow reads the upper 8 of 16, which others decode.
     """
     from PIL import Image
 
@@ -118,8 +132,8 @@ def open_picture(path: Path, formats: Sequence[str] = _PICTURE_FORMATS) -> Itera
                 length = path.stat().st_size
                 if claim := refuse_bomb(picture.height, picture.width, length, per_byte=256):
                     raise ValueError(f"it {claim}")
-            tiles = getattr(picture, "tile", ())
-            if len(picture.getbands()) > 1 and any(";16" in str(tile[3]) for tile in tiles):
+            deep = any(";16" in str(tile[3]) for tile in getattr(picture, "tile", ()))
+            if deep and bits == 8 and len(picture.getbands()) > 1:
                 raise ValueError("it has colours of 16 bits: save it with 8, or give raws")
             yield picture
     except (OSError, SyntaxError, EOFError, ValueError, Image.DecompressionBombError) as error:

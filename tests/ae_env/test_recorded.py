@@ -172,10 +172,9 @@ def touch(folder: Path, *names: str) -> Path:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        *(
-            ("settings.csv", "a,b\n1,2", "column file"),
-            ("settings.csv", "file,iso\nx,many", "line 2"),
-        ),
+        ("settings.csv", "a,b\n1,2", "column file"),
+        ("settings.csv", "file,iso\nx,many", "line 2"),
+        ("settings.csv", "a link to /dev/zero", "no ordinary file"),
         *(("settings.csv", "idx,iso\nfirst,100", "line 2"), ("s.txt", "", "that has captures")),
         ("settings.csv", "file,iso\nx,100\nx,200", "one row for 'x'"),
         ("settings.csv", "file,iso\n\udcff,100", "CSV file in UTF-8"),
@@ -185,7 +184,10 @@ def touch(folder: Path, *names: str) -> Path:
 )
 def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_text(text, errors="surrogateescape")
+    if text.startswith("a link to "):
+        (tmp_path / name).symlink_to(text.removeprefix("a link to "))
+    else:
+        (tmp_path / name).write_text(text, errors="surrogateescape")
     with pytest.raises(ValueError, match=message):
         recorded.index_recorded(tmp_path, {})
 

@@ -319,6 +319,7 @@ def test_light_follows_its_rule(spec, stops):
         *(({"kind": "schedule", "ev": [0, v]}, r"'ev'\]\[1\]") for v in (65, math.nan)),
         ({"kind": "schedule", "ev": [0], "file": "light.csv"}, "only one of them"),
         ({"kind": "schedule", "file": "missing.csv"}, "cannot be read"),
+        ({"kind": "schedule", "file": "/dev/zero"}, "cannot be read: .* no ordinary file"),
         ({"kind": "static", "foo": 1}, "'foo': it has none"),
         # The text of a file of a schedule.
         *(("ev\n", "length 0"), ("0\none\n", "row 2"), ("0\ninf\n", "row 2")),

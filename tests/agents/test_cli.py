@@ -103,6 +103,7 @@ def test_help_and_usage_errors_load_nothing_heavy() -> None:
     asked = [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)]
     wrong = [["nonsense"], ["simulate", "a.dng"], ["sweep", "a.dng", "--nonsense"]]
     wrong += [["evaluate", "--frames", "0"], ["bench", "throughput", "--seed", str(2**63)]]
+    wrong += [["report"], ["hdr", "a.dng", "--step", "half"]]
     code = f"""
 import importlib.metadata, sys
 importlib.metadata.version = None  # a source tree need not be installed
@@ -121,6 +122,8 @@ print("loaded", *sys.modules)
     statuses = re.findall(r"^status (\d)$", run.stdout, re.MULTILINE)
     assert statuses == ["0"] * len(asked) + ["2"] * len(wrong)
     assert run.stderr.count("Usage: ae-env") == len(wrong)
+    for said in ("--frames.* '?0", f"--seed.*{2**63}", "`ae-env evaluate`", "--step.*'half'"):
+        assert re.search(said, run.stderr)
     listed, _, *helps = run.stdout.split("status 0\n")
     assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", listed, re.MULTILINE)) == list(COMMANDS)
     assert f"ae-env {simulator.__version__}\n" in run.stdout
@@ -138,7 +141,9 @@ print("loaded", *sys.modules)
     ("arguments", "message"),
     [
         (("simulate", "none.dng", *SIMULATE), "`path` (='none.dng') does not exist"),
+        (("simulate", "loop.dng", *SIMULATE), "`path` (='loop.dng') does not exist"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "nan"), "`shutter` (=nan)"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
@@ -154,6 +159,7 @@ print("loaded", *sys.modules)
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
+        (("train", "agent.yaml", "--tensorboard", "text.dng"), "`tensorboard` (='text.dng')"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
         (("bench", "throughput", "--part", "agents"), "`part` (='agents') is for transfer only"),
@@ -165,7 +171,6 @@ print("loaded", *sys.modules)
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--preset", "quick", "--append", "x.csv"), "`append` (='x.csv')"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
-        (("evaluate", *V1, "--append", "none/x.csv"), "there is no folder none"),
         (("evaluate", *V1, "--on-error", "skip"), "give that, too"),
         (("evaluate", "--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop'"),
         (("evaluate", "--scenes", "polyhaven", "--on-error", "skip"), "files of a folder"),
@@ -192,6 +197,7 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     write_dng(folder / "nameless.dng", nameless)
     if arguments[0] == "evaluate" and not {"--scenes", "--preset"} & {*arguments}:
         arguments = (*arguments, "--scenes", "bundled:small")
+    (folder / "loop.dng").symlink_to("loop.dng")
     before = {path.name for path in folder.iterdir()}
     code, _, error = ae_env(*arguments)
     assert (code, error[:6], error.strip().count("\n")) == (2, "error ", 0)
@@ -200,12 +206,14 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
-def test_a_policy_that_fails(ae_env, tmp_path: Path) -> None:
+def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN)
     small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
     code, _, error = ae_env("evaluate", "--policy", "own.py:Raises", *small)
     assert (code, error.count("\n")) == (1, 1)
     assert re.search(r"own\.py:.*`act` raised KeyError: 'lost'", error)
+    code, _, error = ae_env("evaluate", "--policy", "random", "--scenes", "os:system")
+    assert (code, "`scenes` (='os:system') raised TypeError" in error) == (1, True)
 
 
 @pytest.mark.parametrize(

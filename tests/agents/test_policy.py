@@ -53,11 +53,12 @@ def test_every_listed_name_makes_a_policy(context):
         ("spot?compensatio=1", "'compensatio'.*'compensation'"),
         *(("spot?meter=matrix", "'meter'"), ("oracle?state=3", "'state'")),
         ("spot?compensation=.nan", r"`compensation` \(=nan\)"),
-        *(("spot?damping=1", r"`damping` \(=1\)"), ("spot:A?iso=100", "`iso`")),
+        *(("spot?damping=1", r"`damping` \(=1\) .* in \[0, 0\.999]"), ("spot:A?iso=100", "`iso`")),
         ("ppo:runs/ppo-*", "`training_seeds`"),
         (f"ppo:{policy_names.PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
         ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\)"),
         (f"recorded:{Path(__file__).parent}", "`path`"),  # holds no raw
+        *(("regression?network=1", "`network`"), (f"spot?iso={'1' * 4096}", "YAML scalar")),
         ("spot?damping=[1]", r"'damping' \(='\[1\]'\)"),
         ("spot?damping=0&damping=0", "'damping'.* twice"),
         ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\)"),

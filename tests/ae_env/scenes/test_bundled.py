@@ -412,10 +412,11 @@ def test_a_download_fetches_what_is_missing_and_nothing_broken(server, tmp_path,
     assert polyhaven.download(url=url, progress=None) == [maps["map_1"]]
     assert maps["map_1"].read_bytes() == CONTENT["map_1"]
     maps["map_1"].unlink()
-    (folder / "map_1_1k.hdr").write_bytes(b"another file")
     monkeypatch.setattr("time.sleep", lambda seconds: None)
-    with pytest.raises(ConnectionError, match=r"map_1_1k.hdr cannot be fetched"):
-        polyhaven.download(url=url, progress=None)
-    assert not maps["map_1"].exists()  # no part of a file either
+    for content, reason in ((b"another file", "hash"), (bytes(5002), "must have 5001 bytes")):
+        (folder / "map_1_1k.hdr").write_bytes(content)
+        with pytest.raises(ConnectionError, match=f"map_1_1k.hdr cannot be fetched: .*{reason}"):
+            polyhaven.download(url=url, progress=None)
+        assert not maps["map_1"].exists()  # no part of a file either
     with pytest.raises(ValueError, match="`url`"):
         polyhaven.download(url="ftp://a", progress=None)

@@ -136,6 +136,7 @@ def test_bad_maps(tmp_path) -> None:
     (tmp_path / "text.exr").write_text("no picture")
     np.save(tmp_path / "pickle.npy", np.array([print], object), allow_pickle=True)
     np.save(tmp_path / "three.npy", np.ones((2, 2, 2)))
+    np.lib.format.open_memmap(tmp_path / "large.npy", "w+", "u1", (2**14, 2**14 + 1))  # a hole
     lie = {"descr": "<f8", "fortran_order": False, "shape": (2**20, 2**22)}  # 32 TB
     with (tmp_path / "lie.npy").open("wb") as file:
         np.lib.format.write_array_header_1_0(file, lie)

@@ -384,6 +384,7 @@ def test_brackets_have_the_same_episodes_for_all_policies_and_resume(tmp_path, m
         ("ppo:{0}/a?device=cpu", {"a", "a.safetensors", "a.json"}),
         ("recorded:{0}", {"a", "a.safetensors", "a.json", "a.py", "other.py", "sub/b.py"}),
         ("{0}/a.py:C", {"a.py", "other.py"}),  # which it may import
+        ("{0}", set()),  # a folder of this name is no policy's
     ],
 )
 def test_what_a_name_points_to_counts_and_nothing_else(name, counts, tmp_path):

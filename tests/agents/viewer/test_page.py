@@ -21,6 +21,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from ae_env.scenes import Scene
+from agents.viewer import tab
 from agents.viewer.one_raw_page import opened, wider_f_numbers
 from agents.viewer.server import TokenGuard
 from agents.viewer.viewed_scene import WINDOW_SIZE, OpenedScene, View, ViewedScene, find_scenes
@@ -120,6 +121,19 @@ def test_a_folder_opens_at_its_first_readable_raw_and_few_are_kept(tmp_path):
         assert library.open(f"{i}.dng").scene.scene_id == f"{i}.dng"
     with pytest.raises((ValueError, OSError), match=r"2\.dng"):
         library.open("2.dng")
+
+
+def test_files_of_all_tabs_together_have_a_bound(tmp_path, monkeypatch):
+    for name in ("", "..", "a\0b.dng", "x" * 256):
+        with pytest.raises(ValueError, match="cannot be called"):
+            tab.new_file(tmp_path, name)
+    for own in ("mine", "other"):
+        (tmp_path / own).mkdir()
+    tab.new_file(tmp_path / "other", "a.dng").write_bytes(bytes(10**6))
+    assert tab.new_file(tmp_path / "mine", "a.dng").parent.is_dir()
+    monkeypatch.setattr(tab, "_MOST_STORED", 10**6)
+    with pytest.raises(ValueError, match="close other tabs"):
+        tab.new_file(tmp_path / "mine", "a.dng")
 
 
 def test_a_scene_is_found_by_its_id_and_what_is_none_is_refused():
@@ -341,8 +355,8 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     expect(page.get_by_text(re.compile("did you mean"))).to_be_visible()
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 844})
-        for tab, there in (("Refocus, HDR", "text=Fuse a bracket"), ("Exposure", ".state.shown")):
-            page.get_by_role("tab", name=tab).click()
+        for name, there in (("Refocus, HDR", "text=Fuse a bracket"), ("Exposure", ".state.shown")):
+            page.get_by_role("tab", name=name).click()
             page.locator(there).wait_for()
             page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
     # Another tab of the browser shows another scene.
@@ -362,8 +376,10 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
 def test_takes_a_raw_and_gives_files_back(page, expect, tmp_path):
     openexr = pytest.importorskip("OpenEXR")
     (bad := tmp_path / "holiday.dng").write_bytes(b"not a raw at all" * 100)
-    page.locator("input[type=file]").set_input_files(bad)
+    with page.expect_request("**/upload/*") as asked:
+        page.locator("input[type=file]").set_input_files(bad)
     expect(page.locator(".q-notification", has_text="holiday.dng")).to_be_visible()
+    assert page.request.post(asked.value.url, form={"file": "none"}).status == 400
     page.get_by_role("tab", name="Refocus, HDR").click()
     expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
     expect(page.get_by_role("button", name="Fuse a bracket")).to_be_disabled()

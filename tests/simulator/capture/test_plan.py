@@ -380,8 +380,10 @@ def test_what_clipped_highlights_hide_by_quadrature(ratio: float) -> None:
             return (ratio * x - shown) ** 2 / (1e-4 + 2e-4 * ratio * x) / x**2
 
         square = quad(density, 1.0, 1.0 / ratio)[0]
+        square += ratio * (1.0 - shown) ** 2 / 3e-4  # white in the capture, too
     error = math.sqrt(0.075 * square)
     assert plan.errors["clipped highlights"] == pytest.approx(error, rel=1e-5)
+    assert replace(made, box_factor=2).clipped_light == pytest.approx((0.1, 1.35))
     leading = max(plan.errors, key=plan.errors.get)
     assert leading == ("clipped highlights" if ratio < 1.0 else "rounding")
     bound = _BOUND[leading] * math.hypot(error, plan.errors["rounding"], _LEAST_BOUND)

@@ -13,7 +13,7 @@ from torch import nn
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import get_camera
 from simulator.networks import aperture_module, noise_module
-from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
+from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Stabiliser
 from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
 from simulator.networks.weights import BUILDERS, build_modules
@@ -31,31 +31,6 @@ def test_it_starts_as_the_plain_ratio() -> None:
         changed = ExposureModule().requires_grad_(False)
         getattr(changed, parameter).view(-1)[-1] += 1e-5
         assert not changed.is_identity
-
-
-def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None:
-    """Captures that follow the model w = 1.03; a part of the targets is over-exposed."""
-    rng = np.random.default_rng(0)
-    source, ratio = rng.random((3, 4, 12, 10)), np.array([0.25, 1.7, 0.6])[:, None, None, None]
-    b = np.array([0.002, -0.001, 0.003, -0.004])[:, None, None]
-    target = 1.03 * ratio * (source + b) + rng.normal(0.0, 0.02, source.shape)
-    used = (source <= OVER_EXPOSED) & (target <= OVER_EXPOSED)
-    assert 0.7 < used.mean() < 0.95  # both kinds are there
-    shifts = [np.eye(4)[plane][:, None, None] * np.ones_like(source) for plane in range(4)]
-    columns = [(ratio * column)[used] for column in (source, *shifts)]
-    (w, *v), *_ = np.linalg.lstsq(np.stack(columns, axis=1), target[used], rcond=None)
-    source, target, ratio = map(torch.from_numpy, (source, target, ratio[:, 0, 0, 0]))
-    fit = LinearFit()
-    fit.add(source[:2], target[:2], ratio[:2])
-    fit.add(source[2:], target[2:], ratio[2:])
-    module = fit.solve()
-    assert float(module.w) == pytest.approx(w, rel=1e-6)
-    assert module.b.tolist() == pytest.approx([x / w for x in v], abs=1e-7)
-    source[:, 3:] = 1.0  # a plane without pixels
-    fit = LinearFit()
-    fit.add(source, target, ratio)
-    with pytest.raises(ValueError, match="every plane"):
-        fit.solve()
 
 
 # -- the aperture ----------------------------------------------------------------------------------

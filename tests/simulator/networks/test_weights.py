@@ -108,6 +108,10 @@ def test_files_that_are_not_there_or_cannot_be_read(saved: Path, ending: str) ->
     file.mkdir()  # a file that cannot be read
     with pytest.raises(ValueError, match=r"net-0.5'\) cannot be read: .*Is a directory"):
         weights.read_pair(saved)
+    file.rmdir()
+    file.symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match=r"cannot be read: .* no ordinary file"):
+        weights.read_pair(saved)
 
 
 def test_shipped_weights_load_by_name(saved, monkeypatch, tmp_path_factory):

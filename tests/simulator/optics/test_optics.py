@@ -21,7 +21,7 @@ from scipy.ndimage import correlate
 
 from simulator.optics import discs, motion
 from simulator.optics.discs import DIAMETERS, Blur, DiscBank, blur_many, disc_blur, disc_kernel
-from simulator.optics.flicker_integral import Flash, Lamp, MainsLamp, PulsedLamp
+from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 from simulator.optics.motion import Movement, Path, motion_blur, path_blur, path_taps
 from simulator.optics.thin_lens import Lens, defocus
 
@@ -251,20 +251,6 @@ def test_pulsed_light_is_the_exact_overlap(frequency, duty, time):
         assert lamp.mean_light(start, time) == pytest.approx(exact, rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])
-@pytest.mark.parametrize("decay", [1e-6, 50e-6, 1e-3])
-def test_a_flash_is_its_integral(time, decay):
-    def light(t: float) -> float:
-        return 0.02 / decay * math.exp(-(t - 0.01) / decay)
-
-    lamp = Flash(at=0.01, decay=decay, energy=0.02)
-    for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
-        begin = max(start, 0.01)
-        end = max(begin, min(start + time, begin + 60 * decay))  # then there is nothing left
-        expected = 1.0 + integral(light, begin, end) / time
-        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
-
-
 def test_rows_are_exposed_one_after_the_other():
     lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
     rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
@@ -280,8 +266,8 @@ def test_bad_values_are_refused():
     rows = partial(Lamp().row_light, 0.0, 1.0, rows=4, row_time=1e-5)
     mean = partial(Lamp().mean_light, start=0.0, exposure_time=1.0)
     bad = [(MainsLamp, "frequency", 0.0), (MainsLamp, "depth", 1.5), (MainsLamp, "phase", math.nan)]
-    bad += [(PulsedLamp, "duty", 0.0), (PulsedLamp, "frequency", "100"), (Flash, "decay", 0.0)]
-    bad += [(Flash, "energy", -1.0), (Movement, "subject_speed", -1.0), (mean, "start", math.inf)]
+    bad += [(PulsedLamp, "duty", 0.0), (PulsedLamp, "frequency", "100")]
+    bad += [(Movement, "subject_speed", -1.0), (mean, "start", math.inf)]
     bad += [(mean, "exposure_time", 0.0), (rows, "rows", 0), (rows, "row_time", -1e-5)]
     bad += [(partial(Lens, 0.05), "focus_distance", d) for d in (0.05, -1.0, math.nan)]
     far = partial(Lens, focus_distance=math.inf)

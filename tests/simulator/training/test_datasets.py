@@ -210,6 +210,10 @@ def test_mosaics_linear_frames_and_maps_by_hand(tmp_path: Path) -> None:
     assert (mosaic.nlf.shot, mosaic.nlf.read) == ((0.002,) * 4, (0.00003,) * 4)
     assert linear.light[:, 3, 0].tolist() == [1.0, 0.0, 0.0]
     assert linear.nlf.is_zero
+    (tmp_path / "intel_tau_small" / "C.png").symlink_to("nowhere")
+    with pytest.raises(ValueError, match=r"C\.png' cannot be read: the link leads nowhere"):
+        by_split(tmp_path)
+    (tmp_path / "intel_tau_small" / "C.png").unlink()
     # A map has a median of one, and no lamp outshines it.
     image = np.full((8, 16, 3), 4.0)
     image[0, 0] = 4000.0

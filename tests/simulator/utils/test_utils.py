@@ -194,7 +194,9 @@ DOUBLED = "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for 
         ("", ["is empty: it must map entries to values; known entries: name, part, parts"]),
         ("- a\n- b", ["holds ['a', 'b']: it must map entries"]),
         ("name: x\npart: {steps: 2}\nname: y", ["): the entry 'name' is given twice, again in"]),
-        ("name: " + "[" * 700, ["nested too deeply"]),
+        ("name: " + "[" * 10**6, ["nested too deeply"]),
+        ("- a\n" * 2**18, ["holds more than 65536 values"]),
+        ("a: 0x" + "f" * 9999, ["one of more than 2048 characters"]),  # no text of decimals
         (DOUBLED, ["aliases stand for more than"]),
         ("name: &a {x: 1}\nb: {<<: [*a, *a]}", ["`<<` merges one mapping"]),
         ("name: 2001-13-45", ["is not YAML"]),
