@@ -19,6 +19,8 @@ from typing import Annotated, Any
 from rich.console import Console
 from typer import Argument, Option
 
+from simulator.utils.files import printable
+
 terminal = Console()
 
 # -- options of several commands ------------------------------------------------------------------
@@ -115,7 +117,7 @@ def progress_bars() -> Iterator[Any]:
 
 def print_line(text: str) -> None:
     """Prints a line as it is: names in it are no markup, and it is not wrapped."""
-    terminal.print(text, highlight=False, soft_wrap=True, markup=False)
+    terminal.print(printable(text), highlight=False, soft_wrap=True, markup=False)
 
 
 def print_files(files: Mapping[str, Path]) -> None:

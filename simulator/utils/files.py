@@ -16,6 +16,7 @@ import os
 import platform
 import secrets
 import subprocess
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -124,7 +125,9 @@ def open_picture(
     from PIL import Image
 
     try:
-        with Image.open(path, formats=list(formats)) as picture:
+        with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
+            opened = Image.open(path, formats=list(formats))  # warns of what is refused below
+        with opened as picture:
             if picture.width * picture.height > MAX_PICTURE_PIXELS:
                 size = f"{picture.width} x {picture.height} pixels"
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")

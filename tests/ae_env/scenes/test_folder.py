@@ -58,6 +58,8 @@ def test_options_reach_the_scenes(tmp_path):
     assert {(s.kind, s.hard, s.median_speed) for s in (a, b)} == {("mine", True, 0.5)}
     (only,) = load(tmp_path / "b.hdr", ev100=8.0)
     assert only.ev100 == pytest.approx(8.0, abs=0.05)
+    with pytest.raises(ValueError, match=r"`settings`.* has none"):
+        load(tmp_path / "b.hdr", settings={"iso": 100})
 
 
 #: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same
@@ -351,7 +353,7 @@ def test_maps_are_sampled_where_they_have_the_photosites(tmp_path, caplog):
         ("a.exr", (20_000, 13_000), "claims .*8192 a byte"),
     ],
 )
-def test_errors_name_the_file(tmp_path, name, content, words):
+def test_errors_name_the_file(tmp_path, name, content, words, capfd):
     pytest.importorskip("cv2")
     if isinstance(content, tuple):  # the size that the header of a small file claims
         write_exr(tmp_path / name, np.ones((32, 64)))
@@ -361,6 +363,7 @@ def test_errors_name_the_file(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{name}.*{words}"):
         read_radiance(tmp_path / name)
+    assert capfd.readouterr() == ("", "")  # of the libraries
 
 
 @pytest.mark.parametrize("scale", [2.0**-100, 2.0**110])

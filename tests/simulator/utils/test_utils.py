@@ -325,6 +325,8 @@ def test_a_folder_that_cannot_be_used_costs_one_warning(tmp_path, folder, caplog
     messages = {record.getMessage() for record in caplog.records}
     assert len(messages) == len(caplog.records) <= 2  # once for reading, once for writing
     assert any("could not be stored" in message for message in messages)
+    with pytest.raises(OSError, match=r"`path` .* cannot be written"):  # what a run needs
+        Store(tmp_path / folder).put(KEYS[0], {"light": torch.zeros(4)})
     assert not list(tmp_path.rglob("*.tmp"))
     with pytest.raises(OSError, match=r"`path` .* cannot be written"):  # what a run needs
         Store(tmp_path / folder).put(KEYS[0], {"light": torch.zeros(4)})
