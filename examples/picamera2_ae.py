@@ -1,8 +1,8 @@
 """An exported agent on a Raspberry Pi camera: `python3 examples/picamera2_ae.py policy.onnx`.
 
 First, on any machine: ae-env export regression -o policy.onnx
-The camera needs picamera2, numpy, onnxruntime and pydantic, no torch. `run` takes anything with
-Picamera2's `set_controls`, `camera_configuration` and `capture_request`;
+The camera needs picamera2, numpy, onnxruntime, pydantic and lazy-loader, no torch. `run` takes
+anything with Picamera2's `set_controls`, `camera_configuration` and `capture_request`;
 `examples/simulated_camera.py` has one to try it on.
 """
 
@@ -36,7 +36,7 @@ def planes_of(array, configuration, black_levels):
     places = (red, red ^ 1, blue ^ 1, blue)  # G1 is on red's rows, G2 on blue's
     planes = np.stack([mosaic[i // 2 :: 2, i % 2 :: 2] for i in places])
     black = np.array(black_levels)[:, None, None] * (white + 1.0) / 2.0**16
-    return np.clip((planes - black) / (white - black), -1.0, 1.0)
+    return (planes - black) / (white - black)
 
 
 def run(camera, controller, frames, f_number, base_iso=BASE_ISO):

@@ -194,7 +194,7 @@ def _read_map(path: Path, layer: str | None) -> np.ndarray:
                 "the file must hold one map (H, W) of numbers: a PNG of one channel, an EXR with a "
                 "channel Z, Y or R, or an array"
             )
-        if claim := refuse_bomb(*values.shape, values.nbytes):
+        if claim := refuse_bomb(values.shape[0], values.shape[1], values.nbytes):
             raise ValueError(f"it {claim}")
     except (OSError, SyntaxError, RuntimeError, EOFError, ValueError) as error:
         raise ValueError(f"`depth` (={str(path)!r}) cannot be read: {error}") from error

@@ -1,4 +1,4 @@
-"""An exported agent on a camera: NumPy, ONNX Runtime and pydantic, no torch.
+"""An exported agent on a camera: NumPy, ONNX Runtime, pydantic and lazy-loader, no torch.
 
 One file is enough: beside the network it holds the exposure states, and what the agent keeps in
 mind between frames.
@@ -6,37 +6,71 @@ mind between frames.
 
 from __future__ import annotations
 
+import math
+import sys
+from collections.abc import Iterable
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+
+from simulator.utils.checks import check_flag, check_integer, check_number
 
 #: Entry of the file's metadata that holds the description, and the form that it has.
 METADATA, FORMAT = "ae_env", 1
-#: Signals beyond this many times white are digital numbers.
-_MOST_SIGNAL = 16.0
+#: Values of a signal, 1 at white, are in between; others are digital numbers.
+_LEAST_SIGNAL, _BEYOND_SIGNAL = -0.5, 2.0
+#: The mean of a photograph is above; noise alone has a mean of 0.
+_LEAST_MEAN = -0.05
+#: What the sensors read, as `Controller.decide` calls it.
+_READINGS = ("image_speed", "defocus")
+
+
+def _rising(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] < ends[1]:
+        return ends
+    raise ValueError(f"the first of {ends} must be below the second")
+
+
+def _distinct(states: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
+    if len(set(states)) == len(states):
+        return states
+    raise ValueError("must be distinct")
+
 
 Positive = Annotated[float, Field(gt=0.0, lt=1e9)]
-Range = tuple[float, float]
+Exponent = Annotated[float, Field(ge=-64.0, le=64.0)]
+Range = Annotated[tuple[Exponent, Exponent], AfterValidator(_rising)]
+States = list[tuple[Positive, Positive, Positive]]
 
 
-class Card(BaseModel):
+class _Entries(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
+
+
+class Ranges(_Entries):
+    """Values that are -1 and 1 to the network, in powers of two."""
+
+    settings: tuple[Range, Range, Range]
+    sensors: tuple[Range, Range]
+
+
+class Card(_Entries):
     """What an exported file says about its agent: the network, and how a camera's frames go in."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     format: Literal[1]
     kind: Literal["regression", "ppo"]
     #: ISO speed, exposure time [s] and marked f-number of each state.
-    states: Annotated[list[tuple[Positive, Positive, Positive]], Field(min_length=1)]
+    states: Annotated[States, Field(min_length=1), AfterValidator(_distinct)]
     #: Planes R, G1, G2, B, and their height and width.
-    frame_shape: tuple[Literal[4], Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
+    frame_shape: tuple[Literal[4], PositiveInt, PositiveInt]
     sensors: bool
     same_light_ev: Positive
-    pedestal: Positive
-    ranges: dict[Literal["settings", "sensors"], list[Range]]
+    pedestal: Annotated[float, Field(gt=0.0, lt=1.0)]
+    ranges: Ranges
 
 
 class ExposureState(NamedTuple):
@@ -66,6 +100,8 @@ class Controller:
     the metered light moves by more than the agent's tolerance, the earlier ones are forgotten.
     (PPO without a history remembers nothing.) A bad reading counts for nothing: the camera keeps
     the state that was chosen last, or before the first choice the nearest to its own settings.
+    Use `decide` for one camera, and `act` with the three `encode_` methods for several: the rules
+    are the same.
 
     Args:
         path: An ``.onnx`` file of `agents.onboard.export.export_agent`.
@@ -98,8 +134,9 @@ class Controller:
             self.card = Card.model_validate_json(found[METADATA])
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise ValueError(f"{given} is damaged: its {where}: {first['msg']}") from None
+            where = ".".join(map(str, first["loc"])) or "card"
+            rule = first["msg"].removeprefix("Value error, ")
+            raise ValueError(f"{given} is damaged: its {where}: {rule}") from None
         self.states = [ExposureState(*state) for state in self.card.states]
         self.num_states = len(self.states)
         #: Shape of a camera's frame: planes R, G1, G2, B, and their height and width.
@@ -107,14 +144,25 @@ class Controller:
         self._shapes = {"raw": self.frame_shape, "settings": (3,)}
         if self.card.sensors:
             self._shapes["sensors"] = (2,)
-        inputs = {node.name: tuple(node.shape[1:]) for node in self._session.get_inputs()}
-        if inputs != self._shapes or self._session.get_outputs()[0].shape[1] != self.num_states:
-            raise ValueError(f"{given} is damaged: its network takes {inputs}, not {self._shapes}")
+        each = {"scores": (self.num_states,), "precision": (self.num_states,), "ev100": ()}
+        outputs = {"logits": (self.num_states,)} if self.card.kind == "ppo" else each
+        for entries, shapes, nodes in (
+            ("`frame_shape` and `sensors`", self._shapes, self._session.get_inputs()),
+            ("`kind` and `states`", outputs, self._session.get_outputs()),
+        ):
+            kinds = {name: f"tensor({'uint8' if name == 'raw' else 'float'})" for name in shapes}
+            wanted = {name: (kinds[name], *shape) for name, shape in shapes.items()}
+            has = {node.name: (node.type, *node.shape[1:]) for node in nodes}
+            if has != wanted:
+                fault = f"by its {entries} the network has {wanted}, but it has {has}"
+                raise ValueError(f"{given} is damaged: {fault}")
+        self._outputs = list(outputs)
         self._encoded = np.stack([self.encode_settings(state) for state in self.states])
         self.reset(num_cameras)
 
     def reset(self, num_cameras: int = 1) -> None:
         """Forgets the frames so far."""
+        check_integer("num_cameras", num_cameras, 1)
         self._weighted, self._precision = np.zeros((2, num_cameras, self.num_states))
         self._light, self._frames = np.zeros((2, num_cameras))
         self._last = np.full(num_cameras, -1)
@@ -123,7 +171,7 @@ class Controller:
 
     def act(
         self,
-        raw: NDArray[np.uint8],
+        raw: NDArray[Any],
         settings: NDArray[np.float32],
         sensors: NDArray[np.float32] | None = None,
         action_masks: NDArray[np.bool_] | None = None,
@@ -133,23 +181,36 @@ class Controller:
         Args:
             raw: (N, *`frame_shape`) uint8 as the environment observes it, see `encode_frame`.
             settings: (N, 3) in [-1, 1] that the frames were taken with, see `encode_settings`.
-            sensors: (N, 2) in [-1, 1], where the agent was trained with them; a camera whose
-                reading is not finite keeps its state.
+            sensors: (N, 2) in [-1, 1], where the agent was trained with them, see `encode_sensors`;
+                a camera whose reading is not finite keeps its state.
             action_masks: (N, S) bool, False where a state is not allowed.
 
         Raises:
-            ValueError: If an array has the wrong shape or dtype, a setting is out of range, or a
-                mask allows nothing.
+            ValueError: If an array has the wrong shape or dtype, a setting or a sensor is out of
+                range, or a mask allows nothing.
         """
-        shown: dict[str, NDArray[Any]] = {"raw": np.asarray(raw)}
-        if shown["raw"].dtype != np.uint8:
-            raise ValueError(f"`raw` (dtype {shown['raw'].dtype}) must be uint8")
-        shown["settings"] = np.asarray(settings, np.float32)
+        shown = {"raw": _array("raw", raw), "settings": _array("settings", settings, np.float64)}
         if sensors is not None:
-            shown["sensors"] = np.asarray(sensors, np.float32)
+            shown["sensors"] = _array("sensors", sensors, np.float64)
         masks = self._checked(shown, action_masks)
-        bad = ~np.isfinite(shown.get("sensors", self._light[:, None])).all(axis=1)
-        return self._act(shown, masks, ["a sensor is not finite" if held else "" for held in bad])
+        shown["raw"], self.reasons = _codes(shown["raw"])
+        bad = ~np.isfinite(shown.get("sensors", self._light[:, None]))
+        for camera, i in np.argwhere(bad) if bad.any() else ():
+            self.reasons[camera] = self.reasons[camera] or f"`{_READINGS[i]}` is not finite"
+        good = np.flatnonzero([not reason for reason in self.reasons])
+        # Of a camera that is held: minus the distance to its last state, else to its settings.
+        kept = np.where((self._last < 0)[:, None], shown["settings"], self._encoded[self._last])
+        utility = -np.square(kept[:, None] - self._encoded).sum(axis=2)
+        if len(good):
+            fed = {name: v if name == "raw" else v.astype(np.float32) for name, v in shown.items()}
+            if len(good) < len(masks):
+                fed = {name: values[good] for name, values in fed.items()}
+            found = self._session.run(self._outputs, fed)
+            ppo = self.card.kind == "ppo"
+            utility[good] = found[0] if ppo else self._accumulated(good, *found)
+        chosen = np.argmax(np.where(masks, utility, -np.inf), axis=1).astype(np.int64)
+        self._last[good] = chosen[good]
+        return chosen
 
     def decide(
         self,
@@ -166,82 +227,71 @@ class Controller:
             planes: (4, H, W) signal of R, G1, G2, B, 0 at black and 1 at white; of any size that is
                 at least that of `frame_shape`. None for a frame that was dropped.
             current: What the frame was really taken with, as its metadata say.
-            image_speed: Of the image, as a gyro reads it [frame heights/s].
-            defocus: Diameter of the largest disc of defocus at f/4 [pixel of a 64-pixel frame].
+            image_speed: Of the image, as a gyro reads it [frame heights/s]. NaN if it is missing.
+            defocus: Diameter of the largest disc of defocus at f/4 [pixel of a 64-pixel frame]. NaN
+                if it is missing.
             fixed_aperture: Choose among the states whose f-number is nearest to the current one.
 
         Returns:
-            The state, and a reason where the last one is held: a dropped frame, or a value of the
-            frame, gyro or focus drive that is not finite.
+            The state, and a reason where the last one is held: a dropped frame, a value that is not
+            finite, of the frame or of a sensor that the agent uses, or a frame below black.
 
         Raises:
             ValueError: If `planes` is no signal (integers, digital numbers), a reading is negative,
                 or `current` is not positive and finite.
         """
-        for name, value in zip(ExposureState._fields, current, strict=True):
-            if not (np.isfinite(value) and value > 0.0):
-                raise ValueError(f"`current.{name}` (={value!r}) must be positive and finite")
-        readings = {"image_speed": image_speed, "defocus": defocus}
-        for name, value in readings.items():
-            if value < 0.0:
-                raise ValueError(f"`{name}` (={value!r}) must be at least 0")
-        bad = [name for name, value in readings.items() if not np.isfinite(value)]
-        reason = f"`{bad[0]}` is not finite" if bad else ""
-        raw = np.zeros(self.frame_shape, np.uint8)
-        if planes is None:
-            reason = "no frame"
-        elif np.isfinite(planes := self._check_planes(planes)).all():
-            raw = self._encode(planes)
-        else:
-            reason = "the frame is not finite"
-        masks = np.ones((1, self.num_states), bool)
+        check_flag("fixed_aperture", fixed_aperture)
+        state, masks = _exposure("current", current), None
+        sensors = self.encode_sensors(image_speed, defocus)[None]
         if fixed_aperture:
-            stops = np.array([abs(np.log2(s.f_number / current.f_number)) for s in self.states])
+            stops = np.array([abs(np.log2(s.f_number / state.f_number)) for s in self.states])
             masks = (stops < stops.min() + 0.01)[None]
-        shown: dict[str, NDArray[Any]] = {"raw": raw[None]}
-        shown["settings"] = self.encode_settings(current)[None]
-        if self.card.sensors:
-            least = np.maximum([*readings.values()], 2.0**-64)
-            shown["sensors"] = self._unit(np.log2(least), "sensors")[None]
-        return Decision(self.states[int(self._act(shown, masks, [reason])[0])], reason)
+        raw, settings = self.encode_frame(planes)[None], self.encode_settings(state)[None]
+        chosen = self.act(raw, settings, sensors if self.card.sensors else None, masks)
+        return Decision(self.states[int(chosen[0])], self.reasons[0])
 
-    def encode_frame(self, planes: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """The observed frame of a signal (4, H, W): averaged to `frame_shape`, companded."""
-        return self._encode(self._check_planes(planes))
+    def encode_frame(self, planes: NDArray[np.floating] | None) -> NDArray[Any]:
+        """The observed frame of a signal (4, H, W), see `decide`: averaged, companded, uint8.
 
-    def _encode(self, planes: NDArray[np.floating]) -> NDArray[np.uint8]:
-        _, height, width = self.frame_shape
-        averaged = _averaged(_averaged(np.asarray(planes, np.float64), height, 1), width, 2)
+        A dropped or bad frame becomes an array of objects, which all are the reason, a text: `act`
+        holds the state of its camera. `np.stack` takes both. What is no signal is a `ValueError`.
+        """
+        reason, (_, height, width) = "no frame", self.frame_shape
+        if planes is not None:
+            signal = self._signal(planes).astype(np.float64)
+            with np.errstate(invalid="ignore"):  # infinite values of both signs
+                averaged = _averaged(_averaged(signal, height, 1), width, 2)
+                mean = averaged.mean()
+            reason = "" if mean >= _LEAST_MEAN else "the frame is below black"
+            reason = reason if math.isfinite(mean) else "the frame is not finite"
+        if reason:
+            return np.full(self.frame_shape, reason, object)
         pedestal = self.card.pedestal
         shown = np.clip(averaged, -pedestal, 1.0)
         root = np.sqrt((shown + pedestal) / (1.0 + pedestal))
         return np.rint(255.0 * root).astype(np.uint8)
 
     def encode_settings(self, state: ExposureState) -> NDArray[np.float32]:
-        """The observed settings (3,) of a state: Av, Tv and Sv in [-1, 1]."""
+        """The observed settings (3,) of a state: Av, Tv and Sv in [-1, 1].
+
+        A value that is not positive and finite is a `ValueError`.
+        """
+        state = _exposure("state", state)
         aperture, time = 2 * np.log2(state.f_number), -np.log2(state.exposure_time)
-        return self._unit(np.array([aperture, time, np.log2(state.iso / 3.125)]), "settings")
+        apex = np.array([aperture, time, np.log2(state.iso / 3.125)])
+        return _unit(apex, self.card.ranges.settings)
 
-    def _unit(self, values: NDArray[np.float64], name: Any) -> NDArray[np.float32]:
-        low, high = np.array(self.card.ranges[name]).T
-        return np.clip(2.0 * (values - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+    def encode_sensors(self, image_speed: float, defocus: float) -> NDArray[np.float32]:
+        """The observed sensors (2,) in [-1, 1], see `decide`; NaN for a reading that is not finite.
 
-    def _act(
-        self, shown: dict[str, NDArray[Any]], masks: NDArray[np.bool_], reasons: list[str]
-    ) -> NDArray[np.int64]:
-        """`act` of what is checked; cameras with a reason keep their state."""
-        self.reasons = reasons
-        good = np.flatnonzero([not reason for reason in reasons])
-        # Of a camera that is held: minus the distance to its last state, else to its settings.
-        kept = np.where((self._last < 0)[:, None], shown["settings"], self._encoded[self._last])
-        utility = -np.square(kept[:, None] - self._encoded).sum(axis=2, dtype=np.float64)
-        if len(good):
-            found = self._session.run(None, {name: value[good] for name, value in shown.items()})
-            ppo = self.card.kind == "ppo"
-            utility[good] = found[0] if ppo else self._accumulated(good, *found)
-        chosen = np.argmax(np.where(masks, utility, -np.inf), axis=1).astype(np.int64)
-        self._last[good] = chosen[good]
-        return chosen
+        A reading that is no number, or negative, is a `ValueError`.
+        """
+        readings = np.zeros(2)
+        for i, value in enumerate((image_speed, defocus)):
+            if not (isinstance(value, Real) and math.isnan(value)):
+                check_number(_READINGS[i], value, 0.0, math.inf, more="; NaN if it is missing")
+            readings[i] = max(value, 2.0**-64) if math.isfinite(value) else math.nan
+        return _unit(np.log2(readings), self.card.ranges.sensors)
 
     def _accumulated(
         self, good: NDArray[Any], scores: NDArray[Any], precision: NDArray[Any], ev: NDArray[Any]
@@ -257,19 +307,23 @@ class Controller:
         self._precision[good] += precision
         return self._weighted[good] / self._precision[good]
 
-    def _check_planes(self, planes: NDArray[np.floating]) -> NDArray[np.floating]:
-        planes, (count, height, width) = np.asarray(planes), self.frame_shape
-        if not np.issubdtype(planes.dtype, np.floating):
-            rule = "floating point, 0 at black and 1 at white; digital numbers are no signal"
-            raise ValueError(f"`planes` (dtype {planes.dtype}) must be {rule}")
-        least = planes.ndim == 3 and planes.shape[1] >= height and planes.shape[2] >= width
-        if not least or len(planes) != count:
-            rule = f"({count}, H, W), at least {height} x {width}"
-            raise ValueError(f"`planes` (shape {planes.shape}) must be {rule}")
-        most = float(np.max(planes, initial=0.0, where=np.isfinite(planes)))
-        if most > _MOST_SIGNAL:
-            raise ValueError(f"`planes` must be a signal, 1 at white, but reach {most:g}")
-        return planes
+    def _signal(self, planes: Any) -> NDArray[np.floating]:
+        """`planes` as an array; raises what the caller got wrong."""
+        signal, (count, height, width) = _array("planes", planes), self.frame_shape
+        rule = "a signal, 0 at black and 1 at white; digital numbers are none"
+        if not np.issubdtype(signal.dtype, np.floating):
+            raise ValueError(f"`planes` (dtype {signal.dtype}) must be floating point, {rule}")
+        least = signal.ndim == 3 and signal.shape[1] >= height and signal.shape[2] >= width
+        if not least or len(signal) != count:
+            size = f"({count}, H, W), at least {height} x {width}"
+            raise ValueError(f"`planes` (shape {signal.shape}) must be {size}")
+        low, high = signal.min(), signal.max()  # NaN if any value is
+        if not (np.isfinite(low) and np.isfinite(high)):
+            known = signal[np.isfinite(signal)]
+            low, high = known.min(initial=0.0), known.max(initial=0.0)
+        if low < _LEAST_SIGNAL or high >= _BEYOND_SIGNAL:
+            raise ValueError(f"`planes` (from {low:g} to {high:g}) must be {rule}")
+        return signal
 
     def _checked(
         self, shown: dict[str, NDArray[Any]], action_masks: NDArray[np.bool_] | None
@@ -281,16 +335,55 @@ class Controller:
             given = shown[name].shape if name in shown else None
             if given != wanted:
                 raise ValueError(f"`{name}` (shape {given}) must be {wanted}")
-        if not (np.abs(shown["settings"]) <= 1.0 + 1e-6).all():
-            raise ValueError("`settings` must be in [-1, 1]; see `Controller.encode_settings`")
+        for name, values in shown.items():
+            if name == "raw" or (good := np.abs(values) <= 1.0 + 1e-6).all():
+                continue
+            if name == "settings" or not (good | ~np.isfinite(values)).all():
+                raise ValueError(f"`{name}` must be in [-1, 1]; see `Controller.encode_{name}`")
         masks = np.ones((count, self.num_states), bool) if action_masks is None else action_masks
-        masks = np.asarray(masks)
+        masks = _array("action_masks", masks)
         if masks.shape != (count, self.num_states) or masks.dtype != bool:
             rule = f"({count}, {self.num_states}) of bool"
             raise ValueError(f"`action_masks` ({masks.shape} of {masks.dtype}) must be {rule}")
         if not masks.any(axis=1).all():
             raise ValueError("`action_masks` must allow a state to every camera")
         return masks
+
+
+def _array(name: str, values: Any, dtype: Any = None) -> NDArray[Any]:
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"`{name}` must be an array of numbers: {error}") from error
+
+
+def _exposure(name: str, state: Any) -> ExposureState:
+    """`state` in floats; raises which of its values is wrong."""
+    values, fields = tuple(state) if isinstance(state, Iterable) else (), ExposureState._fields
+    if len(values) != len(fields):
+        raise ValueError(f"`{name}` (={state!r}) must be ({', '.join(fields)})")
+    least, most = sys.float_info.min, sys.float_info.max
+    pairs = zip(fields, values, strict=True)
+    return ExposureState(*(check_number(f"{name}.{n}", v, least, most) for n, v in pairs))
+
+
+def _codes(raw: NDArray[Any]) -> tuple[NDArray[np.uint8], list[str]]:
+    """Frames without those that `Controller.encode_frame` found bad, and why these are bad."""
+    reasons = [""] * len(raw)
+    if raw.dtype == object:
+        firsts = [frame.flat[0] for frame in raw]
+        reasons = [first if isinstance(first, str) else "" for first in firsts]
+        raw = np.where(np.array(reasons, bool)[:, None, None, None], 0, raw)
+        codes = _array("raw", raw, np.uint8)
+        raw = codes if (codes == raw).all() else raw
+    if raw.dtype != np.uint8:
+        raise ValueError(f"`raw` (dtype {raw.dtype}) must be uint8; see `Controller.encode_frame`")
+    return raw, reasons
+
+
+def _unit(values: NDArray[np.float64], ranges: Any) -> NDArray[np.float32]:
+    low, high = np.array(ranges).T
+    return np.clip(2.0 * (values - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
 
 def _averaged(values: NDArray[np.float64], size: int, axis: int) -> NDArray[np.float64]:

@@ -42,8 +42,8 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
     (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
     Colours are converted by the chromaticities that a file states, whatever its white, else taken
     to be sRGB's; alpha and further channels are ignored; a file with luminance only is grey. Of an
-    OpenEXR file that is the part and layer with R, G and B; the picture fills its display window,
-    black where there are no data.
+    OpenEXR file that is the part and layer with R, G and B, or with luminance and chroma (Y, RY,
+    BY); the picture fills its display window, black where there are no data.
 
     `layer` is a part or layer of an OpenEXR file, such as ``"ViewLayer.Combined"``; needed where
     several have R, G and B.
@@ -66,10 +66,10 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
                 raise RadianceError("has no layers: leave out `layer`")
             image, primaries = _read_hdr(path)
         else:
-            image, primaries = read_exr(path, (("R", "G", "B"), ("Y",)), layer)
+            image, primaries = read_exr(path, (("R", "G", "B"), ("Y", "RY", "BY"), ("Y",)), layer)
         if len(image) == 1:
             image = np.repeat(image, 3, axis=0)
-        elif np.abs(np.subtract(primaries, SRGB)).max() > 1e-4:
+        elif not np.abs(np.subtract(primaries, SRGB)).max() <= 1e-4:  # NaN is none of these
             matrix = np.linalg.inv(_xyz_from_rgb(SRGB)) @ _xyz_from_rgb(primaries)
             image = np.tensordot(matrix.astype(np.float32), image, axes=1)
         return _clean(image.astype(np.float32, copy=False), path)
@@ -89,6 +89,11 @@ def _xyz_from_rgb(chromaticities: Sequence[float]) -> np.ndarray:
     if not np.isfinite(columns).all() or not white[1] or abs(np.linalg.det(matrix)) < 1e-9:
         raise RadianceError(f"states primaries that are none: {tuple(chromaticities)}")
     return np.asarray(matrix * np.linalg.solve(matrix, white / white[1]))
+
+
+def _check_aspect(aspect: float) -> None:
+    if not abs(aspect - 1.0) <= 0.01:
+        raise RadianceError(f"has pixels that are not square (aspect {aspect:g}): resample it")
 
 
 def _refuse_lies(path: Path, height: int, width: int) -> None:
@@ -118,8 +123,10 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
         name, equals, value = line.partition("=")
         if equals:
             entries[name.strip()] = value.strip()
-            if name.strip() == "PIXASPECT" and not re.fullmatch(r"1(\.0*)?", value.strip()):
-                raise RadianceError(f"has pixels that are not square ({line}): resample it")
+    aspect = np.nan
+    with contextlib.suppress(ValueError):
+        aspect = float(entries.get("PIXASPECT", 1))
+    _check_aspect(aspect)
     kind = entries.get("FORMAT", "32-bit_rle_rgbe")
     if kind not in _RADIANCE_FORMATS:
         raise RadianceError(f"has the format {kind!r}, which is none of {[*_RADIANCE_FORMATS]}")
@@ -155,6 +162,10 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
 
 
 # -- OpenEXR ----------------------------------------------------------------------------------
+
+
+#: Beside these a channel means another thing than alone: that of a colour, a direction, a place.
+_COMPANIONS = {"R": {"G"}, "Y": {"X", "RY", "BY"}, "Z": {"X"}, "V": {"U"}}
 
 
 class _Layer(NamedTuple):
@@ -200,8 +211,12 @@ def read_exr(
     header = headers[chosen.part]
     data, shown = (np.array(header[name]) for name in ("dataWindow", "displayWindow"))
     width, height = shown[1] - shown[0] + 1
-    if {plane.shape for plane in planes} != {tuple((data[1] - data[0] + 1)[::-1])}:
-        raise RadianceError(f"must have {', '.join(chosen.channels)} of the same size")
+    planes = [_interpolated(plane, tuple((data[1] - data[0] + 1)[::-1])) for plane in planes]
+    primaries = header.get("chromaticities", SRGB)
+    if chosen.channels[-1].upper().endswith("BY"):  # (R - Y) / Y and (B - Y) / Y
+        luminance, (red, blue) = planes[0], (planes[0] * (1 + chroma) for chroma in planes[1:])
+        of_red, of_green, of_blue = _xyz_from_rgb(primaries)[1].astype(np.float32)
+        planes = [red, (luminance - of_red * red - of_blue * blue) / of_green, blue]
     image = np.full((len(planes), height, width), outside, np.float32)
     (left, top), (right, bottom) = np.maximum(data[0], shown[0]), np.minimum(data[1], shown[1]) + 1
     if right > left and bottom > top:
@@ -209,7 +224,19 @@ def read_exr(
         source = (slice(top - data[0][1], bottom - data[0][1]), slice(left - data[0][0], None))
         for plane, values in zip(target, planes, strict=True):
             plane[:, left - shown[0][0] : right - shown[0][0]] = values[source][:, : right - left]
-    return image, header.get("chromaticities", SRGB)
+    return image, primaries
+
+
+def _interpolated(plane: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Every pixel of a plane that has samples at every first, second, ... row and column only."""
+    if not plane.size or any(n % stored for n, stored in zip(size, plane.shape, strict=True)):
+        raise RadianceError(f"must have channels of {size} samples, but has {plane.shape}")
+    for axis, count in enumerate(size):
+        if plane.shape[axis] < count:
+            at = np.arange(count, dtype=np.float32) / (count // plane.shape[axis])
+            low, high = (plane.take(at.astype(int) + i, axis, mode="clip") for i in (0, 1))
+            plane = low + (high - low) * np.expand_dims(at % 1.0, 1 - axis)
+    return plane
 
 
 @contextlib.contextmanager
@@ -243,7 +270,8 @@ def _chosen(headers: Sequence[Any], kinds: Sequence[tuple[str, ...]], layer: str
         groups: dict[str, dict[str, str]] = {}
         for channel in header["channels"]:
             prefix, _, base = channel.name.rpartition(".")
-            groups.setdefault(prefix, {})[base.upper()] = channel.name
+            # In the order of ASCII, so that R comes before r.
+            groups.setdefault(prefix, {}).setdefault(base.upper(), channel.name)
         part = header.get("name", "") if len(headers) > 1 else ""
         for prefix, channels in groups.items():
             name = ".".join(filter(None, (part, prefix)))
@@ -252,8 +280,8 @@ def _chosen(headers: Sequence[Any], kinds: Sequence[tuple[str, ...]], layer: str
                 names[-1] += ", deep"
                 continue
             for kind, layers in zip(kinds, found, strict=True):
-                whole = kind != ("R",) or "G" not in channels  # red alone is no picture's
-                if whole and set(kind) <= set(channels) and layer in (None, name):
+                part_of_more = len(kind) == 1 and _COMPANIONS.get(kind[0], set()) & set(channels)
+                if set(kind) <= set(channels) and not part_of_more and layer in (None, name):
                     layers.append(_Layer(index, name, tuple(channels[base] for base in kind)))
     layers = next((layers for layers in found if layers), [])
     # R, G, B beside layers of their own are the picture.
@@ -270,9 +298,7 @@ def _chosen(headers: Sequence[Any], kinds: Sequence[tuple[str, ...]], layer: str
     header = headers[chosen.part]
     if str(header.get("envmap", "")).endswith("CUBE"):
         raise RadianceError("is a cube map: convert it to an equirectangular panorama")
-    if abs(header.get("pixelAspectRatio", 1.0) - 1.0) > 0.01:
-        ratio = header["pixelAspectRatio"]
-        raise RadianceError(f"has pixels that are not square (aspect {ratio:g}): resample it")
+    _check_aspect(header.get("pixelAspectRatio", 1.0))
     return chosen
 
 

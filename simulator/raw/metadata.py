@@ -59,7 +59,9 @@ _NAMES = (
     *("PhotographicSensitivity", "DefaultScale", "BaselineExposure", *OPCODES, "DNGVersion"),
     *("UniqueCameraModel", "CFALayout", "SampleFormat"),
 )
-_NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
+#: Of Panasonic's and Leica's RW2 and RWL: where the pixels are, how many, how they are packed.
+_PANASONIC = {0x118: "RawDataOffset", 2: "SensorWidth", 3: "SensorHeight", 0x2D: "RawFormat"}
+_NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES} | _PANASONIC
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
 _WANTED = {*_NAME_OF_CODE, _SUB_DIRECTORIES, _EXIF}
 #: 42 is TIFF; the others are the same structure under Olympus' and Panasonic's own magic.
@@ -173,6 +175,9 @@ def missing_bytes(directories: Sequence[Directory], size: int) -> int:
     """
     end = size
     for tags in directories:
+        begin, *sides, packing = (sum(numbers(tags, name)) for name in _PANASONIC.values())
+        if begin and packing != 8:  # all others have 14 pixels in 16 bytes, or less
+            end = max(end, int(begin + math.prod(sides) * 16 / 14))
         for offsets, counts in (_POSITIONS[:2], _POSITIONS[2:]):
             pairs = zip(numbers(tags, offsets), numbers(tags, counts), strict=False)
             ends = (int(a + b) for a, b in pairs if b and a != _NO_POSITION)
@@ -368,7 +373,7 @@ def read_black_level(
     tile, which begins at the corner of the ActiveArea, plus BlackLevelDeltaV of its row, plus
     BlackLevelDeltaH of its column (DNG specification 1.4). Four values without a
     BlackLevelRepeatDim are a tile of 2 x 2 (several writers of DNGs leave it out), one value is
-    that of all pixels whatever the tile.
+    that of all pixels whatever the tile, and values beyond those of the tile count for nothing.
 
     Args:
         tags: Of the directory that describes the mosaic.
@@ -380,10 +385,14 @@ def read_black_level(
         None where the file does not say, or says what cannot be.
     """
     values = numbers(tags, "BlackLevel")
-    rows, columns = tags.get("BlackLevelRepeatDim", (2, 2))[:2] if len(values) > 1 else (1, 1)
-    corner = numbers(tags, "ActiveArea")[:2] or (0, 0)
-    if len(values) != rows * columns or not values or min(values) < 0 or len(corner) != 2:
+    corner, tile = numbers(tags, "ActiveArea")[:2] or (0, 0), numbers(tags, "BlackLevelRepeatDim")
+    if len(values) == 1 or (len(values) == 4 and "BlackLevelRepeatDim" not in tags):
+        tile = (1, 1) if len(values) == 1 else (2, 2)
+    fits = len(tile) == 2 and 0 < math.prod(tile) <= len(values) and min(values) >= 0
+    if not fits or len(corner) != 2:
         return None
+    rows, columns = map(int, tile)
+    values = values[: rows * columns]
     down, right = (a - int(b) for a, b in zip(origin, corner, strict=True))
     height, width = shape
     level = np.reshape(values, (rows, columns))
@@ -393,10 +402,10 @@ def read_black_level(
         ("BlackLevelDeltaH", right, width, (None, slice(None))),
     ):
         if name in tags:
-            deltas = np.array(numbers(tags, name))[max(begin, 0) : begin + count]
-            if len(deltas) != count:
+            deltas, places = np.array(numbers(tags, name)), np.arange(begin, begin + count)
+            if len(deltas) <= places[-1]:
                 return None
-            level = level + deltas[axis]
+            level = level + deltas[places.clip(0)][axis]
     planes = [level[row::2, column::2] for row, column in cfa.offsets]
     means = [float(plane.mean()) for plane in planes]
     if all(np.ptp(plane) == 0.0 for plane in planes):

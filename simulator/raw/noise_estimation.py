@@ -30,6 +30,8 @@ _MAX_PIXELS = 1_500_000
 _CLIPPED = 0.01
 #: Texture only adds: levels above the fit by more than this are left out (relative).
 _ENVELOPE, _INLIER = 0.05, 0.15
+#: Extremes that many pixels share are clips where they are near black and white.
+_SHARED, _NEAR_BLACK, _NEAR_WHITE = 1e-3, 2e-3, 0.75
 _TINY = 1e-14
 
 
@@ -62,10 +64,11 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
     True
     """
     planes = _central_bands(check_packed("data", data).detach().cpu().numpy()).astype(np.float64)
-    white = min(1.0, float(planes.max()))
-    floor = float(planes.min())
-    if np.mean(planes == floor) < 1e-3:
-        floor = -np.inf  # the lowest value, not a clip
+    white, floor = min(1.0, float(planes.max())), float(planes.min())
+    if white < _NEAR_WHITE and np.mean(planes == white) >= _SHARED:
+        white = 1.0
+    if floor > _NEAR_BLACK or np.mean(planes == floor) < _SHARED:
+        floor = -np.inf
     found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3] * len(planes)
 
     def look(first: int, last: int) -> None:
@@ -78,8 +81,7 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
     if len(mean) < _MIN_BLOCKS:
         raise ValueError(
             f"`data` (shape {tuple(planes.shape)}, {len(mean)} unclipped blocks) must have "
-            f"at least {_MIN_BLOCKS} unclipped blocks of {_BLOCK} x {_BLOCK} to estimate the "
-            "noise; give `nlf`"
+            f"at least {_MIN_BLOCKS} unclipped blocks of {_BLOCK} x {_BLOCK} to estimate the noise"
         )
     shot, read = 0.0, 1.0
     levels = _level_sets(mean, slope)

@@ -69,6 +69,11 @@ _MEASURED = 10**6
 _FULL_LEVELS = {"canonpowershots40": 0.92}
 _LARGEST_BASELINE = 32.0  # [EV]; beyond it a file is damaged
 _DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
+_BLACK_LEVEL_RULE = (
+    "must have a BlackLevel of as many values, 0 or more, as its BlackLevelRepeatDim says (1 or 4 "
+    "without one), and a BlackLevelDelta for each column and row, but has {found} of them; "
+    "exiftool -BlackLevel=64 writes one for all"
+)
 #: What LibRaw raises; NotImplementedError is a RuntimeError.
 _LIBRAW_ERRORS = (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError)
 
@@ -115,8 +120,8 @@ def read_raw(
             levels. By default a built-in camera of the file's make and model is used in that way,
             and for any other one a profile is made from the file.
         nlf: Noise level function of this raw. By default the file's own (DNG NoiseProfile), else
-            the camera's calibration at this ISO, else a blind estimate from the pixels;
-            ``metadata["nlf_source"]`` says which.
+            the camera's calibration at this ISO, else a blind estimate from the pixels; where they
+            do not tell, that of rounding, with a warning. ``metadata["nlf_source"]`` says which.
 
     Returns:
         The raw, with ``metadata`` keys ``path`` (file name), ``make``, ``model``, ``flip``
@@ -203,7 +208,7 @@ def _read(
             *(path.name, float(packed.max()), profile.white_level),
         )
     box_factor = own.box_factor if own is not None else 1
-    noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
+    noise, source = _noise(path, packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
         profile = profile.with_nlf(known.iso, noise)
     return RawImage(
@@ -358,6 +363,7 @@ def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None
 
 
 def _noise(
+    path: Path,
     packed: np.ndarray,
     camera: CameraProfile,
     nlf: NoiseLevelFunction | None,
@@ -375,9 +381,18 @@ def _noise(
     if camera.nlf_by_iso:
         return None, f"camera calibration ({camera.name})"
     # Clipped at black, a dark raw shows no read noise; rounding alone leaves this much.
-    rounding = NoiseLevelFunction((0.0,) * 4, tuple(1.0 / (12.0 * s**2) for s in camera.span))  # type: ignore[arg-type]
-    estimate = estimate_nlf(packed).scaled(float(box_factor**2)).at_least(rounding)
-    return estimate, "blind estimate"
+    read: Any = tuple(1.0 / (12.0 * s**2) for s in camera.span)
+    rounding = NoiseLevelFunction((0.0,) * 4, read, source="rounding alone")
+    try:
+        estimate = estimate_nlf(packed)
+    except ValueError as error:
+        logger.warning(
+            "%s: its noise cannot be told, so that of rounding alone is assumed; give `nlf`, or a "
+            "calibrated `camera`, to read_raw. The reason: %s",
+            *(path.name, error),
+        )
+        return rounding, "assumed: rounding alone"
+    return estimate.scaled(float(box_factor**2)).at_least(rounding), "blind estimate"
 
 
 # -- decoding, before the camera is known --------------------------------------------------------
@@ -510,6 +525,10 @@ def _from_libraw(
     # moves an odd margin to an even one.
     margins = sizes.top_margin, sizes.left_margin
     stated = read_black_level(tags, cfa, margins, mosaic.shape)
+    if stated is None and "BlackLevel" in tags and first(directories, "DNGVersion"):
+        names = ("BlackLevel", "BlackLevelRepeatDim", "BlackLevelDeltaH", "BlackLevelDeltaV")
+        found = ", ".join(f"{len(tags[n])} in {n} {tags[n][:4]}" for n in names if n in tags)
+        raise RawFileError(_BLACK_LEVEL_RULE.format(found=found))  # LibRaw says 0
     if stated is not None:
         scale = 1.0
         if tags.get("SampleFormat") == (_FLOATING_POINT,):  # of which LibRaw makes whole numbers
@@ -616,6 +635,8 @@ def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> 
         found["iso"] = next((v[0] for v in more if v and v[0] > 0), found["iso"])
     known = {k: float(v) for k, v in found.items() if math.isfinite(v) and v > 0}
     marks_stops = bool(_STOP_MARKING.intersection(make.lower().split()[:1]))
+    model = str((first(directories, "Model") or ("",))[0])
+    marks_stops &= not model.lower().startswith(("sm-", "galaxy"))  # phones of one of them
     for recorded in first_numbers(directories, "ExposureTime"):
         marks_stops &= getattr(recorded, "denominator", 1) < _MEASURED
     if marks_stops and "exposure_time" in known:

@@ -101,7 +101,8 @@ class PackedCapture:
         """
         try:
             red, green_1, blue, green_2 = np.load(self.file, mmap_mode="r", allow_pickle=False)
-            if claim := refuse_bomb(*red.shape, red.nbytes):
+            height, width = red.shape
+            if claim := refuse_bomb(height, width, red.nbytes):
                 raise ValueError(claim)
             planes = torch.from_numpy(np.stack([red, green_1, green_2, blue]))
         except (ValueError, TypeError, EOFError) as error:

@@ -25,11 +25,8 @@ from simulator import CameraSettings, RawImage, get_camera, write_dng
 def test_every_listed_name_makes_a_policy(context):
     assert all(getattr(agents, name).__doc__ for name in agents.__all__)
     names = policy_names.list_policies()
-    assert (
-        len(names)
-        == len(set(names))
-        == 8 + len(policy_names.METERS) * len(policy_names.PROGRAMS) + 4
-    )  # and rpi_agc
+    meters = len(policy_names.METERS) * len(policy_names.PROGRAMS) + 4  # and rpi_agc
+    assert len(names) == len(set(names)) == 8 + meters
     learnt = {"ppo", "regression", "ppo:video", "regression:video"}
     assert learnt < set(names)
     for name in set(names) - learnt:  # they come at one resolution, below

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from agents.applications.refocus import read_depth
+from simulator.radiance import reading
 from simulator.radiance.reading import read_radiance
 
 OpenEXR = pytest.importorskip("OpenEXR")
@@ -47,11 +48,19 @@ def test_the_part_and_layer_with_the_colours_is_the_picture(tmp_path):
     with pytest.raises(ValueError, match="`depth`"):  # red is no distance
         read_depth(write(path, part("beauty", channels())))
     # Blender's names, small letters, and layers beside R, G, B.
-    blender = channels(layer="ViewLayer.Combined.") | {"ViewLayer.Depth.Z": DISTANCE}
+    normals = {f"ViewLayer.Normal.{name}": GREY for name in "XYZ"}
+    blender = channels(layer="ViewLayer.Combined.") | {"ViewLayer.Depth.Z": DISTANCE} | normals
     assert_image(read_radiance(write(path, part("a", blender))))
-    assert (read_depth(path, layer="ViewLayer.Depth") == 3.0).all()
+    assert all((read_depth(path, layer=n) == 3.0).all() for n in (None, "ViewLayer.Depth"))
     small = {name.lower(): plane for name, plane in channels().items()}
     assert_image(read_radiance(write(path, part("a", small))))
+    small = {name.lower(): plane for name, plane in channels(IMAGE + 1).items()}
+    assert_image(read_radiance(write(path, part("a", channels() | small))))
+    for planes in (normals, dict.fromkeys("UV", GREY), dict.fromkeys(("Y", "RY", "BY"), GREY)):
+        with pytest.raises(ValueError, match="must have"):  # neither light nor depth
+            read_depth(write(path, part("n", planes), part("beauty", channels())))
+        with pytest.raises(ValueError, match=r"must have|states primaries"):
+            read_radiance(write(path, part("n", planes, chromaticities=(float("nan"),) * 8)))
     assert_image(read_radiance(write(path, part("a", channels() | channels(IMAGE + 1, "left.")))))
 
 
@@ -66,6 +75,19 @@ def test_colours_are_converted_by_the_chromaticities_of_the_file(tmp_path):
     for head in ("FORMAT=32-bit_rle_xyze", "PRIMARIES=1 0 0 1 0 0 .333333 .333333"):
         (tmp_path / "a.hdr").write_bytes(f"#?RADIANCE\n{head}\n\n-Y 6 +X 10\n".encode() + pixels)
         assert_image(read_radiance(tmp_path / "a.hdr"), atol=0.06)  # 8 bits of mantissa
+
+
+def test_luminance_and_chroma(tmp_path):
+    """R = (RY + 1) Y, B = (BY + 1) Y, and Y = 0.2126 R + 0.7152 G + 0.0722 B (OpenEXR, BT.709)."""
+    rise, luminance = np.add.outer(np.arange(6.0), np.arange(10.0)), IMAGE[..., 1].copy()
+    red, blue = (rise / 50.0).astype(np.float32), (rise / -40.0).astype(np.float32)
+    path = write(tmp_path / "a.exr", part("a", {"Y": luminance, "RY": red, "BY": blue}))
+    r, b = (1 + red) * luminance, (1 + blue) * luminance
+    expected = np.dstack([r, (luminance - 0.2126 * r - 0.0722 * b) / 0.7152, b])
+    assert_image(read_radiance(path), expected, rtol=1e-3)
+    # OpenEXR writes no channels of fewer pixels from Python.
+    found = reading._interpolated(red[::2, ::2], (6, 10))
+    np.testing.assert_allclose(found[:5, :9], red[:5, :9], rtol=1e-5)
 
 
 def rgbe(image):
@@ -102,7 +124,7 @@ def test_radiance_files_of_every_orientation_and_header(tmp_path):
         path.write_bytes(head.encode() + rgbe(stored))
         assert_image(read_radiance(path), atol=0.02)
     # No FORMAT; CRLF; primaries that some programs write.
-    zeros = f"#?RADIANCE\nPRIMARIES={' 0' * 8}\n\n-Y 6 +X 10\n"
+    zeros = f"#?RADIANCE\nPIXASPECT=.999998\nPRIMARIES={' 0' * 8}\n\n-Y 6 +X 10\n"
     for head in ("#?RGBE\n\n-Y 6 +X 10\n", "#?RADIANCE\r\n\r\n-Y 6 +X 10\r\n", zeros):
         path.write_bytes(head.encode() + rgbe(IMAGE))
         assert_image(read_radiance(path), atol=0.02)

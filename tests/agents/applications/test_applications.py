@@ -108,7 +108,7 @@ def test_bad_arguments(arguments, named: str) -> None:
         refocus(raw, **given)
 
 
-def test_millimetres_with_a_hole_disparity_and_an_exr(tmp_path) -> None:
+def test_millimetres_with_a_hole_and_disparity(tmp_path) -> None:
     millimetres = np.array([[500, 1000, 0], [2000, 4000, 65535]], np.uint16)
     Image.fromarray(millimetres).save(tmp_path / "depth.png")
     depth = read_depth(tmp_path / "depth.png")
@@ -121,11 +121,6 @@ def test_millimetres_with_a_hole_disparity_and_an_exr(tmp_path) -> None:
     assert depth[0, 0] == np.inf
     np.testing.assert_allclose([depth[0, 1], depth[1, 0]], [2.0, 1.0])
     assert depth[1, 1] in (1.0, 2.0)
-    openexr = pytest.importorskip("OpenEXR")
-    values = np.array([[1.5, 2.5]], np.float32)
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    openexr.File(header, {"Z": values}).write(str(tmp_path / "z.exr"))
-    np.testing.assert_array_equal(read_depth(tmp_path / "z.exr"), values)
 
 
 def test_bad_maps(tmp_path) -> None:

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -122,22 +123,23 @@ def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):
     first = camera.decide(None, state)
     assert (first.state, first.held) == (state, True)  # its own state, before the first choice
     good = camera.decide(planes, state)
-    for frame, readings in (
-        *((None, {}), (bad, {}), (planes, {"image_speed": nan})),
-        *((planes, {"defocus": np.inf}), (planes, {"image_speed": -np.nan})),
-    ):
+    for frame, readings in ((None, {}), (bad, {}), (planes, {"defocus": np.inf})):
         held = camera.decide(frame, camera.states[5], **readings)
         assert (held.state, held.held, bool(held.reason)) == (good.state, True, True)
     fresh = Controller(exported[1])
     assert fresh.decide(planes, state) == good
     darker = 0.25 * planes
     assert camera.decide(darker, state) == fresh.decide(darker, state)
-    two, codes = Controller(exported[1], 2), camera.encode_frame(planes)
-    shown = np.stack([codes] * 2), np.stack([camera.encode_settings(state)] * 2)
-    chosen = two.act(*shown, np.array([[0.1, 0.1], [nan, 0.1]], np.float32))
-    assert (chosen[1], [bool(reason) for reason in two.reasons]) == (37, [False, True])
-    again = two.act(*shown, np.full((2, 2), 0.1, np.float32))
-    assert again[0] == again[1] == chosen[0]
+    frames = (planes, None, bad, planes - 0.4, planes, planes)  # black subtracted twice: 3
+    several, settings = Controller(exported[1], 6), np.stack([camera.encode_settings(state)] * 6)
+    read = [camera.encode_sensors(*pair) for pair in ((1, 1), *[(0.1, 1)] * 3, (nan, 1), (1, nan))]
+    raw, readings = np.stack([camera.encode_frame(frame) for frame in frames]), np.stack(read)
+    chosen = several.act(raw, settings, readings)
+    assert chosen[1:].tolist() == [37] * 5
+    reasons = r";no.*;.*finite;.*black;.*speed.*;.*defocus.*"
+    assert re.fullmatch(reasons, ";".join(several.reasons))
+    again = several.act(np.stack([raw[0]] * 6).astype(np.uint8), settings, readings[[0] * 6])
+    assert again.tolist() == [chosen[0]] * 6
 
 
 def test_a_damaged_card_is_named(exported, tmp_path):
@@ -145,44 +147,49 @@ def test_a_damaged_card_is_named(exported, tmp_path):
     model = onnx.load(str(exported[1]))
     (entry,) = (entry for entry in model.metadata_props if entry.key == "ae_env")
     whole = json.loads(entry.value)
+    kind = {"ppo": "regression", "regression": "ppo"}[whole["kind"]]
+    (*settings, last), sensors = whole["ranges"]["settings"], whole["ranges"]["sensors"]
     for name, value in (
-        *(("states", [[100, 0, 4]]), ("states", whole["states"][1:]), ("format", 2)),
-        *(("frame_shape", [4, 32, 32]), ("kind", "dqn"), ("same_light_ev", "NaN"), ("more", 1)),
+        *(("states", [[100, 0, 4]]), ("states", whole["states"][1:]), ("format", 2), ("more", 1)),
+        *(("frame_shape", [4, 32, 32]), ("kind", "dqn"), ("kind", kind), ("same_light_ev", "NaN")),
+        *(("states", whole["states"][:1] * len(whole["states"])), ("sensors", False)),
+        *(("pedestal", "0.001"), ("ranges", {}), ("ranges", {"settings": [*settings, last]})),
+        *(("ranges", {"settings": v, "sensors": sensors}) for v in (settings, [*settings, [4, 4]])),
+        ("ranges", {"settings": [*settings, last[::-1]], "sensors": sensors}),
     ):
         entry.value = json.dumps({**whole, name: value})
         onnx.save(model, str(tmp_path / "x.onnx"))
-        with pytest.raises(ValueError, match=r"`path` .* damaged"):
+        with pytest.raises(ValueError, match=rf"`path` .* damaged: .*{name}"):
             Controller(tmp_path / "x.onnx")
 
 
 def test_what_cannot_be_exported_or_loaded_is_named(exported, context, tmp_path):
-    file = tmp_path / "x.onnx"
-    for name in ("matrix:P", "regression?foresight=trend"):
-        with pytest.raises(ValueError, match="`policy`"):
-            export_agent(make_policy(name, context), file)
-    with pytest.raises(ValueError, match="`out`"):
-        export_agent(make_policy("ppo", context), tmp_path / "x")
-    assert not file.exists()
-    broken = tmp_path / "broken.onnx"
+    controller, file, broken = Controller(exported[1]), tmp_path / "x.onnx", tmp_path / "y.onnx"
     broken.write_bytes(b"no model")
-    for path in (broken, file):
-        with pytest.raises(ValueError, match="`path`"):
-            Controller(path)
-    controller = Controller(exported[1])
-    frame, signal = np.zeros((1, 4, 64, 64), np.uint8), np.zeros((4, 64, 64))
-    ready = frame, np.zeros((1, 3)), np.zeros((1, 2))
-    for named, method, arguments in (
-        ("sensors", controller.act, (frame, np.zeros((1, 3)))),
-        ("raw", controller.act, (frame[[0, 0]], np.zeros((1, 3)), np.zeros((1, 2)))),
-        ("raw", controller.act, (frame.astype(np.int64), np.zeros((1, 3)), np.zeros((1, 2)))),
-        ("settings", controller.act, (frame, np.full((1, 3), np.nan), np.zeros((1, 2)))),
-        ("action_masks", controller.act, (*ready, np.zeros((1, 64), bool))),
-        ("action_masks", controller.act, (*ready, np.ones((1, 64)))),
-        ("planes", controller.decide, (np.zeros((4, 8, 8)), controller.states[0])),
-        ("planes", controller.decide, (np.zeros((4, 64, 64), np.uint16), controller.states[0])),
-        ("planes", controller.decide, (np.full((4, 64, 64), 4095.0), controller.states[0])),
-        ("current.exposure_time", controller.decide, (signal, ExposureState(100, 0.0, 4))),
-        ("current.iso", controller.decide, (signal, ExposureState(np.inf, 1.0, 4))),
+    frame, signal, nan = np.zeros((1, 4, 64, 64), np.uint8), np.zeros((4, 64, 64)), float("nan")
+    ready, state = (frame, np.zeros((1, 3)), np.zeros((1, 2))), controller.states[0]
+    act, decide = controller.act, controller.decide
+    sensed = functools.partial(decide, signal, state)
+    wrong = signal[:, :8], signal.astype(np.uint16), signal - 4000, signal + 14, [[0], 0]
+    raws = frame[[0, 0]], frame.astype(int), frame + 0.0, frame.astype(object) + 0.5
+    for named, call in (
+        *(("path", lambda v=v: Controller(v)) for v in (broken, file)),
+        ("policy", lambda: export_agent(make_policy("matrix:P", context), file)),
+        ("policy", lambda: export_agent(make_policy("regression?foresight=trend", context), file)),
+        ("out", lambda: export_agent(exported[0], tmp_path / "x")),
+        *(("sensors", lambda v=v: act(*ready[:2], v)) for v in (None, ready[2] + 5, [["x"] * 2])),
+        *(("raw", lambda v=v: act(v, *ready[1:])) for v in raws),
+        *(("settings", lambda v=v: act(frame, v, ready[2])) for v in (ready[1] * nan, "x")),
+        *(("action_masks", lambda v=v: act(*ready, np.full((1, 64), v))) for v in (False, 1.0)),
+        *(("num_cameras", lambda v=v: Controller(exported[1], v)) for v in (0, 1.5)),
+        *(("image_speed", lambda v=v: sensed(image_speed=v)) for v in (None, "x", -1.0)),
+        ("defocus", lambda: controller.encode_sensors(1.0, -np.inf)),
+        *(("current", lambda v=v: decide(signal, v)) for v in (None, (400, 0.01))),
+        *(("current.exposure_time", lambda v=v: decide(signal, (100, v, 4))) for v in (0, "1/125")),
+        *(("state.iso", lambda v=v: controller.encode_settings((v, 1, 4))) for v in (0, np.inf)),
+        *(("planes", lambda v=v: decide(v, state)) for v in wrong),
+        *(("planes", lambda v=v: controller.encode_frame(v)) for v in wrong),
     ):
         with pytest.raises(ValueError, match=f"`{named}`"):
-            method(*arguments)
+            call()
+    assert not file.exists()
