@@ -146,7 +146,6 @@ print("loaded", *sys.modules)
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "nan"), "`shutter` (=nan)"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`source-aperture` (=-2"),
         (("film", "--scenes", "mixed", "--source-iso", 100), "`source-iso` (=100.0) is about"),
         ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
@@ -164,21 +163,17 @@ print("loaded", *sys.modules)
         (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
         (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
-        (("evaluate", "--preset", "standrad"), "did you mean 'standard'"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--preset", "quick", "--append", "x.csv"), "`append` (='x.csv')"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
         (("evaluate", *V1, "--on-error", "skip"), "give that, too"),
         (("evaluate", "--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop'"),
-        (("evaluate", "--scenes", "polyhaven", "--on-error", "skip"), "files of a folder"),
-        (("evaluate", *V1, "--append", "."), "must be a file, but it is a folder"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`aperture` (=8)"),
         ((*OPEN, "--depth", "small.png", "--png", "small.png"), "`png`"),
         ((*OPEN, "--depth-kind", "disparity"), "`depth-kind`"),
         ((*OPEN, *SMALL, "--focal-length", "-3"), "`focal-length` (=-3"),
         ((*OPEN, *SMALL[:2]), "`focal-length` (=None)"),
         ((*OPEN, *FITS, "--focus", "0.001"), "`focus` (=0.001)"),
-        ((*OPEN, *SMALL, "--focus", "far"), "`focus` (='far') must be metres"),
         (("refocus", "nameless.dng", *OPEN[2:], *FITS), "`--pixel-pitch`"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else "",
@@ -217,7 +212,6 @@ def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
     [
         (OSError(28, "No space left on device"), 1, "error [Errno 28] No space left on device\n"),
         (RuntimeError("out of\nmemory"), 1, "error RuntimeError: out of memory; `ae-env --debug`"),
-        (FileNotFoundError(2, "No such file", "a.dng"), 2, "No such file: 'a.dng'\n"),
         (KeyboardInterrupt(), 130, "stopped\n"),  # a simulation restarts
     ],
 )
@@ -258,7 +252,6 @@ def test_all_scorers_are_listed(ae_env) -> None:
     code, out, _ = ae_env("scorers")
     assert {*list_scorers()} <= {line.split()[0] for line in out.splitlines() if line.strip()}
     assert (code, "Needs extra cv" in out) == (0, True)
-    assert "AE_ENV_NIMA_AESTHETIC" in out
 
 
 def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:
