@@ -6,6 +6,7 @@ import importlib
 import os
 import re
 import shutil
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
@@ -26,19 +27,13 @@ _ID = re.compile(r"([\w-][\w/-]*[\w-]/)?[\w-]+-v\d+")
 
 
 def check_dataset_id(dataset_id: str) -> None:
-    """Checks the name of a dataset that is to be written, and that the extra is installed."""
-    rule = None
-    try:
-        if not _ID.fullmatch(dataset_id):
-            rule = "must be a name of letters, digits, - and _, after a namespace of two or more "
-            rule += "or none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
-        elif dataset_id in _minari().list_local_datasets():
-            rule = "is there already: take a higher version, or remove it with "
-            rule += f"`minari delete {dataset_id}`"
-    except OSError as error:
-        rule = f"cannot be written to Minari's folder: {error}"
-    if rule is not None:
+    """Checks that a dataset of this name can be written, and that the extra is installed."""
+    if not _ID.fullmatch(dataset_id):
+        rule = "must be a name of letters, digits, - and _, after a namespace of two or more or "
+        rule += "none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
         raise ValueError(f"`out` (={dataset_id!r}) {rule}")
+    with _reserved(dataset_id):
+        pass
 
 
 def record_dataset(
@@ -73,24 +68,25 @@ def record_dataset(
     """
     check_dataset_id(dataset_id)
     minari, report = _minari(), progress or (lambda *_: None)
-    root = Path(minari.storage.get_dataset_path(""))
     oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
     with (
         closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
-        _reserved(root, dataset_id) as folder,
+        _reserved(dataset_id) as folder,
     ):
 
         def recorded() -> Iterator[Any]:
             for i in range(episodes):
                 report(i, episodes)
                 content = _record_episode(env, policy, name, seed + i)
+                _check_room(folder, content)
                 yield minari.data_collector.EpisodeBuffer(id=i, **content)
             report(episodes, episodes)
 
         with _datasets_in(folder):
-            minari.create_dataset_from_buffers(
+            found = recorded()
+            dataset = minari.create_dataset_from_buffers(
                 dataset_id,
-                recorded(),
+                [next(found)],
                 env=env,
                 algorithm_name=name,
                 description=f"{episodes} episodes of {name} in {task}, seeds from {seed}",
@@ -98,19 +94,22 @@ def record_dataset(
                 data_format="hdf5",
                 jpeg_encoding=False,
             )
+            for one in found:  # each is on disk before there must be room for the next
+                dataset.storage.update_episodes([one])
         namespace = dataset_id.rpartition("/")[0]
         if namespace and namespace not in minari.namespace.list_local_namespaces():
             minari.namespace.create_namespace(namespace)
-        (folder / dataset_id).rename(root / dataset_id)
+        (folder / dataset_id).rename(folder.parent / dataset_id)
     return minari.load_dataset(dataset_id)
 
 
 @contextmanager
-def _reserved(root: Path, dataset_id: str) -> Iterator[Path]:
-    """An empty folder below `root` for a dataset that no other process may record meanwhile.
+def _reserved(dataset_id: str) -> Iterator[Path]:
+    """An empty folder in Minari's, for a dataset that nobody has recorded or may meanwhile.
 
     Folders that processes left which have died are removed.
     """
+    minari, root = _minari(), os.environ.get(_ROOT, "Minari's folder")
 
     @contextmanager
     def emptied(folder: Path) -> Iterator[None]:
@@ -123,7 +122,10 @@ def _reserved(root: Path, dataset_id: str) -> Iterator[Path]:
                 Path(f"{folder}.lock").unlink(missing_ok=True)
 
     try:
-        root.mkdir(parents=True, exist_ok=True)
+        root = minari.storage.get_dataset_path("").resolve()  # Minari fails in a relative one
+        if dataset_id in minari.list_local_datasets() or (root / dataset_id).exists():
+            rule = f"take a higher version, or remove it with `minari delete {dataset_id}`"
+            raise ValueError(f"`out` (={dataset_id!r}) is there already: {rule}")
         for left in filter(Path.is_dir, root.glob(".unfinished-*")):
             with suppress(Timeout), emptied(left):
                 pass
@@ -137,6 +139,13 @@ def _reserved(root: Path, dataset_id: str) -> Iterator[Path]:
     except OSError as error:
         reason = f"`out` (={dataset_id!r}) cannot be written to {root}: {error.strerror or error}"
         raise OSError(error.errno, reason) from error
+
+
+def _check_room(folder: Path, content: Mapping[str, Any]) -> None:
+    """Raises an `OSError` where an episode has no room in `folder`: HDF5 crashes on a full disk."""
+    size = sum(np.asarray(value).nbytes for value in content["observations"].values())
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(2 * size + 2**20))  # chunks that are not full, and what describes them
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import json
 import os
 import socket
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,13 +22,13 @@ from safetensors.torch import save
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.folder import find_files
+from ae_env.scenes.folder import find_files, is_raw
 from ae_env.scenes.load import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import prepare_scene
 from ae_env.scorers.score_table import ScoreTables
 from simulator import get_camera
-from simulator.utils.files import write_atomically
+from simulator.utils.files import printable, write_atomically
 
 #: What is known of a run besides its shards.
 PLAN = "plan.json"
@@ -41,7 +41,8 @@ class ShardPlan:
 
     `files` are raws and radiance maps as the workers find them, `names` those in the tables; `out`
     is a folder that all workers reach. Scenes are averaged to `resolution` packed pixels a side;
-    `camera` photographs radiance maps, a raw has its own; `seed` is that of the captures' noise.
+    `camera` photographs radiance maps, a raw has its own, and its own settings but for `settings`;
+    `seed` is that of the captures' noise.
     """
 
     files: tuple[str, ...]
@@ -55,12 +56,13 @@ class ShardPlan:
     weights: str = "compact"
     captures: bool = False
     seed: int = 0
+    settings: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, what: str, out: Path, **options: Any) -> ShardPlan:
         """The plan for a file, folder or glob of raws and radiance maps."""
         base, files = find_files(what)
-        names = [str(f.relative_to(base)) if f != base else f.name for f in files]
+        names = [printable(str(f.relative_to(base)) if f != base else f.name) for f in files]
         paths = tuple(str(file.resolve()) for file in files)
         return cls(paths, tuple(names), str(out.resolve()), **options)
 
@@ -112,7 +114,8 @@ class ShardWriter:
         own = slice(shard * plan.per_shard, (shard + 1) * plan.per_shard)
         for path, name in zip(plan.files[own], plan.names[own], strict=True):
             try:
-                found = load_scenes(path, "all", camera=self._camera, resolution=plan.resolution)
+                spec = {"path": path, "settings": plan.settings} if is_raw(path) else path
+                found = load_scenes(spec, "all", camera=self._camera, resolution=plan.resolution)
                 if self._networks is not None:
                     found = [self._networks.denoised(scene) for scene in found]
             except (ValueError, OSError) as error:
@@ -137,6 +140,7 @@ class ShardWriter:
             "shard": shard,
             "scenes": scenes,
             "bad": len(bad),
+            "reason": f"{bad[0]['file']}: {bad[0]['error']}" if bad else "",
             "seconds": perf_counter() - begun,
             "node": socket.gethostname(),
             "process": os.getpid(),

@@ -34,7 +34,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, read_bounded
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, printable, read_bounded
 
 logger = logging.getLogger(__name__)
 
@@ -100,9 +100,9 @@ class FolderOptions:
             lux = lux.get(path.name)
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
         given |= {"illuminance": lux}
-        if not _is_raw(path):
-            has_layers = path.suffix.lower() == ".exr"
-            given |= {"ev100": self.ev100, "layer": self.layer if has_layers else None}
+        if not is_raw(path):
+            layer = self.layer if path.suffix.lower() == ".exr" else None
+            given |= {"ev100": self.ev100, "layer": layer}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -123,7 +123,7 @@ def folder_scenes(
     groups = {path: named.get(path.resolve()) for path in files}
     for path in files:
         if groups[path] is None and path.parent != base:
-            groups[path] = path.parent.relative_to(base).as_posix()
+            groups[path] = printable(path.parent.relative_to(base).as_posix())
     return _read_files(spec, base, groups, options, request, hint=_HOW_TO_SKIP)
 
 
@@ -147,7 +147,7 @@ def sequence_scenes(
             "would come a frame too early; cut the recording there, into two folders"
         )
     base, found = find_files(spec)
-    raws = [path for path in found if _is_raw(path)]
+    raws = [path for path in found if is_raw(path)]
     folders = list(dict.fromkeys(path.parent for path in raws))
     if not folders:
         raise ValueError(
@@ -155,8 +155,8 @@ def sequence_scenes(
             "maps have no settings of their own"
         )
     _check_training_groups(spec, request.split, len(folders))
-    names = {folder: folder.relative_to(base).as_posix() for folder in folders}
-    own = base.resolve().name
+    names = {folder: printable(folder.relative_to(base).as_posix()) for folder in folders}
+    own = printable(base.resolve().name)
     if base in names and own and own not in names.values():
         names[base] = own  # else "."
     groups = {raw: names[raw.parent] for raw in sorted(raws, key=lambda p: folders.index(p.parent))}
@@ -223,8 +223,9 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
 
 
-def _is_raw(path: Path) -> bool:
-    return path.suffix.lower() in RAW_SUFFIXES
+def is_raw(path: str | Path) -> bool:
+    """Whether a file is a raw by the ending of its name."""
+    return Path(path).suffix.lower() in RAW_SUFFIXES
 
 
 def _read_files(
@@ -241,6 +242,13 @@ def _read_files(
     `groups` has the source group of each; None for the file itself, or shots that belong to it.
     `hint` ends the error of a file that cannot be read, where there are others.
     """
+    endings = {path.suffix.lower() for path in groups}
+    kinds = {"settings": RAW_SUFFIXES, "layer": (".exr",), "ev100": RADIANCE_SUFFIXES}
+    for name, known in kinds.items():
+        value = getattr(options, name)
+        if value not in (None, {}) and endings.isdisjoint(known):
+            rule = f"is for files that end in {', '.join(known[:8])}: {str(spec)!r} has none"
+            raise ValueError(f"`{name}` (={value!r}) {rule}")
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}  # of raws without a group
     skipped: list[str] = []
@@ -252,7 +260,7 @@ def _read_files(
         for path, group in groups.items():
             place = places[path]
             unique = times[place.with_suffix("")] == 1
-            name = (place.with_suffix("") if unique else place).as_posix()
+            name = printable((place.with_suffix("") if unique else place).as_posix())
             try:
                 scenes += _read_file(path, name, group, options, request, shots)
             except (ValueError, OSError) as error:  # it may also have vanished since it was listed
@@ -283,16 +291,16 @@ def _read_file(
 ) -> list[Scene]:
     """The scenes of a file; the `Shot` of a raw without a group goes into `shots`."""
     fields = options.fields(path)
-    if _is_raw(path):
+    if is_raw(path):
         raw = read_raw(path, settings=options.settings)
-        source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
+        source = f"{printable(path.name)}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
         scene = Scene.from_raw(raw, scene_id=name, group=group or name, source=source, **fields)
         scenes = [request.sized(scene)]
     else:
         scenes = list(radiance_scenes(path, request, name=name, group=group or name, **fields))
     for scene in scenes:
         _ = scene.ev100  # raises where a frame is black and its light unknown
-    if _is_raw(path) and group is None:
+    if is_raw(path) and group is None:
         shots[name] = describe(raw)
     return scenes
 
@@ -315,7 +323,7 @@ def radiance_scenes(
     relative brightness. `name` begins the scene ids; `layer` is as of `read_radiance`,
     `fields` are further arguments of `Scene.from_radiance`.
     """
-    file = Path(path).name
+    file = printable(Path(path).name)
     image = read_radiance(path, layer=layer)
     if "illuminance" not in fields:
         image = near_one(image)

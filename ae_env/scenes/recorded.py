@@ -37,7 +37,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import marks_stops, read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
 from simulator.utils.checks import check_key, check_number
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, open_picture
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, open_picture, printable
 
 logger = logging.getLogger(__name__)
 
@@ -326,7 +326,7 @@ def _recorded(
     known: Mapping[str, float],
 ) -> RecordedFile:
     """`path` with its settings, and with what is left of its name once those are taken out."""
-    parts = [*path.relative_to(folder).parts[:-1], path.stem]
+    parts = [printable(p) for p in (*path.relative_to(folder).parts[:-1], path.stem)]
     settings: dict[str, float] = {}
     left: list[str] = []
     last = -1  # part that states a setting
@@ -358,7 +358,7 @@ def _recorded(
         ) from None
     except ValueError as error:
         raise ValueError(f"recorded file {str(path)!r}: {error}") from error
-    names = [name for name in left if name] or [folder.resolve().name]
+    names = [name for name in left if name] or [printable(folder.resolve().name)]
     subject = [name for name in left[last + 1 :] if name] or names
     frames = [match for name in names if (match := _FRAME.fullmatch(name))]
     still = "/".join(name for name in names if not _FRAME.fullmatch(name))
@@ -367,7 +367,7 @@ def _recorded(
         settings=taken_at,
         scene="/".join(names),
         group="/".join(name for name in subject if not _FRAME.fullmatch(name)) or still,
-        sequence=(still or folder.resolve().name) if frames else "",
+        sequence=(still or printable(folder.resolve().name)) if frames else "",
         frame=int(frames[-1][1]) if frames else 0,
     )
 

@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from simulator.utils.checks import did_you_mean
+from simulator.utils.files import printable
 
 #: In an installed package a folder of this one, in a clone the one beside the packages.
 _FOLDERS = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "configs")
@@ -106,7 +107,7 @@ def _module(path: str, file: Path, argument: str) -> ModuleType:
         content = file.read_bytes()
     except OSError as error:
         raise ValueError(f"{argument}: {path} cannot be read: {error.strerror}") from error
-    name = f"ae_env_user_{file.stem}_{sha256(str(file).encode()).hexdigest()[:12]}"
+    name = f"ae_env_user_{file.stem}_{sha256(printable(str(file)).encode()).hexdigest()[:12]}"
     digest = sha256(content).hexdigest()
     known = sys.modules.get(name)
     if known is not None and vars(known).get("_ae_env_content") == digest:

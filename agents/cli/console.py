@@ -5,17 +5,21 @@ Help must come at once: no module of a command imports anything heavy, see `main
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
 from typer import Argument, Option
+
+from simulator.utils.files import printable
 
 terminal = Console()
 
@@ -38,9 +42,15 @@ Raw = Annotated[Path, Argument(help="Any Bayer raw that LibRaw reads.")]
 Folder = Annotated[Path, Option(help="Folder for the results.")]
 OutDng = Annotated[Path, Option("--out", "-o", help="DNG to write.")]
 Png = Annotated[Path | None, Option(help="Also write the developed picture here.")]
-SourceIso = Annotated[float | None, Option(help="ISO speed of RAW, instead of what the file says.")]
-SourceShutter = Annotated[str | None, Option(help="Exposure time of RAW [s], likewise.")]
-SourceAperture = Annotated[str | None, Option(help="F-number of RAW, likewise.")]
+_SOURCE = {
+    "source_iso": Annotated[
+        float | None, Option(help="ISO speed of the raws, instead of what the files say.")
+    ],
+    "source_shutter": Annotated[str | None, Option(help="Their exposure time [s], likewise.")],
+    "source_aperture": Annotated[str | None, Option(help="Their f-number, likewise.")],
+}
+#: Options of `takes_source` by the setting that each is.
+SOURCE = {"iso": "source-iso", "exposure_time": "source-shutter", "f_number": "source-aperture"}
 Weights = Annotated[
     str,
     Option(
@@ -107,7 +117,7 @@ def progress_bars() -> Iterator[Any]:
 
 def print_line(text: str) -> None:
     """Prints a line as it is: names in it are no markup, and it is not wrapped."""
-    terminal.print(text, highlight=False, soft_wrap=True, markup=False)
+    terminal.print(printable(text), highlight=False, soft_wrap=True, markup=False)
 
 
 def print_files(files: Mapping[str, Path]) -> None:
@@ -149,6 +159,32 @@ def trust_configuration(trust: bool) -> None:
         os.environ[TRUST_VARIABLE] = "all"
 
 
+def takes_source(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command the options `SOURCE`; its argument `source` has those that were given."""
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        iso, shutter, f_number = (given.pop(name) for name in _SOURCE)
+        source = {} if iso is None else {"iso": iso}
+        if shutter is not None:
+            source["exposure_time"] = parse_seconds(shutter, "source-shutter")
+        if f_number is not None:
+            source["f_number"] = parse_f_number(f_number, "source-aperture")
+        if source:
+            from simulator.raw.read import check_settings
+
+            with option_names(**SOURCE):
+                check_settings(source)
+        command(**given, source=source)
+
+    signature = inspect.signature(command, eval_str=True)
+    own = [p for p in signature.parameters.values() if p.name != "source"]
+    kind = inspect.Parameter.KEYWORD_ONLY
+    own += [inspect.Parameter(k, kind, default=None, annotation=a) for k, a in _SOURCE.items()]
+    run.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
+    return run
+
+
 @contextmanager
 def option_names(**options: str) -> Iterator[None]:
     """Errors within name the option that the user typed, by the argument that it became."""
@@ -161,10 +197,13 @@ def option_names(**options: str) -> Iterator[None]:
         raise ValueError(text) from error
 
 
-def scene_files(scenes: Any, on_error: str) -> Any:
-    """The environment's `scenes` for the options `--scenes` and `--on-error`."""
-    if on_error == "stop":
+def scene_files(scenes: Any, on_error: str, source: Mapping[str, float]) -> Any:
+    """The environment's `scenes` for `--scenes`, `--on-error` and the options of a `source`."""
+    if on_error == "stop" and not source:
         return scenes
+    options: dict[str, Any] = {SOURCE[setting]: value for setting, value in source.items()}
+    options |= {} if on_error == "stop" else {"on-error": on_error}
+    name, value = options.popitem()
     from ae_env.scenes.load import NAMED
     from ae_env.scenes.recorded import RecordedOptions
 
@@ -172,13 +211,16 @@ def scene_files(scenes: Any, on_error: str) -> Any:
     if scenes is None:
         rule = "is about the files of --scenes: give that, too"
     elif scenes in NAMED:
-        rule = f"is about the files of a folder: {scenes!r} has none that could be left out"
+        rule = f"is about the files of a folder: {scenes!r} has none"
+    elif RecordedOptions.of(scenes) is not None and source:
+        rule = "is for raws that are simulated from: recorded grids take 'recorded:FOLDER?iso=100'"
     elif RecordedOptions.of(scenes) is not None:
         rule = "must be 'stop' for recorded grids: take captures that cannot be read out of the "
         rule += "folder, and their states are forbidden"
     if rule is not None:
-        raise ValueError(f"`on-error` (={on_error!r}) {rule}")
-    return {"path": scenes, "on_error": on_error}
+        raise ValueError(f"`{name}` (={value!r}) {rule}")
+    found = {"path": scenes, "on_error": on_error}
+    return {**found, "settings": source} if source else found
 
 
 def make_folder(

@@ -61,6 +61,7 @@ def download(
     print_line("try next: ae-env quickstart --scenes polyhaven --out real_scenes")
 
 
+@console.takes_source
 def record(
     policy: Annotated[str, Option(help="The policy that acts.")],
     out: Annotated[str, Option("--out", "-o", help="Name, such as ae_env/matrix-v0.")],
@@ -73,6 +74,7 @@ def record(
     episodes: Annotated[int, Option(help="How many.", min=1, max=1_000_000)] = 200,
     seed: console.Seed = 0,
     trust: console.Trust = False,
+    source: Any = None,
 ) -> None:
     """Record episodes of a policy as a Minari dataset.
 
@@ -95,7 +97,7 @@ def record(
     check_dataset_id(out)
     check_policy(policy)
     options: dict[str, Any] = {"split": "train"} | ({} if env is None else load_preset(env))
-    given = {"split": split, "scenes": scenes}
+    given = {"split": split, "scenes": console.scene_files(scenes, "stop", source)}
     options |= {name: value for name, value in given.items() if value is not None}
     task = f"ae_env/{task}"
     with closing(gym.make_vec(f"ae_env:{task}", num_envs=1, **options)) as envs:
@@ -127,6 +129,7 @@ TakesNoiseOut = Annotated[
 ]
 
 
+@console.takes_source
 def score_tables(
     what: Annotated[
         str, Argument(help="A folder or glob of raws and radiance maps, or one of them.")
@@ -146,6 +149,7 @@ def score_tables(
     weights: TakesNoiseOut = "compact",
     captures: Annotated[bool, Option(help="Also write the captures.")] = False,
     seed: console.Seed = 0,
+    source: Any = None,
 ) -> None:
     """Score every exposure state of many raws or radiance maps; writes Parquet, shard by shard.
 
@@ -171,6 +175,7 @@ def score_tables(
         check_weights(weights)
     options: dict[str, Any] = {"resolution": resolution, "camera": camera, "grid": grid}
     options |= {"per_shard": per_shard, "scorer": scorer, "weights": weights}
+    options["settings"] = source
     plan = ShardPlan.of(what, out, **options, captures=captures, seed=seed)
     console.make_folder(out)
     begun = perf_counter()
@@ -183,7 +188,8 @@ def score_tables(
     seconds = perf_counter() - begun
     print_line(f"{scenes} scenes in {seconds:.1f} s, {bad} files that could not be read")
     if bad:
-        print_line(f"which and why: {out}/bad-*.jsonl")
+        reason = next(one["reason"] for one in made if one["bad"])
+        print_line(f"which and why: {out}/bad-*.jsonl; the first is {reason}")
     if not scenes:
         raise ValueError(f"`what` (={what!r}): none of its files could be made a scene")
     print_files({"score tables": out / "tables-*.parquet"})

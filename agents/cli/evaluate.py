@@ -43,6 +43,7 @@ Scenes = Annotated[
 ]
 
 
+@console.takes_source
 def evaluate(
     context: typer.Context,
     policy: console.Policies = None,
@@ -52,6 +53,7 @@ def evaluate(
     ] = None,
     scenes: Scenes = None,
     on_error: console.OnError = "stop",
+    source: Any = None,
     split: Annotated[str | None, Option(help="train, test (default) or all.")] = None,
     grid: Annotated[str | None, Option(help="default, third_stop, video or bracket.")] = None,
     scorer: Annotated[str | None, Option(help="The scorer of the states: balanced...")] = None,
@@ -90,7 +92,7 @@ def evaluate(
     """
     options = (*_ENVIRONMENT, *_CONDITION, *_EPISODES)
     given = {name: context.params[name] for name in options if context.params[name] is not None}
-    found = console.scene_files(scenes, on_error)
+    found = console.scene_files(scenes, on_error, source)
     given |= {} if found is None else {"scenes": found}
     console.trust_configuration(trust)
     device = console.torch_device(device)

@@ -33,10 +33,12 @@ Scenes = Annotated[
 ]
 
 
+@console.takes_source
 def quickstart(
     scenes: Scenes = "bundled",
     out: console.Folder = Path("quickstart"),
     on_error: console.OnError = "stop",
+    source: Any = None,
     seed: console.Seed = 0,
     device: console.Device = "cpu",
 ) -> None:
@@ -53,7 +55,7 @@ def quickstart(
     console.make_folder(out)
     device = console.torch_device(device)
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
-    files = console.scene_files(scenes, on_error)
+    files = console.scene_files(scenes, on_error, source)
     learnt, zero_shot = training_arguments(files)
     environment = {**learnt, "split": "train", "resolution": 64}
     unseen = {"scenes": files, "split": "test", "resolution": 64}
@@ -72,7 +74,7 @@ def quickstart(
             result = evaluate(
                 policies, unseen, episodes_per_scene=EPISODES, seed=seed, progress=task
             )
-    commands = next_commands(scenes, out, agents, on_error)
+    commands = next_commands(scenes, out, agents, on_error, source)
     meta = {"trained_on": learnt["scenes"], "zero_shot": zero_shot}
     more: dict[str, Any] = {"next_commands": commands, "extra_meta": meta}
     written = write_report(result, out, command=console.command_line(), **more)
@@ -122,11 +124,12 @@ def _policies(
 
 
 def next_commands(
-    scenes: str, out: Path, agents: Mapping[str, Path], on_error: str = "stop"
+    scenes: str, out: Path, agents: Mapping[str, Path], on_error: str, source: Mapping[str, float]
 ) -> Sequence[str]:
     """Command lines to try afterwards."""
     own = [] if scenes == "bundled" else ["--scenes", scenes]
     own += [] if on_error == "stop" else ["--on-error", on_error]
+    own += [word for name, v in source.items() for word in (f"--{console.SOURCE[name]}", str(v))]
     evaluation = ["ae-env", "evaluate", "--policy", f"ppo:{agents['ppo']}"]
     evaluation += ["--policy", "matrix:tuned", *own, "--out", f"{out}/meters"]
     return (

@@ -18,6 +18,7 @@ DEFAULT_SCENES = "bundled:small"
 POLICIES = ("average:tuned", "average:tuned?foresight=model", "regression:video?foresight=learnt")
 
 
+@console.takes_source
 def view(
     what: Annotated[
         str,
@@ -37,6 +38,7 @@ def view(
     tolerance: console.Tolerance = console.TOLERANCE,
     device: console.Device = "auto",
     cache: console.Cache = True,
+    source: Any = None,
 ) -> None:
     """Look at a scene in the browser: any settings, all scores, episodes of two policies.
 
@@ -62,7 +64,7 @@ def view(
     port = free_port(port)
     simulator = make_simulator(weights, device, cache, depth)
     with progress_bars() as progress, progress("scenes") as task:
-        library = find_scenes(what)
+        library = find_scenes(what, source)
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
 
@@ -73,6 +75,7 @@ def view(
     serve(options, port, open_browser, announce)
 
 
+@console.takes_source
 def film(
     policy: console.Policies = None,
     light: Annotated[
@@ -83,6 +86,7 @@ def film(
     frames: Annotated[int, Option(help="Actions of the episode.", min=1, max=10_000)] = 64,
     seed: console.Seed = 0,
     out: Annotated[Path, Option(help="The animated GIF.")] = Path("film.gif"),
+    source: Any = None,
 ) -> None:
     """Film one episode of AutoExposureVideo-v0: policies side by side, in the same moving light.
 
@@ -103,7 +107,8 @@ def film(
     check_word("light", light, (*MOVES, *KIND_SETS))
     for name in policy or POLICIES:
         check_policy(name)
-    options: dict[str, Any] = {"scenes": scenes, "split": "test", "max_episode_steps": frames + 1}
+    options: dict[str, Any] = {"scenes": console.scene_files(scenes, "stop", source)}
+    options |= {"split": "test", "max_episode_steps": frames + 1}
     options |= {"lighting": {"kind": "moving", "kinds": light}, "with_oracle": True}
     options["render_mode"] = "rgb_array"
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", num_envs=1, **options)

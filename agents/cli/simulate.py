@@ -13,7 +13,7 @@ from typer import Option
 from agents.cli import console
 from agents.cli.console import check_outputs, print_files, print_line, progress_bars
 from simulator.utils.checks import check_number, check_word
-from simulator.utils.files import write_picture
+from simulator.utils.files import printable, write_picture
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _SHEET_SIZE = 128
 
 
+@console.takes_source
 def simulate(
     raw: console.Raw,
     iso: Annotated[float, Option(help="Target ISO speed.")],
@@ -32,9 +33,7 @@ def simulate(
     aperture: Annotated[str, Option(help="Target f-number, such as 4 or f/4.")],
     out: console.OutDng = Path("out.dng"),
     png: console.Png = None,
-    source_iso: console.SourceIso = None,
-    source_shutter: console.SourceShutter = None,
-    source_aperture: console.SourceAperture = None,
+    source: Any = None,
     seed: console.Seed = 0,
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
@@ -50,7 +49,7 @@ def simulate(
 
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
-    from simulator import CameraSettings
+    from simulator import CameraSettings, read_raw
     from simulator.capture.decision import check_tolerance
     from simulator.capture.sensor import Noise
     from simulator.utils.checks import check_word
@@ -62,7 +61,7 @@ def simulate(
         settings = CameraSettings(iso, seconds, f_number)
     check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
     simulator = make_simulator(weights, device, cache, depth)
-    source = _read(raw, source_iso, source_shutter, source_aperture)
+    source = read_raw(raw, settings=source)
     if noise == "sensor":
         source.camera.read_noise(iso)  # refuses a camera without its calibration
     prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
@@ -94,13 +93,12 @@ def _remarks(source: RawImage, result: RawImage, *, details: bool) -> Iterator[s
         yield f"highlights: {hidden:.2%} of the source is saturated: neutral, as bright as is known"
 
 
+@console.takes_source
 def sweep(
     raw: console.Raw,
     out: console.Folder = Path("sweep"),
     dngs: Annotated[bool, Option(help="Also write the 64 DNGs, full size.")] = False,
-    source_iso: console.SourceIso = None,
-    source_shutter: console.SourceShutter = None,
-    source_aperture: console.SourceAperture = None,
+    source: Any = None,
     seed: console.Seed = 0,
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
@@ -118,16 +116,16 @@ def sweep(
     from ae_env.rendering import contact_sheet
     from ae_env.scenes import Scene
     from ae_env.scenes.load import SceneNetworks
-    from simulator import write_dng
+    from simulator import read_raw, write_dng
     from simulator.capture.decision import check_tolerance
 
     check_tolerance(tolerance)
     simulator = make_simulator(weights, device, cache, depth)
-    source = _read(raw, source_iso, source_shutter, source_aperture)
+    source = read_raw(raw, settings=source)
     console.make_folder(out)
     sheet = out / "contact_sheet.png"
     with progress_bars() as progress, progress("contact sheet") as task:
-        scene = Scene.from_raw(source, scene_id=raw.stem)
+        scene = Scene.from_raw(source, scene_id=printable(raw.stem))
         size = min(_SHEET_SIZE, *scene.light.shape[1:])
         if weights == "none":
             scene = scene.resized(size)
@@ -185,10 +183,11 @@ PixelPitch = Annotated[
 ]
 
 
+@console.takes_source
 def refocus(
     raw: console.Raw,
     aperture: Annotated[str, Option(help="Wider f-number, such as 1.4 or f/1.4.")],
-    out: console.OutDng = Path("out.dng"),
+    out: console.OutDng = Path("refocused.dng"),
     png: console.Png = None,
     depth: DepthMap = None,
     depth_kind: DepthKindName = None,
@@ -197,9 +196,7 @@ def refocus(
     focus: Focus = None,
     focal_length: FocalLength = None,
     pixel_pitch: PixelPitch = None,
-    source_iso: console.SourceIso = None,
-    source_shutter: console.SourceShutter = None,
-    source_aperture: console.SourceAperture = None,
+    source: Any = None,
     seed: console.Seed = 0,
     weights: console.Weights = "large",
     device: console.Device = "auto",
@@ -207,11 +204,12 @@ def refocus(
 ) -> None:
     """Open the aperture of one raw beyond its lens: shallow depth of field, written as a DNG.
 
-    Example: `ae-env refocus IMG_0001.CRW --aperture 1.4 -o out.dng --png out.png`
+    Example: `ae-env refocus IMG_0001.CRW --aperture 1.4 -o refocused.dng --png refocused.png`
     """
     import numpy as np
 
     from agents.applications import refocus as applied
+    from simulator import read_raw
     from simulator.raw.develop import as_recorded
 
     f_number = console.parse_f_number(aperture)
@@ -224,7 +222,7 @@ def refocus(
     if pixel_pitch is not None:
         check_number("pixel-pitch", pixel_pitch, 0.1, 100.0, more=" micrometres")
     check_outputs(raw, depth, out=(out, ".dng"), png=(png, ".png"))
-    source = _read(raw, source_iso, source_shutter, source_aperture)
+    source = read_raw(raw, settings=source)
     metres, lens = None, None
     if depth is not None:
         with console.option_names(kind="depth-kind", scale="depth-scale"):
@@ -282,32 +280,32 @@ def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
     )
 
 
+@console.takes_source
 def hdr(
     raw: console.Raw,
     out: Annotated[
         Path, Option("--out", "-o", help="EXR to write: linear light, 1 at the raw's white.")
-    ] = Path("out.exr"),
+    ] = Path("fused.exr"),
     png: Annotated[Path | None, Option(help="Also write the fused picture here.")] = None,
     stops: Annotated[float, Option(help="The bracket reaches this far down and up [EV].")] = 4.0,
     step: Annotated[float, Option(help="Between its pictures [EV].")] = 0.5,
-    source_iso: console.SourceIso = None,
-    source_shutter: console.SourceShutter = None,
-    source_aperture: console.SourceAperture = None,
+    source: Any = None,
     weights: console.Weights = "large",
     device: console.Device = "auto",
     cache: console.Cache = True,
 ) -> None:
     """Simulate a bracket of one raw, reduce its noise and fuse it to one picture.
 
-    Example: `ae-env hdr IMG_0001.CRW -o out.exr --png out.png`
+    Example: `ae-env hdr IMG_0001.CRW -o fused.exr --png fused.png`
     """
     from agents.applications import hdr as applied
+    from simulator import read_raw
 
     applied.bracket_exposures(stops, step)
     applied.import_openexr()
     check_outputs(raw, out=(out, ".exr"), png=(png, ".png"))
     simulator = make_simulator(weights, device, cache)
-    source = _read(raw, source_iso, source_shutter, source_aperture)
+    source = read_raw(raw, settings=source)
     picture = applied.hdr_picture(source, stops=stops, step=step, simulator=simulator)
     print_line(f"source {source.settings} ({source.camera.name})")
     darkest, brightest = picture.exposures[0], picture.exposures[-1]
@@ -336,20 +334,6 @@ def make_simulator(weights: str, device: str, cache: bool, depth: str = "far") -
     if depth == "unknown":
         raise ValueError("`depth` (='unknown') needs networks: leave out `--weights none`")
     return CameraSimulator(device=device)
-
-
-def _read(path: Path, iso: float | None, shutter: str | None, aperture: str | None) -> RawImage:
-    """The raw at `path`, with the settings that the options give instead of the file's."""
-    from simulator import read_raw
-
-    given: dict[str, float] = {}
-    if iso is not None:
-        given["iso"] = iso
-    if shutter is not None:
-        given["exposure_time"] = console.parse_seconds(shutter, "source-shutter")
-    if aperture is not None:
-        given["f_number"] = console.parse_f_number(aperture, "source-aperture")
-    return read_raw(path, settings=given)
 
 
 def _write(raw: RawImage, out: Path, png: Path | None) -> None:

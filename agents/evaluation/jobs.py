@@ -43,7 +43,7 @@ from agents.policy_names import (
     weight_files,
 )
 from simulator.utils.cache import Store, cache_key
-from simulator.utils.files import sibling
+from simulator.utils.files import printable, sibling
 
 #: About the time of a frame's score table in static and in changing light, of a frame of a policy,
 #: and of a policy's `fit` [ms]: only the order of the work and the progress bar depend on it.
@@ -300,7 +300,8 @@ def named_content(name: str) -> str:
     found = hashlib.sha256()
     for file in filter(Path.is_file, files):
         with file.open("rb") as stream:
-            found.update(f"{file.name}\0{os.fstat(stream.fileno()).st_size}\0".encode())
+            size = os.fstat(stream.fileno()).st_size
+            found.update(f"{printable(file.name)}\0{size}\0".encode())
             while piece := stream.read(2**20):
                 found.update(piece)
     return found.hexdigest() if files else ""

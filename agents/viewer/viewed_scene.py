@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache, partial
 from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ from simulator.capture.plan import SimulationPlan
 from simulator.radiance.reading import RADIANCE_SUFFIXES
 from simulator.raw.develop import render_srgb, upright
 from simulator.utils.checks import did_you_mean
-from simulator.utils.files import RAW_SUFFIXES
+from simulator.utils.files import RAW_SUFFIXES, printable
 
 #: Camera in whose colours named scenes and radiance maps are made, as the environment's default.
 CAMERA = "nikon_z6"
@@ -95,23 +96,24 @@ class Library:
 
 def _free_name(name: str, taken: Container[str]) -> str:
     """`name` as it can be shown, with a number where it is taken."""
-    name = name.encode(errors="surrogateescape").decode(errors="replace")
+    name = printable(name)
     numbered = (f"{name} ({number})" for number in count(2))
     return next(text for text in chain([name], numbered) if text not in taken)
 
 
 @lru_cache(maxsize=_KEPT)
-def _read_raw(path: Path, name: str) -> OpenedScene:
-    raw = read_raw(path)
+def _read_raw(path: Path, name: str, **settings: float) -> OpenedScene:
+    raw = read_raw(path, settings=settings)
     return OpenedScene(Scene.from_raw(raw, scene_id=name), raw)
 
 
-def find_scenes(what: str) -> Library:
+def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({})) -> Library:
     """The library of what ``ae-env view`` was asked to show.
 
     Args:
         what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
             (of a recorded grid the light that its captures tell together), or a bundled scene's id.
+        settings: Of all raws, in place of their files'.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
@@ -124,8 +126,10 @@ def find_scenes(what: str) -> Library:
             else:
                 own = path != base and path.is_relative_to(base)
                 name = _free_name(str(path.relative_to(base)) if own else path.name, readers)
-                readers[name] = partial(_read_raw, path, name)
+                readers[name] = partial(_read_raw, path, name, **settings)
         return Library(readers, _first_readable(what, readers))
+    if settings:
+        raise ValueError(f"`what` (={what!r}) must be raws, where their settings are given")
     try:
         return Library(_loaded(what))
     except ValueError:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from simulator.radiance.procedural import NATIVE_SIZE
+from simulator.utils.files import printable
 
 #: Directions of the views cut from a panorama [degrees], and their field of view.
 AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
@@ -76,7 +77,7 @@ def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
 
 def hash_fraction(name: str) -> float:
     """A number in [0, 1) that `name` alone decides."""
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
+    return int.from_bytes(hashlib.sha256(printable(name).encode()).digest()[:8], "big") / 2**64
 
 
 def assumed_ev100(group: str) -> float:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import re
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +27,7 @@ RADIANCE_SUFFIXES = (".hdr", ".exr")
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 _RADIANCE_FORMATS = {"32-bit_rle_rgbe": SRGB, "32-bit_rle_xyze": _XYZ}
+_ONE_AT_A_TIME = threading.Lock()
 _RESOLUTION = re.compile(r"([-+])([XY]) +(\d{1,18}) +([-+])([XY]) +(\d{1,18})\s*")
 
 
@@ -193,11 +196,11 @@ def read_exr(
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with _silence(), OpenEXR.File(os.fsencode(path), header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]  # it empties its own
             _refuse_lies(path, *_claimed_size(headers))
             chosen = _chosen(headers, kinds, layer)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _silence(), OpenEXR.File(os.fsencode(path), separate_channels=True) as file:
             channels = file.parts[chosen.part].channels
             planes = [np.asarray(channels[n].pixels, np.float32) for n in chosen.channels]
     except RadianceError:
@@ -234,6 +237,19 @@ def _interpolated(plane: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
             low, high = (plane.take(at.astype(int) + i, axis, mode="clip") for i in (0, 1))
             plane = low + (high - low) * np.expand_dims(at % 1.0, 1 - axis)
     return plane
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Within, nothing that OpenEXR prints is shown: the error that follows says it."""
+    with _ONE_AT_A_TIME, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        shown = os.dup(2)
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(shown, 2)
+            os.close(shown)
 
 
 def _claimed_size(headers: Sequence[Any]) -> tuple[int, int]:

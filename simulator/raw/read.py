@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import logging
 import math
@@ -40,7 +41,7 @@ from simulator.raw.metadata import (
 from simulator.raw.noise_estimation import estimate_nlf
 from simulator.settings import CameraSettings, snap_exposure_time
 from simulator.utils.checks import check_type, check_word
-from simulator.utils.files import as_path, refuse_bomb
+from simulator.utils.files import as_path, printable, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -153,6 +154,8 @@ def check_settings(settings: object) -> None:
     check_type("settings", settings, CameraSettings, Mapping, None)
     for name in settings if isinstance(settings, Mapping) else ():
         check_word("settings", name, _SETTINGS)
+    if isinstance(settings, Mapping):
+        CameraSettings(**{"iso": 100.0, "exposure_time": 1.0, "f_number": 1.0, **settings})
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
@@ -169,7 +172,7 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
         if own is not None:
             return {name: getattr(own.settings, name) for name in _SETTINGS}
         try:
-            with rawpy.imread(str(path)) as raw:
+            with _open(path) as raw:
                 return _exposure(raw, directories, make)
         except _LIBRAW_ERRORS as error:
             raise _unreadable(error, directories) from None
@@ -216,7 +219,7 @@ def _read(
         decoded.white_balance,
         box_factor,
         metadata={
-            "path": path.name,
+            "path": printable(path.name),
             "make": make,
             "model": model,
             "nlf_source": source,
@@ -497,12 +500,17 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
     return strip.reshape(height, width).astype(np.uint16, copy=False)
 
 
+def _open(path: Path) -> rawpy.RawPy:
+    name = str(path)  # of which LibRaw's wrapper takes UTF-8 only
+    return rawpy.imread(name if printable(name) == name else io.BytesIO(path.read_bytes()))
+
+
 def _decode_with_libraw(
     path: Path, directories: Sequence[Directory], make: str, opened: ExitStack
 ) -> _Decoded:
     """A file as LibRaw reads it; `opened` closes its memory, in which the mosaic lies."""
     try:
-        raw = opened.enter_context(rawpy.imread(str(path)))
+        raw = opened.enter_context(_open(path))
         # No pixel is decoded before one is asked for.
         bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, path.stat().st_size)
         if bomb:

@@ -48,7 +48,7 @@ from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
 from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_integer, check_word
-from simulator.utils.files import open_picture, refuse_bomb
+from simulator.utils.files import open_picture, printable, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -142,19 +142,19 @@ def detail_pictures(
             light = read_radiance(path)
             light = light / max(float(np.median(light[1])), 1e-6 * float(light.max()))
             clipped = torch.from_numpy(np.minimum(light, _BRIGHTEST))
-            pictures.append(DetailPicture(path.stem, group, "radiance", clipped))
+            pictures.append(DetailPicture(printable(path.stem), group, "radiance", clipped))
         pictures += photograph_pictures(data, split)
         pictures += recorded_mosaics(data, split)
         for path, group in _files(data, "intel_tau_small", (".png",), split):
             import cv2
 
             with open_picture(path, ["PNG"], bits=16):
-                frame = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+                frame = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
                 if frame is None:
                     raise ValueError("its pixels end too early")
             light = np.ascontiguousarray(frame[:, :, ::-1].transpose(2, 0, 1), np.float32)
             linear = torch.from_numpy(light / 65535.0)
-            pictures.append(DetailPicture(path.stem, group, "linear", linear))
+            pictures.append(DetailPicture(printable(path.stem), group, "linear", linear))
     return [*pictures, *_drawings(split, _DRAWN[split] if drawn is None else drawn, seed)]
 
 
@@ -169,17 +169,17 @@ def radiance_files(
 def photograph_pictures(data: Path, split: Split) -> Iterator[DetailPicture]:
     """Photographs of a split, unprocessed to linear light, 1.0 at the photograph's white."""
     for path, group in _files(data, "photo_pool", (".jpg", ".png"), split):
-        rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
+        rng = np.random.default_rng(zlib.crc32(printable(path.stem).encode()))
         with open_picture(path) as picture:
             light = unprocess(np.asarray(picture.convert("RGB")), rng)
-        yield DetailPicture(path.stem, group, "photograph", torch.from_numpy(light))
+        yield DetailPicture(printable(path.stem), group, "photograph", torch.from_numpy(light))
 
 
 def recorded_mosaics(data: Path, split: Split) -> Iterator[DetailPicture]:
     """Raws of real sensors at low ISO, of a split."""
     for path, group in _files(data, "canon_crw_cc0", (".CRW",), split):
         raw = read_raw(path)
-        yield DetailPicture(path.stem, group, "mosaic", raw.data, raw.noise)
+        yield DetailPicture(printable(path.stem), group, "mosaic", raw.data, raw.noise)
     description = data / "gopro_raw" / "meta.json"
     if not description.is_file():
         return
@@ -204,7 +204,7 @@ def _files(
     if not files:
         logger.warning("no %s files in %s: they are left out", " or ".join(suffixes), data / folder)
     for path in files:
-        group = _groups(data).get(path.name, path.stem)
+        group = _groups(data).get(path.name, printable(path.stem))
         group = next((g for g, names in _RAWS.items() if path.name.startswith(names)), group)
         if detail_split(group) == split:
             yield path, group
@@ -439,8 +439,8 @@ def map_scenes(
     path: Path, group: str, camera: CameraProfile, size: int
 ) -> Iterator[ReferenceScene]:
     """Views into a radiance map, see `reference_scenes`."""
-    about: Any = {"group": group, "kind": "radiance", "source": path.name}
-    for name, view in _views(path.stem, read_radiance(path)):
+    about: Any = {"group": group, "kind": "radiance", "source": printable(path.name)}
+    for name, view in _views(printable(path.stem), read_radiance(path)):
         yield from _cut_out(view, camera, size, scene_id=name, **about)
 
 

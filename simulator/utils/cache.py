@@ -121,8 +121,9 @@ class Store:
 
     A result is one safetensors file without pickles, JSON values in its header. It is written whole
     or not at all; several processes may share the folder. A damaged file, or a folder that cannot
-    be read or written, is logged and costs time only. Beyond `max_bytes` of all files, if given,
-    those used longest ago are removed; each of several processes may exceed it by a sixteenth.
+    be read, is logged and costs time only. Beyond `max_bytes` of all files, if given, those used
+    longest ago are removed; each of several processes may exceed it by a sixteenth. Then a folder
+    that cannot be written costs time only, too; else `put` raises an `OSError`.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int | None = None) -> None:
@@ -160,7 +161,10 @@ class Store:
             return
         try:
             write_atomically(self.path(key), content)
-        except OSError as error:  # a full or read-only disk must not stop the run
+        except OSError as error:
+            if self.max_bytes is None:
+                raise
+            # A full or read-only disk must not stop a run that could do without.
             reason = os.strerror(error.errno) if error.errno else error
             _warn_once(f"results could not be stored in {self.folder}: {reason}")
             return

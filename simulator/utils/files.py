@@ -16,6 +16,7 @@ import os
 import platform
 import secrets
 import subprocess
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -78,6 +79,15 @@ def as_path(path: object) -> Path:
     return Path(path)
 
 
+def printable(name: str) -> str:
+    """`name` of a file as text that can be written as UTF-8: bytes that are none become escapes.
+
+    >>> printable(os.fsdecode(b"caf\\xe9.dng"))
+    'caf\\\\udce9.dng'
+    """
+    return name.encode(errors="backslashreplace").decode()
+
+
 def read_bounded(path: Path, most: int = 2**26) -> bytes:
     """Content of an ordinary file of at most so many bytes; an `OSError` for another one."""
     if path.exists() and not path.is_file() and not path.is_dir():
@@ -117,7 +127,9 @@ def open_picture(
     from PIL import Image
 
     try:
-        with Image.open(path, formats=list(formats)) as picture:
+        with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
+            opened = Image.open(path, formats=list(formats))  # warns of what is refused below
+        with opened as picture:
             if picture.width * picture.height > MAX_PICTURE_PIXELS:
                 size = f"{picture.width} x {picture.height} pixels"
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")
@@ -145,7 +157,7 @@ def write_atomically(
     after they are on the disk, so that a loss of power leaves the old file or the new one.
     """
     path = as_path(path)
-    content = content.encode() if isinstance(content, str) else content
+    content = printable(content).encode() if isinstance(content, str) else content
     pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
     start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
     temporary = path.parent / f".{start}.{secrets.token_hex(4)}.tmp"

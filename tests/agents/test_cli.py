@@ -146,11 +146,11 @@ print("loaded", *sys.modules)
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "nan"), "`shutter` (=nan)"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`source-aperture` (=-2"),
+        (("film", "--scenes", "mixed", "--source-iso", 100), "`source-iso` (=100.0) is about"),
         ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", *UNKNOWN), "`policy` (='matrx:P') must"),  # before scenes are read
-        (("film", *UNKNOWN), "`policy` (='matrx:P') must"),
         (("record", *UNKNOWN, "-o", "ae_env/b-v0"), "`policy` (='matrx:P') must"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
@@ -160,26 +160,20 @@ print("loaded", *sys.modules)
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
         (("bench", "throughput", "--part", "agents"), "`part` (='agents') is for transfer only"),
-        (("bench", "transfer", "--part", "table"), "`part` (='table')"),
         (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
         (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
-        (("evaluate", "--preset", "standrad"), "did you mean 'standard'"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--preset", "quick", "--append", "x.csv"), "`append` (='x.csv')"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
         (("evaluate", *V1, "--on-error", "skip"), "give that, too"),
         (("evaluate", "--scenes", "recorded:a", "--on-error", "skip"), "must be 'stop'"),
-        (("evaluate", "--scenes", "polyhaven", "--on-error", "skip"), "files of a folder"),
-        (("evaluate", *V1, "--append", "."), "must be a file, but it is a folder"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`aperture` (=8)"),
         ((*OPEN, "--depth", "small.png", "--png", "small.png"), "`png`"),
         ((*OPEN, "--depth-kind", "disparity"), "`depth-kind`"),
         ((*OPEN, *SMALL, "--focal-length", "-3"), "`focal-length` (=-3"),
         ((*OPEN, *SMALL[:2]), "`focal-length` (=None)"),
         ((*OPEN, *FITS, "--focus", "0.001"), "`focus` (=0.001)"),
-        ((*OPEN, *SMALL, "--focus", "far"), "`focus` (='far') must be metres"),
-        ((*OPEN, "--focus", "2"), "`focus` (=2) is an option of a known `--depth`"),
         (("refocus", "nameless.dng", *OPEN[2:], *FITS), "`--pixel-pitch`"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else "",
@@ -218,7 +212,6 @@ def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
     [
         (OSError(28, "No space left on device"), 1, "error [Errno 28] No space left on device\n"),
         (RuntimeError("out of\nmemory"), 1, "error RuntimeError: out of memory; `ae-env --debug`"),
-        (FileNotFoundError(2, "No such file", "a.dng"), 2, "No such file: 'a.dng'\n"),
         (KeyboardInterrupt(), 130, "stopped\n"),  # a simulation restarts
     ],
 )
@@ -257,10 +250,8 @@ main.main()
 
 def test_all_scorers_are_listed(ae_env) -> None:
     code, out, _ = ae_env("scorers")
-    assert code == 0
     assert {*list_scorers()} <= {line.split()[0] for line in out.splitlines() if line.strip()}
-    assert "Needs extra cv" in out
-    assert "AE_ENV_NIMA_AESTHETIC" in out
+    assert (code, "Needs extra cv" in out) == (0, True)
 
 
 def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:
@@ -403,8 +394,7 @@ def test_what_a_raw_hides_is_printed(ae_env, tmp_path: Path) -> None:
 
 def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
     code, text, _ = ae_env("sweep", dng, "--out", tmp_path / "sweep", "--dngs")
-    assert code == 0
-    assert "contact sheet" in text
+    assert (code, "contact sheet" in text) == (0, True)
     with Image.open(tmp_path / "sweep" / "contact_sheet.png") as sheet:
         assert min(sheet.size) > 300
     files = sorted((tmp_path / "sweep").glob("*.dng"))
@@ -472,8 +462,7 @@ def test_hdr(ae_env, dng: Path, tmp_path: Path) -> None:
     openexr = pytest.importorskip("OpenEXR")
     out, png = tmp_path / "out.exr", tmp_path / "out.png"
     code, text, _ = ae_env("hdr", dng, "-o", out, "--png", png, "--stops", 2, "--weights", "none")
-    assert code == 0
-    assert "fused 9 simulated pictures, -2 to +2 EV" in text
+    assert (code, "fused 9 simulated pictures, -2 to +2 EV" in text) == (0, True)
     with openexr.File(str(out)) as file:
         assert file.channels()["RGB"].pixels.shape == (100, 120, 3)
     with Image.open(png) as picture:
@@ -499,14 +488,11 @@ def test_the_plan_of_options_of_a_preset_and_of_an_environment(preset, tmp_path)
     assert plan.policies == ("matrix:P", "random", "oracle")
     options = {"scorer": "noise", "frames": 3, "lighting": "ramp"}
     changed = make_plan(preset, None, ["random"], options)
-    assert changed.environment["scorer"] == "noise"
-    assert changed.environment["scenes"] == "bundled:small"
+    assert {"scorer": "noise", "scenes": "bundled:small"}.items() <= changed.environment.items()
     assert (changed.policies, changed.frames) == (("random",), 3)
     assert list(changed.all_conditions) == ["ramp"]
-    (tmp_path / "env.yaml").write_text(
-        "scenes: 'bundled:small'\nresolution: 40\nlighting: {kind: tunnel}\ndelay: 1\n"
-        "max_episode_steps: 30\n"
-    )
+    text = "scenes: 'bundled:small', resolution: 40, lighting: {kind: tunnel}, delay: 1"
+    (tmp_path / "env.yaml").write_text(f"{{{text}, max_episode_steps: 30}}")
     plan = make_plan(None, str(tmp_path / "env.yaml"), ["random"], {"delay": 0})
     assert plan.environment == {"scenes": "bundled:small", "resolution": 40}
     assert {n: c.delay for n, c in plan.all_conditions.items()} == {"tunnel": 0}
@@ -515,11 +501,12 @@ def test_the_plan_of_options_of_a_preset_and_of_an_environment(preset, tmp_path)
 def test_broken_files_of_a_folder_are_skipped_when_asked(ae_env, dng, tmp_path, caplog):
     (tmp_path / "env.yaml").write_text("{simulator: null, resolution: 36}")
     (tmp_path / "IMG_2.dng").write_bytes(b"\xff\xd8\xff")
+    dng.rename(dng.with_stem(os.fsdecode(b"\xff")))
     command = ("evaluate", "--env", tmp_path / "env.yaml", "--scenes", dng.parent)
     command += ("--policy", "random", "--frames", 2, "--workers", 1)
     code, _, error = ae_env(*command)
     assert (code, "damaged; --on-error skip" in error) == (2, True)
-    code, _, error = ae_env(*command, "--on-error", "skip")
+    code, _, error = ae_env(*command, "--on-error", "skip", "--source-iso", 100)
     assert code == 0, error
     assert "1 of 2 scene files skipped (IMG_2.dng: " in caplog.text
 

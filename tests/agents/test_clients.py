@@ -1,11 +1,9 @@
 """Other people's training code runs every task unchanged, and reads recorded episodes."""
 
-import errno
-import os
+import resource
 import runpy
 from dataclasses import asdict
 from pathlib import Path
-from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -102,7 +100,8 @@ TASK, RECORDED = "ae_env/AutoExposure-v0", {**SMALL, "split": "test"}
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "minari")
     return tmp_path / "minari"
 
 
@@ -134,7 +133,7 @@ class Stops(Policy):
         raise KeyError("lost")
 
 
-def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context, monkeypatch):
+def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context):
     with pytest.raises(UserCodeError, match=r"'stops'.*KeyError: 'lost'"):
         record_dataset(Stops(context), "stops", TASK, RECORDED, "mine-v0", episodes=1)
     assert list(folder.iterdir()) == []
@@ -148,12 +147,15 @@ def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context, mo
         record_dataset(policy, "random", TASK, RECORDED, "mine-v0", episodes=1)
         left = {path.name for path in folder.iterdir() if path.is_dir()}
         assert left == {".unfinished-ae-mine-v0", "mine-v0"}
-    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr("minari.data_collector.EpisodeBuffer", Mock(side_effect=full))
-    with pytest.raises(OSError, match=r"`out`.*No space left") as caught:
-        record_dataset(policy, "random", TASK, RECORDED, "new-v0", episodes=1)
-    assert caught.value.errno == errno.ENOSPC
-    for wrong in ("mine", "a/mine-v0", "mine-v0"):  # namespaces have two letters or more; is there
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))  # as a full disk, to each file
+    try:
+        with pytest.raises(OSError, match=r"`out`.*File too large"):
+            record_dataset(policy, "random", TASK, RECORDED, "new-v0", episodes=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    (folder / "other-v0").mkdir()
+    for wrong in ("mine", "a/mine-v0", "mine-v0", "other-v0"):  # the last two are there
         with pytest.raises(ValueError, match=rf"`out` \(='{wrong}'\)"):
             record_dataset(policy, "random", TASK, RECORDED, wrong, episodes=1)
 

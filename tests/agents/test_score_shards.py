@@ -26,6 +26,7 @@ def folder(tmp_path_factory):
         raw = RawImage(light.clamp(max=1.0), CameraSettings(100, 1 / 64, 4), camera)
         write_dng(path / f"night-{i}.dng", raw)
     (path / "night-3.dng").write_bytes(b"no raw")
+    (path / "night-5.dng").rename(path / os.fsdecode(b"night-5\xff.dng"))
     return path
 
 

@@ -1,6 +1,7 @@
 """A user's files: raws and maps with bad ones among them, groups and splits, recorded sequences."""
 
 import logging
+import os
 import struct
 from datetime import datetime, timedelta
 
@@ -57,6 +58,8 @@ def test_options_reach_the_scenes(tmp_path):
     assert {(s.kind, s.hard, s.median_speed) for s in (a, b)} == {("mine", True, 0.5)}
     (only,) = load(tmp_path / "b.hdr", ev100=8.0)
     assert only.ev100 == pytest.approx(8.0, abs=0.05)
+    with pytest.raises(ValueError, match=r"`settings`.* has none"):
+        load(tmp_path / "b.hdr", settings={"iso": 100})
 
 
 #: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same
@@ -350,7 +353,7 @@ def test_maps_are_sampled_where_they_have_the_photosites(tmp_path, caplog):
         ("a.exr", (20_000, 13_000), "claims .*8192 a byte"),
     ],
 )
-def test_errors_name_the_file(tmp_path, name, content, words):
+def test_errors_name_the_file(tmp_path, name, content, words, capfd):
     pytest.importorskip("cv2")
     if isinstance(content, tuple):  # the size that the header of a small file claims
         write_exr(tmp_path / name, np.ones((32, 64)))
@@ -360,6 +363,7 @@ def test_errors_name_the_file(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{name}.*{words}"):
         read_radiance(tmp_path / name)
+    assert capfd.readouterr() == ("", "")  # of the libraries
 
 
 @pytest.mark.parametrize("scale", [2.0**-100, 2.0**110])
@@ -369,7 +373,8 @@ def test_the_scale_of_a_map_does_not_matter(tmp_path, scale):
     for folder, factor in (("a", 1.0), ("b", scale)):
         (tmp_path / folder).mkdir()
         write_exr(tmp_path / folder / "map.exr", image * factor)
-        scenes += load_scenes(tmp_path / folder, "all", camera=CAMERA, resolution=8)
+        own = (tmp_path / folder).rename(tmp_path / os.fsdecode(folder.encode() + b"\xff"))
+        scenes += load_scenes(own, "all", camera=CAMERA, resolution=8)
     first, second = scenes
     assert second.ev100 == pytest.approx(first.ev100, abs=1e-6)
     torch.testing.assert_close(second.light, first.light, rtol=1e-5, atol=0.0)

@@ -154,10 +154,11 @@ def test_levels_colour_and_metadata(tmp_path):
         read_raw(path)
     with pytest.raises(ValueError, match="`settings`"):
         read_raw(path, settings={"speed": 64})
+    path = path.rename(tmp_path / os.fsdecode(b"\xff.dng"))  # a name that is no UTF-8
     raw = read_raw(str(path), settings=SETTINGS, nlf=NLF)
     assert raw.metadata["pixel_aspect"] == 2.0
     assert raw.settings == SETTINGS  # given settings are not snapped
-    known = {"path": "a.dng", "make": "Test", "model": "Sensor", "nlf_source": "given"}
+    known = {"path": "\\udcff.dng", "make": "Test", "model": "Sensor", "nlf_source": "given"}
     assert known.items() <= raw.metadata.items()
     camera = raw.camera
     assert (raw.noise, camera.name, camera.bit_depth) == (NLF, "test_sensor", 12)

@@ -340,7 +340,8 @@ def test_20_to_25_exposures_scatter_around_the_right_one_by_three_ev(illuminance
 
 
 def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
-    # 320 lux is EV 7, and x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
+    # 320 lux is EV 7: ISO 100, 1/8 s, f/4 is right.
+    # x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
     card, settings = 0.18 * 250 / (120 * math.pi), CameraSettings(100, 1 / 8, 4)
     assert card == pytest.approx(0.119, abs=5e-4)
     assert sequences.grey_signal(lit_scene(320.0), settings) == pytest.approx(card)

@@ -319,13 +319,17 @@ def test_a_folder_that_cannot_be_used_costs_one_warning(tmp_path, folder, caplog
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for key in KEYS[:3]:  # every environment has a store of its own
-        store = Store(tmp_path / folder)
+        store = Store(tmp_path / folder, max_bytes=10**6)
         store.put(key, {"light": torch.zeros(4)})
         assert store.get(key) is None
     messages = {record.getMessage() for record in caplog.records}
     assert len(messages) == len(caplog.records) <= 2  # once for reading, once for writing
     assert any("could not be stored" in message for message in messages)
+    with pytest.raises(OSError, match=r"`path` .* cannot be written"):  # what a run needs
+        Store(tmp_path / folder).put(KEYS[0], {"light": torch.zeros(4)})
     assert not list(tmp_path.rglob("*.tmp"))
+    with pytest.raises(OSError, match=r"`path` .* cannot be written"):  # what a run needs
+        Store(tmp_path / folder).put(KEYS[0], {"light": torch.zeros(4)})
     store.clear()
 
 
