@@ -70,8 +70,8 @@ def record_dataset(
     minari, report = _minari(), progress or (lambda *_: None)
     oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
     with (
+        _reserved(dataset_id) as folder,  # while the environment loads, too
         closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
-        _reserved(dataset_id) as folder,
     ):
 
         def recorded() -> Iterator[Any]:
@@ -123,14 +123,14 @@ def _reserved(dataset_id: str) -> Iterator[Path]:
 
     try:
         root = minari.storage.get_dataset_path("").resolve()  # Minari fails in a relative one
-        if dataset_id in minari.list_local_datasets() or (root / dataset_id).exists():
-            rule = f"take a higher version, or remove it with `minari delete {dataset_id}`"
-            raise ValueError(f"`out` (={dataset_id!r}) is there already: {rule}")
         for left in filter(Path.is_dir, root.glob(".unfinished-*")):
             with suppress(Timeout), emptied(left):
                 pass
         folder = root / f".unfinished-{dataset_id.replace('/', '-')}"
         with emptied(folder):
+            if dataset_id in minari.list_local_datasets() or (root / dataset_id).exists():
+                rule = f"take a higher version, or remove it with `minari delete {dataset_id}`"
+                raise ValueError(f"`out` (={dataset_id!r}) is there already: {rule}")
             folder.mkdir()
             yield folder
     except Timeout:

@@ -69,10 +69,6 @@ def test_speeds_snap_within_3_percent(speed: float) -> None:
 @pytest.mark.parametrize("exposure_time", [1 / 90, 1 / 45, 1 / 55, 0.0002 / 3, 45.0, 120.0])
 def test_speeds_far_from_a_nominal_stop_are_kept(exposure_time: float) -> None:
     assert CameraSettings.from_exif(100, exposure_time, 4).exposure_time == exposure_time
-    for recorded, exact in ((1 / 60, 1 / 64), (0.01667, 1 / 64), (6.0, 6.35)):
-        assert CameraSettings(100, recorded, 4).exposure_time == recorded  # given ones stay
-        snapped = CameraSettings.from_exif(100, recorded, 4)
-        assert snapped.exposure_time == pytest.approx(exact, rel=1e-4)
 
 
 @pytest.mark.parametrize(
