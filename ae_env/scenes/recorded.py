@@ -457,7 +457,7 @@ def _in_file(path: Path) -> dict[str, float]:
     try:
         with open_picture(path) as picture:
             exif = picture.getexif()
-            camera = [str(exif.get(n, "")) for n in (ExifTags.Base.Make, ExifTags.Base.Model)]
+            make, model = (str(exif.get(getattr(ExifTags.Base, n), "")) for n in ("Make", "Model"))
             tags = exif.get_ifd(ExifTags.IFD.Exif)
     except ValueError:
         if not path.exists():  # a link that leads nowhere
@@ -467,7 +467,7 @@ def _in_file(path: Path) -> dict[str, float]:
     values = {what: tags.get(tag) for what, tag in zip(_SETTINGS, names, strict=True)}
     numbers = {n: v[0] if isinstance(v, tuple) else v for n, v in values.items() if v}
     found = {name: float(value) for name, value in numbers.items() if float(value) > 0}
-    if "exposure_time" in found and marks_stops(*camera, numbers["exposure_time"]):
+    if "exposure_time" in found and marks_stops(make, model, numbers["exposure_time"]):
         found["exposure_time"] = snap_exposure_time(found["exposure_time"])
     return found
 

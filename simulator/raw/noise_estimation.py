@@ -103,7 +103,7 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     every = -(-height * width // _MAX_PIXELS)
     if every <= 1:
         return planes
-    starts = range(0, height - 63, 64 * every)
+    starts = range(0, max(1, height - 63), 64 * every)
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
