@@ -71,6 +71,8 @@ def read_radiance(path: str | Path, *, layer: str | None = None) -> np.ndarray:
             image = np.repeat(image, 3, axis=0)
         elif not np.abs(np.subtract(primaries, SRGB)).max() <= 1e-4:  # NaN is none of these
             matrix = np.linalg.inv(_xyz_from_rgb(SRGB)) @ _xyz_from_rgb(primaries)
+            most = np.max(image, initial=0.0, where=np.isfinite(image))  # inf - inf is no colour
+            image = np.nan_to_num(image, nan=0.0, posinf=most, neginf=0.0)
             image = np.tensordot(matrix.astype(np.float32), image, axes=1)
         return _clean(image.astype(np.float32, copy=False), path)
     except FileNotFoundError:

@@ -71,7 +71,9 @@ def test_colours_are_converted_by_the_chromaticities_of_the_file(tmp_path):
     primaries = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
     path = write(tmp_path / "a.exr", part("a", channels(xyz), chromaticities=primaries))
     assert_image(read_radiance(path), rtol=2e-3, atol=2e-3)
-    pixels = rgbe(xyz)
+    pixels, xyz[0, 0] = rgbe(xyz), np.inf  # the sun
+    path = write(tmp_path / "b.exr", part("a", channels(xyz), chromaticities=primaries))
+    assert read_radiance(path)[:, 0, 0].min() > 0.5 * np.delete(xyz, 0, axis=0).max()
     for head in ("FORMAT=32-bit_rle_xyze", "PRIMARIES=1 0 0 1 0 0 .333333 .333333"):
         (tmp_path / "a.hdr").write_bytes(f"#?RADIANCE\n{head}\n\n-Y 6 +X 10\n".encode() + pixels)
         assert_image(read_radiance(tmp_path / "a.hdr"), atol=0.06)  # 8 bits of mantissa

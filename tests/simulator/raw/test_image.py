@@ -474,10 +474,7 @@ def test_clipped_planes_become_as_bright_as_white(recorded, expected) -> None:
     [*((v,) * 4 for v in (0.92, 0.97, 1.0, 1.02, 1.06)), (1.0, 2.0, 2.0, 4 / 3)],
 )
 def test_what_noise_alone_clips_stays_near_white(light: tuple[float, ...]) -> None:
-    """A flat patch at ISO 6400: nothing measured is replaced, and the rest is off by the noise.
-
-    In the last one noise clips red alone, and what it tells of red is known of the other planes.
-    """
+    """A flat patch at ISO 6400: nothing measured is replaced, and the rest is off by the noise."""
     deviation, true = 0.03, torch.tensor(light)[:, None, None]
     nlf = NoiseLevelFunction((deviation**2,) * 4, (0.0,) * 4)
     noise = deviation * torch.randn(4, 48, 48, generator=torch.Generator().manual_seed(0))
