@@ -124,7 +124,7 @@ def measure_highlights(seed: int, quick: bool, split: Split = "test") -> list[Ro
     data, rows = data_folder(), []
     simulators = {k: CameraSimulator.from_pretrained(k, device="cpu") for k in SIZES}
     files = [] if data is None else list(radiance_files(data, split))
-    if data is not None and split == "test":  # no network and no choice has seen these
+    if data is not None and split == "test":  # no network was trained on these
         files += (f for s in get_args(Split) for f in radiance_files(data, s, FURTHER_MAPS))
     for number, (path, _) in enumerate(files[:2] if quick else files):
         light = torch.from_numpy(read_radiance(path))
