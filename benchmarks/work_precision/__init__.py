@@ -23,14 +23,13 @@ from benchmarks.fidelity.models import train_missing
 from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, sections, table
 from benchmarks.isolated import CORES, ROOT, timed
 from benchmarks.work_precision import plans
-from benchmarks.work_precision.methods import Method, all_methods
+from benchmarks.work_precision.methods import DEFAULT, Method, all_methods
 from benchmarks.work_precision.plans import GRID, SIZES, Trial, trials
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage
 from simulator.noise.noise_level_function import noise_variance
 from simulator.utils.files import data_folder
 
-#: Processes among which the scenes of the plan's predictions are shared out: of the validation
-#: split, which the plan's constants were calibrated on, and of the test split.
+#: Processes among which the scenes of the plan's predictions are shared out, by split.
 _SHARES = {"validation": 4, "test": 8}
 #: States of each scene at which all methods are compared, by height; quick: scenes and states.
 STATES, QUICK_SCENES = {128: 4, 512: 2}, {128: (2, 2), 512: (1, 1)}
@@ -161,15 +160,10 @@ def undominated(points: Sequence[tuple[float, float]]) -> list[bool]:
 
     One that is faster and, to a hundredth of a decibel, as good beats another.
     """
-
-    def beaten(own: int) -> bool:
-        ms, db = points[own]
-        return any(
-            other != own and a <= ms and b >= db - _SAME_DB and (a < ms or b > db or other < own)
-            for other, (a, b) in enumerate(points)
-        )
-
-    return [not beaten(i) for i in range(len(points))]
+    ms, db = (np.array(values)[:, None] for values in zip(*points, strict=True))
+    earlier = np.tri(len(points), k=-1, dtype=bool).T
+    beats = (ms <= ms.T) & (db >= db.T - _SAME_DB) & ((ms < ms.T) | (db > db.T) | earlier)
+    return [not beaten for beaten in beats.any(axis=0)]
 
 
 # -- report ---------------------------------------------------------------------------------------
@@ -202,9 +196,9 @@ photographs; floor of the noise: {noise_variance_floor:.1%}"""
 _BOUND = """tolerance = {tolerance:g} | cases = {cases} | networks = {networks} |
 predicted = {predicted:.3g} | measured = {measured:.3g} |
 90 % bound holds = {covered:.0%} | kept = {said:.0%} | truly = {kept:.0%}"""
-_FACTORS = """split = {split} | scenes = {scenes} | led by = {led by} | cases = {cases} |
+_FACTORS = """scenes = {scenes} | led by = {led by} | places = {places} | cases = {cases} |
 10 % = {low:.2f} | median = {middle:.2f} | 90 % = {high:.2f} | worst = {worst:.2f} |
-90 % bound holds = {covered:.1%}"""
+bound holds = {covered:.1%} | of places left out = {new:.1%}"""
 _LEFT_OUT = """kind = {kind} | noise reduction = {share[noise_reduction]:.0%} |
 aperture = {share[aperture]:.0%} | defocus = {share[defocus]:.0%} |
 motion blur = {share[motion_blur]:.0%} | noise = {share[noise]:.0%} |
@@ -257,17 +251,25 @@ def _by_tolerance(rows: list[Row]) -> list[Row]:
 
 def _by_part(rows: list[Row]) -> list[Row]:
     """Measured error over its bound by the part that leads the predicted error."""
-    frame, found = pd.DataFrame(rows), []
+    frame, found = pd.DataFrame([row for row in rows if row["tolerance"] == DEFAULT]), []
     frame["led by"] = [max(own, key=own.__getitem__) for own in frame["errors"]]
     frame["share"] = frame["measured"] / frame["bound"]
-    maps = frame[frame["kind"] == "radiance"]
-    for scenes, some in {"maps": maps, "all": frame}.items():
-        for (split, part), own in some.groupby(["split", "led by"]):
-            row: Row = {"scenes": scenes, "split": split, "led by": part, "cases": len(own)}
+    for scenes, some in {"maps": frame[frame["kind"] == "radiance"], "all": frame}.items():
+        for part, own in some.groupby("led by"):
+            row: Row = {"scenes": scenes, "led by": part, "cases": len(own)}
             row |= {name: own["share"].quantile(q) for name, q in _QUANTILES.items()}
-            row["worst"] = own["share"].max()
-            found.append(row | {"covered": (own["share"] <= 1.0).mean()})
+            row |= {"worst": own["share"].max(), "covered": (own["share"] <= 1.0).mean()}
+            found.append(row | {"places": own["place"].nunique(), "new": _of_new_places(own)})
     return found
+
+
+def _of_new_places(frame: pd.DataFrame) -> float:
+    """Share of the cases below the bound that conformal prediction finds on all other places."""
+    held = 0
+    for place, own in frame.groupby("place"):
+        others = np.sort(np.append(frame["share"][frame["place"] != place], np.inf))
+        held += (own["share"] <= others[int(np.ceil(0.9 * len(others))) - 1]).sum()
+    return held / len(frame)
 
 
 def _headline(rows: list[Row]) -> Figure:

@@ -67,9 +67,8 @@ def all_methods() -> list[Method]:
         Method("exposure+nlf", prepare=bare.prepare),
         *(_denoised_by(name, denoise, bare) for name, denoise in classical().items()),
     ]
-    dtypes: list[Dtype] = ["float32"]
-    if computes_bfloat16(torch.device("cpu")):
-        dtypes.append("bfloat16")
+    both = computes_bfloat16(torch.device("cpu"))
+    dtypes: tuple[Dtype, ...] = ("float32", "bfloat16") if both else ("float32",)
     for dtype in dtypes:
         for name in FAMILY:
             tolerances = TOLERANCES if name == "large" and dtype == "float32" else (DEFAULT,)
@@ -125,11 +124,7 @@ def _noisy(light: Tensor, settings: CameraSettings, raw: RawImage, seed: int) ->
 
 
 def planned(name: str, tolerance: float, dtype: Dtype = "float32") -> Method:
-    own = simulator(name, dtype)
-
-    def prepare(raw: RawImage) -> Prepared:
-        return own.prepare(raw, depth="unknown", tolerance=tolerance)
-
+    prepare = partial(simulator(name, dtype).prepare, depth="unknown", tolerance=tolerance)
     return Method(f"{name} {tolerance:g}", dtype, tolerance, prepare=prepare)
 
 

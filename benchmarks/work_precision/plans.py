@@ -203,7 +203,11 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
                 shows = torch.where(white, torch.inf, wanted)
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
-                row |= {"settings": str(settings), "tolerance": tolerance}
+                row |= {
+                    "settings": str(settings),
+                    "tolerance": tolerance,
+                    "place": trial.scene.group,
+                }
                 row |= {"network": plan.network, "errors": dict(plan.errors)}
                 row |= {"predicted": plan.predicted_error, "bound": plan.error_bound}
                 rows.append(row | {"measured": distance(light, added, truth, wanted, shows)})

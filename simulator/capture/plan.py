@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from simulator.capture.prepared_scene import PreparedScene
 
 #: Factor on the predicted error below which 90 % of the measured ones are, by its largest part:
-#: split conformal prediction on maps that no network was trained on, none of the test split
-#: (`ae-env bench work-precision`); of unknown depth on validation scenes. The network's comes on
-#: top of its own `spread`; no case was led by the ISO: that of cameras without their last ISOs.
+#: conformal prediction on maps of 44 places that no network was trained on, of unknown depth on
+#: scenes that have it (`ae-env bench work-precision`). The network's comes on top of its own
+#: `spread`; no case was led by the ISO: that of cameras without their last ISOs.
 _BOUND = {
-    "left out": 1.13,
-    "network": 0.98,
-    "clipped highlights": 1.34,
-    "unknown depth": 0.98,
+    "left out": 1.16,
+    "network": 1.01,
+    "clipped highlights": 1.42,
+    "unknown depth": 1.03,
     "ISO": 2.5,
     "rounding": 0.55,
 }
