@@ -82,8 +82,8 @@ def as_path(path: object) -> Path:
 def printable(name: str) -> str:
     """`name` of a file as text that can be written as UTF-8: bytes that are none become escapes.
 
-    >>> printable(os.fsdecode(b"caf\\xe9.dng"))
-    'caf\\\\udce9.dng'
+    >>> printable(os.fsdecode(b"ete\\xe9.dng"))
+    'ete\\\\udce9.dng'
     """
     return name.encode(errors="backslashreplace").decode()
 
