@@ -214,7 +214,12 @@ def read_exr(
     data, shown = (np.array(header[name]) for name in ("dataWindow", "displayWindow"))
     width, height = shown[1] - shown[0] + 1
     planes = [_interpolated(plane, tuple((data[1] - data[0] + 1)[::-1])) for plane in planes]
-    primaries = header.get("chromaticities", SRGB)
+    try:
+        primaries = [float(value) for value in header.get("chromaticities", SRGB)]
+    except (TypeError, ValueError):
+        primaries = []
+    if len(primaries) != len(SRGB):
+        raise RadianceError("states chromaticities that are not eight numbers")
     if chosen.channels[-1].upper().endswith("BY"):  # (R - Y) / Y and (B - Y) / Y
         luminance, (red, blue) = planes[0], (planes[0] * (1 + chroma) for chroma in planes[1:])
         of_red, of_green, of_blue = _xyz_from_rgb(primaries)[1].astype(np.float32)
