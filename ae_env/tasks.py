@@ -436,7 +436,7 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
 
     ## Episode End
 
-    Terminated when the agent stops, chooses what takes more than the time left, or has taken the last frame.
+    Terminated when the agent stops, its choice takes more than the time left, or no frame is left.
 
     ## Arguments
 

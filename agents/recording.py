@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ def check_dataset_id(dataset_id: str) -> None:
         rule = "must be a name of letters, digits, - and _, after a namespace of two or more or "
         rule += "none, and end in -vNUMBER, such as 'ae_env/matrix-v0'"
         raise ValueError(f"`out` (={dataset_id!r}) {rule}")
-    with _reserved(dataset_id):
+    with _writing(dataset_id), _reserved(dataset_id):
         pass
 
 
@@ -69,10 +69,10 @@ def record_dataset(
     check_dataset_id(dataset_id)
     minari, report = _minari(), progress or (lambda *_: None)
     oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
-    with (
-        _reserved(dataset_id) as folder,  # while the environment loads, too
-        closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
-    ):
+    with ExitStack() as opened:
+        with _writing(dataset_id):  # reserved while the environment loads, too
+            folder = opened.enter_context(_reserved(dataset_id))
+        env = opened.enter_context(closing(gym.make(f"ae_env:{task}", **{**options, **oracle})))
 
         def recorded() -> Iterator[Any]:
             for i in range(episodes):
@@ -82,7 +82,7 @@ def record_dataset(
                 yield minari.data_collector.EpisodeBuffer(id=i, **content)
             report(episodes, episodes)
 
-        with _datasets_in(folder):
+        with _writing(dataset_id), _datasets_in(folder):
             found = recorded()
             dataset = minari.create_dataset_from_buffers(
                 dataset_id,
@@ -96,11 +96,26 @@ def record_dataset(
             )
             for one in found:  # each is on disk before there must be room for the next
                 dataset.storage.update_episodes([one])
-        namespace = dataset_id.rpartition("/")[0]
-        if namespace and namespace not in minari.namespace.list_local_namespaces():
-            minari.namespace.create_namespace(namespace)
-        (folder / dataset_id).rename(folder.parent / dataset_id)
+        with _writing(dataset_id):
+            namespace = dataset_id.rpartition("/")[0]
+            if namespace and namespace not in minari.namespace.list_local_namespaces():
+                minari.namespace.create_namespace(namespace)
+            (folder / dataset_id).rename(folder.parent / dataset_id)
     return minari.load_dataset(dataset_id)
+
+
+@contextmanager
+def _writing(dataset_id: str) -> Iterator[None]:
+    """Errors within, of the disk or of another process, name the dataset."""
+    try:
+        yield
+    except Timeout:
+        rule = "is being recorded by another process: take another name, or wait"
+        raise ValueError(f"`out` (={dataset_id!r}) {rule}") from None
+    except OSError as error:
+        where = os.environ.get(_ROOT, "Minari's folder")
+        reason = f"`out` (={dataset_id!r}) cannot be written to {where}: {error.strerror or error}"
+        raise OSError(error.errno, reason) from error
 
 
 @contextmanager
@@ -109,7 +124,7 @@ def _reserved(dataset_id: str) -> Iterator[Path]:
 
     Folders that processes left which have died are removed.
     """
-    minari, root = _minari(), os.environ.get(_ROOT, "Minari's folder")
+    minari = _minari()
 
     @contextmanager
     def emptied(folder: Path) -> Iterator[None]:
@@ -121,24 +136,17 @@ def _reserved(dataset_id: str) -> Iterator[Path]:
                 shutil.rmtree(folder, ignore_errors=True)
                 Path(f"{folder}.lock").unlink(missing_ok=True)
 
-    try:
-        root = minari.storage.get_dataset_path("").resolve()  # Minari fails in a relative one
-        for left in filter(Path.is_dir, root.glob(".unfinished-*")):
-            with suppress(Timeout), emptied(left):
-                pass
-        folder = root / f".unfinished-{dataset_id.replace('/', '-')}"
-        with emptied(folder):
-            if dataset_id in minari.list_local_datasets() or (root / dataset_id).exists():
-                rule = f"take a higher version, or remove it with `minari delete {dataset_id}`"
-                raise ValueError(f"`out` (={dataset_id!r}) is there already: {rule}")
-            folder.mkdir()
-            yield folder
-    except Timeout:
-        rule = "is being recorded by another process: take another name, or wait"
-        raise ValueError(f"`out` (={dataset_id!r}) {rule}") from None
-    except OSError as error:
-        reason = f"`out` (={dataset_id!r}) cannot be written to {root}: {error.strerror or error}"
-        raise OSError(error.errno, reason) from error
+    root = minari.storage.get_dataset_path("").resolve()  # Minari fails in a relative one
+    for left in filter(Path.is_dir, root.glob(".unfinished-*")):
+        with suppress(Timeout), emptied(left):
+            pass
+    folder = root / f".unfinished-{dataset_id.replace('/', '-')}"
+    with emptied(folder):
+        if dataset_id in minari.list_local_datasets() or (root / dataset_id).exists():
+            rule = f"take a higher version, or remove it with `minari delete {dataset_id}`"
+            raise ValueError(f"`out` (={dataset_id!r}) is there already: {rule}")
+        folder.mkdir()
+        yield folder
 
 
 def _check_room(folder: Path, content: Mapping[str, Any]) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from safetensors.torch import save
 
 from ae_env.grid import ExposureGrid
@@ -82,12 +83,13 @@ class ShardPlan:
     def begin(self) -> None:
         """Writes the plan, or raises a `ValueError` where the folder's is another."""
         path, text = Path(self.out, PLAN), json.dumps(asdict(self), indent=1).encode()
-        if path.exists() and path.read_bytes() != text:
-            raise ValueError(
-                f"`out` (={self.out!r}) holds the tables of other files or options, see {PLAN}: "
-                "give another folder, or delete that one"
-            )
-        write_atomically(path, text)
+        with FileLock(path.with_name(f".{PLAN}.lock")):
+            if path.exists() and path.read_bytes() != text:
+                raise ValueError(
+                    f"`out` (={self.out!r}) holds the tables of other files or options, see {PLAN}:"
+                    " give another folder, or delete that one"
+                )
+            write_atomically(path, text)
 
 
 class ShardWriter:

@@ -68,9 +68,8 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
     """The object that a Python file calls `name`, a class or a function.
 
     The file is run once, and again after it has changed. It may import modules beside it at its
-    top, not later in a function; files in different folders may have helpers of the same name, of
-    which each gets its own. A relative `path` is
-    looked for in the current folder, ``~`` is the home.
+    top, not later in a function; files in different folders may have helpers of the same name, each
+    its own. A relative `path` is looked for in the current folder, ``~`` is the home.
 
     Args:
         path, name: The file, and the object's name.

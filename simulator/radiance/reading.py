@@ -282,9 +282,9 @@ def _chosen(headers: Sequence[Any], kinds: Sequence[tuple[str, ...]], layer: str
         part = header.get("name", "") if len(headers) > 1 else ""
         for prefix, channels in groups.items():
             name = ".".join(filter(None, (part, prefix)))
-            names.append(f"{name or 'no layer'} ({', '.join(channels)})")
+            names.append(f"{name or 'one without a name'} ({', '.join(channels)})")
             if str(header.get("type")).endswith(("deepscanline", "deeptile")):
-                names[-1] += ", deep"
+                names[-1] += ", deep, which is not read"
                 continue
             for kind, layers in zip(kinds, found, strict=True):
                 part_of_more = len(kind) == 1 and _COMPANIONS.get(kind[0], set()) & set(channels)
