@@ -15,6 +15,9 @@ import numpy as np
 from simulator.settings import CameraSettings
 from simulator.utils.checks import did_you_mean
 
+#: Most states of a grid, each an object.
+_MOST_STATES = 2**16
+
 
 def plain(value: Any) -> Any:
     """`value` as numbers and lists where it is a scalar or an array of NumPy or torch."""
@@ -64,6 +67,8 @@ class ExposureGrid:
                     f"`{name}` (={given!r}) must be a strictly ascending list of numbers"
                 )
             object.__setattr__(self, name, tuple(float(v) for v in values))
+        if math.prod(self.shape) > _MOST_STATES:
+            raise ValueError(f"a grid must have at most {_MOST_STATES} states, not {self.shape}")
         assert self.states  # makes, and so checks, every CameraSettings
 
     @classmethod
