@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,7 +65,7 @@ class ExposureGrid:
             # NaN is not ascending; `CameraSettings` checks the ranges below.
             if not (values and numbers and all(a < b for a, b in pairwise(values))):
                 raise ValueError(
-                    f"`{name}` (={given!r}) must be a strictly ascending list of numbers"
+                    f"`{name}` (={reprlib.repr(given)}) must be a strictly ascending list of numbers"
                 )
             object.__setattr__(self, name, tuple(float(v) for v in values))
         if math.prod(self.shape) > _MOST_STATES:
