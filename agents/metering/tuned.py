@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policy import Floats
-from simulator.utils.files import write_atomically
+from simulator.utils.files import read_bounded, write_atomically
 
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
 EV_BANDWIDTHS = (0.35, 0.6, 1.0)
@@ -121,10 +121,10 @@ class ScoreRegression:
     def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:
         """Read what `save` wrote; a `ValueError`, where `name` names the file, if it is none."""
         from safetensors import SafetensorError
-        from safetensors.numpy import load_file
+        from safetensors.numpy import load
 
         try:
-            return cls(**load_file(path))
+            return cls(**load(read_bounded(Path(path))))
         except (OSError, SafetensorError, TypeError) as error:
             raise ValueError(f"`{name}` (={str(path)!r}) holds no tuned program: {error}") from None
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from simulator.utils.checks import check_flag, check_integer, check_number
+from simulator.utils.files import read_bounded
 
 #: Entry of the file's metadata that holds the description, and the form that it has.
 METADATA, FORMAT = "ae_env", 1
@@ -123,7 +124,7 @@ class Controller:
         options.intra_op_num_threads = 1  # the network is small: threads cost more than they bring
         try:
             self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
+                read_bounded(Path(path)), options, providers=["CPUExecutionProvider"]
             )
             found = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:  # ONNX Runtime has errors of its own
