@@ -20,9 +20,10 @@ BASE_ISO = 100.0
 def planes_of(array, configuration, black_levels):
     """Signal (4, H/2, W/2) of R, G1, G2, B of a raw as `make_array("raw")` gives it.
 
-    That is (H, stride) bytes: rows of 16-bit samples, padded. `configuration` is that of the raw
-    stream, which says order and bits of the samples (a Raspberry Pi 5 moves them up to 16 bits);
-    `black_levels` those of R, Gr, Gb, B in the metadata, on 16 bits whatever the sensor has.
+    That is (H, stride) bytes: rows of samples of 16 bits (8 where the format says so), padded.
+    `configuration` is that of the raw stream, which says order and bits of the samples (a Raspberry
+    Pi 5 moves them up to 16 bits); `black_levels` those of R, Gr, Gb, B in the metadata, on 16 bits
+    whatever the sensor has.
     """
     known = re.fullmatch(r"S(RGGB|GRBG|GBRG|BGGR)(\d+)", configuration["format"])
     if known is None:
@@ -31,7 +32,10 @@ def planes_of(array, configuration, black_levels):
         )
     order, white = known[1], 2.0 ** int(known[2]) - 1.0
     width, height = configuration["size"]
-    mosaic = array.view(np.uint16)[:height, :width].astype(np.float64)
+    samples = array.view(np.uint8 if white < 256.0 else np.uint16)
+    mosaic = samples[:height, :width].astype(np.float64)
+    if mosaic.shape != (height, width):
+        raise ValueError(f"raw of {samples.shape} samples must hold {height} rows of {width}")
     red, blue = order.index("R"), order.index("B")
     places = (red, red ^ 1, blue ^ 1, blue)  # G1 is on red's rows, G2 on blue's
     planes = np.stack([mosaic[i // 2 :: 2, i % 2 :: 2] for i in places])

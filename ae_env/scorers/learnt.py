@@ -22,6 +22,9 @@ from simulator.utils.cache import cache_dir
 from simulator.utils.checks import check_integer, check_type
 from simulator.utils.files import read_bounded
 
+#: Most bytes of a model file; ONNX allows no more.
+_MOST_BYTES = 2**31
+
 
 def find_model_file(
     scorer: str, given: str | os.PathLike[str] | None, variable: str, name: str, *, how: str
@@ -34,7 +37,7 @@ def find_model_file(
     named = os.environ.get(variable) if given is None else os.fspath(given)
     file = Path(named).expanduser() if named else cache_dir() / name
     if file.is_file():
-        return str(file.resolve()), hashlib.sha256(file.read_bytes()).hexdigest()
+        return str(file.resolve()), hashlib.sha256(read_bounded(file, _MOST_BYTES)).hexdigest()
     if named:
         source = f"`{variable}`" if given is None else "`file`"
         raise ValueError(f"{source} (={named!r}) must be the model file of {scorer!r}; {how}")
@@ -267,7 +270,7 @@ class Classifier:
         for name, values, low in (("mean", mean, -math.inf), ("std", std, 0.0)):
             try:
                 red, green, blue = (float(value) for value in values)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 red = green = blue = math.nan
             if not min(red, green, blue) > low:
                 rule = "three numbers, for R, G and B" + (", > 0" if name == "std" else "")
@@ -347,7 +350,7 @@ def _session(file: str, digest: str) -> Any:
             f"scorer 'classifier' reads {file!r} by ONNX Runtime: pip install 'ae-env[onnx]' "
             f"({error})"
         ) from error
-    content = Path(file).read_bytes()
+    content = read_bounded(Path(file), _MOST_BYTES)
     if hashlib.sha256(content).hexdigest() != digest:
         raise ValueError(f"`model` (={file!r}) must not change while it is in use")
     options = onnxruntime.SessionOptions()

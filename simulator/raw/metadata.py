@@ -35,6 +35,7 @@ Directory = dict[str, tuple[Any, ...]]
 class Ratio(float):
     """A rational of a file, which keeps the denominator that it was written with."""
 
+    __slots__ = ("denominator",)
     denominator: int
 
     def __new__(cls, numerator: int, denominator: int) -> Ratio:
@@ -58,7 +59,7 @@ _NAMES = (
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
     *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
     *("PhotographicSensitivity", "DefaultScale", "BaselineExposure", *OPCODES, "DNGVersion"),
-    *("UniqueCameraModel", "CFALayout", "SampleFormat"),
+    *("UniqueCameraModel", "CFALayout", "SampleFormat", "ShutterSpeedValue", "ApertureValue"),
 )
 #: Of Panasonic's and Leica's RW2 and RWL: where the pixels are, how many, how they are packed.
 _PANASONIC = {0x118: "RawDataOffset", 2: "SensorWidth", 3: "SensorHeight", 0x2D: "RawFormat"}
@@ -70,6 +71,8 @@ _MAGIC = (42, 0x4F52, 0x5352, 0x55)
 #: Beyond these a file is damaged, or made to take forever; camera files stay far below.
 _MAX_DIRECTORIES, _MAX_TAGS, _MAX_VALUES = 64, 4096, 2**18
 _NO_POSITION = 2**32 - 1
+#: Formats of RATIONAL and SRATIONAL, of which tifffile reads half where there are more than 1024.
+_RATIONALS = {5: "I", 10: "i"}
 
 
 def read_directories(stream: BinaryIO) -> list[Directory]:
@@ -94,11 +97,16 @@ def read_directories(stream: BinaryIO) -> list[Directory]:
             followers: list[Any] = []
             entries, following = _read_entries(file, offset)
             for at, entry in entries.items():
-                code, _, count = struct.unpack_from(f"{form.byteorder}HHI", entry)
+                code, kind, count, place = struct.unpack(f"{form.byteorder}HHII", entry)
                 if not 0 < count <= room or code not in _WANTED:
                     continue
                 room -= count
                 with suppress(Exception):  # of a damaged tag, tifffile may raise anything
+                    if kind in _RATIONALS and code in _NAME_OF_CODE:
+                        layout = f"{form.byteorder}{2 * count}{_RATIONALS[kind]}"
+                        parts = iter(struct.unpack(layout, _read_at(stream, place, 8 * count)))
+                        tags[_NAME_OF_CODE[code]] = tuple(map(Ratio, parts, parts))
+                        continue
                     tag = tifffile.TiffTag.fromfile(file, offset=at, header=entry)  # type: ignore[arg-type]
                     if code == _EXIF:
                         followers.append(tag.valueoffset)
@@ -146,11 +154,7 @@ def _values(tag: tifffile.TiffTag) -> tuple[Any, ...]:
         return (text.split("\0")[0].strip(),)
     if isinstance(value, bytes):
         return tuple(value) if kind == tifffile.DATATYPE.BYTE else (value,)
-    values = tuple(np.ravel(value).tolist())
-    if kind in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
-        pairs = zip(values[::2], values[1::2], strict=True)
-        return tuple(Ratio(*pair) for pair in pairs)
-    return values
+    return tuple(np.ravel(value).tolist())
 
 
 def first(directories: Sequence[Directory], name: str) -> tuple[Any, ...] | None:
@@ -167,6 +171,15 @@ def numbers(tags: Directory, name: str) -> tuple[float, ...]:
 def first_numbers(directories: Sequence[Directory], name: str) -> tuple[float, ...]:
     """`numbers` of the first directory that has the tag; empty if there is none."""
     return next((numbers(tags, name) for tags in directories if name in tags), ())
+
+
+def undefined(directories: Sequence[Directory], *names: str) -> bool:
+    """Whether the first tag that a file has of `names` holds no number, but a denominator of 0.
+
+    LibRaw takes that for a denominator of 1.
+    """
+    name = next((name for name in names if first(directories, name)), None)
+    return name is not None and not first_numbers(directories, name)
 
 
 def missing_bytes(directories: Sequence[Directory], size: int) -> int:

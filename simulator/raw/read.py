@@ -37,11 +37,12 @@ from simulator.raw.metadata import (
     read_directories,
     read_noise_profile,
     read_own_record,
+    undefined,
 )
 from simulator.raw.noise_estimation import estimate_nlf
 from simulator.settings import CameraSettings, snap_exposure_time
 from simulator.utils.checks import check_type, check_word
-from simulator.utils.files import as_path, printable, refuse_bomb
+from simulator.utils.files import as_path, file_fault, printable, read_bounded, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +57,8 @@ _COMPRESSIONS, _VC5 = (1, 7, 8), 9
 _LETTERS = {0: "R", 1: "G", 2: "B"}
 _SETTINGS = ("iso", "exposure_time", "f_number")
 _TAGS = {"iso": "PhotographicSensitivity", "exposure_time": "ExposureTime", "f_number": "FNumber"}
+#: What LibRaw takes where a file lacks these.
+_SPARE = {"exposure_time": ("ShutterSpeedValue",), "f_number": ("ApertureValue",)}
 #: Makers whose cameras record the stop that is marked, 1/60 s for 1/64 s, by the first word of
 #: their name; others (phones, computers, industrial cameras) record the time itself, and so does
 #: whoever gives it with this denominator or a larger one (Android: nanoseconds).
@@ -136,15 +139,13 @@ def read_raw(
         RawFileError: (a `ValueError`) If the file is not a raw, not a Bayer raw (X-Trans, Foveon,
             linear DNG, monochrome), cut short or damaged, may not be read, changes meanwhile, or
             claims more than `MAX_PIXELS` of `simulator.utils.files`, or `MAX_PIXELS_PER_BYTE`
-            for each byte of the file.
+            for each byte of the file, 64 where it claims more than `MAX_FLAT_PIXELS`.
         ValueError: If settings are missing from the file and not given, or `camera` does not fit.
     """
     path = as_path(path)
     check_settings(settings)
-    if not path.is_file():
-        missing = "is no ordinary file" if path.exists() else "does not exist"
-        what = "is a folder" if path.is_dir() else missing
-        raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
+    if fault := file_fault(path):
+        raise FileNotFoundError(f"`path` (={str(path)!r}) {fault}; give a raw file")
     with _errors_name(path):
         return _read(path, settings, camera, nlf)
 
@@ -165,6 +166,8 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
     """
     path = as_path(path)
     with _errors_name(path):
+        if fault := file_fault(path):
+            raise RawFileError(fault)
         with path.open("rb") as stream:
             directories = read_directories(stream)
             make, _ = camera_identity(stream, directories)
@@ -502,7 +505,7 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
 
 def _open(path: Path) -> rawpy.RawPy:
     name = str(path)  # of which LibRaw's wrapper takes UTF-8 only
-    return rawpy.imread(name if printable(name) == name else io.BytesIO(path.read_bytes()))
+    return rawpy.imread(name if printable(name) == name else io.BytesIO(read_bounded(path, 2**30)))
 
 
 def _decode_with_libraw(
@@ -571,8 +574,8 @@ def _from_libraw(
         extra=_extra(
             int(sizes.flip),
             moment.replace(tzinfo=None) if known else None,
-            raw.other.focal_length,
-            sizes.pixel_aspect,
+            0.0 if undefined(directories, "FocalLength") else raw.other.focal_length,
+            1.0 if undefined(directories, "DefaultScale") else sizes.pixel_aspect,
         ),
         origin=margins,
     )
@@ -610,6 +613,8 @@ def _white_balance(
 ) -> tuple[tuple[float, float, float], str]:
     """Gains of R, G, B with green 1: the camera's, else LibRaw's daylight ones, else neutral."""
     known = {"camera": raw.camera_whitebalance, "daylight": raw.daylight_whitebalance}
+    if undefined(directories, "AsShotNeutral"):
+        del known["camera"]
     for source, gains in known.items():
         red, green, blue = (gains[plane_letters(directories).index(letter)] for letter in "RGB")
         if all(np.isfinite(g) and g > 0 for g in (red, green, blue)):
@@ -649,6 +654,8 @@ def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> 
         cut = setting == "iso" and found[setting] == stated % 2**16
         if stated and (not found[setting] or same or cut):
             found[setting] = float(stated)
+        if undefined(directories, name, *_SPARE.get(setting, ())):
+            found[setting] = 0.0
     if found["iso"] in (0, 65535):  # none, or it does not fit EXIF's 16 bits
         more = (first_numbers(directories, name) for name in LONG_ISO)
         found["iso"] = next((v[0] for v in more if v and v[0] > 0), found["iso"])

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import math
+import os
 from contextlib import closing
 from pathlib import Path
 
@@ -206,7 +207,8 @@ def test_save_and_load_give_the_same_regression(tmp_path):
     query = np.array([[0.1, 0.2], [3.0, -3.0]])
     np.testing.assert_array_equal(model.predict(query), again.predict(query))
     (tmp_path / "text").write_text("no tensors here")
-    for name in ("missing.safetensors", "text"):
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("missing.safetensors", "text", "pipe"):
         with pytest.raises(ValueError, match="`path`"):
             ScoreRegression.load(tmp_path / name)
     good, nan = vars(model), np.full_like(model.scores, np.nan)

@@ -103,15 +103,17 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported, left_justi
 
 def test_order_and_padding_of_a_raw_stream_are_those_of_its_configuration() -> None:
     example = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "picamera2_ae.py")))
-    mosaic = np.array([[1, 2, 5, 6], [3, 4, 7, 8]], np.uint16) * 64  # rows of 8 bytes, padded to 12
-    array = np.pad(mosaic.view(np.uint8), ((0, 0), (0, 4)))
-    for order, planes in (("BGGR", (4, 3, 2, 1)), ("GBRG", (3, 4, 1, 2))):
-        raw = {"format": f"S{order}10", "size": (4, 2)}
-        found = example.planes_of(array, raw, [4096] * 4)  # 64 of 10 bits
-        wanted = [(64 * np.array([[v, v + 4]]) - 64) / (1023 - 64) for v in planes]
+    mosaic = np.array([[1, 2, 5, 6], [3, 4, 7, 8]])
+    for order, bits, planes in (("BGGR", 10, (4, 3, 2, 1)), ("GBRG", 8, (3, 4, 1, 2))):
+        black, raw = 2**bits // 16, {"format": f"S{order}{bits}", "size": (4, 2)}
+        samples = (black * mosaic).astype(np.uint8 if bits == 8 else np.uint16)
+        array = np.pad(samples.view(np.uint8), ((0, 0), (0, 4)))  # the stride is longer
+        found = example.planes_of(array, raw, [4096] * 4)
+        wanted = [black * np.array([[v - 1, v + 3]]) / (2**bits - 1 - black) for v in planes]
         np.testing.assert_allclose(found, wanted)
-    with pytest.raises(ValueError, match="SRGGB12_CSI2P"):
-        example.planes_of(array, {"format": "SRGGB12_CSI2P", "size": (4, 2)}, [4096] * 4)
+    for form, words in (("SRGGB12_CSI2P", "SRGGB12_CSI2P"), ("SRGGB16", "2 rows of 9")):
+        with pytest.raises(ValueError, match=words):
+            example.planes_of(array, {"format": form, "size": (9, 2)}, [4096] * 4)
 
 
 def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):

@@ -80,6 +80,12 @@ def test_what_libraw_takes_for_something_else(tmp_path):
     light = (MOSAIC[::2, ::2] - 64) / (4095 - 64)
     np.testing.assert_allclose(raw.data[0], light, atol=1e-4)  # of 14 bits
     assert (raw.camera.make, raw.camera.model) == ("Test", "Test Sensor")
+    tags = dict.fromkeys(("ExposureTime", "FNumber", "FocalLength"), ("2I", (5, 0)))  # not 5 s
+    tags |= dict.fromkeys(("AsShotNeutral", "DefaultScale"), ("2I", (2, 0, 1, 1, 1, 1)))
+    assert read_settings(write_sample_dng(path, **tags)) == {}
+    known = read_raw(path, settings=SETTINGS, nlf=NLF).metadata
+    assert not {"focal_length", "pixel_aspect"} & {*known}
+    assert known["white_balance_source"] == "daylight"
     path = write_sample_dng(path, CFALayout=("H", (3,)))
     with pytest.raises(RawFileError, match="CFALayout"):
         read_raw(path)
@@ -142,9 +148,12 @@ def test_a_pixels_own_black_level_makes_nothing_white_and_may_be_negative(tmp_pa
     wanted = np.array([4090 - 20, 4094]) - 64  # 4095 is white
     np.testing.assert_allclose(raw.data.unique(), wanted / (4095 - 64), rtol=1e-6)
     assert not raw.saturated.any()
-    deltas = {"BlackLevelDeltaV": ("2i", (-1, 10) * 64)}
-    raw = read_raw(write_sample_dng(path, black=(0,), **deltas), **given)
-    np.testing.assert_allclose(raw.data[0], (MOSAIC[::2, ::2] + 0.1) / 4095, rtol=1e-6)
+    for rows in (64, 1024, 1025, 2602):
+        deltas = {"BlackLevelDeltaV": ("2i", (-1, 10) * rows)}
+        mosaic = np.resize(MOSAIC, (rows, 96))
+        raw = read_raw(write_sample_dng(path, mosaic, black=(0,), **deltas), **given)
+        light = (mosaic[: rows // 2 * 2 : 2, ::2] + 0.1) / 4095
+        np.testing.assert_allclose(raw.data[0], light, rtol=1e-6)
 
 
 def test_levels_colour_and_metadata(tmp_path):
@@ -159,6 +168,9 @@ def test_levels_colour_and_metadata(tmp_path):
     assert raw.settings == SETTINGS  # given settings are not snapped
     known = {"path": "\\udcff.dng", "make": "Test", "model": "Sensor", "nlf_source": "given"}
     assert known.items() <= raw.metadata.items()
+    os.truncate(path, 2**36)  # a hole
+    with pytest.raises(RawFileError, match=f"more than {2**30} bytes"):
+        read_raw(path, settings=SETTINGS)
     camera = raw.camera
     assert (raw.noise, camera.name, camera.bit_depth) == (NLF, "test_sensor", 12)
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
@@ -245,6 +257,8 @@ def test_what_is_no_file(given, own_dng, tmp_path):
     for path in (tmp_path / "none", tmp_path, Path(os.devnull)):
         with pytest.raises(FileNotFoundError, match="`path`"):
             read_raw(path)
+        with pytest.raises(RawFileError, match=r"\) (does not exist|is a folder|is no ordinary)"):
+            read_settings(path)
     for target, raw, name in (("a.tif", read_raw(own_dng), "path"), (own_dng, None, "raw")):
         with pytest.raises(ValueError, match=f"`{name}`"):
             write_dng(tmp_path / target, raw)
@@ -318,7 +332,7 @@ LARGEST = ("white_level", 65535)
         *(("WhiteLevel", "I", (white,), LARGEST) for white in (0, 65536, 2**32 - 1)),
         ("WhiteLevel", "I", (64,), "above its black levels, .* white 64"),
         ("Sides", "I", (20_000,), "20000 x 20000 pixels.*at most 268435456 are read"),
-        ("Sides", "I", (8_000,), "8000 x 8000 pixels.*at most 1024 a byte are read"),
+        ("Sides", "I", (4_000,), "4000 x 4000 pixels.*at most 1024 a byte are read"),
     ],
 )
 def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, form, values, changed):
@@ -455,7 +469,7 @@ def test_identities_of_other_containers(tmp_path):
 
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
-@pytest.mark.parametrize("kind", [1, 3, 4, 12])
+@pytest.mark.parametrize("kind", [1, 3, 4, 5, 12])
 def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
     codes = sorted({*range(254, 345), *tifffile.TIFF.TAG_READERS, *range(50706, 50830), 34665})
     path = tmp_path / "a.dng"
