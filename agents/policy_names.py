@@ -240,13 +240,13 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     built_in = {known.partition(":")[0] for known in (*_POLICIES, *_BRACKETS)}
     named = all(part.isidentifier() for part in (*head.split("."), tail))
     if head in built_in or not named:
-        raise _refusal(name, _known(base))
+        raise _refusal(name, _known(base, head))
     try:
         loaded = importlib.import_module(head)
     except Exception as error:  # the user's module runs, and may raise anything
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and f"{head}.".startswith(f"{missing}."):
-            raise _refusal(name, f"{_known(base)} (there is no module {missing!r})") from None
+            raise _refusal(name, _known(base, head)) from None
         text = f": {head} cannot be imported: {type(error).__name__}: {error}"
         raise _refusal(name, text) from error
     return find_attribute(loaded, tail, f"`policy` (={name!r})"), {}
@@ -279,12 +279,19 @@ def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str
         raise _refusal(name, f": {cls.__name__} does not take the option {option!r}{takes}")
 
 
-def _known(base: str) -> str:
-    """What a name may be, for an error about the unknown `base`."""
+def _known(base: str, head: str) -> str:
+    """What a name may be, for an error about the unknown `base`, which begins with `head`."""
+    if head in (*METERS, "rpi_agc"):
+        programs = PROGRAMS if head in METERS else MANUAL_PROGRAMS
+        return f": its program must be one of {', '.join(f'{head}:{p}' for p in programs)}"
     files = [f"{head}:{argument.upper()}" for head, (_, argument) in WITH_FILE.items()]
     names = [*_POLICIES, *files, *_BRACKETS]
     single = [name for name in names if name.partition(":")[0] not in METERS]
-    hint = did_you_mean(base, [*_SHORT, *names], cutoff=0.5)
+    path = re.search(r"[./\\]", head)  # which no built-in name has
+    hint = did_you_mean(base, [*_SHORT, *names], cutoff=0.6 if path else 0.5)
+    if path:
+        own = "one of your own is package.module:Class or path.py:Class"
+        return f": there is no module and no Python file {head!r}; {own}{hint}"
     return (
         f" must be one of {', '.join(single)}; a meter ({', '.join(METERS)}), alone or with a "
         f"program ({', '.join(PROGRAMS)}); package.module:Class or path.py:Class{hint}"

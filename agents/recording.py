@@ -113,7 +113,8 @@ def _writing(dataset_id: str) -> Iterator[None]:
         rule = "is being recorded by another process: take another name, or wait"
         raise ValueError(f"`out` (={dataset_id!r}) {rule}") from None
     except OSError as error:
-        where = os.environ.get(_ROOT, "Minari's folder")
+        named = os.environ.get(_ROOT)
+        where = named or "Minari's folder" + f" ({_ROOT} is empty)" * (named is not None)
         reason = f"`out` (={dataset_id!r}) cannot be written to {where}: {error.strerror or error}"
         raise OSError(error.errno, reason) from error
 
@@ -140,7 +141,7 @@ def _reserved(dataset_id: str) -> Iterator[Path]:
     for left in filter(Path.is_dir, root.glob(".unfinished-*")):
         with suppress(Timeout), emptied(left):
             pass
-    folder = root / f".unfinished-{dataset_id.replace('/', '-')}"
+    folder = root / f".unfinished-{dataset_id.replace('/', '.')}"  # a name holds no point
     with emptied(folder):
         if dataset_id in minari.list_local_datasets() or (root / dataset_id).exists():
             rule = f"take a higher version, or remove it with `minari delete {dataset_id}`"

@@ -212,7 +212,8 @@ def _quit(status: int, *_: Any) -> None:
 
 
 def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
+    own = isinstance(error, OSError) and error.filename is None and error.strerror
+    text = " ".join(str(own or error).split())  # errors of ours name the file themselves
     if isinstance(error, ValueError | OSError | ImportError):
         return text
     return f"{type(error).__name__}: {text}; `ae-env --debug` shows where"

@@ -150,6 +150,7 @@ def export(
     task = "ae_env:ae_env/AutoExposure-v0"
     with contextlib.closing(gym.make_vec(task, scenes="bundled:small", **options)) as envs:
         agent = make_policy(name, PolicyContext.from_envs(envs))
+    agent.name = policy  # for errors
     file = export_agent(agent, out)
     controller = Controller(file)
     console.terminal.print(

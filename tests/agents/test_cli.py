@@ -152,6 +152,7 @@ print("loaded", *sys.modules)
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", *UNKNOWN), "`policy` (='matrx:P') must"),  # before scenes are read
         (("record", *UNKNOWN, "-o", "ae_env/b-v0"), "`policy` (='matrx:P') must"),
+        (("export", "ppo:video"), "`policy` (='ppo:video') must be without a history"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
@@ -210,7 +211,7 @@ def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("raised", "status", "message"),
     [
-        (OSError(28, "No space left on device"), 1, "error [Errno 28] No space left on device\n"),
+        (OSError(28, "No space left on device"), 1, "error No space left on device\n"),
         (RuntimeError("out of\nmemory"), 1, "error RuntimeError: out of memory; `ae-env --debug`"),
         (KeyboardInterrupt(), 130, "stopped\n"),  # a simulation restarts
     ],

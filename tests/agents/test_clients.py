@@ -140,13 +140,14 @@ def test_what_is_unfinished_is_removed_and_names_are_checked(folder, context):
     policy = make_policy("random", context)
     for left in ("mine-v0", "other-v1", "x81nf"):  # of processes that have died
         (folder / f".unfinished-{left}").mkdir()
-    with FileLock(folder / ".unfinished-ae-mine-v0.lock"):  # another process records it
-        (folder / ".unfinished-ae-mine-v0").mkdir()
+    with FileLock(folder / ".unfinished-ae.mine-v0.lock"):  # another process records it
+        (folder / ".unfinished-ae.mine-v0").mkdir()
         with pytest.raises(ValueError, match=r"`out`.* another process"):
             record_dataset(policy, "random", TASK, RECORDED, "ae/mine-v0", episodes=1)
-        record_dataset(policy, "random", TASK, RECORDED, "mine-v0", episodes=1)
+        for name in ("mine-v0", "ae-mine-v0"):
+            record_dataset(policy, "random", TASK, RECORDED, name, episodes=1)
         left = {path.name for path in folder.iterdir() if path.is_dir()}
-        assert left == {".unfinished-ae-mine-v0", "mine-v0"}
+        assert left == {".unfinished-ae.mine-v0", "mine-v0", "ae-mine-v0"}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))  # as a full disk, to each file
     try:
