@@ -459,7 +459,7 @@ def clipped(*pixels: tuple[float, ...], balance: tuple[float, float, float] = BA
         *(((v / 2, v, v / 1.25), (v / 2, v, v / 1.25)) for v in WHITE[:3]),
         ((4.5, 9.0, 7.2), (1.8, 3.6, 2.88)),  # 1.8 times as bright as red's white
         ((3.0, 0.3, 0.2), (1.0, 0.3, 0.2)),  # a red lamp stays red
-        ((0.9, 1.0, 0.2), (0.9, 1.025, 0.2)),  # levels 1.8 and 0.25 are known
+        ((0.9, 1.0, 0.2), (0.9, 1.0, 0.2)),  # of the levels 1.8 and 0.25 the lower
     ],
 )
 def test_clipped_planes_become_as_bright_as_white(recorded, expected) -> None:
@@ -495,11 +495,18 @@ def test_a_full_photosite_below_white_and_an_absurd_balance() -> None:
     found = neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist()
     assert found == pytest.approx([1.0, 0.94, 1.0, 1.0])  # the level 0.94 is below white
     raw = replace(raw, camera=replace(Z6, full_level=0.92))
-    assert neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist() == pytest.approx(
-        [1.8, 3.6, 3.6, 2.88]
-    )
+    found = neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist()
+    assert found == pytest.approx([1.8, 3.6, 3.6, 2.88])
     raw = clipped((1.0, 1.0, 1.0), balance=(1e30, 1.0, 1.0))
     assert neutral_highlights(raw, raw.saturated).max() == 16.0
+
+
+def test_one_sample_near_white_tells_nothing_of_a_lamp_around_it() -> None:
+    data = torch.ones(4, 64, 64)
+    data[1, 32, 32] = 0.995
+    raw = RawImage(data, replace(BASE, iso=3200), Z6, white_balance=(2.0, 1.0, 1.5))
+    lamp = neutral_highlights(raw, raw.saturated)[:, 24, 24]
+    torch.testing.assert_close(lamp, torch.tensor([1.8, 3.6, 3.6, 2.4]), rtol=0.01, atol=0)
 
 
 @pytest.mark.parametrize("ratio", [1 / 16, 4.0])
