@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from simulator.settings import CameraSettings
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import as_float, did_you_mean
+
+#: Most states of a grid, each an object.
+_MOST_STATES = 2**16
 
 
 def plain(value: Any) -> Any:
@@ -56,14 +59,15 @@ class ExposureGrid:
     def __post_init__(self) -> None:
         for name in ("isos", "exposure_times", "f_numbers"):
             given = getattr(self, name)
-            values = tuple(plain_list(given) or ())
-            numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in values)
-            # NaN is not ascending; `CameraSettings` checks the ranges below.
-            if not (values and numbers and all(a < b for a, b in pairwise(values))):
-                raise ValueError(
-                    f"`{name}` (={given!r}) must be a strictly ascending list of numbers"
-                )
-            object.__setattr__(self, name, tuple(float(v) for v in values))
+            values = tuple(map(as_float, plain_list(given) or ()))
+            # `CameraSettings` checks the ranges below.
+            fit = bool(values) and all(map(math.isfinite, values))
+            if not (fit and all(a < b for a, b in pairwise(values))):
+                rule = "must be a strictly ascending list of numbers"
+                raise ValueError(f"`{name}` (={reprlib.repr(given)}) {rule}")
+            object.__setattr__(self, name, values)
+        if math.prod(self.shape) > _MOST_STATES:
+            raise ValueError(f"a grid must have at most {_MOST_STATES} states, not {self.shape}")
         assert self.states  # makes, and so checks, every CameraSettings
 
     @classmethod

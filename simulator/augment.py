@@ -274,7 +274,7 @@ _check_seed = functools.partial(check_integer, low=0, high=2**63 - 1)
 def _check_range(name: str, given: Any, low: float, high: float) -> tuple[float, float]:
     try:
         first, last = (math.nan if isinstance(v, bool) else float(v) for v in given)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         first = last = math.nan
     if not low <= first <= last <= high:
         raise ValueError(

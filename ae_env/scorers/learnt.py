@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils import fuse_conv_bn_eval
@@ -22,6 +20,10 @@ from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.utils.user_files import UserCodeError
 from simulator.utils.cache import cache_dir
 from simulator.utils.checks import check_integer, check_type
+from simulator.utils.files import read_bounded
+
+#: Most bytes of a model file; ONNX allows no more.
+_MOST_BYTES = 2**31
 
 
 def find_model_file(
@@ -35,7 +37,7 @@ def find_model_file(
     named = os.environ.get(variable) if given is None else os.fspath(given)
     file = Path(named).expanduser() if named else cache_dir() / name
     if file.is_file():
-        return str(file.resolve()), hashlib.sha256(file.read_bytes()).hexdigest()
+        return str(file.resolve()), hashlib.sha256(read_bounded(file, _MOST_BYTES)).hexdigest()
     if named:
         source = f"`{variable}`" if given is None else "`file`"
         raise ValueError(f"{source} (={named!r}) must be the model file of {scorer!r}; {how}")
@@ -121,24 +123,14 @@ def read_network(file: str | os.PathLike[str]) -> NimaMobileNet:
 
     A `ValueError` if it cannot be read, or is not of this network.
     """
+    from simulator.networks.weights import load_into, read_weights
+
     network = NimaMobileNet()
     try:
-        weights = load_file(file)
-        missing, unexpected = network.load_state_dict(weights, strict=False)
-    except (OSError, SafetensorError, RuntimeError) as error:
-        raise ValueError(
-            f"`file` (={str(file)!r}) must be weights of NIMA's MobileNet in .safetensors: {error}"
-        ) from error
-    # The counters of training batches are not among the published numbers.
-    missing = [key for key in missing if not key.endswith("num_batches_tracked")]
-    if missing or unexpected:
-        raise ValueError(
-            f"`file` (={str(file)!r}) must hold exactly the arrays of NIMA's MobileNet: {missing} "
-            f"are missing, {unexpected} are none of it"
-        )
-    for key, values in weights.items():
-        if not bool(values.isfinite().all()):
-            raise ValueError(f"`file` (={str(file)!r}): {key} must be finite")
+        load_into(network, read_weights(read_bounded(Path(file))), "they")
+    except (OSError, ValueError) as error:
+        rule = "must be weights of NIMA's MobileNet in .safetensors"
+        raise ValueError(f"`file` (={str(file)!r}) {rule}: {error}") from error
     network.eval().requires_grad_(False)
     for layer in network.features:
         assert isinstance(layer, ConvNormReLU6)
@@ -278,7 +270,7 @@ class Classifier:
         for name, values, low in (("mean", mean, -math.inf), ("std", std, 0.0)):
             try:
                 red, green, blue = (float(value) for value in values)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 red = green = blue = math.nan
             if not min(red, green, blue) > low:
                 rule = "three numbers, for R, G and B" + (", > 0" if name == "std" else "")
@@ -358,7 +350,7 @@ def _session(file: str, digest: str) -> Any:
             f"scorer 'classifier' reads {file!r} by ONNX Runtime: pip install 'ae-env[onnx]' "
             f"({error})"
         ) from error
-    content = Path(file).read_bytes()
+    content = read_bounded(Path(file), _MOST_BYTES)
     if hashlib.sha256(content).hexdigest() != digest:
         raise ValueError(f"`model` (={file!r}) must not change while it is in use")
     options = onnxruntime.SessionOptions()

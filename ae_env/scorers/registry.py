@@ -19,14 +19,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from numbers import Real
 from typing import Any, TypeVar
 
 from ae_env.scorers import defects, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
 from ae_env.scorers.terms import CompositeScorer, check_part
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import as_float, did_you_mean
 
 ENTRY_POINT_GROUP = "ae_env.scorers"
 #: ``pyiqa:NAME`` is the metric NAME of the package pyiqa.
@@ -169,9 +168,8 @@ def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
 
 def _weighted_mean(spec: Mapping[str, float]) -> CompositeScorer:
     names = [_short(name) for name in spec if isinstance(name, str)]
-    weights = [weight for weight in spec.values() if isinstance(weight, Real)]
-    fit = all(0 < w < math.inf and not isinstance(w, bool) for w in weights)
-    if not (spec and fit and len(spec) == len(set(names)) == len(weights)):
+    fit = all(0 < as_float(weight) < math.inf for weight in spec.values())
+    if not (spec and fit and len(spec) == len(set(names))):
         raise ValueError(
             f"`scorer` (={dict(spec)!r}) must map one name or more, which differ behind the colon, "
             "to weights > 0 and finite, as {'noise': 0.5} does"

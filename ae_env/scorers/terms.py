@@ -12,7 +12,6 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from numbers import Real
 from typing import Any, get_args
 
 import numpy as np
@@ -22,6 +21,7 @@ from ae_env.observation import decode_observation, encode_observation
 from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, PixelBlur, Scorer
 from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop
+from simulator.utils.checks import as_float
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class CompositeScorer:
         self, parts: Mapping[str, Scorer], weights: Mapping[str, float] | None = None
     ) -> None:
         weights = dict.fromkeys(parts, 1.0) if weights is None else dict(weights)
-        fit = all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values())
+        fit = all(0 < as_float(w) < math.inf for w in weights.values())
         if not (parts and fit and set(weights) == set(parts)):
             rule = f"must give each of the parts {list(parts)} a finite number > 0"
             raise ValueError(f"`weights` (={weights}) {rule}")

@@ -21,7 +21,7 @@ from simulator.optics.thin_lens import SHARP
 from simulator.radiance.reading import read_exr
 from simulator.training.scenes import fill_from_nearest
 from simulator.utils.checks import check_number, check_word
-from simulator.utils.files import open_picture, refuse_bomb
+from simulator.utils.files import file_fault, open_picture, refuse_bomb
 
 #: The numbers of a depth map: distances, or inverse distances.
 DepthKind = Literal["distance", "disparity"]
@@ -177,6 +177,8 @@ def read_depth(
 def _read_map(path: Path, layer: str | None) -> np.ndarray:
     """The map (H, W) of numbers in a file, float64."""
     try:
+        if fault := file_fault(path):
+            raise ValueError(f"the file {fault}")
         match path.suffix.lower():
             case ".png":
                 with open_picture(path, ["PNG"]) as picture:

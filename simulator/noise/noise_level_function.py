@@ -49,7 +49,7 @@ class NoiseLevelFunction:
             given: Any = getattr(self, name)
             try:
                 values = tuple(map(float, given))
-            except (TypeError, ValueError):  # a single number, a word
+            except (TypeError, ValueError, OverflowError):  # a single number, a word
                 values = ()
             if len(values) != 4 or not all(map(math.isfinite, values)) or min(values) < 0.0:
                 raise ValueError(

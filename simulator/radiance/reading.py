@@ -27,6 +27,8 @@ RADIANCE_SUFFIXES = (".hdr", ".exr")
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 _RADIANCE_FORMATS = {"32-bit_rle_rgbe": SRGB, "32-bit_rle_xyze": _XYZ}
+#: Entries of a Radiance header whose lines multiply each other, and how many numbers a line has.
+_MULTIPLIERS = {"PIXASPECT": 1, "COLORCORR": 3}
 _ONE_AT_A_TIME = threading.Lock()
 _RESOLUTION = re.compile(r"([-+])([XY]) +(\d{1,18}) +([-+])([XY]) +(\d{1,18})\s*")
 
@@ -124,11 +126,12 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     for line in found[1].decode("utf-8", "replace").splitlines():
         name, equals, value = line.partition("=")
         if equals:
-            entries[name.strip()] = value.strip()
-    aspect = np.nan
-    with contextlib.suppress(ValueError):
-        aspect = float(entries.get("PIXASPECT", 1))
-    _check_aspect(aspect)
+            earlier = entries.get(name.strip(), "") if name.strip() in _MULTIPLIERS else ""
+            entries[name.strip()] = f"{earlier} {value}".strip()
+    aspect, correction = (_product(entries.get(n, ""), k) for n, k in _MULTIPLIERS.items())
+    _check_aspect(aspect[0])
+    if not ((correction >= 1e-6) & (correction <= 1e6)).all():
+        raise RadianceError(f"states a COLORCORR that is none: {entries['COLORCORR']}")
     kind = entries.get("FORMAT", "32-bit_rle_rgbe")
     if kind not in _RADIANCE_FORMATS:
         raise RadianceError(f"has the format {kind!r}, which is none of {[*_RADIANCE_FORMATS]}")
@@ -160,7 +163,17 @@ def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     if shown[2] == "X":  # columns are written, not rows
         image = image.swapaxes(0, 1)
     upright = image[:: 1 if signs["Y"] == "-" else -1, :: 1 if signs["X"] == "+" else -1]
-    return upright[:, :, ::-1].transpose(2, 0, 1), primaries
+    light = upright[:, :, ::-1].transpose(2, 0, 1)
+    if (correction != 1.0).any():  # the light has been multiplied by it
+        light = light / correction.astype(np.float32)[:, None, None]
+    return light, primaries
+
+
+def _product(text: str, count: int) -> np.ndarray:
+    """Product of all lines of `count` numbers; 1 where there is none, NaN where it is no number."""
+    with contextlib.suppress(ValueError), np.errstate(over="ignore"):
+        return np.array(text.split(), np.float64).reshape(-1, count).prod(axis=0)
+    return np.full(count, np.nan)
 
 
 # -- OpenEXR ----------------------------------------------------------------------------------

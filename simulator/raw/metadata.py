@@ -36,6 +36,7 @@ class Ratio(float):
     """A rational of a file, which keeps the denominator that it was written with."""
 
     __slots__ = ("denominator",)
+    denominator: int
 
     def __new__(cls, numerator: int, denominator: int) -> Ratio:
         """NaN over a denominator of 0."""

@@ -42,7 +42,7 @@ from simulator.raw.metadata import (
 from simulator.raw.noise_estimation import estimate_nlf
 from simulator.settings import CameraSettings, snap_exposure_time
 from simulator.utils.checks import check_type, check_word
-from simulator.utils.files import as_path, printable, refuse_bomb
+from simulator.utils.files import as_path, file_fault, printable, read_bounded, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -139,15 +139,13 @@ def read_raw(
         RawFileError: (a `ValueError`) If the file is not a raw, not a Bayer raw (X-Trans, Foveon,
             linear DNG, monochrome), cut short or damaged, may not be read, changes meanwhile, or
             claims more than `MAX_PIXELS` of `simulator.utils.files`, or `MAX_PIXELS_PER_BYTE`
-            for each byte of the file.
+            for each byte of the file, 64 where it claims more than `MAX_FLAT_PIXELS`.
         ValueError: If settings are missing from the file and not given, or `camera` does not fit.
     """
     path = as_path(path)
     check_settings(settings)
-    if not path.is_file():
-        missing = "is no ordinary file" if path.exists() else "does not exist"
-        what = "is a folder" if path.is_dir() else missing
-        raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
+    if fault := file_fault(path):
+        raise FileNotFoundError(f"`path` (={str(path)!r}) {fault}; give a raw file")
     with _errors_name(path):
         return _read(path, settings, camera, nlf)
 
@@ -168,6 +166,8 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
     """
     path = as_path(path)
     with _errors_name(path):
+        if fault := file_fault(path):
+            raise RawFileError(fault)
         with path.open("rb") as stream:
             directories = read_directories(stream)
             make, _ = camera_identity(stream, directories)
@@ -505,7 +505,7 @@ def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | 
 
 def _open(path: Path) -> rawpy.RawPy:
     name = str(path)  # of which LibRaw's wrapper takes UTF-8 only
-    return rawpy.imread(name if printable(name) == name else io.BytesIO(path.read_bytes()))
+    return rawpy.imread(name if printable(name) == name else io.BytesIO(read_bounded(path, 2**30)))
 
 
 def _decode_with_libraw(

@@ -66,11 +66,22 @@ def check_integer(
     raise ValueError(f"`{name}` (={value!r}) must be an integer {rule}{more}")
 
 
+def as_float(value: Any) -> float:
+    """`value` as a float: NaN where it is no real number, infinite where it is too large for one.
+
+    To be compared: beside a NumPy scalar, bounds lose digits.
+    """
+    try:
+        return float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
 def check_number(name: str, value: Any, low: float, high: float, *, more: str = "") -> float:
     """`value` as a float; a `ValueError`, which `more` ends, unless it is in [`low`, `high`]."""
-    number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    number = as_float(value)
     if low <= number <= high:
-        return float(number)
+        return number
     rule = f"number in [{low:g}, {high:g}]"
     if high == sys.float_info.max:
         rule = "finite number > 0" if low == sys.float_info.min else f"finite number >= {low:g}"

@@ -48,11 +48,13 @@ MAX_PIXELS_PER_BYTE = 1024
 #: The same for a radiance map; a flat one in OpenEXR's DWAB compression has over 3000.
 MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 
-#: Most pixels of a developed picture, and most of one with more than 256 pixels a byte, as a black
-#: one has: decoded, they take some 1 GB.
+#: Most pixels of a developed picture, and most of any with more than 256 pixels a byte (64 of a raw
+#: or a radiance map, of which real ones have 1, enlarged ones 6), as a black one has: decoded, they
+#: take some 1 GB.
 MAX_PICTURE_PIXELS, MAX_FLAT_PIXELS = 2**26, 2**24
 
 _BITS_PER_SAMPLE = 258
+_SPECIAL = "is no ordinary file"
 
 #: Libraries that numbers depend on.
 _LIBRARIES = ("torch", "numpy", "gymnasium", "stable-baselines3", "scikit-image", "rawpy")
@@ -88,25 +90,40 @@ def printable(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
+def file_fault(path: Path) -> str:
+    """Why a path is none of an ordinary file (a pipe is read for ever); empty where it is."""
+    if path.is_file():
+        return ""
+    return "is a folder" if path.is_dir() else _SPECIAL if path.exists() else "does not exist"
+
+
 def read_bounded(path: Path, most: int = 2**26) -> bytes:
     """Content of an ordinary file of at most so many bytes; an `OSError` for another one."""
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+    if file_fault(path) == _SPECIAL:
+        raise OSError(errno.EINVAL, f"it {_SPECIAL}", str(path))
     with path.open("rb") as stream:
-        content = stream.read(most + 1)
-    if len(content) > most:
+        size = os.fstat(stream.fileno()).st_size
+        content = stream.read(most + 1) if size <= most else b""
+    if max(size, len(content)) > most:
         raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
     return content
 
 
-def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
+def refuse_bomb(
+    height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE, large: int = 64
+) -> str:
     """Why a picture must not be decoded: it claims far more pixels than `size` bytes can hold.
 
-    Empty where it may be decoded; each byte of the file may stand for `per_byte` pixels at most.
+    Empty where it may be decoded; each byte of the file may stand for `per_byte` pixels at most, or
+    `large` in one of more than `MAX_FLAT_PIXELS`.
+
+    >>> refuse_bomb(8192, 16384, 2**21), refuse_bomb(8000, 8000, 37_825)
+    ('', 'claims 8000 x 8000 pixels in 37825 bytes, where at most 64 a byte are read')
     """
     pixels = height * width
     if pixels > MAX_PIXELS:
         return f"claims {height} x {width} pixels, where at most {MAX_PIXELS} are read"
+    per_byte = large if pixels > MAX_FLAT_PIXELS else per_byte
     if pixels > per_byte * size:
         claim = f"claims {height} x {width} pixels in {size} bytes"
         return f"{claim}, where at most {per_byte} a byte are read"
@@ -127,6 +144,8 @@ def open_picture(
     from PIL import Image
 
     try:
+        if fault := file_fault(path):
+            raise ValueError(f"it {fault}")
         with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
             opened = Image.open(path, formats=list(formats))  # warns of what is refused below
         with opened as picture:
@@ -135,7 +154,7 @@ def open_picture(
                 raise ValueError(f"it has {size}, where at most {MAX_PICTURE_PIXELS} are read")
             if picture.width * picture.height > MAX_FLAT_PIXELS:
                 length = path.stat().st_size
-                if claim := refuse_bomb(picture.height, picture.width, length, per_byte=256):
+                if claim := refuse_bomb(picture.height, picture.width, length, large=256):
                     raise ValueError(f"it {claim}")
             stored = getattr(picture, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,))  # of a TIFF
             deep = max(stored) > 8 or any(";16" in str(t[3]) for t in getattr(picture, "tile", ()))

@@ -156,6 +156,7 @@ def link(path: Path) -> None:
         (partial(bomb, 9500), r"val_1.png' cannot be read: it has 9500 x 9500 pixels"),
         (partial(bomb, 14000), r"val_1.png' cannot be read: Image size"),
         (link, r"val_1.JPEG' cannot be read: the link leads nowhere"),
+        (lambda file: (file.unlink(), os.mkfifo(file)), "val_1.JPEG' cannot .* no ordinary file"),
         (None, r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
         (only_one_state, "1 of 1 captures in the grid, .*param_3"),
     ],

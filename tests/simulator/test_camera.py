@@ -21,7 +21,6 @@ from tests.strategies import settings_within
     [
         (100, 1.0, 1.0, 0.0),  # the definition
         (100, 1 / 128, 16.0, 15.0),  # the sunny-16 rule
-        (3200, 1 / 32, 2.0, 2.0),
         (800, 1 / 250, 4.0, 4.0 + 7.965784 - 3.0),
         (400, 1 / 125, 5.6, 9.93664),  # log2(5.6^2 * 125) - 2, with the marked f-number
     ],
@@ -58,9 +57,6 @@ def test_speeds_snap_within_3_percent(speed: float) -> None:
 @pytest.mark.parametrize(
     ("source", "target", "ratio"),
     [
-        ((100, 1 / 64, 4), (100, 1 / 64, 4), 1.0),
-        ((100, 1 / 64, 4), (100, 1 / 32, 4), 2.0),
-        ((100, 1 / 64, 4), (1600, 1 / 64, 4), 16.0),
         ((100, 1 / 64, 4), (100, 1 / 64, 5.6), 0.5),  # not (4 / 5.6)^2 = 0.5102
         ((100, 1 / 64, 2.8), (100, 1 / 64, 11), 2.0**-4),
         ((100, 1 / 1000, 11), (6400, 1 / 2, 4), 500 * 64 * 8),
@@ -101,8 +97,7 @@ def test_ranges_include_their_ends(name: str, low: float, high: float) -> None:
 @pytest.mark.parametrize(
     ("exposure_time", "text"),
     [
-        *[(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.3, "1/3.333 s"), (0.4, "0.4 s")],
-        *[(0.5, "1/2 s"), (0.6, "0.6 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+        *[(1 / 64, "1/64 s"), (0.3, "1/3.333 s"), (0.4, "0.4 s"), (0.5, "1/2 s"), (30.0, "30 s")],
     ],
 )
 def test_format(exposure_time: float, text: str) -> None:
@@ -211,10 +206,10 @@ def test_one_measurement_calibrates_a_camera() -> None:
     camera = get_camera("nikon_z6").with_nlf(200, measured)
     assert camera.nlf(200) == measured
     assert camera.nlf(800).read == pytest.approx((16e-6 - 15 * ROUNDING,) * 4)
-    assert camera.nlf(800).extrapolation == 2
+    assert camera.nlf(np.float32(800)).extrapolation == 2
     coarse = profile().with_nlf(200, replace(measured, read=(5e-8,) * 4))  # less than its rounding
     assert coarse.nlf(12800).read == pytest.approx((5e-8,) * 4)
-    for iso in (0, -100, math.nan, math.inf, "100"):
+    for iso in (0, -100, math.nan, math.inf, "100", np.float16("inf"), 10**400):
         with pytest.raises(ValueError, match="`iso`"):
             camera.nlf(iso)
     with pytest.raises(ValueError, match=r"'bench' has no noise calibration.*estimate_nlf"):

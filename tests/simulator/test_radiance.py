@@ -62,6 +62,10 @@ def test_the_part_and_layer_with_the_colours_is_the_picture(tmp_path):
         with pytest.raises(ValueError, match=r"must have|states primaries"):
             read_radiance(write(path, part("n", planes, chromaticities=(float("nan"),) * 8)))
     assert_image(read_radiance(write(path, part("a", channels() | channels(IMAGE + 1, "left.")))))
+    (deep := np.empty((6, 10), object)).fill(np.ones(2, np.float32))
+    kind = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+    with pytest.raises(ValueError, match="deep, which is not read"):
+        read_radiance(write(path, part("a", dict.fromkeys("RGB", deep), **kind)))
 
 
 def test_colours_are_converted_by_the_chromaticities_of_the_file(tmp_path):
@@ -130,7 +134,11 @@ def test_radiance_files_of_every_orientation_and_header(tmp_path):
     for head in ("#?RGBE\n\n-Y 6 +X 10\n", "#?RADIANCE\r\n\r\n-Y 6 +X 10\r\n", zeros):
         path.write_bytes(head.encode() + rgbe(IMAGE))
         assert_image(read_radiance(path), atol=0.02)
+    head = b"#?RADIANCE\nCOLORCORR=4 1 1\nCOLORCORR=.5 1 1\n\n-Y 6 +X 10\n"
+    path.write_bytes(head + rgbe(IMAGE * (2, 1, 1)))  # red times 4 and times 0.5
+    assert_image(read_radiance(path), atol=0.02)
     for head, words in (
+        ("#?RADIANCE\nCOLORCORR=2 1\n\n-Y 6 +X 10\n", "COLORCORR"),
         ("#?RADIANCE\nFORMAT=32-bit_rle_luv\n\n-Y 6 +X 10\n", "32-bit_rle_luv"),
         ("#?RADIANCE\nPIXASPECT=2.0\n\n-Y 6 +X 10\n", "not square"),
         ("#?RADIANCE\nPRIMARIES=1 2 3\n\n-Y 6 +X 10\n", "PRIMARIES"),

@@ -130,7 +130,7 @@ def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> Non
         ("ae_env.scorers.terms:Nothing", "cannot be loaded: "),
         ("math:pi", "must be callable"),
         ({"no.py:Level": 1.0}, r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"),
-        ({}, "must map one name or more"),
+        *((wrong, "must map one name or more") for wrong in ({}, {"noise": 10**400})),
         (lambda images, captures: None, "must be 'raw' or 'srgb'"),
         *((Own(depends_on="imgae"), "imgae"), (Own(domain="RGB"), "RGB")),
         (3, "name, a mapping of weights or a callable"),

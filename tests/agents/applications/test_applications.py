@@ -1,6 +1,7 @@
 """Refocusing against a thin lens, depth maps of all kinds; exposure fusion by its formulas."""
 
 import importlib.util
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -135,6 +136,9 @@ def test_bad_maps(tmp_path) -> None:
     lie = {"descr": "<f8", "fortran_order": False, "shape": (2**20, 2**22)}  # 32 TB
     with (tmp_path / "lie.npy").open("wb") as file:
         np.lib.format.write_array_header_1_0(file, lie)
+    os.mkfifo(tmp_path / "pipe.npy")
+    with pytest.raises(ValueError, match="does not exist"):
+        read_depth(tmp_path / "missing.exr")
     names = {"missing.png", *(path.name for path in tmp_path.iterdir())}
     for name in names if importlib.util.find_spec("OpenEXR") else names - {"text.exr"}:
         with pytest.raises(ValueError, match=rf"`depth` \(='.*{name}'"):

@@ -4,11 +4,13 @@ import dataclasses
 import functools
 import json
 import math
+import os
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from ae_env.grid import ExposureGrid
 from agents.metering import programs
@@ -205,9 +207,20 @@ def test_save_and_load_give_the_same_regression(tmp_path):
     query = np.array([[0.1, 0.2], [3.0, -3.0]])
     np.testing.assert_array_equal(model.predict(query), again.predict(query))
     (tmp_path / "text").write_text("no tensors here")
-    for name in ("missing.safetensors", "text"):
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("missing.safetensors", "text", "pipe"):
         with pytest.raises(ValueError, match="`path`"):
             ScoreRegression.load(tmp_path / name)
+    good, nan = vars(model), np.full_like(model.scores, np.nan)
+    short, empty = np.zeros(2), np.zeros((0, 2))
+    for changes in (
+        *({"scores": v} for v in (nan, model.scores[1:], model.scores[:, 0], nan.astype(bool))),
+        *({"bandwidths": v} for v in (short, np.ones(3), model.bandwidths.astype("c8"))),
+        *({"features": empty, "scores": empty}, {"features": short[:0]}, {"more": short}),
+    ):
+        save_file({**good, **changes}, tmp_path / "x")
+        with pytest.raises(ValueError, match=r"^`path` \(='[^']*x'\) holds no tuned program: .*\Z"):
+            ScoreRegression.load(tmp_path / "x")
 
 
 CONTROLLERS = (*METERS, "rpi_agc")

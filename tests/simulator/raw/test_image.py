@@ -58,7 +58,8 @@ def test_unpack_clips_to_the_sensor_and_rounds():
     for shape in ((4,), (1, 8), (2, 2, 2)):
         with pytest.raises(ValueError, match="`mosaic`"):
             pack_mosaic(np.zeros(shape, np.uint16), camera())
-    usual = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()}
+    usual = {"data": torch.zeros(4, 2, 2).double(), "settings": SETTINGS, "camera": camera()}
+    assert RawImage(**usual).data.dtype == torch.float32
     bad = {"camera": ["nikon_z6"], "settings": [(100, 0.01)], "nlf": [(1e-4, 1e-6)]}
     bad |= {"box_factor": [0, 1.5], "white_balance": [(1.0, 1.0), (1.0, 0.0, 1.0)]}
     beyond_float32 = torch.full((4, 2, 2), 1e300, dtype=torch.float64)
@@ -66,14 +67,6 @@ def test_unpack_clips_to_the_sensor_and_rounds():
     for name, value in ((name, value) for name, values in bad.items() for value in values):
         with pytest.raises(ValueError, match=f"`{name}`"):
             RawImage(**(usual | {name: value}))
-
-
-def test_noise_is_the_files_own_before_the_cameras():
-    z6, data = get_camera("nikon_z6"), torch.zeros(4, 2, 2)
-    assert RawImage(data, SETTINGS, z6).noise.shot[1] == pytest.approx(7.47234302281224e-06)
-    own = NoiseLevelFunction((1e-3,) * 4, (1e-6,) * 4)
-    assert RawImage(data, SETTINGS, z6, nlf=own).noise == own
-    assert RawImage(data.double(), SETTINGS, z6).data.dtype == torch.float32
 
 
 @pytest.mark.parametrize("rows", [1, 127, 300])

@@ -168,6 +168,9 @@ def test_levels_colour_and_metadata(tmp_path):
     assert raw.settings == SETTINGS  # given settings are not snapped
     known = {"path": "\\udcff.dng", "make": "Test", "model": "Sensor", "nlf_source": "given"}
     assert known.items() <= raw.metadata.items()
+    os.truncate(path, 2**36)  # a hole
+    with pytest.raises(RawFileError, match=f"more than {2**30} bytes"):
+        read_raw(path, settings=SETTINGS)
     camera = raw.camera
     assert (raw.noise, camera.name, camera.bit_depth) == (NLF, "test_sensor", 12)
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
@@ -254,6 +257,8 @@ def test_what_is_no_file(given, own_dng, tmp_path):
     for path in (tmp_path / "none", tmp_path, Path(os.devnull)):
         with pytest.raises(FileNotFoundError, match="`path`"):
             read_raw(path)
+        with pytest.raises(RawFileError, match=r"\) (does not exist|is a folder|is no ordinary)"):
+            read_settings(path)
     for target, raw, name in (("a.tif", read_raw(own_dng), "path"), (own_dng, None, "raw")):
         with pytest.raises(ValueError, match=f"`{name}`"):
             write_dng(tmp_path / target, raw)
@@ -327,7 +332,7 @@ LARGEST = ("white_level", 65535)
         *(("WhiteLevel", "I", (white,), LARGEST) for white in (0, 65536, 2**32 - 1)),
         ("WhiteLevel", "I", (64,), "above its black levels, .* white 64"),
         ("Sides", "I", (20_000,), "20000 x 20000 pixels.*at most 268435456 are read"),
-        ("Sides", "I", (8_000,), "8000 x 8000 pixels.*at most 1024 a byte are read"),
+        ("Sides", "I", (4_000,), "4000 x 4000 pixels.*at most 1024 a byte are read"),
     ],
 )
 def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, form, values, changed):
