@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +14,9 @@ import numpy as np
 
 from simulator.settings import CameraSettings
 from simulator.utils.checks import as_float, did_you_mean
+
+#: Most states of a grid, each an object.
+_MOST_STATES = 2**16
 
 
 def plain(value: Any) -> Any:
@@ -59,10 +63,11 @@ class ExposureGrid:
             # `CameraSettings` checks the ranges below.
             fit = bool(values) and all(map(math.isfinite, values))
             if not (fit and all(a < b for a, b in pairwise(values))):
-                raise ValueError(
-                    f"`{name}` (={given!r}) must be a strictly ascending list of numbers"
-                )
+                rule = "must be a strictly ascending list of numbers"
+                raise ValueError(f"`{name}` (={reprlib.repr(given)}) {rule}")
             object.__setattr__(self, name, values)
+        if math.prod(self.shape) > _MOST_STATES:
+            raise ValueError(f"a grid must have at most {_MOST_STATES} states, not {self.shape}")
         assert self.states  # makes, and so checks, every CameraSettings
 
     @classmethod

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils import fuse_conv_bn_eval
@@ -122,24 +120,14 @@ def read_network(file: str | os.PathLike[str]) -> NimaMobileNet:
 
     A `ValueError` if it cannot be read, or is not of this network.
     """
+    from simulator.networks.weights import load_into, read_weights
+
     network = NimaMobileNet()
     try:
-        weights = load(read_bounded(Path(file)))
-        missing, unexpected = network.load_state_dict(weights, strict=False)
-    except (OSError, SafetensorError, RuntimeError) as error:
-        raise ValueError(
-            f"`file` (={str(file)!r}) must be weights of NIMA's MobileNet in .safetensors: {error}"
-        ) from error
-    # The counters of training batches are not among the published numbers.
-    missing = [key for key in missing if not key.endswith("num_batches_tracked")]
-    if missing or unexpected:
-        raise ValueError(
-            f"`file` (={str(file)!r}) must hold exactly the arrays of NIMA's MobileNet: {missing} "
-            f"are missing, {unexpected} are none of it"
-        )
-    for key, values in weights.items():
-        if not bool(values.isfinite().all()):
-            raise ValueError(f"`file` (={str(file)!r}): {key} must be finite")
+        load_into(network, read_weights(read_bounded(Path(file))), "they")
+    except (OSError, ValueError) as error:
+        rule = "must be weights of NIMA's MobileNet in .safetensors"
+        raise ValueError(f"`file` (={str(file)!r}) {rule}: {error}") from error
     network.eval().requires_grad_(False)
     for layer in network.features:
         assert isinstance(layer, ConvNormReLU6)

@@ -145,7 +145,8 @@ def export(
     _, card = load_agent(name.partition(":")[2], kind)
     seen, grid = card["context"], trained_grid(card)
     states = {n: list(getattr(grid, n)) for n in ("isos", "exposure_times", "f_numbers")}
-    options = {"resolution": seen["resolution"][-1], "sensors": seen["sensors"], "grid": states}
+    resolution = [64, *seen.get("resolution", ())][-1]
+    options = {"resolution": resolution, "sensors": seen.get("sensors", True), "grid": states}
     task = "ae_env:ae_env/AutoExposure-v0"
     with contextlib.closing(gym.make_vec(task, scenes="bundled:small", **options)) as envs:
         agent = make_policy(name, PolicyContext.from_envs(envs))

@@ -18,7 +18,7 @@ from torch import nn
 
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
 from agents.learning.networks import UNWATCHED, Optimisation, Session
-from agents.learning.policy_file import MAX_WIDTH, load_agent, load_into
+from agents.learning.policy_file import MAX_WIDTH, load_agent
 from agents.metering.reading import (
     BLACK_SIGNAL,
     TARGET_SIGNAL,
@@ -28,6 +28,7 @@ from agents.metering.reading import (
     mean_reading,
 )
 from agents.policy import Floats
+from simulator.networks.weights import load_into
 from simulator.utils.config_file import Configuration
 
 #: Frames ahead that are forecast, from the frame in hand (0) on.
@@ -135,9 +136,10 @@ class LearntTracker:
 def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
     """The forecaster that a training wrote; raises as `load_agent`."""
     tensors, card = load_agent(path, "forecaster")
-    network = LightForecaster(card["width"])
-    load_into(network, tensors, path)
-    return network.to(device).eval()
+    with torch.device("meta"):  # what a card claims takes no memory: the file's tensors are used
+        network = LightForecaster(card["width"])
+    load_into(network, tensors, f"`weights` (={str(path)!r})")
+    return network.to(device, torch.float32).eval()
 
 
 # -- training -------------------------------------------------------------------------------------

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import reprlib
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import AliasPath, BaseModel, Field, ValidationError
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from ae_env.grid import ExposureGrid
 from agents.policy import Policy, PolicyContext
-from simulator.networks.weights import check_finite, read_pair, write_pair
+from simulator.networks.weights import check_finite, load_into, read_pair, write_pair
 from simulator.utils.checks import check_type
 from simulator.utils.config_file import one_line
 from simulator.utils.files import sibling
 
 FORMAT_VERSION = 1
-#: Most hidden features of a network.
-MAX_WIDTH = 65536
+#: Most hidden features of a network, and most frames that it remembers.
+MAX_WIDTH, MAX_HISTORY = 65536, 256
+#: Where a card has its agent's history.
+_HISTORY = AliasPath("training", "training", "history")
 #: Entries of a card's context that describe the grid.
 _GRID = ("isos", "exposure_times", "f_numbers")
 #: Nominal values are rounded: 1/1000 s stands for 1/1024 s.
@@ -29,12 +32,13 @@ _ROUNDED = 0.03
 
 
 class _Card(BaseModel):
-    """Entries that every card must have."""
+    """Entries that every card must have; `history` is of a PPO's hyperparameters."""
 
     width: int = Field(strict=True, ge=1, le=MAX_WIDTH)
-    context: dict[str, Any]
+    context: dict[str, bool | str | list[float]]
     training: dict[str, Any]
     aliases: dict[str, str]
+    history: int = Field(0, strict=True, ge=0, le=MAX_HISTORY, validation_alias=_HISTORY)
 
 
 def save_agent(
@@ -59,7 +63,7 @@ def save_agent(
             tensors[name] = value.detach().cpu().contiguous()
         else:
             aliases[name] = source
-    check_finite(tensors, path)
+    check_finite(tensors)
     content = save(tensors)
     card = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
     described = {} if context is None else describe_context(context)
@@ -86,22 +90,14 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
     found = card.get("kind"), card.get("format")
     if found != (kind, FORMAT_VERSION):
         wanted = f"a {kind} agent of format {FORMAT_VERSION}"
-        raise ValueError(f"{given} must be {wanted}, got {found[0]!r} of format {found[1]!r}")
+        got = " of format ".join(map(reprlib.repr, found))
+        raise ValueError(f"{given} must be {wanted}, got {got}")
     try:
-        aliases = _Card.model_validate(card).aliases
+        known = _Card.model_validate(card)
     except ValidationError as error:
         raise ValueError(f"{given}: {card_path.name}: {one_line(error)}") from error
-    copies = {name: tensors[source] for name, source in aliases.items() if source in tensors}
-    return tensors | copies, card
-
-
-def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -> None:
-    """Gives `module` the tensors of `load_agent`; a `ValueError` if they are of another network."""
-    try:
-        module.load_state_dict(tensors)
-    except RuntimeError as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"`weights` (={str(path)!r}) do not fit the network: {text}") from error
+    copies = {name: tensors[source] for name, source in known.aliases.items() if source in tensors}
+    return tensors | copies, card | {"history": known.history}
 
 
 def describe_context(context: PolicyContext) -> dict[str, Any]:
@@ -127,7 +123,7 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
     """
     for name, here in describe_context(context).items():
         trained = card["context"].get(name)
-        differs, values = trained != here, f"= {trained}, the environment has {here}"
+        differs, values = trained != here, f"= {reprlib.repr(trained)}, the environment has {here}"
         if differs and name in _GRID:
             known = getattr(trained_grid(card), name)
             below, above = known[0] * (1.0 - _ROUNDED), known[-1] * (1.0 + _ROUNDED)
@@ -167,7 +163,7 @@ class NetworkPolicy(Policy, ABC):
             tensors, card = load_agent(str(weights), self.kind)
             check_context(card, context)
             network = self.make_network(context, card)
-            load_into(network, tensors, str(weights))
+            load_into(network, tensors, f"`weights` (={str(weights)!r})")
             network.to(device)
         self.network: Any = network.eval()
         self.reset(0)

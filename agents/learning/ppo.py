@@ -32,7 +32,7 @@ from agents.learning.networks import (
     StateHead,
     with_history,
 )
-from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
+from agents.learning.policy_file import MAX_HISTORY, MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
 from agents.policy import Bools, Ints, Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
@@ -150,7 +150,7 @@ class PPOTraining(Configuration):
     vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)
     max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)
     width: int = Field(default=256, ge=1, le=MAX_WIDTH)
-    history: int = Field(default=0, ge=0, le=256)
+    history: int = Field(default=0, ge=0, le=MAX_HISTORY)
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
     def check_batch(self, num_envs: int) -> None:
@@ -169,8 +169,7 @@ class PPOPolicy(NetworkPolicy):
     @staticmethod
     def make_network(context: PolicyContext, card: dict[str, Any]) -> ExposureActorCritic:
         """See `NetworkPolicy.make_network`."""
-        history = card["training"].get("training", {}).get("history", 0)
-        space = context.observation_space
+        history, space = card["history"], context.observation_space
         return ExposureActorCritic(
             with_history(space, history) if history else space,
             gym.spaces.Discrete(len(context.grid)),

@@ -167,6 +167,9 @@ class MeteringPolicy(Policy):
                 f"policy {self.name!r} was fitted on {fitted} readings but sees "
                 f"{readings.shape[1]}: the environments must agree on `sensors`"
             )
+        known, states = self.regression.scores.shape[1], len(self.context.grid)
+        if known != states:
+            raise ValueError(f"policy {self.name!r} was fitted on {known} states, not on {states}")
         compensated = readings - np.eye(1, readings.shape[1]) * self.options.compensation
         scores = self.regression.predict(compensated) - 10.0 * self._chooser.over_cap
         if self._previous is not None:

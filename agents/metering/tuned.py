@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policy import Floats
+from simulator.networks.weights import read_weights
 from simulator.utils.files import read_bounded, write_atomically
 
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
@@ -120,12 +121,20 @@ class ScoreRegression:
     @classmethod
     def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:
         """Read what `save` wrote; a `ValueError`, where `name` names the file, if it is none."""
-        from safetensors import SafetensorError
-        from safetensors.numpy import load
-
         try:
-            return cls(**load(read_bounded(Path(path))))
-        except (OSError, SafetensorError, TypeError) as error:
+            found = read_weights(read_bounded(Path(path), 2**30))
+            names = [field.name for field in fields(cls)]
+            if sorted(found) != sorted(names):
+                raise ValueError(f"it must hold {', '.join(names)}")
+            features, scores, bandwidths = (found[name].double().numpy() for name in names)
+            fits = features.ndim == scores.ndim == 2 and bandwidths.shape == features.shape[1:]
+            if not (fits and len(features) == len(scores) and features.size and scores.size):
+                shapes = features.shape, scores.shape, bandwidths.shape
+                raise ValueError(f"its shapes {shapes} are not (n, d), (n, S) and (d,)")
+            if not (bandwidths > 0.0).all():
+                raise ValueError("its bandwidths must be > 0")
+            return cls(features, scores, bandwidths)
+        except (OSError, ValueError) as error:
             raise ValueError(f"`{name}` (={str(path)!r}) holds no tuned program: {error}") from None
 
 

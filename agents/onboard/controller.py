@@ -6,6 +6,7 @@ mind between frames.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import sys
 from collections.abc import Iterable
@@ -18,10 +19,12 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from simulator.utils.checks import check_flag, check_integer, check_number
-from simulator.utils.files import read_bounded
+from simulator.utils.files import as_path, read_bounded
 
 #: Entry of the file's metadata that holds the description, and the form that it has.
 METADATA, FORMAT = "ae_env", 1
+#: What stands in place of the digest while the file's digest is computed.
+NO_DIGEST = "0" * 64
 #: Values of a signal, 1 at white, are in between; others are digital numbers.
 _LEAST_SIGNAL, _BEYOND_SIGNAL = -0.5, 2.0
 #: The mean of a photograph is above; noise alone has a mean of 0.
@@ -72,6 +75,8 @@ class Card(_Entries):
     same_light_ev: Positive
     pedestal: Annotated[float, Field(gt=0.0, lt=1.0)]
     ranges: Ranges
+    #: Of the whole file, in which `NO_DIGEST` stands in place of it; files of before have none.
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
 
 
 class ExposureState(NamedTuple):
@@ -119,16 +124,18 @@ class Controller:
         except ImportError as error:
             how = "pip install onnxruntime, or the extra 'ae-env[onnx]'"
             raise ImportError(f"a Controller needs ONNX Runtime: {how}") from error
-        given = f"`path` (={str(path)!r})"
+        given, file = f"`path` (={str(path)!r})", as_path(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # the network is small: threads cost more than they bring
         try:
+            content = read_bounded(file, 2**30)
             self._session = onnxruntime.InferenceSession(
-                read_bounded(Path(path)), options, providers=["CPUExecutionProvider"]
+                content, options, providers=["CPUExecutionProvider"]
             )
             found = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:  # ONNX Runtime has errors of its own
-            raise ValueError(f"{given} cannot be read: {error}") from error
+            reason = " ".join(str(getattr(error, "strerror", None) or error).split())
+            raise ValueError(f"{given} cannot be read: {reason}") from error
         if METADATA not in found:
             raise ValueError(f"{given} must be an export of `ae-env export`")
         try:
@@ -157,6 +164,10 @@ class Controller:
             if has != wanted:
                 fault = f"by its {entries} the network has {wanted}, but it has {has}"
                 raise ValueError(f"{given} is damaged: {fault}")
+        if own := self.card.sha256:
+            content = content.replace(own.encode(), NO_DIGEST.encode())
+            if hashlib.sha256(content).hexdigest() != own:
+                raise ValueError(f"{given} is damaged: its sha256 is not that of its content")
         self._outputs = list(outputs)
         self._encoded = np.stack([self.encode_settings(state) for state in self.states])
         self.reset(num_cameras)
@@ -207,6 +218,10 @@ class Controller:
             if len(good) < len(masks):
                 fed = {name: values[good] for name, values in fed.items()}
             found = self._session.run(self._outputs, fed)
+            sound = np.all([np.isfinite(v.reshape(len(v), -1)).all(axis=1) for v in found], axis=0)
+            for camera in good[~sound]:
+                self.reasons[camera] = "the network's output is not finite"
+            good, found = good[sound], [values[sound] for values in found]
             ppo = self.card.kind == "ppo"
             utility[good] = found[0] if ppo else self._accumulated(good, *found)
         chosen = np.argmax(np.where(masks, utility, -np.inf), axis=1).astype(np.int64)
@@ -235,11 +250,12 @@ class Controller:
 
         Returns:
             The state, and a reason where the last one is held: a dropped frame, a value that is not
-            finite, of the frame or of a sensor that the agent uses, or a frame below black.
+            finite, of the frame, of a sensor that the agent uses or of the network's output, or a
+            frame below black.
 
         Raises:
-            ValueError: If `planes` is no signal (integers, digital numbers), a reading is negative,
-                or `current` is not positive and finite.
+            ValueError: If `planes` is no signal (integers, digital numbers) or is masked, a reading
+                is negative, or `current` is not positive and finite.
         """
         check_flag("fixed_aperture", fixed_aperture)
         state, masks = _exposure("current", current), None
@@ -352,6 +368,8 @@ class Controller:
 
 
 def _array(name: str, values: Any, dtype: Any = None) -> NDArray[Any]:
+    if isinstance(values, np.ma.MaskedArray):  # NumPy would drop the mask
+        raise ValueError(f"`{name}` must be no masked array: give NaN for what is missing")
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:

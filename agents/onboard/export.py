@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import logging
@@ -17,7 +18,7 @@ from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES
 from agents.learning.ppo import PPOPolicy
 from agents.learning.regression import SAME_LIGHT_EV, RegressionPolicy
 from agents.metering.reading import BLACK_SIGNAL, SATURATED_STEP_EV, TARGET_SIGNAL, WHITE_SIGNAL
-from agents.onboard.controller import FORMAT, METADATA
+from agents.onboard.controller import FORMAT, METADATA, NO_DIGEST
 from agents.policy import Policy
 from simulator.utils.files import write_atomically
 
@@ -102,10 +103,13 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
         "same_light_ev": SAME_LIGHT_EV,
         "pedestal": PEDESTAL,
         "ranges": {"settings": SETTINGS_RANGES.tolist(), "sensors": SENSOR_RANGES.tolist()},
+        "sha256": NO_DIGEST,
     }
     onnx.helper.set_model_props(model, {METADATA: json.dumps(card)})
     onnx.checker.check_model(model, full_check=True)
-    return write_atomically(file, model.SerializeToString())
+    content = model.SerializeToString()
+    digest = hashlib.sha256(content).hexdigest()
+    return write_atomically(file, content.replace(NO_DIGEST.encode(), digest.encode()))
 
 
 def _graph(policy: Policy) -> nn.Module:

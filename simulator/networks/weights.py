@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import reprlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import resources
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
@@ -19,6 +19,7 @@ from simulator.capture.statistics import Residual
 from simulator.networks.aperture_module import ApertureModule, AperturePreset
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, Preset
+from simulator.utils.cache import DAMAGE, safetensors_header
 from simulator.utils.checks import check_type, check_word, did_you_mean
 from simulator.utils.files import read_bounded, sibling, write_atomically
 
@@ -39,6 +40,10 @@ BUILDERS: dict[str, Callable[[], nn.ModuleDict]] = {
 }
 #: Increased when the networks change such that older weights no longer fit.
 FORMAT_VERSION = 2
+#: Types that weights may have, but for the integers in which batch normalisation counts.
+_FLOATS, _COUNTER = ("F64", "F32", "F16", "BF16"), "num_batches_tracked"
+#: Most bytes of the header of a weights file, and most tensors that a message names.
+_MOST_HEADER, _MOST_NAMED = 2**20, 8
 
 
 def build_modules(preset: str) -> nn.ModuleDict:
@@ -65,7 +70,7 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
     Raises:
         ValueError: If the weights are not finite; nothing is written then.
     """
-    check_finite(modules.state_dict(), path)
+    check_finite(modules.state_dict())
     content = save({k: v.detach().cpu().contiguous() for k, v in modules.state_dict().items()})
     head = {
         "format": FORMAT_VERSION,
@@ -113,20 +118,51 @@ def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             "another training, or being written at this moment; train or copy both again"
         )
     try:
-        tensors = load(content)
-    except SafetensorError as error:
+        tensors = read_weights(content)
+    except ValueError as error:
         damage = f"{file.name} cannot be read: {error}; train them again"
         raise ValueError(f"{given}: {damage}") from error
-    check_finite(tensors, path)
     return tensors, card
 
 
-def check_finite(tensors: Mapping[str, Tensor], path: str | Path) -> None:
+def read_weights(content: bytes) -> dict[str, Tensor]:
+    """The tensors of a safetensors file; a `ValueError` unless they are finite floating-point."""
+    try:
+        header = safetensors_header(content, _MOST_HEADER)
+        header.pop("__metadata__", None)
+        for name, kind in ((name, entry["dtype"]) for name, entry in header.items()):
+            if kind not in _FLOATS and not (kind == "I64" and name.endswith(_COUNTER)):
+                raise ValueError(f"{reprlib.repr(name)} is not of {', '.join(_FLOATS)}")
+        tensors = load(content)
+    except DAMAGE as error:
+        raise ValueError(" ".join(str(error)[:200].split())) from error
+    check_finite(tensors)
+    return tensors
+
+
+def load_into(module: nn.Module, tensors: Mapping[str, Tensor], given: str) -> None:
+    """Gives `module`, which may be on the meta device, its `tensors`.
+
+    A `ValueError`, which begins with `given`, names the first that are missing or do not fit.
+    """
+    own = module.state_dict()
+    faults = [f"{n} is missing" for n in own if n not in tensors and not n.endswith(_COUNTER)]
+    faults += [f"{reprlib.repr(n)} is none of its tensors" for n in tensors if n not in own]
+    for name in (n for n in own if n in tensors and tensors[n].shape != own[n].shape):
+        faults.append(f"{name} has shape {[*tensors[name].shape]}, not {[*own[name].shape]}")
+    if faults:
+        more = f" (and {len(faults) - _MOST_NAMED} more)" if len(faults) > _MOST_NAMED else ""
+        raise ValueError(f"{given} do not fit the network: {'; '.join(faults[:_MOST_NAMED])}{more}")
+    missing = {n: value for n, value in own.items() if n not in tensors}
+    module.load_state_dict({**missing, **tensors}, assign=any(v.is_meta for v in own.values()))
+
+
+def check_finite(tensors: Mapping[str, Tensor]) -> None:
     """Raises a `ValueError` that names the first of `tensors` that holds a NaN or an infinity."""
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            rule = f"must be finite ({name} is not): train again with a lower learning_rate"
-            raise ValueError(f"`weights` (={str(path)!r}) {rule}")
+            rule = "must be finite: train again with a lower learning_rate"
+            raise ValueError(f"weights, of {reprlib.repr(name)}, {rule}")
 
 
 def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
@@ -155,11 +191,7 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     if card["preset"] == "ncs":
         tensors = _from_authors(tensors)
     modules = build_modules(card["preset"])
-    try:
-        modules.load_state_dict(tensors)
-    except RuntimeError as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"`weights` (={str(name)!r}) do not fit the networks: {text}") from error
+    load_into(modules, tensors, f"`weights` (={str(name)!r})")
     if "noise" in modules and card.get("residual") is not None:
         modules["noise"].residual = Residual.from_card(card["residual"])  # type: ignore[assignment]
     modules.eval().requires_grad_(False)
@@ -181,7 +213,8 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
     wrong += [] if "sha256" in card else ["sha256"]
     if wrong:
         rule = f"the .json must be a model card of {known}, with the hash `sha256`"
-        raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {card.get(wrong[0])!r}")
+        got = reprlib.repr(card.get(wrong[0]))
+        raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {got}")
 
 
 # -- the weights that the paper's authors released ------------------------------------------------

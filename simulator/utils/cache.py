@@ -39,8 +39,10 @@ _FILE = re.compile(r"\.?(bundled-.*-)?[0-9a-f]{24,32}\.(safetensors|npz)(\..*\.t
 #: A half-written file older than this was left by a killed process [s].
 _ABANDONED = 3600.0
 
-#: What `decode` may raise.
-DAMAGE = (SafetensorError, ValueError, LookupError, TypeError)
+#: Most dimensions of a tensor in a file: for 70,000 torch needs a minute.
+_MOST_DIMENSIONS = 8
+#: What `safetensors_header` and `decode` may raise, and safetensors for what it cannot make.
+DAMAGE = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
 
 Value = TypeVar("Value")
 
@@ -237,14 +239,28 @@ def encode(values: Mapping[str, Any]) -> bytes:
 
 def decode(content: bytes) -> dict[str, Any]:
     """The values of `encode`; one of `DAMAGE` is raised where `content` is not what it returned."""
+    header = safetensors_header(content)["__metadata__"]
     tensors = load(content)
-    # The header is JSON after eight bytes of its length.
-    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
     if header["digest"] != _digest(tensors, header["json"]):
         raise ValueError("its content is not what was written")
     described = json.loads(header["json"])
     arrays = {name: tensors[name].numpy() for name in described["arrays"]}
     return {**tensors, **arrays, **described["values"]}
+
+
+def safetensors_header(content: bytes, most: int = 2**30) -> dict[str, Any]:
+    """Header of a safetensors file, JSON after eight bytes of its length; to be read before `load`.
+
+    One of `DAMAGE` is raised unless it has at most `most` bytes, and tensors few dimensions.
+    """
+    length = int.from_bytes(content[:8], "little")
+    if length > most:
+        raise ValueError(f"its header has {length} bytes, at most {most} are read")
+    header: dict[str, Any] = json.loads(content[8 : 8 + length])
+    shapes = [own["shape"] for name, own in header.items() if name != "__metadata__"]
+    if max(map(len, shapes), default=0) > _MOST_DIMENSIONS:
+        raise ValueError(f"a tensor has more than {_MOST_DIMENSIONS} dimensions")
+    return header
 
 
 def _digest(tensors: Mapping[str, torch.Tensor], text: str) -> str:

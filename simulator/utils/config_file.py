@@ -31,6 +31,7 @@ _PLAIN = {
     **dict.fromkeys(("dict_type", "mapping_type", "model_type"), "must be a mapping"),
 }
 
+_MOST_COMPLAINTS = 8
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 200
 
@@ -181,19 +182,19 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
-    """All of pydantic's complaints in one line, each with the entry that it is about.
+    """Pydantic's first eight complaints in one line, each with the entry that it is about.
 
     `prefix` stands before every entry's name; of `model` the nearest to an unknown one is proposed.
     """
-    parts = []
-    for item in error.errors():
+    parts, more = [], error.error_count() - _MOST_COMPLAINTS
+    for item in error.errors()[:_MOST_COMPLAINTS]:
         entry = ".".join(str(key) for key in item["loc"])
         message = _PLAIN.get(item["type"]) or item["msg"].removeprefix("Value error, ")
         if item["type"] == "extra_forbidden" and model is not None:
             message = _unknown(model, item["loc"])
         given = f" (={_short.repr(item['input'])})" if entry and item["type"] != "missing" else ""
         parts.append(f"{prefix}{entry}{given}: {message}" if entry else message)
-    return "; ".join(parts)
+    return "; ".join(parts) + (f"; and {more} more" if more > 0 else "")
 
 
 def _unknown(model: Any, location: tuple[int | str, ...]) -> str:

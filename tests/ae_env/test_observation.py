@@ -124,22 +124,6 @@ def test_exposure_values_by_hand_and_the_nearest_state() -> None:
         assert {type(value) for value in grid.isos} == {float}
 
 
-@given(grids(), SEEDS)
-def test_grids_are_what_their_lists_say(grid: ExposureGrid, seed: int) -> None:
-    lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
-    assert ExposureGrid.from_spec(json.loads(json.dumps(lists))) == grid
-    states = np.arange(len(grid))
-    controls = grid.controls(states)
-    assert [grid.index(*row) for row in controls.tolist()] == states.tolist()
-    for state, (i, t, n) in zip(grid, controls.tolist(), strict=True):
-        wanted = (grid.isos[i], grid.exposure_times[t], grid.f_numbers[n])
-        assert (state.iso, state.exposure_time, state.f_number) == wanted
-    for state in np.random.default_rng(seed).choice(states, 3):
-        nearest = grid.nearest(grid.ev100[state])
-        assert nearest <= state
-        assert grid.ev100[nearest] == pytest.approx(grid.ev100[state], abs=1e-9)
-
-
 SINGLE = [ControlActions, RelativeActions, ContinuousActions]
 PAIRS = [(single, getattr(wrappers, f"Vector{single.__name__}")) for single in SINGLE]
 
@@ -226,6 +210,7 @@ def test_odd_actions_and_other_environments_are_refused(single: type, vector: ty
 def test_other_ways_to_act_reach_every_state(grid: ExposureGrid, seed: int) -> None:
     lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
     env = make_env(grid=json.loads(json.dumps(lists)))
+    assert env.unwrapped.grid == grid
     rng = np.random.default_rng(seed)
     controls, steps, apex = (wrapper(env) for wrapper in SINGLE)
     values = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid])

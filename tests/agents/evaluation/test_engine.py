@@ -45,19 +45,6 @@ def result(small, few):
     return found
 
 
-def test_shapes_and_oracle(result):
-    episodes = len(result.scene_ids)
-    assert result.scores.shape == result.allowed.shape == (episodes, 3, 64)
-    assert result.tracks["random*3"].states.shape == (3, episodes, 3)
-    assert len(set(result.scene_ids.tolist())) == episodes // 2
-    assert (result.tracks["oracle"].states[0] == result.oracle_states[:, None]).all()
-    assert result.tracks["oracle"].privileged
-    assert result.tracks["matrix:P"].ms_alone > 0
-    oracle = result.episode_metrics("oracle")
-    assert np.abs(oracle["regret"]).max() < 1e-12
-    assert oracle["ev_error"].max() == 0.0
-
-
 def test_the_batch_size_changes_nothing_and_a_plan_is_the_same(small, few, result, tmp_path):
     policies = {"matrix:P": make_policy("matrix:P", small)}
     again = evaluate(policies, few, episodes_per_scene=2, frames=3, batch=32)

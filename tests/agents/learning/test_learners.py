@@ -209,17 +209,21 @@ def test_weights_that_are_not_finite_replace_none(agent: Path, context, network)
     assert load_agent(agent, "regression")[1] == card
 
 
+HISTORIES = (10**9, "x", [1], 1000.0, -1)
+
+
 @pytest.mark.parametrize(
     ("suffix", "content", "message"),
     [
-        (".json", None, "regression-0.5.json"),
-        (".safetensors", None, "regression-0.5.safetensors"),
+        *((suffix, None, f"regression-0.5{suffix}") for suffix in (".json", ".safetensors")),
         (".safetensors", b"", "regression-0.5.safetensors"),
         (".json", b"{", "regression-0.5.json"),
         (".json", b'{"kind": "regression", "format": 1}', "width: .*context: "),
         (".json", {"format": 2}, "format 2"),
         (".json", {"width": 10**9}, r"width \(=1000000000\)"),
         (".json", {"width": 9}, r"[^\n]*weight[^\n]*\Z"),
+        *((".json", {"training": {"training": {"history": h}}}, "history ") for h in HISTORIES),
+        (".json", {"training": "x"}, "training "),
         (".json", {"sha256": 7}, "the hash of "),
         (".json", {"context": {"observation": "uint8", "resolution": [4]}}, "resolution = "),
         (".json", {"kind": "ppo"}, "'ppo'"),

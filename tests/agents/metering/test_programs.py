@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from ae_env.grid import ExposureGrid
 from agents.metering import programs
@@ -210,6 +211,16 @@ def test_save_and_load_give_the_same_regression(tmp_path):
     for name in ("missing.safetensors", "text", "pipe"):
         with pytest.raises(ValueError, match="`path`"):
             ScoreRegression.load(tmp_path / name)
+    good, nan = vars(model), np.full_like(model.scores, np.nan)
+    short, empty = np.zeros(2), np.zeros((0, 2))
+    for changes in (
+        *({"scores": v} for v in (nan, model.scores[1:], model.scores[:, 0], nan.astype(bool))),
+        *({"bandwidths": v} for v in (short, np.ones(3), model.bandwidths.astype("c8"))),
+        *({"features": empty, "scores": empty}, {"features": short[:0]}, {"more": short}),
+    ):
+        save_file({**good, **changes}, tmp_path / "x")
+        with pytest.raises(ValueError, match=r"^`path` \(='[^']*x'\) holds no tuned program: .*\Z"):
+            ScoreRegression.load(tmp_path / "x")
 
 
 CONTROLLERS = (*METERS, "rpi_agc")

@@ -130,7 +130,11 @@ def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):
         assert (held.state, held.held, bool(held.reason)) == (good.state, True, True)
     fresh = Controller(exported[1])
     assert fresh.decide(planes, state) == good
-    darker = 0.25 * planes
+    run = camera._session.run  # as if a weight were NaN
+    camera._session = SimpleNamespace(run=lambda *given: [v * nan for v in run(*given)])
+    reason = "the network's output is not finite"
+    assert camera.decide(0.5 * planes, camera.states[5]) == (good.state, reason)
+    camera._session, darker = SimpleNamespace(run=run), 0.25 * planes
     assert camera.decide(darker, state) == fresh.decide(darker, state)
     frames = (planes, None, bad, planes - 0.4, planes, planes)  # black subtracted twice: 3
     several, settings = Controller(exported[1], 6), np.stack([camera.encode_settings(state)] * 6)
@@ -144,8 +148,13 @@ def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):
     assert again.tolist() == [chosen[0]] * 6
 
 
-def test_a_damaged_card_is_named(exported, tmp_path):
+def test_a_damaged_card_or_weight_is_named(exported, tmp_path):
     onnx = pytest.importorskip("onnx")
+    content = bytearray(exported[1].read_bytes())
+    content[len(content) // 2] ^= 1  # of a weight
+    (tmp_path / "x.onnx").write_bytes(content)
+    with pytest.raises(ValueError, match=r"`path` .* damaged: its sha256"):
+        Controller(tmp_path / "x.onnx")
     model = onnx.load(str(exported[1]))
     (entry,) = (entry for entry in model.metadata_props if entry.key == "ae_env")
     whole = json.loads(entry.value)
@@ -172,10 +181,11 @@ def test_what_cannot_be_exported_or_loaded_is_named(exported, context, tmp_path)
     ready, state = (frame, np.zeros((1, 3)), np.zeros((1, 2))), controller.states[0]
     act, decide = controller.act, controller.decide
     sensed = functools.partial(decide, signal, state)
-    wrong = signal[:, :8], signal.astype(np.uint16), signal - 4000, signal + 14, [[0], 0]
+    masked = np.ma.masked_greater(signal, 1.0)
+    wrong = signal[:, :8], signal.astype(np.uint16), signal - 4000, signal + 14, [[0], 0], masked
     raws = frame[[0, 0]], frame.astype(int), frame + 0.0, frame.astype(object) + 0.5
     for named, call in (
-        *(("path", lambda v=v: Controller(v)) for v in (broken, file)),
+        *(("path", lambda v=v: Controller(v)) for v in (broken, file, "", None)),
         ("policy", lambda: export_agent(make_policy("matrix:P", context), file)),
         ("policy", lambda: export_agent(make_policy("regression?foresight=trend", context), file)),
         ("out", lambda: export_agent(exported[0], tmp_path / "x")),
