@@ -481,7 +481,7 @@ def test_what_noise_alone_clips_stays_near_white(light: tuple[float, ...]) -> No
     assert (inner - 1.0).square().mean().sqrt() < 1.1 * deviation
 
 
-def test_a_full_photosite_below_white_and_an_absurd_balance() -> None:
+def test_full_below_white_an_absurd_balance_and_one_measured_sample() -> None:
     """Some compact cameras' photosites are full below white; of others such a value is measured."""
     raw = clipped((1.0, 1.0, 1.0))
     raw.data[1] = 0.94  # a smaller full well than the other green's
@@ -492,12 +492,8 @@ def test_a_full_photosite_below_white_and_an_absurd_balance() -> None:
     assert found == pytest.approx([1.8, 3.6, 3.6, 2.88])
     raw = clipped((1.0, 1.0, 1.0), balance=(1e30, 1.0, 1.0))
     assert neutral_highlights(raw, raw.saturated).max() == 16.0
-
-
-def test_one_sample_near_white_tells_nothing_of_a_lamp_around_it() -> None:
-    data = torch.ones(4, 64, 64)
-    data[1, 32, 32] = 0.995
-    raw = RawImage(data, replace(BASE, iso=3200), Z6, white_balance=(2.0, 1.0, 1.5))
+    raw = RawImage(torch.ones(4, 64, 64), replace(BASE, iso=3200), Z6, None, (2.0, 1.0, 1.5))
+    raw.data[1, 32, 32] = 0.995  # one sample near white tells nothing of the lamp around it
     lamp = neutral_highlights(raw, raw.saturated)[:, 24, 24]
     torch.testing.assert_close(lamp, torch.tensor([1.8, 3.6, 3.6, 2.4]), rtol=0.01, atol=0)
 
