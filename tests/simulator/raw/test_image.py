@@ -503,8 +503,7 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     pixels = [(v / 2, v, v / 1.25) for v in WHITE]
     raw, settings = clipped(*pixels), CameraSettings(100, ratio / 64, 4)
     prepared = CameraSimulator(device="cpu").prepare(raw)
-    # A quarter is clipped, the others are 0.26 below white: 1 + 0.26 / 2 + 0.8 / 4^4
-    # times red's white, which is 2.
+    # A quarter is clipped, others are 0.26 below white: 2 (1 + 0.26 / 2 + 0.8 / 4^4), red's is 2.
     level = torch.tensor([0.5, 1.1, 1.6, 2.26625]) * ratio
     expected = level / torch.tensor([2, 1, 1, 1.25])[:, None]
     scene = Scene.from_raw(raw, scene_id="raw")
