@@ -2,8 +2,8 @@
 
 One crop of every source of the test split of `simulator.training.scenes`: views into radiance maps,
 photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
-every method; the gain is that of the PSNR over the noisy input. One thread. Clipped views into maps
-go the whole way of a user's raw besides, the estimate of what is clipped included.
+every method; the gain is that of the PSNR over the noisy input. One thread. Clipped views of maps
+go the whole way of a user's raw, the estimate of what is clipped included.
 """
 
 from __future__ import annotations
@@ -38,13 +38,12 @@ from simulator.utils.files import data_folder
 CAMERAS = ("nikon_z6", "canon_70d")
 ISOS, LEVELS = (400, 1600, 6400, 16000), (0, -3, -6)
 #: Of views with highlights; at level 0 the brightest 5 % of samples begin at half of white.
-BRIGHT_ISOS, BRIGHT_LEVELS = (1600, 6400), (0, -1, -2, -4)
+BRIGHT_ISOS, BRIGHT_LEVELS, BRIGHT_GAINS = (1600, 6400), (0, -1, -2, -4), ((1, 1, 1), (2, 1, 1.5))
 #: Side of a crop [packed pixel], and sources measured by one part.
 SIZE, _AT_ONCE = 128, 4
 #: A recorded mosaic is a case where the noise that is added has this many times its own variance.
 _CLEAN_RATIO = 16.0
-#: Non-local means' strength in units of the noise and patch size: the best of a few on
-#: the validation maps.
+#: Non-local means' strength in units of the noise, and patch size: the best on validation maps.
 NLM_STRENGTH, NLM_PATCH = 0.6, 3
 REFERENCE = "BM3D"
 #: A denoiser takes a raw (4, H, W) and its noise, and returns (4, H, W).
@@ -133,18 +132,21 @@ def measure_highlights(seed: int, quick: bool, split: Split = "test") -> list[Ro
         rng = np.random.default_rng([zlib.crc32(path.stem.encode()), seed])
         top, left = (int(rng.integers(n - 2 * SIZE + 1)) for n in light.shape[1:])
         light = sample_mosaic(lens_blur(light[:, top : top + 2 * SIZE, left : left + 2 * SIZE]))
-        camera, white = get_camera(CAMERAS[number % 2]), max(2 * float(light.quantile(0.95)), 1e-9)
-        for iso, level in product(BRIGHT_ISOS, BRIGHT_LEVELS):
-            true, noise = light * (2.0**level / white), noise_generator(seed, number, iso, level)
+        for gains, iso, level in product(BRIGHT_GAINS, BRIGHT_ISOS, BRIGHT_LEVELS):
+            true = light / torch.tensor(gains)[[0, 1, 1, 2], None, None]
+            true *= 2.0**level / max(2 * float(true.quantile(0.95)), 1e-9)
+            noise = noise_generator(seed, number, iso, level)
+            camera = get_camera(CAMERAS[number % 2])
             noisy = ReferenceCamera(camera).record(true, iso, noise)
-            raw = RawImage(noisy, CameraSettings(iso, 1 / 60, 4), camera)
+            raw = RawImage(noisy, CameraSettings(iso, 1 / 60, 4), camera, white_balance=gains)
             made = {k: s.prepare(raw) for k, s in simulators.items()}
             found = {"the estimate alone": made["large"].light}
             found |= {k: p.denoised_lights[-1].light for k, p in made.items()}
             for (name, clean), most in product(found.items(), (1.0, math.inf)):
                 errors = [_error(x, true.clamp(max=most), most) for x in (noisy, clean)]
                 row: Row = {"part": "highlights", "method": name, "source": path.stem, "iso": iso}
-                row |= {"ev": level, "light": "above white" if most > 1 else "up to white"}
+                row |= {"light": f"{'above' if most > 1 else 'up to'} white", "ev": level}
+                row |= {"gains": "{:g}, {:g}, {:g}".format(*gains)}
                 rows.append(row | {"gain_db": 10.0 * math.log10(errors[0] / errors[1])})
     return rows
 
@@ -210,8 +212,7 @@ _HADAMARD = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    step = 1 if quick else _AT_ONCE
-    starts = list(range(0, len(sources()), step))[: 2 if quick else None]
+    starts = list(range(0, len(sources()), 1 if quick else _AT_ONCE))[: 2 if quick else None]
     return [
         Part(f"{methods} {first}", measure, {"methods": methods, "first": first}, threads=1)
         for methods, first in product(("networks", "classical"), starts)
@@ -250,12 +251,12 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     means = gains_of(cases, ["iso", "ev", "method"])
     means = means.sort_values(["iso", "ev"], ascending=[True, False], kind="stable")
     line, group = "method = {method}", "ISO {iso:.0f}, EV {ev:.0f}"
-    shown = gains_of(bright, ["method", "light"]).to_dict("records")
+    shown = gains_of(bright, ["method", "light", "gains"]).to_dict("records")
     tables = {"methods": table(summary, _COLUMNS)}
     contents = "{gain_db:.2f} ({worst:.2f}, {below:.0%})"
     tables["by_iso"] = pivot(means.to_dict("records"), line, group, contents)
-    columns = f"method = {{method}} | light counts = {{light}} | cases = {{cases}} | {_GAINS}"
-    tables["highlights"] = table(shown, columns)
+    columns = "method = {method} | light counts = {light} | white balance = {gains} | "
+    tables["highlights"] = table(shown, f"{columns}cases = {{cases}} | {_GAINS}")
     return Report([*summary, *rows], tables, meta={"sources": len(by_source)})
 
 

@@ -22,9 +22,6 @@ from simulator.utils.cache import cache_dir
 from simulator.utils.checks import check_integer, check_type
 from simulator.utils.files import read_bounded
 
-#: Most bytes of a model file; ONNX allows no more.
-_MOST_BYTES = 2**31
-
 
 def find_model_file(
     scorer: str, given: str | os.PathLike[str] | None, variable: str, name: str, *, how: str
@@ -37,7 +34,7 @@ def find_model_file(
     named = os.environ.get(variable) if given is None else os.fspath(given)
     file = Path(named).expanduser() if named else cache_dir() / name
     if file.is_file():
-        return str(file.resolve()), hashlib.sha256(read_bounded(file, _MOST_BYTES)).hexdigest()
+        return str(file.resolve()), hashlib.sha256(read_bounded(file, 2**31)).hexdigest()
     if named:
         source = f"`{variable}`" if given is None else "`file`"
         raise ValueError(f"{source} (={named!r}) must be the model file of {scorer!r}; {how}")
@@ -350,7 +347,7 @@ def _session(file: str, digest: str) -> Any:
             f"scorer 'classifier' reads {file!r} by ONNX Runtime: pip install 'ae-env[onnx]' "
             f"({error})"
         ) from error
-    content = read_bounded(Path(file), _MOST_BYTES)
+    content = read_bounded(Path(file), 2**31)  # ONNX allows no more
     if hashlib.sha256(content).hexdigest() != digest:
         raise ValueError(f"`model` (={file!r}) must not change while it is in use")
     options = onnxruntime.SessionOptions()

@@ -178,7 +178,7 @@ def _read_map(path: Path, layer: str | None) -> np.ndarray:
     """The map (H, W) of numbers in a file, float64."""
     try:
         if fault := file_fault(path):
-            raise ValueError(f"the file {fault}")
+            raise ValueError(f"it {fault}")
         match path.suffix.lower():
             case ".png":
                 with open_picture(path, ["PNG"]) as picture:

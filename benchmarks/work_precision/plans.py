@@ -7,11 +7,10 @@ in units of the target's noise, between what is simulated and what the reference
 scene is photographed several times. The noise that is added last is known in closed form and not
 drawn. What the finite number of photographs adds to a square is subtracted: from dm by the usual
 correction, from ds by multiplying the differences of two halves of the photographs. Pixels that are
-white in the scene at these settings count as equal.
+white in the scene, and within the noise white in the captures, count as equal.
 
-Scenes are of the test split, but those that constants are calibrated on, photographed by a
-reference camera without hidden errors, so that what is measured is the simulator and not one body.
-The simulator is not told their depth.
+Scenes are photographed by a reference camera without hidden errors, so that what is measured is the
+simulator and not one body. The simulator is not told their depth.
 """
 
 from __future__ import annotations

@@ -174,10 +174,7 @@ def first_numbers(directories: Sequence[Directory], name: str) -> tuple[float, .
 
 
 def undefined(directories: Sequence[Directory], *names: str) -> bool:
-    """Whether the first tag that a file has of `names` holds no number, but a denominator of 0.
-
-    LibRaw takes that for a denominator of 1.
-    """
+    """Whether the first of `names` that a file has is over a denominator of 0; LibRaw takes 1."""
     name = next((name for name in names if first(directories, name)), None)
     return name is not None and not first_numbers(directories, name)
 

@@ -640,13 +640,9 @@ def _colour_matrix(
 
 def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory], make: str) -> dict[str, float]:
     """Settings that a file states, the shutter speed as the exact stop where a stop is recorded."""
-    other = raw.other
-    found = {
-        "iso": other.iso_speed,
-        "exposure_time": other.shutter_speed,
-        "f_number": other.aperture,
-    }
-    found = {name: float(f"{value:.7g}") for name, value in found.items()}  # it has float32
+    values = raw.other.iso_speed, raw.other.shutter_speed, raw.other.aperture
+    of_name = zip(_SETTINGS, values, strict=True)
+    found = {name: float(f"{value:.7g}") for name, value in of_name}  # it has float32
     for setting, name in _TAGS.items():  # phones write no EXIF directory, where LibRaw looks
         stated = next((v for v in first_numbers(directories, name) if v > 0), 0.0)
         # LibRaw has float32, and the lower 16 bits of an ISO that is written with 32.

@@ -67,10 +67,7 @@ def check_integer(
 
 
 def as_float(value: Any) -> float:
-    """`value` as a float: NaN where it is no real number, infinite where it is too large for one.
-
-    To be compared: beside a NumPy scalar, bounds lose digits.
-    """
+    """`value` as a float: NaN where it is no real number, infinite where it is too large."""
     try:
         return float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     except OverflowError:
@@ -79,7 +76,7 @@ def as_float(value: Any) -> float:
 
 def check_number(name: str, value: Any, low: float, high: float, *, more: str = "") -> float:
     """`value` as a float; a `ValueError`, which `more` ends, unless it is in [`low`, `high`]."""
-    number = as_float(value)
+    number = as_float(value)  # beside a NumPy scalar, bounds lose digits
     if low <= number <= high:
         return number
     rule = f"number in [{low:g}, {high:g}]"

@@ -210,9 +210,9 @@ def test_saturated_and_black_parts_need_no_network(compact, monkeypatch):
     monkeypatch.setattr(network, "uncorrected", counted)
     expected, result = compact.denoise(everywhere), compact.denoise(tolerant)
     assert seen[0] == 360 * 640
-    assert sum(seen[1:]) < 0.87 * seen[0]
+    assert sum(seen[1:]) < 0.9 * seen[0]
     clipped, light = torch.zeros(360, 640, dtype=torch.bool), tolerant.light
-    clipped[:304, :544] = clipped[336:] = True  # less the rim, whose estimate falls towards white
+    clipped[:288, :528] = clipped[336:] = True  # less the rim, whose estimate falls towards white
     torch.testing.assert_close(result[:, clipped], 1.8 * data[:, clipped])  # lamp, or black
     off, change = ((a - expected)[:, ~clipped].std() for a in (result, light))
     assert 0 < float(off) < 0.25 * float(change)

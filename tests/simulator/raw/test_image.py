@@ -452,7 +452,7 @@ def clipped(*pixels: tuple[float, ...], balance: tuple[float, float, float] = BA
         *(((v / 2, v, v / 1.25), (v / 2, v, v / 1.25)) for v in WHITE[:3]),
         ((4.5, 9.0, 7.2), (1.8, 3.6, 2.88)),  # 1.8 times as bright as red's white
         ((3.0, 0.3, 0.2), (1.0, 0.3, 0.2)),  # a red lamp stays red
-        ((0.9, 1.0, 0.2), (0.9, 1.025, 0.2)),  # levels 1.8 and 0.25 are known
+        ((0.9, 1.0, 0.2), (0.9, 1.0, 0.2)),  # of the levels 1.8 and 0.25 the lower
     ],
 )
 def test_clipped_planes_become_as_bright_as_white(recorded, expected) -> None:
@@ -481,18 +481,21 @@ def test_what_noise_alone_clips_stays_near_white(light: tuple[float, ...]) -> No
     assert (inner - 1.0).square().mean().sqrt() < 1.1 * deviation
 
 
-def test_a_full_photosite_below_white_and_an_absurd_balance() -> None:
+def test_full_below_white_an_absurd_balance_and_one_measured_sample() -> None:
     """Some compact cameras' photosites are full below white; of others such a value is measured."""
     raw = clipped((1.0, 1.0, 1.0))
     raw.data[1] = 0.94  # a smaller full well than the other green's
     found = neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist()
     assert found == pytest.approx([1.0, 0.94, 1.0, 1.0])  # the level 0.94 is below white
     raw = replace(raw, camera=replace(Z6, full_level=0.92))
-    assert neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist() == pytest.approx(
-        [1.8, 3.6, 3.6, 2.88]
-    )
+    found = neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist()
+    assert found == pytest.approx([1.8, 3.6, 3.6, 2.88])
     raw = clipped((1.0, 1.0, 1.0), balance=(1e30, 1.0, 1.0))
     assert neutral_highlights(raw, raw.saturated).max() == 16.0
+    raw = RawImage(torch.ones(4, 64, 64), replace(BASE, iso=3200), Z6, None, (2.0, 1.0, 1.5))
+    raw.data[1, 32, 32] = 0.995  # one sample near white tells nothing of the lamp around it
+    lamp = neutral_highlights(raw, raw.saturated)[:, 24, 24]
+    torch.testing.assert_close(lamp, torch.tensor([1.8, 3.6, 3.6, 2.4]), rtol=0.01, atol=0)
 
 
 @pytest.mark.parametrize("ratio", [1 / 16, 4.0])
@@ -500,8 +503,7 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     pixels = [(v / 2, v, v / 1.25) for v in WHITE]
     raw, settings = clipped(*pixels), CameraSettings(100, ratio / 64, 4)
     prepared = CameraSimulator(device="cpu").prepare(raw)
-    # A quarter is clipped, the others are 0.26 below white: 1 + 0.26 / 2 + 0.8 / 4^4
-    # times red's white, which is 2.
+    # A quarter is clipped, others are 0.26 below white: 2 (1 + 0.26 / 2 + 0.8 / 4^4), red's is 2.
     level = torch.tensor([0.5, 1.1, 1.6, 2.26625]) * ratio
     expected = level / torch.tensor([2, 1, 1, 1.25])[:, None]
     scene = Scene.from_raw(raw, scene_id="raw")
