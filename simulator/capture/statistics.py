@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+import reprlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -363,14 +364,12 @@ class Residual:
         """Of the numbers in a model card; a `ValueError` if they are none."""
         try:
             tables, spread = np.array([values[n] for n in _TABLES], float), float(values["spread"])
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             tables, spread = np.full((3, 1), math.nan), math.nan
         known = tables.ndim == 2 and tables.shape[1] > 1 and bool((tables >= 0.0).all())
         if not known or not max(tables.max(), spread) < math.inf or not spread >= 1.0:
-            raise ValueError(
-                f"`residual` (={values!r}) must have {', '.join(_TABLES)}, of one length, finite "
-                "and >= 0, and a spread >= 1"
-            )
+            rule = f"{', '.join(_TABLES)}, of one length, finite and >= 0, and a spread >= 1"
+            raise ValueError(f"`residual` (={reprlib.repr(values)}) must have {rule}")
         return cls(tables[0], tables[1], tables[2], spread)
 
     def to_card(self) -> dict[str, Any]:
