@@ -305,8 +305,9 @@ class Controller:
         """
         readings = np.zeros(2)
         for i, value in enumerate((image_speed, defocus)):
-            if not (isinstance(value, Real) and math.isnan(value)):
-                check_number(_READINGS[i], value, 0.0, math.inf, more="; NaN if it is missing")
+            if not (isinstance(value, Real) and value != value):  # NaN; `isnan` refuses large ones
+                more = "; NaN if it is missing"
+                value = check_number(_READINGS[i], value, 0.0, math.inf, more=more)
             readings[i] = max(value, 2.0**-64) if math.isfinite(value) else math.nan
         return _unit(np.log2(readings), self.card.ranges.sensors)
 

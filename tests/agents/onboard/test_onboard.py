@@ -125,7 +125,7 @@ def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):
     first = camera.decide(None, state)
     assert (first.state, first.held) == (state, True)  # its own state, before the first choice
     good = camera.decide(planes, state)
-    for frame, readings in ((None, {}), (bad, {}), (planes, {"defocus": np.inf})):
+    for frame, readings in ((None, {}), (bad, {}), (planes, {"defocus": 10**400})):
         held = camera.decide(frame, camera.states[5], **readings)
         assert (held.state, held.held, bool(held.reason)) == (good.state, True, True)
     fresh = Controller(exported[1])
