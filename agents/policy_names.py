@@ -246,7 +246,9 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     except Exception as error:  # the user's module runs, and may raise anything
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and f"{head}.".startswith(f"{missing}."):
-            raise _refusal(name, _known(base, head)) from None
+            text = _known(base, head)
+            text += "" if head in text else f" (there is no module {missing!r})"
+            raise _refusal(name, text) from None
         text = f": {head} cannot be imported: {type(error).__name__}: {error}"
         raise _refusal(name, text) from error
     return find_attribute(loaded, tail, f"`policy` (={name!r})"), {}

@@ -32,7 +32,8 @@ def planes_of(array, configuration, black_levels):
         )
     order, white = known[1], 2.0 ** int(known[2]) - 1.0
     width, height = configuration["size"]
-    samples = array.view(np.uint8 if white < 256.0 else np.uint16)
+    kind = np.dtype(np.uint8 if white < 256.0 else np.uint16)
+    samples = array[..., : array.shape[-1] // kind.itemsize * kind.itemsize].view(kind)
     mosaic = samples[:height, :width].astype(np.float64)
     if mosaic.shape != (height, width):
         raise ValueError(f"raw of {samples.shape} samples must hold {height} rows of {width}")

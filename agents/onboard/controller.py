@@ -167,7 +167,7 @@ class Controller:
         if own := self.card.sha256:
             content = content.replace(own.encode(), NO_DIGEST.encode())
             if hashlib.sha256(content).hexdigest() != own:
-                raise ValueError(f"{given} is damaged: its sha256 is not that of its content")
+                raise ValueError(f"{given} was damaged or changed: its sha256 is another")
         self._outputs = list(outputs)
         self._encoded = np.stack([self.encode_settings(state) for state in self.states])
         self.reset(num_cameras)

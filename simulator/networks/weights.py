@@ -161,7 +161,7 @@ def check_finite(tensors: Mapping[str, Tensor]) -> None:
     """Raises a `ValueError` that names the first of `tensors` that holds a NaN or an infinity."""
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            rule = "must be finite: train again with a lower learning_rate"
+            rule = "must be finite; a training that diverged needs a lower learning_rate"
             raise ValueError(f"weights, of {reprlib.repr(name)}, {rule}")
 
 

@@ -40,8 +40,8 @@ _CHUNK = 2**18  # elements
 #: Light of a wholly clipped pixel over the least that would clip all of its planes:
 #: 1 + d (0.25 + c) + 0.8 e^4, c and e the shares of such pixels in the first and second
 #: neighbourhood [packed pixel], d how far below white the others are in the mean: neighbours near
-#: white tell of a sky, dark ones of a lamp. Of those tried none leaves a training map below white
-#: as recorded.
+#: white tell of a sky, dark ones of a lamp. The most of those tried that leave no training map
+#: below white as recorded.
 _ABOVE_WHITE, _AMID_PX = (0.25, 1.0, 0.8), (17, 41)
 #: A clipped plane is raised to this many times white at most: white balance of no light asks for
 #: more, only a damaged one.
@@ -364,7 +364,7 @@ def neutral_highlights(raw: RawImage, saturated: torch.Tensor) -> torch.Tensor:
     number, but the white of the scene is another number in each, so a clipped lamp that is darkened
     as it was recorded turns pink. There a clipped plane takes the lowest level (value times white
     balance gain) of the pixel's other planes, so that a neutral pixel is neutral and a coloured one
-    no brighter than it was; where nothing tells that of any, 1 to 3 times the highest, the more,
+    is raised little; where nothing tells that of any, 1 to 3 times the highest, the more,
     the more pixels around are so and the darker the others are. Its spread is that of what nobody
     measured: highlights lie anywhere above white, with a median of about twice that.
 
@@ -424,11 +424,23 @@ def _clipped_by_noise(
     light, trust = torch.zeros(2, *data.shape, device=data.device)
     if raw.nlf is None and not raw.camera.nlf_by_iso:
         return light, trust
-    noise = raw.noise
-    spread = [math.sqrt(max(s + r, 0.0)) for s, r in zip(noise.shot, noise.read, strict=True)]
-    deviation = torch.tensor(spread).to(data)[:, None, None]
+    variances = zip(raw.noise.shot, raw.noise.read, strict=True)
+    for plane, (shot, read) in enumerate(variances):  # one at a time, which takes less memory
+        own = np.s_[plane : plane + 1]
+        deviation = math.sqrt(max(shot + read, 0.0))
+        light[own], trust[own] = _told_by_neighbours(data[own], full[own], deviation)
+    return light, trust
+
+
+def _told_by_neighbours(
+    data: torch.Tensor, full: torch.Tensor, deviation: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of one plane (1, H, W), see `_clipped_by_noise`."""
+    light, trust = torch.zeros(2, *data.shape, device=data.device)
     near, unseen = (data >= 1.0 - _NEAR_DEVIATIONS * deviation) & ~full, full
     for side, apart in _QUARTERS:
+        if not bool(unseen.any()):
+            break
         at_white, below = _around(full, side + 2 * apart), _around(near, side + 2 * apart)
         quarters = F.pad(_around(near, side), (apart,) * 4, mode="replicate")
         least = -F.max_pool2d(-quarters, 2, 1, dilation=2 * apart)  # of the four
@@ -439,8 +451,6 @@ def _clipped_by_noise(
         light = torch.where(better, 1.0 + above, light)
         trust = torch.where(better, enough, trust)
         unseen = unseen & (trust < 1.0) & (others <= below + 1e-4)
-        if not bool(unseen.any()):
-            break
     return light, trust
 
 

@@ -33,15 +33,16 @@ Directory = dict[str, tuple[Any, ...]]
 
 
 class Ratio(float):
-    """A rational of a file, which keeps the denominator that it was written with."""
+    """A rational of a file, which keeps the two numbers that it was written with."""
 
-    __slots__ = ("denominator",)
+    __slots__ = ("denominator", "numerator")
+    numerator: int
     denominator: int
 
     def __new__(cls, numerator: int, denominator: int) -> Ratio:
         """NaN over a denominator of 0."""
         ratio = super().__new__(cls, numerator / denominator if denominator else math.nan)
-        ratio.denominator = denominator
+        ratio.numerator, ratio.denominator = numerator, denominator
         return ratio
 
 
@@ -174,9 +175,14 @@ def first_numbers(directories: Sequence[Directory], name: str) -> tuple[float, .
 
 
 def undefined(directories: Sequence[Directory], *names: str) -> bool:
-    """Whether the first of `names` that a file has is over a denominator of 0; LibRaw takes 1."""
-    name = next((name for name in names if first(directories, name)), None)
-    return name is not None and not first_numbers(directories, name)
+    """Whether the first of `names` that is not 0 in a file is over a denominator of 0.
+
+    LibRaw goes on to the next where one is 0, and takes 1 for such a denominator.
+    """
+    for name in names:
+        if any(getattr(value, "numerator", value) for value in first(directories, name) or ()):
+            return not first_numbers(directories, name)
+    return False
 
 
 def missing_bytes(directories: Sequence[Directory], size: int) -> int:

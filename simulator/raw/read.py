@@ -57,7 +57,7 @@ _COMPRESSIONS, _VC5 = (1, 7, 8), 9
 _LETTERS = {0: "R", 1: "G", 2: "B"}
 _SETTINGS = ("iso", "exposure_time", "f_number")
 _TAGS = {"iso": "PhotographicSensitivity", "exposure_time": "ExposureTime", "f_number": "FNumber"}
-#: What LibRaw takes where a file lacks these.
+#: What LibRaw takes where a file lacks these, or they are 0.
 _SPARE = {"exposure_time": ("ShutterSpeedValue",), "f_number": ("ApertureValue",)}
 #: Makers whose cameras record the stop that is marked, 1/60 s for 1/64 s, by the first word of
 #: their name; others (phones, computers, industrial cameras) record the time itself, and so does

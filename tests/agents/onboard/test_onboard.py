@@ -153,7 +153,7 @@ def test_a_damaged_card_or_weight_is_named(exported, tmp_path):
     content = bytearray(exported[1].read_bytes())
     content[len(content) // 2] ^= 1  # of a weight
     (tmp_path / "x.onnx").write_bytes(content)
-    with pytest.raises(ValueError, match=r"`path` .* damaged: its sha256"):
+    with pytest.raises(ValueError, match=r"`path` .* changed: its sha256"):
         Controller(tmp_path / "x.onnx")
     model = onnx.load(str(exported[1]))
     (entry,) = (entry for entry in model.metadata_props if entry.key == "ae_env")
