@@ -31,11 +31,22 @@ _GRID = ("isos", "exposure_times", "f_numbers")
 _ROUNDED = 0.03
 
 
+class _Context(BaseModel, strict=True):
+    """What an agent was trained for, as far as its card says."""
+
+    resolution: list[int] = []
+    observation: str = ""
+    sensors: bool = True
+    isos: list[float] = []
+    exposure_times: list[float] = []
+    f_numbers: list[float] = []
+
+
 class _Card(BaseModel):
     """Entries that every card must have; `history` is of a PPO's hyperparameters."""
 
     width: int = Field(strict=True, ge=1, le=MAX_WIDTH)
-    context: dict[str, bool | str | list[float]]
+    context: _Context
     training: dict[str, Any]
     aliases: dict[str, str]
     history: int = Field(0, strict=True, ge=0, le=MAX_HISTORY, validation_alias=_HISTORY)
