@@ -74,7 +74,7 @@ def difference_interval(
     if groups < MIN_GROUPS:
         return Interval(value, None, None, groups, seeds)
     rng = np.random.default_rng([seed, 1])
-    weights = _group_weights(groups, resamples, seed)
+    weights = group_weights(groups, resamples, seed)
     totals = _resampled(first, weights, rng) - _resampled(second, weights, rng)
     statistic = totals / (weights @ span)
     tail = 50.0 * (1.0 - LEVEL)
@@ -83,7 +83,7 @@ def difference_interval(
 
 
 @lru_cache(maxsize=16)
-def _group_weights(groups: int, resamples: int, seed: int) -> Floats:
+def group_weights(groups: int, resamples: int, seed: int) -> Floats:
     """How often each group is drawn, ``(R, G)``; the same for all that are compared."""
     rng = np.random.default_rng(seed)
     weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)
@@ -151,7 +151,7 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
 
 def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:
     """Half widths of the simultaneous intervals of all differences, ``(P, P)``."""
-    weights = _group_weights(len(span), resamples, 0)
+    weights = group_weights(len(span), resamples, 0)
     drawn = [  # training seeds are drawn for each policy
         _resampled(np.atleast_2d(own), weights, np.random.default_rng([0, 1, i])) / (weights @ span)
         for i, own in enumerate(gains)

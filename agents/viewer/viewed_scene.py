@@ -192,6 +192,7 @@ class View:
         clipping: Whether clipped pixels are marked.
         centre: Middle of the part shown pixel by pixel, down and to the right, as shares of the
             upright picture; None for the whole frame.
+        noise_seed: Seed of the capture's noise.
     """
 
     settings: CameraSettings
@@ -199,6 +200,7 @@ class View:
     defocus: float = 0.0
     clipping: bool = False
     centre: tuple[float, float] | None = None
+    noise_seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,7 @@ class ViewedScene:
         with self._lock:
             begun = perf_counter()
             prepared = self._part(view)
-            (capture,) = prepared.expose([view.settings])
+            (capture,) = prepared.expose([view.settings], seed=view.noise_seed)
             taken = perf_counter()
             image = self._to_srgb(capture, view)
             jpeg = encoded(image, quality=88 if view.centre is None else 95)
