@@ -15,6 +15,8 @@ from agents.cli.simulate import make_simulator
 
 #: What is shown where nothing is named; `ae-env warm-up` draws it.
 DEFAULT_SCENES = "bundled:small"
+Port = Annotated[int, Option(help="Port to serve at; 0 for any.", min=0, max=65535)]
+Opens = Annotated[bool, Option("--open/--no-open", help="Open the page in the default browser.")]
 #: Policies of a film where none is given.
 POLICIES = ("average:tuned", "average:tuned?foresight=model", "regression:video?foresight=learnt")
 
@@ -29,10 +31,8 @@ def view(
             "the id of a bundled scene.",
         ),
     ] = DEFAULT_SCENES,
-    port: Annotated[int, Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
-    open_browser: Annotated[
-        bool, Option("--open/--no-open", help="Open the page in the default browser.")
-    ] = True,
+    port: Port = 0,
+    open_browser: Opens = True,
     scorer: Annotated[str, Option(help="Scorer, as for `evaluate`.")] = "balanced",
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
@@ -97,10 +97,8 @@ def judge(
         Path | None, Option(help="CSV of the choices (choices.csv); of --fit, a folder (judging).")
     ] = None,
     seed: console.Seed = 0,
-    port: Annotated[int, Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
-    open_browser: Annotated[
-        bool, Option("--open/--no-open", help="Open the page in the default browser.")
-    ] = True,
+    port: Port = 0,
+    open_browser: Opens = True,
 ) -> None:
     """Choose the better of two frames, blind; with --fit, compare scorers with the choices.
 
@@ -118,8 +116,8 @@ def judge(
         console.make_folder(out or Path("judging"))
         with progress_bars() as progress, progress("scores") as task:
             files = write_fit(choices, out or Path("judging"), console.command_line(), task)
-        print_line(files["tables"].read_text(encoding="utf-8"))
-        print_files(files)
+        print_line(files[1].read_text(encoding="utf-8"))
+        print_files({file.name: file for file in files})
         return
     free_port, serve = _server("judge")
     from agents.viewer.judge_page import JudgePage

@@ -10,7 +10,7 @@ from typing import Any
 from nicegui import run, ui
 
 from ae_env.scenes import Scene
-from agents.report.judging import GRID, Choice, Judging
+from agents.report.judging import GRID, Judging, Row
 from agents.viewer.page import STYLE, PictureStore
 from agents.viewer.tab import complain
 from agents.viewer.viewed_scene import OpenedScene, View, ViewedScene
@@ -29,7 +29,7 @@ class JudgePage:
     ) -> None:
         ui.add_css(STYLE.read_text())
         self._judging, self._scenes, self._pictures = judging, scenes, pictures
-        self._shown: Choice | None = None
+        self._shown: Row | None = None
         self._begun, self._busy = 0.0, asyncio.Lock()
         with ui.element("header").classes("bar"):
             ui.label("Which picture is better?").classes("title")
@@ -41,7 +41,7 @@ class JudgePage:
 
     async def show(self) -> None:
         """Shows the next pair, or that there is none."""
-        pair, done = self._judging.next_pair, len(self._judging.choices)
+        pair, done = self._judging.next_pair(), len(self._judging.choices)
         frames = None if pair is None else await run.io_bound(self._developed, pair)
         for image, source in zip(self._images, frames or ("", ""), strict=True):
             image.props["src"] = source
@@ -50,11 +50,12 @@ class JudgePage:
         ended = "" if pair is not None else ": that was the last pair"
         self._progress.text = f"{done} of {len(self._judging.pairs)}{ended}"
 
-    def _developed(self, pair: Choice) -> list[str]:
+    def _developed(self, pair: Row) -> list[str]:
         """Addresses of the two frames."""
-        opened = OpenedScene(self._scenes[pair.scene_id])
+        opened = OpenedScene(self._scenes[pair["scene_id"]])
         viewed = ViewedScene(opened, CameraSimulator(device="cpu"))
-        views = [View(GRID[state], noise_seed=pair.noise_seed) for state in (pair.left, pair.right)]
+        seed = pair["noise_seed"]
+        views = [View(GRID[pair[side]], noise_seed=seed) for side in ("left", "right")]
         return [self._pictures.address(viewed.picture(view).jpeg) for view in views]
 
     async def _on_key(self, event: Any) -> None:
