@@ -112,15 +112,12 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("paper",), "ae-env bench paper FOLDER"),
         (("paper", "none"), "`folder` (='none')"),
         (("paper", "runs"), "must hold a camera_params.csv"),
-        (("paper", "runs"), "`folder` (='runs')"),
         (("paper", "data", "--weights", "none.safetensors"), "there is no none.json"),
         (("ptc", "data"), "`folder` (='data')"),
         (("ptc", "--weights", "a"), "`weights` (='a')"),
-        (("features", "--weights", "a"), "`weights` (='a')"),
         (("throughput", "--against", "none"), "`against` (='none')"),
         (("recorded", "none"), "`scenes` (='recorded:"),
         (("recorded", "runs"), "`scenes` (='recorded:runs')"),
-        (("recorded", "runs", "--weights", "a"), "`weights` (='a')"),
     ],
 )
 def test_errors_before_any_work(ae_env, benchmarks_here, arguments, named):

@@ -124,19 +124,6 @@ def test_own_file(context, photograph, tmp_path):
         make_policy(f"{file}:Mine", context)
 
 
-def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "judge.md").read_text(encoding="utf-8")
-    file = tmp_path / "my_policy.py"
-    file.write_text(page.partition("```python\n")[2].partition("```")[0])
-    policy = make_policy(f"{file}:HalfGrey", context)
-    states, masks = np.array([0, 63]), np.ones((2, 64), bool)
-    for _ in range(6):
-        states = policy.act(photograph(np.ones((64, 64)), 9.0, states))
-    np.testing.assert_allclose(context.grid.ev100[states], 9.0, atol=0.2)
-    masks[:, states[0]] = False
-    assert policy.act(photograph(np.ones((64, 64)), 9.0, states), masks)[0] != states[0]
-
-
 def test_policies_that_look_at_no_frame(context):
     """Random is seeded, uniform and masked; others need a fit, or to be told the best state."""
     policy, frames = make_policy("random", context), {"raw": np.zeros((500, 4, 8, 8), np.uint8)}
