@@ -280,7 +280,7 @@ def _fetch(url: str, file: str, _: Any, *, size: int) -> None:
         for piece in answer.iter_content(2**16):
             stream.write(piece)
             if stream.tell() > size:
-                raise ValueError(f"it must have at most {size} bytes, but is longer")
+                raise ValueError(f"it may have {size} bytes, but is longer")
 
 
 def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene], maps: int) -> list[Scene]:
