@@ -61,8 +61,7 @@ def view(
         library = find_scenes(what, source)
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
-    show = partial(show_page, options)
-    serve("ae-env view", show, options.folder, port, open_browser, _announce)
+    serve("ae-env view", partial(show_page, options), options.folder, port, open_browser)
 
 
 def _server(command: str) -> tuple[Any, Any]:
@@ -76,11 +75,6 @@ def _server(command: str) -> tuple[Any, Any]:
             f"`ae-env {command}` needs the extra view: pip install 'ae-env[view]'"
         ) from None
     return free_port, serve
-
-
-def _announce(address: str) -> None:
-    print_line(f"open {address}\nCtrl-C stops")
-    console.terminal.file.flush()
 
 
 def judge(
@@ -120,7 +114,7 @@ def judge(
         print_files({file.name: file for file in files})
         return
     free_port, serve = _server("judge")
-    from agents.viewer.judge_page import JudgePage
+    from agents.viewer.judge_page import show_pairs
     from agents.viewer.page import PictureStore
 
     path, port = out or Path("choices.csv"), free_port(port)
@@ -130,12 +124,8 @@ def judge(
         found = judged_scenes(**source)
         judging = Judging(draw_pairs(found, pairs, seed, task, **source), path, name)
     print_line(f"{len(judging.choices)} of {pairs} pairs are in {path}")
-    pictures, folder = PictureStore(), tempfile.TemporaryDirectory(prefix="ae-env-judge-")
-
-    async def show() -> None:
-        await JudgePage(judging, found, pictures).show()
-
-    serve("ae-env judge", show, folder, port, open_browser, _announce)
+    show = partial(show_pairs, judging, found, PictureStore())
+    serve("ae-env judge", show, tempfile.TemporaryDirectory(), port, open_browser)
 
 
 @console.takes_source

@@ -17,7 +17,6 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scorers.registry import describe_scorers, make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
-from ae_env.scorers.terms import CompositeScorer
 from agents.evaluation.evaluation_plan import digest
 from agents.evaluation.intervals import LEVEL, MIN_GROUPS, group_weights, score_interval
 from agents.evaluation.metrics import group_means
@@ -60,10 +59,9 @@ def judged_scenes(scenes: str, split: Any, resolution: int) -> dict[str, Scene]:
 
 def state_scores(scene: Scene, scorers: Sequence[str]) -> Floats:
     """Expected scores (K, S) of a scene at rest under K scorers, at 64 pixels a side."""
-    together = CompositeScorer({name: make_scorer(name) for name in scorers})
+    together = make_scorer(dict.fromkeys(scorers, 1.0))
     small = scene.resized(min(64, *scene.light.shape[1:]))
-    table = ScoreTables(GRID, scene.camera, together).table(small)
-    return np.stack([table.parts[name] for name in scorers])
+    return np.stack([*ScoreTables(GRID, scene.camera, together).table(small).parts.values()])
 
 
 def contested_pairs(scores: Floats) -> list[tuple[int, int]]:
@@ -242,31 +240,29 @@ def write_fit(files: Sequence[Path], out: Path, command: str, progress: Progress
         rule = "must hold choices, and each of them once"
         raise ValueError(f"`choices` (={[str(path) for path in files]}) {rule}")
     names = [row.name for row in describe_scorers() if not row.needs and not row.error]
-    ev100, scores = np.zeros(len(choices)), np.zeros((len(names), len(choices), 2))
-    done = 0
+    ev100, scores, done = np.zeros(len(choices)), np.zeros((len(names), len(choices), 2)), 0
     source: Any
     for source, shown in choices.groupby(["scenes", "split", "resolution"]):
         scenes = judged_scenes(*source)
         for scene_id, own in shown.groupby("scene_id"):
             progress(done := done + len(own), len(choices))
-            scene, states = scenes.get(str(scene_id)), own[["left", "right"]].to_numpy()
+            scene, sides = scenes.get(str(scene_id)), own[["left", "right"]]
             here = own.assign(camera=CAMERA, content=getattr(scene, "content", ""))
-            here = here.assign(
-                **{f"{side}_settings": own[side].map(_settings) for side in ("left", "right")}
-            )
+            here[["left_settings", "right_settings"]] = sides.map(_settings)
             if scene is None or not here.equals(own):
                 rule = "must be as it was judged, but its light or the states differ here"
                 raise ValueError(f"scene {scene_id!r} of `choices` (of {source[0]!r}) {rule}")
             ev100[own.index] = scene.ev100
-            scores[:, own.index] = state_scores(scene, names)[:, states]
-    exposures = exposure_rows(choices, ev100)
-    scorers = scorer_rows(choices, dict(zip(names, scores, strict=True)))
+            scores[:, own.index] = state_scores(scene, names)[:, sides.to_numpy()]
+    by_scorer = dict(zip(names, scores, strict=True))
+    told = {"strength": exposure_rows(choices, ev100), "agreement": scorer_rows(choices, by_scorer)}
     judges, equal = sorted(set(choices.judge)), int((choices.choice == "equal").sum())
-    meta = {**result_meta(command, None), "judges": judges, "plans": sorted(set(choices.plan))}
+    meta = {"judges": judges, "plans": sorted(set(choices.plan)), "equal": equal}
     text = f"{len(choices)} choices by {', '.join(judges)}, {equal} of them equal.\n"
-    for value, rows in (("strength", exposures), ("agreement", scorers)):
+    for value, rows in told.items():
         columns = {rows[0]["kind"]: "{name}", value: "{value:.3f}", "95 % interval": "{ci95:.3f}"}
         columns |= {"choices": "{choices}", "source groups": "{num_groups}"}
         text += f"\n{to_markdown(rows, columns)}\n"
-    results = write_results(out / "judging.json", [*exposures, *scorers], meta | {"equal": equal})
+    rows = [*told["strength"], *told["agreement"]]
+    results = write_results(out / "judging.json", rows, result_meta(command, None) | meta)
     return [results, write_atomically(out / "judging.md", text)]

@@ -21,14 +21,17 @@ _KEYS = {"ArrowLeft": "left", "ArrowRight": "right", "ArrowDown": "equal", "Spac
 _UNDO = "Backspace"
 
 
-class JudgePage:
-    """One tab of the browser; each shows the pair that is next."""
+async def show_pairs(judging: Judging, scenes: Mapping[str, Scene], store: PictureStore) -> None:
+    """Puts the page together, for one tab of the browser: each shows the pair that is next."""
+    await JudgePage(judging, scenes, store).show()
 
-    def __init__(
-        self, judging: Judging, scenes: Mapping[str, Scene], pictures: PictureStore
-    ) -> None:
+
+class JudgePage:
+    """One tab of the browser."""
+
+    def __init__(self, judging: Judging, scenes: Mapping[str, Scene], store: PictureStore) -> None:
         ui.add_css(STYLE.read_text())
-        self._judging, self._scenes, self._pictures = judging, scenes, pictures
+        self._judging, self._scenes, self._store = judging, scenes, store
         self._shown: Row | None = None
         self._begun, self._busy = 0.0, asyncio.Lock()
         with ui.element("header").classes("bar"):
@@ -52,11 +55,10 @@ class JudgePage:
 
     def _developed(self, pair: Row) -> list[str]:
         """Addresses of the two frames."""
-        opened = OpenedScene(self._scenes[pair["scene_id"]])
+        opened, seed = OpenedScene(self._scenes[pair["scene_id"]]), pair["noise_seed"]
         viewed = ViewedScene(opened, CameraSimulator(device="cpu"))
-        seed = pair["noise_seed"]
         views = [View(GRID[pair[side]], noise_seed=seed) for side in ("left", "right")]
-        return [self._pictures.address(viewed.picture(view).jpeg) for view in views]
+        return [self._store.address(viewed.picture(view).jpeg) for view in views]
 
     async def _on_key(self, event: Any) -> None:
         code = event.key.code

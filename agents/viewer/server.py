@@ -8,8 +8,7 @@ import os
 import secrets
 import socket
 import webbrowser
-from collections.abc import Awaitable, Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -113,15 +112,8 @@ def free_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def serve(
-    title: str,
-    show: Callable[[], Awaitable[None]],
-    files: AbstractContextManager[str],
-    port: int,
-    open_browser: bool,
-    announce: Callable[[str], None],
-) -> None:
-    """Serves a page at a free port until it is stopped; `announce` gets the address then.
+def serve(title: str, show: Callable[[], Any], files: Any, port: int, open_browser: bool) -> None:
+    """Serves a page at a free port until it is stopped, and prints the address then.
 
     `show` puts the page together, `files` is a folder for the program's own files.
     """
@@ -134,7 +126,7 @@ def serve(
     with files as folder:
 
         def served() -> None:
-            announce(address)
+            print(f"open {address}\nCtrl-C stops", flush=True)
             if open_browser:
                 webbrowser.open(_page_that_leads_to(address, Path(folder)))
 
