@@ -372,7 +372,7 @@ def test_real_scenes_alone_and_mixed(data_dir):
         assert 1e-3 < scene.illuminance <= 2.0 * polyhaven.ILLUMINANCE[scene.kind][1]
     check_oracles_are_spread(real)
     drawn = [replace(real[0], scene_id=f"drawn-{i}", source="") for i in range(10)]
-    mixed = polyhaven.mixed_scenes(request, drawn, len(real))
+    mixed = polyhaven.mixed_scenes(request, drawn, polyhaven.split_assets("polyhaven", "test"))
     kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
     assert kinds[True] == kinds[False] == 10
     assert {s.group for s in mixed if s.source.startswith("Poly")} < {s.group for s in real}
