@@ -17,7 +17,7 @@ from scipy.stats import norm
 from ae_env.scenes.bundled import add_layout
 from ae_env.scenes.polyhaven import VIEWS as VIEWS_OF_POLYHAVEN
 from ae_env.scenes.polyhaven import asset_views, dome_lux, polyhaven_scenes, split_assets
-from ae_env.scenes.scene import SceneRequest
+from ae_env.scenes.scene import SceneRequest, Split
 from agents.evaluation.engine import evaluate, fit_policies
 from agents.evaluation.intervals import score_interval
 from agents.learning.training import load_config, train_agent
@@ -43,8 +43,8 @@ PLACES, TUNED = (5, 10, 20, None), ("average:tuned", "centre_weighted:tuned", "m
 # -- the posterior ---------------------------------------------------------------------------------
 
 
-def _seen(split: str, views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Features of views, the gap between their incident and their reflected EV, and their places."""
+def _seen(split: Split, views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features of views, by how much their incident EV differs from the meter's, and places."""
     request = SceneRequest(split, CAMERA, RESOLUTION)
     known, gaps, places = [], [], []
     for scene in polyhaven_scenes(request, views=views):
@@ -70,7 +70,8 @@ def _fitted(known: np.ndarray, gaps: np.ndarray, ridge: float) -> tuple[np.ndarr
 def posterior(quick: bool) -> Row:
     """The fit, and how much of the views of each split it covers."""
     views = 4 if quick else VIEWS
-    seen = {split: _seen(split, views) for split in ("train", "validation", "test")}
+    splits: tuple[Split, ...] = ("train", "validation", "test")
+    seen: dict[str, Any] = {split: _seen(split, views) for split in splits}
     known, gaps, places = seen["train"]
     names = np.unique(places)
     folds = np.array_split(np.random.default_rng(0).permutation(len(names)), FOLDS)
@@ -98,7 +99,7 @@ def posterior(quick: bool) -> Row:
             f"{s:.0%}": float((abs(error) < norm.ppf(0.5 + s / 2) * spread).mean()) for s in SHARES
         }
         explained = 1.0 - np.square(error).mean() / seen[split][1].var()
-        row = {"views of": name, "places": len(np.unique(seen[split][2])), "views": len(error)}
+        row: Row = {"views of": name, "places": len(np.unique(seen[split][2])), "views": len(error)}
         rows.append(
             {
                 **row,
@@ -139,7 +140,7 @@ def _comparators(quick: bool) -> dict[str, Any]:
 
 
 #: Light meters in a panorama: lux of a flat receptor that asks for the same exposure.
-RECEPTORS = {
+RECEPTORS: dict[str, Any] = {
     "dome": dome_lux,
     "flat": partial(receptor_reading, dome=False),
     "dome, C 250": receptor_reading,
@@ -160,7 +161,7 @@ def receptors(quick: bool) -> list[Row]:
             for asset in split_assets("polyhaven", "test")
             for view in asset_views(asset, CAMERA, size=size, views=views, read=read)
         ]
-        gap = [s.ev100 - s.incident_light.reflected_ev100 for s in scenes]
+        gap = [s.ev100 - (s.incident_light.reflected_ev100 or s.ev100) for s in scenes]
         options = {"scenes": scenes, "split": "test", "resolution": RESOLUTION}
         result = evaluate(policies, options, episodes_per_scene=1 if quick else 4)
         for policy in policies:
@@ -206,14 +207,10 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             r["score"] > row["score"] for r in judged if r["receptor"] == row["receptor"]
         )
     curves = list(results.values())
-    headings = "views of|places|views|rms [EV]|explained".split("|") + [f"{s:.0%}" for s in SHARES]
+    shares = "".join(f" | {s:.0%} = {{{s:.0%}:.3f}}" for s in SHARES)
+    seen = "views of = {views of} | places = {places} | views = {views} | rms [EV] = {rms [EV]:.2f}"
     tables = {
-        "posterior": table(
-            covers,
-            " | ".join(
-                f"{h} = {{{h}:.2f}}" if i > 2 else f"{h} = {{{h}}}" for i, h in enumerate(headings)
-            ),
-        ),
+        "posterior": table(covers, seen + " | explained = {explained:.2f}" + shares),
         "receptors": pivot(
             judged, "policy = {policy}", "{receptor}", "score = {score:.3f} ({rank})"
         ),
