@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.observation import linear_signal
 from agents.metering.programs import PRIORITY_TIME, ProgramOptions, StateChooser, check_used
-from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
+from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import MANUAL_PROGRAMS
 from simulator.utils.checks import check_integer, check_number, check_word
