@@ -427,6 +427,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `iso`, `exposure_time`, `f_number`, `ev100` | its settings |
     | `clipped_high`, `clipped_low` | shares of the samples at white, and at or below 2^-10 of it |
     | `excess_noise` | noise variance beyond that of the camera at these settings |
+    | `illuminance_spread` | standard deviation of the incident EV; 0 where the light is known |
     | `predicted_error` | the plan's error of this capture, in units of the noise that it should have: what was left out, and of a raw also what networks and saturated highlights are off by |
     | `modules` | steps of the simulator that this capture took |
     | `rewards.score`, `rewards.noise`, ... | the score, each part of the scorer, and the costs |

@@ -354,6 +354,7 @@ class EpisodeCore:
             "excess_noise": found.excess_variance,
             "predicted_error": found.predicted_error,
             "modules": found.modules,
+            "illuminance_spread": episodes.illuminance_spread[episodes.scene[env_indices]],
         }
         if self.options.sensors:
             columns["sensor_normals"] = single_normals(found.keys, 2)

@@ -134,6 +134,7 @@ class Episodes:
         self.allowed = np.ones((count, len(self.grid)), bool)
         self._median_speed, self._own_blur = np.zeros((2, count))
         self._has_subject, self._has_map, self._known = np.zeros((3, count), bool)
+        self.illuminance_spread = np.zeros(count)
         self.box_factor = np.ones(count, np.int64)
         self.scene_ids = self.scenes.scene_ids
         self._ensure_loaded(np.array(self.scenes.loaded, np.int64))
@@ -167,6 +168,7 @@ class Episodes:
             self.allowed[index] = _allowed_states(scene, len(self.grid))
             self._median_speed[index] = scene.median_speed
             self._own_blur[index] = scene.own_blur(4.0)
+            self.illuminance_spread[index] = scene.incident_light.spread
             layout = scene.layout
             self._has_subject[index] = layout is not None and layout.subject is not None
             self._has_map[index] = scene.defocus_map is not None

@@ -20,6 +20,7 @@ from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import Layout
 from simulator.radiance.depth import draw_layout
+from simulator.radiance.incident_light import picture_illuminance
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
 from simulator.radiance.procedural import (
     GENERATOR_VERSION,
@@ -57,7 +58,7 @@ KINDS, HARD = (*GROUPS_PER_KIND, "photograph"), "hard"
 #: From so many missing groups on, drawing takes long enough for a log line and a progress bar.
 _MANY = 64
 #: Part of every cache key: raise it with any change of the stored values.
-_FORMAT = 8
+_FORMAT = 9
 #: Fields of a cached scene that JSON holds.
 _FIELDS = (
     *("scene_id", "group", "illuminance", "white_balance", "kind", "hard", "median_speed"),
@@ -195,6 +196,9 @@ def _scene(drawing: Drawing, request: SceneRequest, **facts: Any) -> Scene:
     scene = Scene.from_radiance(
         light, request.camera, illuminance=lux, illuminant=illuminant, **facts
     )
+    reflected = scene.incident_light.reflected_ev100
+    if reflected is not None:  # what is drawn is lit from the front by `lux`
+        scene = replace(scene, illuminance=picture_illuminance(lux, reflected))
     return add_layout(scene).resized(request.resolution, request.crop)
 
 

@@ -98,9 +98,9 @@ def load_scenes(
 
     Args:
         spec: What to load; the head of this module lists it.
-        split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
-            of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
-            made them has split them.
+        split: ``"train"``, ``"test"``, ``"all"``, or of "polyhaven" ``"validation"``. Source groups
+            never straddle splits. A folder of fewer than 15 groups is all test. Lists and
+            attributes are used as they are: whoever made them has split them.
         camera: In whose colours scenes are made. A raw has its own camera.
         resolution: Packed pixels a side; None keeps each scene's own size.
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
@@ -115,6 +115,10 @@ def load_scenes(
             or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
+    if split == "validation" and spec != "polyhaven":
+        raise ValueError(
+            f"`split` (={split!r}) needs `scenes='polyhaven'`: no others have places for it"
+        )
     check_type("camera", camera, CameraProfile, more="; `simulator.get_camera` gives one by name")
     request = SceneRequest(split, camera, resolution, crop, resize)
     scenes: Sequence[Scene]

@@ -6,8 +6,8 @@ kind and split. Each is looked for in the folder of real files and in the user's
 
 A map is linear but relative. How much light there is is drawn by its kind (`ILLUMINANCE`,
 log-uniform), for each view anew, as the illuminance of a surface that is turned to where it gets
-the most. The view then has the light that the map itself casts on a subject in it
-(`incident_light`), which is less where the light comes from behind.
+the most. The incident light is what a meter with a dome then reads where the map was taken, turned
+against the view (`simulator.radiance.incident_light`).
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from ae_env.scenes.bundled import add_layout, cached_scenes
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
 from ae_env.utils.user_files import find_preset
 from simulator.camera import CameraProfile
+from simulator.radiance.incident_light import FLAT_LUX, receptor_reading
 from simulator.radiance.maps import native_size, perspective
 from simulator.radiance.reading import read_radiance
 from simulator.utils.cache import cache_dir, cache_key
@@ -52,24 +53,24 @@ ILLUMINANCE = {
 _HARD = ("night", "backlit", "tunnel")
 #: Views of one map, unless others are asked for.
 VIEWS = 8
-#: Fields of view [degrees], uniform: of lenses of 19 to 39 mm on a full frame.
-_FIELDS_OF_VIEW = (50.0, 85.0)
-#: Standard deviation and largest size of the pitch [degrees].
-_PITCH, _LARGEST_PITCH = 8.0, 20.0
+#: Fields of view [degrees]: the widths of a full frame behind lenses of 24, 35 and 50 mm.
+_FIELDS_OF_VIEW = (73.7, 54.4, 39.6)
+#: Standard deviation and largest size of the pitch, up and down [degrees].
+_PITCH, _LARGEST_PITCH = 12.0, 30.0
 #: Where the maps come from, and the folder of the cache that they go to.
 URL, _FOLDER = "https://dl.polyhaven.org/file/ph-assets/HDRIs/hdr/1k/", "polyhaven"
 #: Seconds in which a server must answer; further attempts at a file that arrives broken.
 _TIMEOUT, _RETRIES = 30.0, 2
+#: Largest file of a map whose published copy is not known to the byte.
+_LARGEST = 4_000_000
 #: A map with as many pixels at its very maximum was cut there; with this share at 0, below.
 _CUT_PIXELS, _CUT_SHARE = 40, 1e-3
 #: Latitudes that a surface is turned to, to find where it gets the most light [degrees].
 _TURNED = (-30.0, 0.0, 30.0, 60.0, 90.0)
 #: Side of the cells that light is summed over [pixels of a map].
 _CELL = 4
-#: Luminance of linear sRGB.
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Raised when the views change.
-_VERSION = 6
+_VERSION = 7
 
 
 class Asset(Configuration):
@@ -77,9 +78,10 @@ class Asset(Configuration):
 
     name: str = Field(pattern=r"[a-z0-9_]+")
     kind: Literal[tuple(ILLUMINANCE)]  # type: ignore[valid-type]
-    split: Literal["train", "test"]
+    split: Literal["train", "validation", "test"]
     group: str | None = None  # source group: the place; by default the asset itself
     file: str | None = None  # where it lies in a folder of real files
+    made: Literal["published", "converted"] = "published"  # whether the file is the published one
     bytes: int = Field(gt=0)
     sha256: str = Field(pattern=r"[0-9a-f]{64}")
 
@@ -87,6 +89,11 @@ class Asset(Configuration):
     def place(self) -> str:
         """Source group."""
         return self.group or self.name
+
+    @property
+    def converted(self) -> bool:
+        """Whether `bytes` and `sha256` are of a converted copy, not of the published file."""
+        return self.made == "converted"
 
     @property
     def file_name(self) -> str:
@@ -105,8 +112,8 @@ class Asset(Configuration):
         return self.given or self._first_of(cache_dir() / _FOLDER / self.file_name)
 
     def _first_of(self, *paths: Path) -> Path | None:
-        found = (path for path in paths if path.is_file() and path.stat().st_size == self.bytes)
-        return next(found, None)
+        there = (path for path in paths if path.is_file())
+        return next((p for p in there if self.converted or p.stat().st_size == self.bytes), None)
 
 
 class _AssetList(Configuration):
@@ -178,44 +185,27 @@ def asset_views(
     seen = cells.reshape(3, height, _CELL, width, _CELL).mean(axis=(2, 4))
     rng = np.random.default_rng([zlib.crc32(asset.name.encode()), seed])
     low, high = np.log(ILLUMINANCE[asset.kind])
-    most = max(incident_light(seen, a, p) for p in _TURNED for a in range(0, 360, 30))
+    turned = [(a, p) for p in _TURNED for a in range(0, 360, 30)]
+    most = max(receptor_reading(seen, *direction, dome=False) for direction in turned)
     cut = "".join(f"; {where} in the map" for where in cut_values(panorama))
     for index in range(views):
-        azimuth = (index + rng.random()) * 360.0 / views - 180.0
+        azimuth = rng.uniform(-180.0, 180.0)
         pitch = float(np.clip(_PITCH * rng.standard_normal(), -_LARGEST_PITCH, _LARGEST_PITCH))
-        angle = rng.uniform(*_FIELDS_OF_VIEW)
+        angle = float(rng.choice(_FIELDS_OF_VIEW))
         lux = math.exp(rng.uniform(low, high))
-        light = incident_light(seen, azimuth + 180.0, -pitch)
+        light = FLAT_LUX * receptor_reading(seen, azimuth + 180.0, -pitch)
         view = perspective(panorama, azimuth, 2 * size, angle, pitch)
         yield Scene.from_radiance(
             view * np.float32(math.pi / light),
             camera,
             scene_id=f"{asset.name}-{index:02d}",
             group=asset.place,
-            illuminance=lux * min(light / most, 1.0),
+            illuminance=lux * light / most,
             kind=asset.kind,
             hard=asset.kind in _HARD,
             sampled=True,
             source=f"Poly Haven {asset.name} (CC0), {azimuth:.0f} degrees, {angle:.0f} wide{cut}",
         )
-
-
-def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
-    """Illuminance that a panorama casts on a surface, in units of its luminance times steradian.
-
-    What an incident-light meter reads that is held before the subject and faces the camera: turned
-    against the view. A white diffuse surface there has a luminance of it over pi. `azimuth` and
-    `pitch` [degrees] are what the surface faces; a pitch of 90 is level ground.
-    """
-    height, width = panorama.shape[1:]
-    longitude = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * math.pi
-    latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
-    faced, tilt = math.radians(azimuth), math.radians(pitch)
-    cosine = np.cos(latitude)[:, None] * math.cos(tilt) * np.cos(longitude - faced)[None, :]
-    cosine += np.sin(latitude)[:, None] * math.sin(tilt)
-    weight = np.maximum(cosine, 0.0) * np.cos(latitude)[:, None]
-    luminance = np.tensordot(_LUMINANCE, panorama, axes=1)
-    return float((luminance * weight).sum(dtype=np.float64) * 2.0 * math.pi**2 / (height * width))
 
 
 def cut_values(panorama: np.ndarray) -> list[str]:
@@ -231,7 +221,8 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
     """Fetches the maps that are missing or damaged into the cache, and returns their files.
 
     A file is put in place when it is complete and its hash is the list's. No more is read than the
-    list says, 66 MB in all. The environment's proxy (``HTTPS_PROXY``) is used.
+    list says, 110 MB in all. Of a map whose copy was `converted`, only the size is limited. The
+    environment's proxy (``HTTPS_PROXY``) is used.
 
     Args:
         url: Folder that serves ``NAME_1k.hdr``.
@@ -244,6 +235,7 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
     """
     try:
         import pooch
+        from pooch import file_hash
     except ImportError:
         raise ImportError("downloading scenes needs: pip install 'ae-env[hdr]'") from None
     if not url.startswith(("http://", "https://")):
@@ -254,7 +246,7 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
     store = pooch.create(
         path=folder,
         base_url=url if url.endswith("/") else f"{url}/",
-        registry={asset.file_name: f"sha256:{asset.sha256}" for asset in assets},
+        registry={a.file_name: None if a.converted else f"sha256:{a.sha256}" for a in assets},
         retry_if_failed=_RETRIES,
     )
     total = sum(asset.bytes for asset in assets)
@@ -263,9 +255,9 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
         if progress is not None:
             progress(done, total, asset.name)
         cached = folder / asset.file_name
-        whole = cached.is_file() and pooch.file_hash(str(cached)) == asset.sha256
+        whole = cached.is_file() and (asset.converted or file_hash(str(cached)) == asset.sha256)
         if asset.given is None and not whole:
-            fetch = partial(_fetch, size=asset.bytes)
+            fetch = partial(_fetch, size=_LARGEST if asset.converted else asset.bytes)
             try:
                 fetched.append(Path(store.fetch(asset.file_name, downloader=fetch)))
             except (OSError, ValueError) as error:
@@ -288,7 +280,7 @@ def _fetch(url: str, file: str, _: Any, *, size: int) -> None:
         for piece in answer.iter_content(2**16):
             stream.write(piece)
             if stream.tell() > size:
-                raise ValueError(f"it must have {size} bytes, but is longer")
+                raise ValueError(f"it must have at most {size} bytes, but is longer")
 
 
 def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene], maps: int) -> list[Scene]:

@@ -16,10 +16,11 @@ from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
 from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance.incident_light import POSTERIOR, IncidentLight, known_light
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
-from simulator.settings import LUX_AT_EV0, CameraSettings
+from simulator.settings import CameraSettings
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
@@ -27,7 +28,7 @@ from simulator.utils.checks import check_integer, check_number, check_type, chec
 DEFAULT_SPEED = 0.125
 
 Crop = Literal["box", "native"]
-Split = Literal["train", "test", "all"]
+Split = Literal["train", "validation", "test", "all"]
 #: Brings a scene to a resolution by a crop, as `Scene.resized` does.
 Resize = Callable[["Scene", int | None, Crop], "Scene"]
 
@@ -46,8 +47,9 @@ class Scene:
             it has 0.119 of white in green there.
         camera: Camera in whose colour space `light` is.
         nlf: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
-        illuminance: Light that falls on the subject [lux], as an incident-light meter reads it
-            there; None where unknown.
+        illuminance: Light on the subject as an incident-light meter with a dome reads it there, in
+            the lux of a flat receptor that asks for the same (`simulator.radiance.incident_light`);
+            None where unknown.
         white_balance: Gains of R, G, B that make a grey card grey.
         kind: Sort of scene, such as ``"snow"``.
         hard: Whether it belongs to the hard part (back light, snow, night, spot light, motion).
@@ -169,16 +171,27 @@ class Scene:
         return 0.0 if found is None else float(found.double().square().mean().sqrt())
 
     @cached_property
-    def ev100(self) -> float:
-        """EV100 of the right exposure: the incident light's, or the frame's where it is unknown.
+    def incident_light(self) -> IncidentLight:
+        """The incident light, as `illuminance` says or as the frame lets infer.
 
-        With `illuminance` unknown, the EV100 at which the mean of the recorded green (clipped at
-        white, as a meter on the sensor sees it) is 0.12.
+        A `ValueError` where the light is unknown and the frame is black.
         """
-        if self.illuminance is not None:
-            return math.log2(self.illuminance / LUX_AT_EV0)  # `incident_ev100`, checked before
         green = self.light[1:3].mean(dim=0)
-        return -self.reference.log2_exposure - math.log2(mean_anchor(green))
+        try:
+            factor = mean_anchor(green)
+        except ValueError:
+            if self.illuminance is None:
+                raise
+            return known_light(self.illuminance, None)
+        reflected = -self.reference.log2_exposure - math.log2(factor)
+        if self.illuminance is not None:
+            return known_light(self.illuminance, reflected)
+        return POSTERIOR.infer(green * factor, reflected)
+
+    @cached_property
+    def ev100(self) -> float:
+        """EV100 of the right exposure; the mean of what is likely where the light is unknown."""
+        return float(self.incident_light.right_ev100.mean())
 
     @classmethod
     def from_array(

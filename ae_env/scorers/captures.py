@@ -75,8 +75,8 @@ class Captures:
         scene_light: (B, 4, H, W) linear light of the scenes at their reference settings.
         ratio: (B,) float64, exposure ratio from that reference to the capture.
         nlf: Noise of a native sensor pixel at the settings, B long.
-        proper_ev: (B,) float64, EV100 of the right exposure: that of the incident light, or, where
-            it is unknown, the one at which the mean of the recorded green is 0.12.
+        proper_ev: (B,) float64, EV100 of the right exposure: that of the incident light, or the
+            mean of what is likely where this is unknown.
         blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the
             root mean square over the pixels, where they differ.
         white_balance: (B, 3) gains of R, G, B.
@@ -89,6 +89,8 @@ class Captures:
             where all come from light without noise.
         noisy: Whether the captures have noise.
         pixel_blur: How many pixels have which extent of blur; None where all have `blur_px`.
+        likely_ev: (B, K) float64, EV100s that are equally likely the right one; None where the
+            incident light of all is known.
     """
 
     settings: Sequence[CameraSettings]
@@ -104,6 +106,7 @@ class Captures:
     source_noise: Sequence[NoiseLevelFunction] | None = None
     noisy: bool = True
     pixel_blur: PixelBlur | None = None
+    likely_ev: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -243,7 +246,18 @@ def describe_captures(
         source_noise=source_noise,
         noisy=noisy,
         pixel_blur=pixel_blur,
+        likely_ev=_likely_ev(scenes, gain),
     )
+
+
+def _likely_ev(scenes: Sequence[Scene], gain: np.ndarray) -> torch.Tensor | None:
+    """See `Captures`; `gain` (B,) is the light relative to each scene's own."""
+    right = [scene.incident_light.right_ev100 for scene in scenes]
+    most = max(map(len, right), default=1)
+    if most == 1:
+        return None
+    each = np.stack([np.broadcast_to(own, most) for own in right])
+    return torch.from_numpy(each + np.log2(gain)[:, None])
 
 
 def layout_blur(
@@ -338,6 +352,7 @@ class SceneCaptures:
             source_noise=source_noises(prepared, states, gains),
             noisy=self.noisy,
             pixel_blur=pixel_blur,
+            likely_ev=_likely_ev([scene] * count, gains),
         )
 
     def blur(

@@ -229,8 +229,8 @@ class Brightness:
     """Exposure against the incident light: snow stays white and night stays dark.
 
     ``exp(-(sqrt(1 + e^2) - 1))`` with e the stops of over-exposure: EV of the incident light minus
-    EV of the settings. Where the light is unknown, e is against a mean of 0.12 of white. In
-    flickering light, the mean over the rows, each with its own e.
+    EV of the settings. Where the light is unknown, the mean over what is likely. In flickering
+    light, the mean over the rows, each with its own e.
     """
 
     domain: Domain = "raw"
@@ -238,10 +238,11 @@ class Brightness:
     reads_pixels = False
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        error = captures.proper_ev - captures.ev100
-        if captures.row_gain is None:
-            return torch.exp(1.0 - torch.sqrt(1.0 + error**2))
-        error = error[:, None] + captures.row_gain.log2()  # (B, H)
+        likely = captures.likely_ev
+        error = captures.proper_ev[:, None] if likely is None else likely  # (B, K)
+        error = error - captures.ev100[:, None]
+        if captures.row_gain is not None:
+            error = (error[:, :, None] + captures.row_gain.log2()[:, None]).flatten(1)  # (B, K * H)
         return torch.exp(1.0 - torch.sqrt(1.0 + error**2)).mean(dim=1)
 
 

@@ -41,6 +41,7 @@ STATM = Path("/proc/self/statm")
 INFO_KEYS = {
     *("scene_id", "state", "iso", "exposure_time", "f_number", "ev100"),
     *("clipped_high", "clipped_low", "excess_noise", "predicted_error", "modules"),
+    "illuminance_spread",
 }
 
 
