@@ -2,17 +2,27 @@
 
 Trained agents lie under ``runs/bench_agents``, so that a second run continues where the first was
 stopped. It writes the report of an evaluation on each set of scenes to ``agents/`` under the output
-folder. Real places are looked for in the folder of real files and in the cache. Trainings run side
-by side and show their own progress, so this one is no `benchmarks.harness.benchmark`.
+folder. Real places and raws are looked for in the folder of real files and in the cache. Trainings
+run side by side and show their own progress, so this one is no `benchmarks.harness.benchmark`.
 """
 
 from __future__ import annotations
 
+import json
 import time
+from ast import literal_eval
+from collections.abc import Mapping
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from PIL import Image
+
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.scene import Split
 from agents.cli.console import print_files, progress_bars
 from agents.evaluation.engine import evaluate, fit_policies
 from agents.learning.training import AgentConfig, TrainingJob, load_config, train_in_parallel
@@ -21,15 +31,76 @@ from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
 from agents.report.evaluation import write_report
 from agents.rollouts import make_envs
 from benchmarks.isolated import ROOT
+from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.settings import CameraSettings
+from simulator.utils.files import data_folder
 
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}
 SEEDS = (0, 1, 2)
 EPISODES = 8
-#: Unseen scenes of the generators that agents learnt from, and unseen real places.
-SETS = ("bundled", "polyhaven")
-#: Scorers that no agent was trained on.
+#: Unseen scenes: of the generators that agents learnt from; real places; the same views without
+#: their illuminance; and raws of real cameras, whose light nobody measured.
+SETS = {
+    "bundled": "bundled",
+    "polyhaven": "polyhaven",
+    "unknown": "benchmarks.agents:views_of_unknown_light",
+    "raws": "benchmarks.agents:raws",
+}
+#: Scorers that no agent was trained on. `shin` knows nothing of the incident light.
 OTHER_SCORERS = ("fidelity", "shin", "defects")
 QUICK = {"regression": {"frames": 2_000}, "ppo": {"total_timesteps": 2_048}}
+#: Meters that get the constant compensation that suits the training places best [EV].
+COMPENSATED = ("average:P", "centre_weighted:P", "matrix:P")
+COMPENSATIONS = np.arange(-1.0, 2.01, 0.25)
+
+
+def views_of_unknown_light(split: Split, camera: CameraProfile, resolution: int) -> list[Scene]:
+    """The views of `polyhaven`, of whose incident light nothing is known."""
+    views = load_scenes("polyhaven", split, camera=camera, resolution=resolution)
+    return [replace(view, illuminance=None) for view in views]
+
+
+def raws(split: Split, camera: CameraProfile, resolution: int) -> list[Scene]:
+    """Raws of a Canon and two GoPro cameras, each a source group of its own."""
+    data = data_folder()
+    if data is None:
+        raise FileNotFoundError("set AE_ENV_DATA to the folder of real files")
+    size: Any = {"camera": camera, "resolution": resolution}
+    scenes = load_scenes(data / "canon_crw_cc0", split, **size)
+    folder = data / "gopro_raw"
+    for name, meta in json.loads((folder / "meta.json").read_text()).items():
+        tags: dict[str, str] = meta["dng_tags"]
+        iso, seconds, stop = (
+            literal_eval(tags[tag]) for tag in ("ISOSpeedRatings", "ExposureTime", "FNumber")
+        )
+        mosaic = np.asarray(Image.open(folder / name)).astype(np.float32)
+        planes = np.stack([mosaic[i::2, j::2] for i in (0, 1) for j in (0, 1)])
+        light = torch.from_numpy(planes / meta["white"])  # its black is 0
+        shot, read = literal_eval(tags["NoiseProfile"])
+        scene = Scene.from_array(
+            light.clamp(max=1.0),
+            CameraSettings(iso, seconds[0] / seconds[1], stop[0] / stop[1]),
+            camera,
+            scene_id=Path(name).stem,
+            kind="raw",
+            nlf=NoiseLevelFunction((shot,) * 4, (read,) * 4),
+            white_balance=tuple(meta["wb"][:3]),
+            saturated=(light >= 1.0).any(dim=0),
+            sampled=True,
+        )
+        scenes.append(scene.resized(resolution))
+    return scenes
+
+
+def best_compensations(context: PolicyContext, seed: int, episodes: int) -> dict[str, float]:
+    """The compensation [EV] at which each of `COMPENSATED` scores best in the training places."""
+    names = {(m, c): f"{m}?compensation={c:g}" for m in COMPENSATED for c in COMPENSATIONS}
+    policies = {name: make_policy(name, context) for name in names.values()}
+    places = {"scenes": "polyhaven", "split": "train", "resolution": 64}
+    result = evaluate(policies, places, episodes_per_scene=episodes, seed=seed)
+    score = {key: result.normalised(name) for key, name in names.items()}
+    return {m: float(max(COMPENSATIONS, key=lambda c: score[m, c])) for m in COMPENSATED}
 
 
 def changed_config(
@@ -58,26 +129,34 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
 
     with closing(make_envs({"split": "test", "resolution": 64}, num_envs=1, frames=1)) as envs:
         context = PolicyContext.from_envs(envs)
+    policies = _comparators(context, jobs["regression"][0].config.environment, seed, quick)
+    meta["compensated"] = [name for name in policies if "compensation" in name]
+    for name, own in jobs.items():
+        policies[name] = [make_policy(f"{name}:{job.out}", context) for job in own]
+    policies["oracle"] = make_policy("oracle", context)
+    command = "ae-env bench agents" + " --quick" * quick
+    for name, scenes in list(SETS.items())[: 1 if quick else None]:
+        given: dict[str, Any] = {"episodes_per_scene": 1 if quick else EPISODES, "seed": seed}
+        test = {"scenes": scenes, "split": "test", "resolution": 64}
+        with progress_bars() as progress, progress(f"evaluation on {name}") as task:
+            result = evaluate(policies, test, **given, other_scorers=OTHER_SCORERS, progress=task)
+        written: dict[str, Any] = {"source": name, "split": "test", "extra_meta": meta}
+        print_files(write_report(result, out / "agents" / name, command=command, **written))
+
+
+def _comparators(
+    context: PolicyContext, environment: Mapping[str, Any], seed: int, quick: bool
+) -> dict[str, Any]:
+    """Every light meter by its name; `environment` is of the agents' training."""
     meters = [f"{meter}:{p}" for meter in CLASSIC_METERS for p in PROGRAMS if p != "M"]
     names = ["random", "best_fixed", *(meters[:1] if quick else meters)]
-    policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
-    with progress_bars() as progress:
-        with progress("light meters learn their programs") as task:  # on the agents' scenes
-            environment = jobs["regression"][0].config.environment
-            fit_policies(policies, environment, seed=seed, progress=task)
-        for name, own in jobs.items():
-            policies[name] = [make_policy(f"{name}:{job.out}", context) for job in own]
-        policies["oracle"] = make_policy("oracle", context)
-        for scenes in SETS[:1] if quick else SETS:
-            given: dict[str, Any] = {"episodes_per_scene": 1 if quick else EPISODES, "seed": seed}
-            test = {"scenes": scenes, "split": "test", "resolution": 64}
-            with progress(f"evaluation on {scenes}") as task:
-                given |= {"other_scorers": OTHER_SCORERS, "progress": task}
-                result = evaluate(policies, test, **given)
-            written: dict[str, Any] = {"source": scenes, "split": "test", "extra_meta": meta}
-            command = "ae-env bench agents" + " --quick" * quick
-            files = write_report(result, out / "agents" / scenes, command=command, **written)
-            print_files(files)
+    with progress_bars() as progress, progress("light meters learn their programs") as task:
+        if not quick:
+            found = best_compensations(context, seed, episodes=2)
+            names += [f"{name}?compensation={c:g}" for name, c in found.items()]
+        policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
+        fit_policies(policies, environment, seed=seed, progress=task)
+    return policies
 
 
 def _train(jobs: dict[str, list[TrainingJob]]) -> None:
