@@ -1,14 +1,13 @@
 """Files and functions of the packages that a reset and a step enter.
 
-Run ``python -m benchmarks.trace_step``: it prints a table in Markdown, and with ``--files`` also
-the files. Counted with `sys.setprofile` in a default environment, after scenes are loaded and
-kernels compiled. Comprehensions and compiled kernels that Python calls are functions, too.
-Episodes differ in what moves, so several are traced: the table has the median and the most.
+Run ``python -m benchmarks.trace_step``: it prints a table in Markdown, and then the files. Counted
+with `sys.setprofile` in a default environment, after scenes are loaded and kernels compiled.
+Comprehensions and compiled kernels that Python calls are functions, too. Episodes differ in what
+moves, so several are traced: the table has the median and the most.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -60,11 +59,9 @@ def trace(seed: int) -> dict[str, list[tuple[str, str]]]:
 
 
 def main() -> None:
-    """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--files", action="store_true", help="print the files, too")
-    shows_files = parser.parse_args().files
+    """Prints the table, and how many of the episodes enter each file."""
     traced = [trace(seed) for seed in range(EPISODES)]
+    counted: list[str] = []
     print("| call | files | most | functions | moves between files |\n|---|--:|--:|--:|--:|")
     for name in ("reset", *STEPS):
         paths = [[file for file, _ in calls[name]] for calls in traced]
@@ -72,9 +69,9 @@ def main() -> None:
         functions = median(len(set(calls[name])) for calls in traced)
         moves = median(sum(a != b for a, b in pairwise(path)) for path in paths)
         print(f"| {name} | {median(files):g} | {max(files)} | {functions:g} | {moves:g} |")
-        if shows_files:
-            count = Counter(file for path in paths for file in set(path))
-            print("\n".join(f"  {number:3} {file}" for file, number in count.most_common()))
+        count = Counter(file for path in paths for file in set(path))
+        counted += [f"{name}: {number:3} {file}" for file, number in count.most_common()]
+    print("", *counted, sep="\n")
 
 
 if __name__ == "__main__":
