@@ -6,7 +6,8 @@ What `scenes=` may be:
   ``"bundled:large"``: four times the training groups, the same test groups;
   ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
 - ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`); ``"mixed"``:
-  such views and the procedural scenes of ``"bundled:large"``, as many of each;
+  such views and the procedural scenes of ``"bundled:large"``, as many of each; ``"mixed:10"``:
+  views of 10 of the places only;
 - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
 - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
   given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
@@ -153,11 +154,12 @@ def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
         return _bundled(spec, request)
     if spec == "polyhaven":
         return polyhaven_scenes(request)
-    if spec == "mixed":
-        maps = len(split_assets("mixed", request.split))  # raises before anything is drawn
+    if mixed := re.fullmatch(r"mixed(?::(\d+))?", spec):
+        places = None if mixed[1] is None else int(mixed[1])
+        assets = split_assets(spec, request.split, places)  # raises before anything is drawn
         bundled = _bundled("bundled:large", request)
         procedural = [scene for scene in bundled if scene.kind != "photograph"]
-        return mixed_scenes(request, procedural, maps)
+        return mixed_scenes(request, procedural, assets)
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         ours = spec.partition(":")[0] in NAMED
         if _ATTRIBUTE.fullmatch(spec) and not ours:

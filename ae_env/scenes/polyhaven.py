@@ -31,6 +31,7 @@ from simulator.radiance.incident_light import FLAT_LUX, receptor_reading
 from simulator.radiance.maps import native_size, perspective
 from simulator.radiance.reading import read_radiance
 from simulator.utils.cache import cache_dir, cache_key
+from simulator.utils.checks import check_integer
 from simulator.utils.config_file import Configuration, load_yaml
 from simulator.utils.files import data_folder
 
@@ -126,12 +127,18 @@ def list_assets() -> tuple[Asset, ...]:
     return load_yaml(find_preset("polyhaven", "scenes"), _AssetList).assets
 
 
-def split_assets(name: str, split: str) -> list[Asset]:
+def split_assets(name: str, split: str, places: int | None = None) -> list[Asset]:
     """The assets of a split; errors call the scenes `name`.
 
-    A `FileNotFoundError` names the command that fetches maps that are missing.
+    Of `places` places only, drawn by lot, if that is given: of 10 are those of 5. A
+    `FileNotFoundError` names the command that fetches maps that are missing.
     """
     assets = [a for a in list_assets() if split in ("all", a.split)]
+    if places is not None:
+        known = sorted({asset.place for asset in assets})
+        check_integer("places", places, 1, len(known), more=f" of scenes {name!r}")
+        drawn = {known[i] for i in np.random.default_rng(0).permutation(len(known))[:places]}
+        assets = [asset for asset in assets if asset.place in drawn]
     missing = [asset.name for asset in assets if asset.path is None]
     if missing:
         raise FileNotFoundError(
@@ -142,12 +149,15 @@ def split_assets(name: str, split: str) -> list[Asset]:
     return assets
 
 
-def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0) -> list[Scene]:
+def polyhaven_scenes(
+    request: SceneRequest, *, views: int = VIEWS, seed: int = 0, assets: list[Asset] | None = None
+) -> list[Scene]:
     """Views into the panoramas of a split, `views` of each map, one map after the other.
 
-    `seed` is of the views' directions, their fields of view and the level of the light.
+    `seed` is of the views' directions, their fields of view and the level of the light; `assets`
+    are by default all of the split.
     """
-    assets = split_assets("polyhaven", request.split)
+    assets = split_assets("polyhaven", request.split) if assets is None else assets
     camera, plain = request.camera, request.resize is Scene.resized
     resolution = request.resolution if plain else None
     crop: Crop = request.crop if plain else "box"
@@ -280,16 +290,18 @@ def _fetch(url: str, file: str, _: Any, *, size: int) -> None:
         for piece in answer.iter_content(2**16):
             stream.write(piece)
             if stream.tell() > size:
-                raise ValueError(f"it must have at most {size} bytes, but is longer")
+                raise ValueError(f"it may have {size} bytes, but is longer")
 
 
-def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene], maps: int) -> list[Scene]:
-    """`procedural` scenes and as many views of the `maps` maps of the same split.
+def mixed_scenes(
+    request: SceneRequest, procedural: Sequence[Scene], assets: list[Asset]
+) -> list[Scene]:
+    """`procedural` scenes and as many views of the maps of the same split.
 
     Where the scenes are no multiple of the maps, some of these have a view less.
     """
-    views = math.ceil(len(procedural) / maps)
-    real = polyhaven_scenes(request, views=views)
+    views = math.ceil(len(procedural) / len(assets))
+    real = polyhaven_scenes(request, views=views, assets=assets)
     by_view = sorted(range(len(real)), key=lambda i: (i % views, i // views))
     kept = sorted(by_view[: len(procedural)])
     return [*procedural, *(real[i] for i in kept)]

@@ -18,10 +18,11 @@ from ae_env.lighting.moving import read_pans
 from ae_env.scenes import bundled, polyhaven
 from ae_env.scenes.load import _LOADED, load_scenes
 from ae_env.scenes.measured_depth import depth_scenes
-from ae_env.scenes.polyhaven import Asset, incident_light, list_assets
+from ae_env.scenes.polyhaven import Asset, list_assets
 from ae_env.scenes.scene import SceneRequest
 from simulator.camera import get_camera
 from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
+from simulator.radiance.incident_light import receptor_reading
 from simulator.radiance.maps import perspective
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
@@ -32,7 +33,6 @@ from tests.ae_env.scene_files import write_hdr
 from tests.ae_env.scorer_images import make_scene
 
 CAMERA = get_camera("nikon_z6")
-WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def unseen():
 
 
 def check_oracles_are_spread(scenes):
-    """No value of a control is best in more than half of the scenes."""
+    """No value of a control is best in more than 60 % of the scenes."""
     size = scenes[0].light.shape[1]
     env = make_env(scenes=scenes, split="all", resolution=size).unwrapped
     states = []
@@ -50,7 +50,7 @@ def check_oracles_are_spread(scenes):
         env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
         states.append(env.score_table().oracle)
     for control in env.grid.controls(np.array(states)).T:
-        assert np.bincount(control).max() <= 0.5 * len(states)
+        assert np.bincount(control).max() <= 0.6 * len(states)
 
 
 def slope(picture: np.ndarray) -> float:
@@ -261,9 +261,9 @@ def test_the_list_splits_places_and_each_kind_is_tested(tmp_path, monkeypatch):
     assert list(splits.values()).count("test") >= 15  # enough for intervals
     monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
-    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
+    with pytest.raises(FileNotFoundError, match=r"27 of 27 maps .*ae-env scenes download"):
         load_scenes("polyhaven", "test", camera=CAMERA)
-    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
+    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 35 of 35 maps"):
         load_scenes("mixed", "train", camera=CAMERA)
 
 
@@ -275,15 +275,19 @@ def panorama(light) -> np.ndarray:
     return np.repeat(grey[None], 3, axis=0).astype(np.float32)
 
 
-def test_light_on_a_surface_from_an_even_sky_a_dome_and_a_small_lamp():
+def test_what_receptors_read_of_an_even_sky_a_half_sky_and_a_small_lamp():
+    """In closed form: a dome reads (1 + cos) / 2 of a lamp, 2 pi of even light, 3 pi / 2 or pi / 2
+    of the half sphere that it faces or turns from."""
     even = panorama(lambda lon, lat: 2.0 + 0.0 * lat + 0.0 * lon)
+    sky = panorama(lambda lon, lat: (lat > 0) + 0.0 * lon)
     for azimuth, pitch in ((0, 90), (17, 0), (-120, 35), (0, -90)):
-        assert incident_light(even, azimuth, pitch) == pytest.approx(2.0 * math.pi, rel=1e-4)
-    dome = panorama(lambda lon, lat: (lat > 0) + 0.0 * lon)
-    assert incident_light(dome, 0, 90) == pytest.approx(math.pi, rel=1e-3)
-    for azimuth in (0, 45, 180):
-        assert incident_light(dome, azimuth, 0) == pytest.approx(math.pi / 2, rel=1e-3)
-    assert incident_light(dome, 0, -90) == pytest.approx(0, abs=1e-6)
+        assert receptor_reading(even, azimuth, pitch) == pytest.approx(4.0 * math.pi, rel=1e-4)
+        flat = receptor_reading(even, azimuth, pitch, dome=False)
+        assert flat == pytest.approx(2.0 * math.pi, rel=1e-4)
+    for pitch, of_dome, of_flat in ((90, 1.5, 1.0), (0, 1.0, 0.5), (-90, 0.5, 0.0)):
+        dome, flat = (receptor_reading(sky, 45, pitch, dome=is_dome) for is_dome in (True, False))
+        assert dome == pytest.approx(of_dome * math.pi, rel=1e-3)
+        assert flat == pytest.approx(of_flat * math.pi, rel=1e-3, abs=1e-6)
     at = math.radians(40), math.radians(20)
 
     def lamp(longitude, latitude):
@@ -291,12 +295,15 @@ def test_light_on_a_surface_from_an_even_sky_a_dome_and_a_small_lamp():
         return 500.0 * near
 
     light = panorama(lamp)
-    straight = incident_light(light, 40, 20)
+    straight = receptor_reading(light, 40, 20)
     for azimuth, pitch in ((40, 80), (70, 20), (40, -30), (-140, -20)):
         a, p = math.radians(azimuth) - at[0], math.radians(pitch)
         cosine = math.sin(p) * math.sin(at[1]) + math.cos(p) * math.cos(at[1]) * math.cos(a)
-        expected = straight * max(cosine, 0.0)
-        assert incident_light(light, azimuth, pitch) == pytest.approx(expected, abs=straight / 200)
+        close = {"abs": straight / 200}
+        expected = straight * (1.0 + cosine) / 2.0
+        assert receptor_reading(light, azimuth, pitch) == pytest.approx(expected, **close)
+        flat = receptor_reading(light, azimuth, pitch, dome=False)
+        assert flat == pytest.approx(straight * max(cosine, 0.0), **close)
 
 
 def asset_of(name: str, content: bytes, kind: str = "sun") -> Asset:
@@ -317,14 +324,18 @@ def an_asset(tmp_path, monkeypatch):
     return make
 
 
-def test_a_white_wall_under_an_even_sky_is_white_at_any_level(an_asset):
+def test_a_wall_of_an_even_world_is_exposed_alike_at_any_level(an_asset):
     even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
     views = list(polyhaven.asset_views(an_asset(even), CAMERA, size=16, views=50))
     for scene in views:
-        assert scene.light[1:3].mean().item() == pytest.approx(WHITE, rel=0.01)
+        # E = 2 pi L asks for 100 E / 340; x = L / (1.2 * 2^EV100), as ISO 12232 has it.
+        expected = 1.0 / (1.2 * 2.0 * math.pi * 100.0 / 340.0)
+        assert scene.light[1:3].mean().item() == pytest.approx(expected, rel=0.01)
         assert (scene.sampled, scene.box_factor) == (True, 1)
     low, high = np.log(polyhaven.ILLUMINANCE["overcast"])
-    levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
+    # Of lux on a flat surface, pi L; a dome's 2 pi L count 250 / 340 of such lux each.
+    lux = np.array([scene.illuminance for scene in views]) / (2.0 * 250.0 / 340.0)
+    levels = (np.log(lux) - low) / (high - low)
     assert 0 <= levels.min() < levels.max() <= 1
     assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
     assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
@@ -344,9 +355,10 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch)
     for scene in polyhaven.asset_views(an_asset(half), CAMERA, size=16, views=16):
         lux.append(scene.illuminance)
         seen.append(scene.light[1].median().item())
-    order = np.argsort(lux)
-    assert lux[order[-1]] / lux[order[0]] == pytest.approx(20, rel=0.3)
-    assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
+    # A dome that faces the bright half reads 1.5 + 0.05 / 2, one that turns from it 0.5 + 0.075.
+    assert max(lux) / min(lux) == pytest.approx(1.525 / 0.575, rel=0.1)
+    darkest, brightest = np.argmin(lux), np.argmax(lux)
+    assert seen[darkest] / seen[brightest] == pytest.approx(20 * 1.525 / 0.575, rel=0.1)
 
 
 def test_real_scenes_alone_and_mixed(data_dir):
@@ -357,16 +369,16 @@ def test_real_scenes_alone_and_mixed(data_dir):
     assert all(a.content == b.content for a, b in zip(real, again, strict=True))
     for scene in real:
         assert (scene.light.shape, scene.box_factor) == ((4, 36, 36), 7)
-        assert 1e-3 < scene.illuminance <= polyhaven.ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
+        assert 1e-3 < scene.illuminance <= 2.0 * polyhaven.ILLUMINANCE[scene.kind][1]
     check_oracles_are_spread(real)
     drawn = [replace(real[0], scene_id=f"drawn-{i}", source="") for i in range(10)]
-    mixed = polyhaven.mixed_scenes(request, drawn, len(real))
+    mixed = polyhaven.mixed_scenes(request, drawn, polyhaven.split_assets("polyhaven", "test"))
     kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
     assert kinds[True] == kinds[False] == 10
     assert {s.group for s in mixed if s.source.startswith("Poly")} < {s.group for s in real}
     # Pans of moving light are of places to test on, and of their maps.
     places = read_pans()
-    assert set(places) == {asset.name for asset in list_assets() if asset.split == "test"}
+    assert set(places) <= {asset.name for asset in list_assets() if asset.split == "test"}
     assert {len(turn) for turn in places.values()} == {72}
     asset = next(a for a in polyhaven.split_assets("polyhaven", "test") if a.name == "spree_bank")
     panorama, luminance = read_radiance(asset.path), np.float32([0.2126, 0.7152, 0.0722])
@@ -413,7 +425,7 @@ def test_a_download_fetches_what_is_missing_and_nothing_broken(server, tmp_path,
     assert maps["map_1"].read_bytes() == CONTENT["map_1"]
     maps["map_1"].unlink()
     monkeypatch.setattr("time.sleep", lambda seconds: None)
-    for content, reason in ((b"another file", "hash"), (bytes(5002), "must have 5001 bytes")):
+    for content, reason in ((b"another file", "hash"), (bytes(5002), "may have 5001 bytes")):
         (folder / "map_1_1k.hdr").write_bytes(content)
         with pytest.raises(ConnectionError, match=f"map_1_1k.hdr cannot be fetched: .*{reason}"):
             polyhaven.download(url=url, progress=None)

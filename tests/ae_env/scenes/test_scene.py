@@ -50,6 +50,7 @@ def test_grey_card_under_known_light(illuminance: float, tint: float) -> None:
     assert scene.light[1].mean().item() == pytest.approx(0.119, abs=0.0006)
     assert -ref.log2_exposure == pytest.approx(math.log2(illuminance / 2.5), abs=1e-9)
     assert scene.ev100 == pytest.approx(math.log2(illuminance / 2.5), abs=1e-9)
+    assert scene.incident_light.spread == 0.0
     balanced = scene.light[[0, 1, 3], 0, 0].numpy() * np.array(scene.white_balance)
     np.testing.assert_allclose(balanced, balanced[1], rtol=1e-5)
     assert torch.equal(scene.light[1], scene.light[2])
@@ -72,7 +73,9 @@ def test_unknown_light_is_anchored_to_the_mean() -> None:
     assert scene.illuminance is None
     assert scene.light[1].mean().item() == pytest.approx(0.12, rel=1e-5)
     assert -scene.reference.log2_exposure == pytest.approx(7.5)
-    assert scene.ev100 == pytest.approx(7.5, abs=1e-5)
+    assert scene.incident_light.reflected_ev100 == pytest.approx(7.5, abs=1e-5)
+    assert abs(scene.ev100 - 7.5) < 1.5
+    assert scene.incident_light.spread > 0.5
     rgb = np.ones((3, 10, 10), np.float32)
     rgb[:, 0, 0] = 1e6  # a sun, one pixel in a hundred: clipped it counts 1, the others share 0.11
     scene = radiance_scene(rgb, PLAIN)

@@ -210,7 +210,7 @@ def rendered() -> dict[str, torch.Tensor]:
     """Pictures (L, 3, H, W) of a photograph with each defect at its severities."""
     picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
     light = measures.srgb_decode(picture)
-    scene = Scene.from_radiance(light, CAMERA, scene_id="astronaut").resized(128)
+    scene = Scene.from_radiance(light, CAMERA, illuminance=1e3, scene_id="astronaut").resized(128)
     generator = torch.Generator().manual_seed(3)
     return {name: benchmark.render(scene, name, generator) for name in DEFECTS}
 

@@ -305,7 +305,10 @@ def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
         return torch.zeros(len(captures))
 
     lighting = "flicker" if name == "row_gain" else "static"
-    env = AutoExposureEnv(scorer=Own(write, depends_on=depends_on), lighting=lighting, **SMALL)
+    light = dict(SMALL)
+    if name == "likely_ev":
+        light["scenes"] = [random_scene(illuminance=None)]
+    env = AutoExposureEnv(scorer=Own(write, depends_on=depends_on), lighting=lighting, **light)
     before = [scene.clean_light.clone() for scene in env.scenes]
     with pytest.raises(UserCodeError, match="scorer 'Own' changed its `captures` in place"):
         env.reset(seed=0)

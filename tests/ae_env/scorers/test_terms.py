@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.special
+import scipy.stats
 import torch
 from scipy.integrate import quad
 
@@ -37,14 +38,19 @@ def _by_the_formulas(scene, state, speed, defocus):
     x = scene.light.numpy().astype(np.float64) * alpha
     height = x.shape[1]
     ev_state = np.log2(effective(state) ** 2 / state.exposure_time) - np.log2(state.iso / 100)
-    if scene.illuminance is None:  # the EV at which the recorded green has a mean of 0.12
-        green = scene.light.numpy()[1:3].astype(np.float64).mean(axis=0)
-        factor = scipy.optimize.brentq(
-            lambda f: np.minimum(green * f, 1.0).mean() - 0.12, 1e-6, 1e6, xtol=1e-14
-        )
-        e = np.log2(alpha / factor)
+    # An average meter brings the mean of the recorded green to 0.12; the right exposure is within
+    # 1.5 EV of its own.
+    green = scene.light.numpy()[1:3].astype(np.float64).mean(axis=0)
+    factor = scipy.optimize.brentq(
+        lambda f: np.minimum(green * f, 1.0).mean() - 0.12, 1e-6, 1e6, xtol=1e-14
+    )
+    metered = ev_state + np.log2(alpha / factor)
+    if scene.illuminance is None:  # 16 equally likely values of a normal distribution
+        known = scene.incident_light
+        likely = known.ev100 + known.spread * scipy.stats.norm.ppf((np.arange(16) + 0.5) / 16)
     else:
-        e = np.log2(scene.illuminance / 2.5) - ev_state
+        likely = np.log2(scene.illuminance / 2.5)
+    e = np.clip(likely, metered - 1.5, metered + 1.5) - ev_state
     nlf = CAMERA.nlf(state.iso)
     shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
     # What an 8-bit code of the recorded value says of it.
@@ -56,7 +62,7 @@ def _by_the_formulas(scene, state, speed, defocus):
     disc = 4 * defocus * height / 64 / effective(state)
     blur = np.hypot(speed * height * state.exposure_time, disc)
     terms = {
-        "brightness": np.exp(-(np.sqrt(1 + e**2) - 1)),
+        "brightness": np.exp(-(np.sqrt(1 + e**2) - 1)).mean(),
         "highlights": np.exp(-fh / 0.15),
         "shadows": np.exp(-fs / 0.20),
         "noise": (snr**1.5 / (snr**1.5 + 18**1.5)).mean(),
