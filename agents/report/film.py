@@ -33,6 +33,8 @@ class Recording:
     ev100: list[float] = field(default_factory=list)
     best: list[float] = field(default_factory=list)  # EV100 of the best state
     scores: list[float] = field(default_factory=list)
+    states: list[int] = field(default_factory=list)
+    regrets: list[float] = field(default_factory=list)
 
 
 def record(
@@ -63,6 +65,8 @@ def record(
         found.ev100.append(float(info["ev100"][0]))
         found.best.append(float(base.grid.ev100[info["oracle_state"][0]]))
         found.scores.append(float(info["rewards.score"][0]))
+        found.states.append(int(info["state"][0]))
+        found.regrets.append(float(info["regret"][0]))
     return found
 
 
