@@ -179,10 +179,24 @@ def polyhaven_scenes(
     return scenes if plain else [request.sized(scene) for scene in scenes]
 
 
+def dome_lux(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
+    """Illuminance as a meter with a dome reads it in a panorama of luminances; see `Scene`."""
+    return FLAT_LUX * receptor_reading(panorama, azimuth, pitch)
+
+
 def asset_views(
-    asset: Asset, camera: CameraProfile, *, size: int, views: int = VIEWS, seed: int = 0
+    asset: Asset,
+    camera: CameraProfile,
+    *,
+    size: int,
+    views: int = VIEWS,
+    seed: int = 0,
+    read: Callable[[np.ndarray, float, float], float] = dome_lux,
 ) -> Iterator[Scene]:
     """The views of one map, of `size` packed pixels a side; see `polyhaven_scenes`.
+
+    `read` is the light meter: the illuminance in a panorama where it points at an azimuth and a
+    pitch.
 
     The light is sampled at the pitch of the photosites, 2 x `size` a side. Where a map has fewer
     pixels in a view, it is smooth at that pitch; averaged to half of them or less it is not.
@@ -203,7 +217,7 @@ def asset_views(
         pitch = float(np.clip(_PITCH * rng.standard_normal(), -_LARGEST_PITCH, _LARGEST_PITCH))
         angle = float(rng.choice(_FIELDS_OF_VIEW))
         lux = math.exp(rng.uniform(low, high))
-        light = FLAT_LUX * receptor_reading(seen, azimuth + 180.0, -pitch)
+        light = read(seen, azimuth + 180.0, -pitch)
         view = perspective(panorama, azimuth, 2 * size, angle, pitch)
         yield Scene.from_radiance(
             view * np.float32(math.pi / light),
