@@ -18,6 +18,8 @@ from simulator.utils.compute import kernel
 if TYPE_CHECKING:
     import torch
 
+    from simulator.camera import CameraProfile
+
 __all__ = [
     "PEDESTAL",
     "SENSOR_NOISE",
@@ -30,6 +32,7 @@ __all__ = [
     "encode_sensors",
     "encode_settings",
     "frame_statistics",
+    "linear_signal",
 ]
 
 #: Fixed ranges of Av, Tv and Sv that map to [-1, 1].
@@ -93,6 +96,22 @@ def decode_observation(raw: np.ndarray) -> np.ndarray:
     """
     table = (1.0 + PEDESTAL) * (np.arange(256) / 255.0) ** 2 - PEDESTAL
     return np.asarray(table.astype(np.float32)[raw])
+
+
+def linear_signal(
+    raw: np.ndarray, camera: CameraProfile, planes: slice = slice(None)
+) -> np.ndarray:
+    """Signal of observed frames, white is 1; of the `planes` among R, G1, G2, B.
+
+    `raw` (N, 4, h, w) is of any kind: uint8 codes, float32 signal, or the camera's uint16 numbers.
+    """
+    chosen = raw[:, planes]
+    if chosen.dtype == np.uint8:
+        return decode_observation(chosen)
+    if np.issubdtype(chosen.dtype, np.floating):
+        return chosen.astype(np.float32)
+    black, span = (np.array(v)[planes, None, None] for v in (camera.black_level, camera.span))
+    return np.asarray(((chosen - black) / span).astype(np.float32))
 
 
 def _from_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:

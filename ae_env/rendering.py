@@ -12,7 +12,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from ae_env.grid import ExposureGrid
-from ae_env.observation import decode_observation
+from ae_env.observation import linear_signal
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import prepare_scene
 from ae_env.scorers.registry import make_scorer
@@ -46,14 +46,7 @@ def render_frame(
     Returns:
         (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
     """
-    if raw.dtype == np.uint8:
-        signal = decode_observation(raw)
-    elif raw.dtype == np.uint16:
-        black = np.array(camera.black_level)[:, None, None]
-        signal = ((raw - black) / np.array(camera.span)[:, None, None]).astype(np.float32)
-    else:
-        signal = raw
-    image = developed(torch.from_numpy(signal)[None], scene)[0]
+    image = developed(torch.from_numpy(linear_signal(raw[None], camera)), scene)[0]
     factor = -(-FRAME_PIXELS // min(image.shape[:2]))
     picture = Image.fromarray(np.repeat(np.repeat(image, factor, 0), factor, 1))
     lines = (str(settings), f"EV100 {settings.ev100:.1f}   score {score:.3f}")

@@ -379,9 +379,9 @@ def quartiles(values: Sequence[float]) -> list[float]:
 LARGEST_PSNR = 80.0
 
 
-def psnr(estimate: Tensor, truth: Tensor, peak: float = 1.0) -> float:
-    """PSNR over all planes [dB], at most `LARGEST_PSNR`."""
-    error = float((estimate.double() - truth.double()).square().mean()) / peak**2
+def psnr(estimate: Tensor, truth: Tensor) -> float:
+    """PSNR over all planes [dB] where white is 1, at most `LARGEST_PSNR`."""
+    error = float((estimate.double() - truth.double()).square().mean())
     return LARGEST_PSNR if error <= 0 else min(LARGEST_PSNR, -10.0 * math.log10(error))
 
 
@@ -395,13 +395,6 @@ def clipped(image: Tensor, camera: CameraProfile) -> Tensor:
     """`image` (..., 4, H, W) within what a capture can show: [-pedestal, 1]."""
     pedestal = torch.tensor(camera.pedestal).to(image)[:, None, None]
     return torch.maximum(image, -pedestal).clamp(max=1.0)
-
-
-def recorded(signal: Tensor, camera: CameraProfile) -> Tensor:
-    """`signal` (..., 4, H, W) in whole digital numbers of the camera, 1 at white."""
-    span, black = (torch.tensor(v)[:, None, None] for v in (camera.span, camera.black_level))
-    numbers = (signal * span + black).round().clamp(0.0, camera.white_level)
-    return (numbers - black) / span
 
 
 def cropped(scene: ReferenceScene, height: int, width: int) -> ReferenceScene:

@@ -26,9 +26,10 @@ from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures, prepare_scene
-from benchmarks.harness import Part, Report, Row, benchmark, pivot, recorded, ssim, table
+from benchmarks.harness import Part, Report, Row, benchmark, pivot, ssim, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
+from simulator.capture.sensor import clip_and_quantise
 
 #: Captures of a batch that is timed, and the packed size of captures [pixel].
 BATCH, SIZES, SIZE = 64, (128, 256), 128
@@ -215,8 +216,8 @@ def _closeness(
     reference = developed(sharp.expected(proper)[None])[0]
     captures = blurred.expose(states, seed=seed)
     expected = torch.stack([blurred.expected(s) for s in states])
-    clean, pictures = recorded(expected, camera), developed(captures)
-    exposed = recorded(torch.stack([sharp.expected(s) for s in states]), camera)
+    clean, pictures = clip_and_quantise(expected, camera), developed(captures)
+    exposed = clip_and_quantise(torch.stack([sharp.expected(s) for s in states]), camera)
     ratios = torch.tensor([2.0 ** (proper.log2_exposure - s.log2_exposure) for s in states])
     smeared = developed(expected * ratios[:, None, None, None])
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from simulator.utils.checks import check_number
+
 #: Calibration constant of reflected-light meters in the saturation-based ISO 12232 relation used
 #: throughout: a surface of luminance L gives ``x = L * t * ISO / (120 * N**2)`` of sensor white.
 SATURATION_CONSTANT = 120.0
@@ -60,14 +62,7 @@ class CameraSettings:
             ("exposure_time", 1e-9, 1e5),
             ("f_number", 0.5, 1024.0),
         ):
-            value = getattr(self, name)
-            try:
-                number = math.nan if isinstance(value, str | bytes | bool) else float(value)
-            except (TypeError, ValueError, OverflowError):
-                number = math.nan
-            if not low <= number <= high:
-                raise ValueError(f"`{name}` (={value!r}) must be a number in [{low:g}, {high:g}]")
-            object.__setattr__(self, name, number)
+            object.__setattr__(self, name, check_number(name, getattr(self, name), low, high))
         stop = round(6.0 * math.log2(self.f_number))
         exposure = math.log2(self.exposure_time) + math.log2(self.iso / 100.0) - stop / 3.0
         object.__setattr__(self, "aperture_stop", stop)

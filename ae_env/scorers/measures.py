@@ -104,6 +104,11 @@ LEVELS = 256
 #: Largest squared Sobel gradient that Shim's metric assumes, of luma in [0, 1]: 4^2 + 4^2; and the
 #: sum of each side of Scharr's filter, with which gradients are grey levels per pixel.
 _LARGEST_SOBEL, _SCHARR_SUM = 32.0, 32.0
+#: As the papers have them: delta and lambda of Shim; p and k of Zhang; alpha, beta, K_g and K_e
+#: [1 / bit] of Shin.
+_DELTA, _LAMBDA = 0.06, 1000.0
+_PERCENTILE, _CONCENTRATION = 0.7, 5.0
+_ALPHA, _BETA, _GRADIENT_GAIN, _ENTROPY_GAIN = 0.4, 0.4, 2.0, 0.125
 
 
 def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
@@ -123,50 +128,35 @@ def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
     return bits.clamp_(min=0.0)
 
 
-def shim_response(
-    luma: torch.Tensor, *, threshold: float = 0.06, slope: float = 1000.0
-) -> torch.Tensor:
+def shim_response(luma: torch.Tensor) -> torch.Tensor:
     """Shim's logarithmic response (B, H, W) in [0, 1] to the gradient of each pixel.
 
-    With m = \\|Sobel\\| / sqrt(32), of luma in [0, 1], delta the `threshold` and lambda the
-    `slope`: ``log(lambda (m - delta) + 1) / log(lambda (1 - delta) + 1)`` where m >= delta, else 0.
+    With m = \\|Sobel\\| / sqrt(32), of luma in [0, 1], delta = 0.06 and lambda = 1000:
+    ``log(lambda (m - delta) + 1) / log(lambda (1 - delta) + 1)`` where m >= delta, else 0.
     """
     gradient = squared_gradient(check_luma(luma), SOBEL).mul_(1.0 / _LARGEST_SOBEL).sqrt_()
-    above = gradient.sub_(threshold).clamp_(min=0.0).mul_(slope)
-    return above.log1p_().mul_(1.0 / math.log1p(slope * (1.0 - threshold)))
+    above = gradient.sub_(_DELTA).clamp_(min=0.0).mul_(_LAMBDA)
+    return above.log1p_().mul_(1.0 / math.log1p(_LAMBDA * (1.0 - _DELTA)))
 
 
-def shim_gradient(
-    luma: torch.Tensor, *, threshold: float = 0.06, slope: float = 1000.0
-) -> torch.Tensor:
+def shim_gradient(luma: torch.Tensor) -> torch.Tensor:
     """Shim's gradient information: mean over the pixels of `shim_response`, in [0, 1].
 
     The paper sums over the pixels; the mean does not depend on the size.
 
-    Args:
-        luma: (B, H, W) in [0, 1].
-        threshold: delta, gradients below it count as noise, in [0, 1).
-        slope: lambda > 0; the larger, the more weak gradients count.
-
     Source: I. Shim, J.-Y. Lee, I. S. Kweon, "Auto-adjusting camera exposure for outdoor robotics
     using gradient information", IROS 2014; delta 0.06, lambda 1000.
     """
-    response = shim_response(luma, threshold=threshold, slope=slope)
-    return response.mean(dim=(1, 2), dtype=torch.float64)
+    return shim_response(luma).mean(dim=(1, 2), dtype=torch.float64)
 
 
-def zhang_gradient(luma: torch.Tensor, *, p: float = 0.7, k: float = 5.0) -> torch.Tensor:
+def zhang_gradient(luma: torch.Tensor) -> torch.Tensor:
     """Zhang's soft percentile of the squared gradient [(grey levels of 255 per pixel)^2].
 
     The squared gradients G (Scharr's filter over 32) of the S pixels are sorted, ascending, and
     averaged with weights ``sin(pi/2 i / (n - 1))^k`` for i < n and
     ``sin(pi/2 - pi/2 (i - n + 1) / (S - n))^k`` above, n = floor(p S), i from 0. Its range is
-    0 to 2 * 127.5^2.
-
-    Args:
-        luma: (B, H, W) in [0, 1].
-        p: Percentile that counts most, in (0, 1).
-        k: Concentration around it, > 0.
+    0 to 2 * 127.5^2. The percentile p = 0.7 counts most, k = 5 is the concentration around it.
 
     Source: Z. Zhang, C. Forster, D. Scaramuzza, "Active exposure control for robust visual odometry
     in HDR environments", ICRA 2017; p 0.7, k 5.
@@ -176,18 +166,18 @@ def zhang_gradient(luma: torch.Tensor, *, p: float = 0.7, k: float = 5.0) -> tor
         ascending = torch.from_numpy(np.sort(squares.detach().numpy(), axis=1))
     else:
         ascending = squares.sort(dim=1).values
-    weights = _percentile_weights(squares.shape[1], p, k).to(squares)
+    weights = _percentile_weights(squares.shape[1]).to(squares)
     scale = (255.0 / _SCHARR_SUM) ** 2
     return (ascending * weights).sum(dim=1, dtype=torch.float64).mul_(scale)
 
 
-def _percentile_weights(samples: int, p: float, k: float) -> torch.Tensor:
+def _percentile_weights(samples: int) -> torch.Tensor:
     """(samples,) float64 weights of Zhang's metric; they sum to 1, or are 0 for one sample."""
-    index, split = torch.arange(samples, dtype=torch.float64), math.floor(p * samples)
+    index, split = torch.arange(samples, dtype=torch.float64), math.floor(_PERCENTILE * samples)
     rising = index / max(split - 1, 1)
     falling = 1.0 - (index - split + 1.0) / (samples - split)
     angle = torch.where(index < split, rising, falling) * (0.5 * math.pi)
-    weights = angle.sin().clamp_(min=0.0) ** k
+    weights = angle.sin().clamp_(min=0.0) ** _CONCENTRATION
     return weights / weights.sum().clamp(min=1e-300)
 
 
@@ -219,26 +209,12 @@ def immerkaer_sigma(luma: torch.Tensor) -> torch.Tensor:
     return inner * (255.0 * math.sqrt(0.5 * math.pi) / 6.0)
 
 
-def shin_metric(
-    luma: torch.Tensor,
-    *,
-    alpha: float = 0.4,
-    beta: float = 0.4,
-    gradient_gain: float = 2.0,
-    entropy_gain: float = 0.125,
-) -> torch.Tensor:
+def shin_metric(luma: torch.Tensor) -> torch.Tensor:
     """Shin's noise-aware metric: ``alpha K_g L_grad + (1 - alpha) K_e H - beta L_noise``.
 
     L_grad is mean over standard deviation (of a sample) of the means of `shim_response` in a grid
     of 10 x 10 cells, 0 where there is no gradient and at most 1000; H is `histogram_entropy`;
-    L_noise is `shin_noise`. About -10 to 3.
-
-    Args:
-        luma: (B, H, W) in [0, 1].
-        alpha: Weight of the gradient against the entropy, in [0, 1].
-        beta: Weight of the noise, >= 0.
-        gradient_gain: K_g.
-        entropy_gain: K_e [1 / bit].
+    L_noise is `shin_noise`. About -10 to 3, with alpha = beta = 0.4, K_g = 2 and K_e = 1/8.
 
     Source: U. Shin, J. Park, G. Shim, F. Rameau, I. S. Kweon, "Camera exposure control for robust
     robot vision with noise-aware image quality assessment", IROS 2019, with the factor of 1/6 in
@@ -247,9 +223,9 @@ def shin_metric(
     cells = adaptive_avg_pool2d(shim_response(luma).double(), 10).flatten(1)  # (B, 100)
     mean, deviation = cells.mean(dim=1), cells.std(dim=1)
     uniformity = (mean / deviation.clamp(min=1e-12)).clamp_(max=1000.0)
-    detail = alpha * gradient_gain * uniformity
-    detail += (1.0 - alpha) * entropy_gain * histogram_entropy(luma)
-    return detail - beta * shin_noise(luma)
+    detail = _ALPHA * _GRADIENT_GAIN * uniformity
+    detail += (1.0 - _ALPHA) * _ENTROPY_GAIN * histogram_entropy(luma)
+    return detail - _BETA * shin_noise(luma)
 
 
 def shin_noise(luma: torch.Tensor) -> torch.Tensor:

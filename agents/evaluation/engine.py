@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ae_env.observation import linear_signal
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
@@ -35,7 +36,7 @@ from agents.evaluation.evaluation_plan import (
     plan_scenes,
 )
 from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
-from agents.metering.reading import linear_signal, signal_codes
+from agents.metering.reading import signal_codes
 from agents.policy import Ints, Policy, PolicyContext
 from agents.policy_names import make_policy, training_seeds
 from agents.rollouts import (

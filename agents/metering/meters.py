@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.observation import linear_signal
 from agents.metering.reading import (
     BLACK_SIGNAL,
     GREEN,
@@ -21,7 +22,6 @@ from agents.metering.reading import (
     Meter,
     Reading,
     frame_ev100,
-    linear_signal,
     mean_reading,
 )
 from agents.policy import Floats, Observations

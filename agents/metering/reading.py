@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.grid import ExposureGrid
-from ae_env.observation import PEDESTAL, decode_observation, decode_settings, encode_array
+from ae_env.observation import PEDESTAL, decode_settings, encode_array, linear_signal
 from agents.policy import Bools, Floats, Ints, Observations
 from simulator.camera import CameraProfile
 
@@ -81,23 +81,6 @@ def frame_states(observations: Observations, grid: ExposureGrid) -> Ints:
     """State of `grid` that is nearest to the (nominal) settings of each frame, ``(N,)``."""
     shown = np.stack(decode_settings(observations["settings"]), axis=1)
     return np.asarray(np.abs(shown[:, None] - grid.apex).sum(axis=2).argmin(axis=1))
-
-
-def linear_signal(
-    raw: NDArray[Any], camera: CameraProfile, planes: slice = slice(None)
-) -> NDArray[np.float32]:
-    """Signal of observed frames, white is 1; of the `planes` among R, G1, G2, B.
-
-    `raw` (N, 4, h, w) is of any kind: uint8 codes, float32 signal, or the camera's uint16 numbers.
-    """
-    chosen = raw[:, planes]
-    if chosen.dtype == np.uint8:
-        return decode_observation(chosen)
-    if np.issubdtype(chosen.dtype, np.floating):
-        return chosen.astype(np.float32)
-    black, span = (np.array(v)[planes, None, None] for v in (camera.black_level, camera.span))
-    signal: NDArray[np.float32] = ((chosen - black) / span).astype(np.float32)
-    return signal
 
 
 def signal_codes(

@@ -9,13 +9,15 @@ nearest states of a grid. The numbers of that tuning come first.
 from __future__ import annotations
 
 import functools
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.observation import linear_signal
 from agents.metering.programs import PRIORITY_TIME, ProgramOptions, StateChooser, check_used
-from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
+from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import MANUAL_PROGRAMS
 from simulator.utils.checks import check_integer, check_number, check_word
@@ -82,6 +84,7 @@ GAIN_PASSES, GAIN_LIMIT, GAIN_DONE = 8, 10.0, 1.01
 _LEAST_SIGNAL = 1e-3
 
 
+@dataclass
 class LibcameraAgc:
     """The algorithm for `num_cameras` N: statistics of a frame in, the next exposure out.
 
@@ -99,28 +102,22 @@ class LibcameraAgc:
         compensation, flicker_period, speed, startup_frames: As of `RpiAgc`.
     """
 
-    def __init__(
-        self,
-        num_cameras: int,
-        *,
-        metering: str = "centre_weighted",
-        constraint: str = "normal",
-        ladder: Ladder = LADDERS["normal"],
-        compensation: float = 0.0,
-        max_exposure_time: float | None = None,
-        exposure_time: float | None = None,
-        gain: float | None = None,
-        flicker_period: float | None = None,
-        speed: float = SPEED,
-        startup_frames: int = STARTUP_FRAMES,
-    ) -> None:
-        self.weights = np.array(ZONE_WEIGHTS[metering], np.float64)
-        self.constraints = CONSTRAINTS[constraint]
-        self.ladder, self.compensation = ladder, compensation
-        self.max_exposure_time = np.inf if max_exposure_time is None else max_exposure_time
-        self.exposure_time, self.gain, self.flicker_period = exposure_time, gain, flicker_period
-        self.speed, self.startup_frames = speed, startup_frames
-        self._filtered, self._frames = np.full(num_cameras, np.nan), 0
+    num_cameras: int
+    _: KW_ONLY
+    metering: str = "centre_weighted"
+    constraint: str = "normal"
+    ladder: Ladder = LADDERS["normal"]
+    compensation: float = 0.0
+    max_exposure_time: float = np.inf
+    exposure_time: float | None = None
+    gain: float | None = None
+    flicker_period: float | None = None
+    speed: float = SPEED
+    startup_frames: int = STARTUP_FRAMES
+
+    def __post_init__(self) -> None:
+        self.weights = np.array(ZONE_WEIGHTS[self.metering], np.float64)
+        self._filtered, self._frames = np.full(self.num_cameras, np.nan), 0
 
     def update(
         self, zones: Floats, histogram: Floats, exposure: Floats, lux: Floats | float = DEFAULT_LUX
@@ -137,7 +134,7 @@ class LibcameraAgc:
         aimed = np.broadcast_to(np.interp(lux, TARGET_LUX, TARGET_SIGNALS), count)
         wanted: Floats = np.minimum(aimed * brighter, TARGET_LIMIT)
         factor = zone_factor(zones, self.weights, wanted)
-        for constraint in self.constraints:
+        for constraint in CONSTRAINTS[self.constraint]:
             bound = np.full(count, min(constraint.target * brighter, TARGET_LIMIT))
             other = bound / inter_quantile_mean(histogram, *constraint.quantiles)
             adopted = other > factor if constraint.lower else other < factor
@@ -297,7 +294,7 @@ class RpiAgc(Policy):
             constraint=constraint,
             ladder=Ladder(shutter, gains),
             compensation=compensation,
-            max_exposure_time=shutter_cap,
+            max_exposure_time=np.inf if shutter_cap is None else shutter_cap,
             exposure_time=time if program in ("S", "M") else None,
             gain=None if iso is None else iso / 100.0,
             flicker_period=flicker_period,

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from benchmarks.denoising import Denoiser, classical
 from benchmarks.fidelity.models import weights
-from benchmarks.harness import recorded
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio
 from simulator.capture.decision import DEFAULT_TOLERANCE
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.compute import computes_bfloat16
 
@@ -101,7 +101,7 @@ class _Exposed:
         self._raw = raw
 
     def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
-        return torch.stack([recorded(self.expected(s), self._raw.camera) for s in states])
+        return torch.stack([clip_and_quantise(self.expected(s), self._raw.camera) for s in states])
 
     def expected(self, settings: CameraSettings) -> Tensor:
         return self._raw.data * exposure_ratio(self._raw.settings, settings)

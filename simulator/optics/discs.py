@@ -482,15 +482,6 @@ def _square(diameter, largest, out):  # type: ignore[no-untyped-def]
 
 
 @_blend_jit()
-def _extremes(values):  # type: ignore[no-untyped-def]
-    low = high = values[0]
-    for x in range(len(values)):
-        low = values[x] if values[x] < low else low
-        high = values[x] if values[x] > high else high
-    return low, high
-
-
-@_blend_jit()
 def _below(knots, value):  # type: ignore[no-untyped-def]
     """The last interval between `knots` that begins at `value` or before."""
     index = 0
@@ -537,18 +528,13 @@ def _blend(first, last, diameter, knots, images, samples, out):  # type: ignore[
 
 @_blend_jit()
 def _mark(diameter, knots, used):  # type: ignore[no-untyped-def]
-    """Marks the images around the diameters of each group of pixels."""
-    width = diameter.shape[1]
-    squares = np.empty(_BLENDED, np.float32)
+    """Marks the images that some pixel has a share of."""
     for y in range(len(diameter)):
-        for start in range(0, width, _BLENDED):
-            end = min(start + _BLENDED, width)
-            squared = squares[: end - start]
-            _square(diameter[y, start:end], knots[-1], squared)
-            low, high = _extremes(squared)
-            stop = _below(knots, high)
-            used[_below(knots, low) + (low == knots[-1]) : stop + 1] = True
-            used[stop + 1] |= high > knots[stop]
+        for x in range(diameter.shape[1]):
+            squared = min(diameter[y, x] * diameter[y, x], knots[-1])
+            index = _below(knots, squared)
+            used[index] |= squared < knots[index + 1]
+            used[index + 1] |= squared > knots[index]
 
 
 @_blend_jit()

@@ -14,7 +14,6 @@ import torch
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
-from simulator.utils.compute import parallel_ranges
 
 _BLOCK, _STEP = 8, 4
 #: Share of each level's blocks that is used: those with the least slope.
@@ -69,14 +68,9 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
         white = 1.0
     if floor > _NEAR_BLACK or np.mean(planes == floor) < _SHARED:
         floor = -np.inf
-    found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3] * len(planes)
-
-    def look(first: int, last: int) -> None:
-        for index in range(first, last):
-            found[index] = _blocks_of(planes[index], white, floor)
-
+    found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3]
     if min(planes.shape[1:]) >= _BLOCK + 2:
-        parallel_ranges(look, len(planes))
+        found = [_blocks_of(plane, white, floor) for plane in planes]
     mean, energy, slope = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(mean) < _MIN_BLOCKS:
         raise ValueError(

@@ -158,7 +158,6 @@ print("loaded", *sys.modules)
         (("train", "agent.yaml", "--tensorboard", "text.dng"), "`tensorboard` (='text.dng')"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
         (("bench", "throughput", "--part", "agents"), "`part` (='agents') is for transfer only"),
-        (("bench", "throughput", "--against", "."), "`against` (='.') must be a checkout"),
         (("film", "--scene", "nowhere", "--scenes", "bundled:small"), "(='nowhere') must be an id"),
         (("quickstart", "--seed", 2**32 - 1), "`seed` (=4294967295) must be"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),

@@ -98,27 +98,6 @@ def test_reasons(changes: dict, settings: CameraSettings, left_out: str | None, 
     assert word in (plan.details() if left_out is None else plan.left_out[left_out])
 
 
-def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
-    with_module, without = prepared().plan(CLEANER), prepared(networks=False).plan(CLEANER)
-    assert with_module.excess_noise == 0.0
-    light = LIGHT.double()
-    read, shot = (
-        [torch.tensor(getattr(Z6.nlf(iso), name)).double()[:, None, None] for iso in (1600, 100)]
-        for name in ("read", "shot")
-    )
-    given, wanted = (r + s * light for r, s in zip(read, shot, strict=True))
-    assert without.excess_noise == pytest.approx(float(((given - wanted) / wanted).mean()))
-
-
-def test_only_pixels_with_too_much_noise_count_as_excess() -> None:
-    """At 0 the source has 4 times the target's variance, at 0.5 a twelfth of it."""
-    light = torch.zeros(4, 2, 2)
-    light[:, 1] = 0.5
-    source, target = (NoiseLevelFunction((a,) * 4, (b,) * 4) for a, b in ((0, 4e-6), (1e-4, 1e-6)))
-    plan = PreparedScene(light, SOURCE, Z6.with_nlf(1600, target), source).plan(SOURCE)
-    assert plan.excess_noise == pytest.approx((3 + 0) / 2, rel=1e-5)
-
-
 def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Per sample: 2 + 4 + 2 (1 + 3^2) + 6 + 14 + 6, for a disc of 3.5 pixel; and the network's."""
     monkeypatch.setattr(plan_module, "seconds_per_operation", lambda: 1e-9)

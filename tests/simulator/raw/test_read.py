@@ -89,11 +89,6 @@ def test_what_libraw_takes_for_something_else(tmp_path):
     path = write_sample_dng(path, CFALayout=("H", (3,)))
     with pytest.raises(RawFileError, match="CFALayout"):
         read_raw(path)
-    with path.open("rb") as stream:
-        (apart,) = read_directories(stream)
-    apart |= {"StripOffsets": (512, 8000), "RowsPerStrip": (32,), "CFALayout": (1,)}
-    with pytest.raises(RawFileError, match="strips one after another"):
-        read_module._check_structure([apart], True, 10**6)
 
 
 def test_a_raw_without_noise_is_read_and_phones_mark_no_stops(tmp_path, caplog):
@@ -127,18 +122,6 @@ def test_gain_maps_and_baseline_go_along(tmp_path):
             assert bytes(tags[name].value) == bytes(values)
     with tifffile.TiffFile(tmp_path / "c.dng") as file:  # positions would be wrong
         assert not set(maps) & {tag.name for tag in file.pages[0].tags}
-
-
-def test_opcode_lists_of_another_frame_are_left_out(tmp_path):
-    tags = {"StripOffsets": (8,), "ImageLength": (64,), "ImageWidth": (96,)}
-    tags |= {"PhotometricInterpretation": (32803,), "OpcodeList1": (b"1",), "OpcodeList3": (b"3",)}
-    for area, origin, size, left in (
-        ((0, 0, 64, 96), (0, 0), (32, 48), ["OpcodeList1", "OpcodeList3"]),
-        ((2, 4, 64, 96), (2, 4), (31, 46), ["OpcodeList3"]),  # bad pixels: of the whole sensor
-        ((1, 1, 63, 95), (2, 2), (30, 46), []),  # as LibRaw begins an odd area
-    ):
-        found = read_module._passed_on(tmp_path, [tags | {"ActiveArea": area}], origin, size)
-        assert list(found.get("opcodes", (0, {}))[1]) == left
 
 
 def test_a_pixels_own_black_level_makes_nothing_white_and_may_be_negative(tmp_path):

@@ -147,19 +147,6 @@ def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:
         assert blur(copy).min() < 0.35  # something is in focus
 
 
-def test_softness_is_that_of_edges() -> None:
-    """Edges anywhere in a pixel: 2/3 of the square is between neighbours, 5/3 between second ones.
-
-    Private: the whole path would need a picture of every softness.
-    """
-    rng = np.random.default_rng(0)
-    edge = np.repeat(rng.uniform(1.0, 2.0, (256, 64)), 400, axis=1)  # 50 steps to a pixel
-    rows = np.stack([np.roll(r, int(rng.integers(400))) for r in edge])
-    pixels = rows.reshape(256, -1, 50).mean(axis=2)
-    assert pictured._edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
-    assert pictured._edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
-
-
 def by_split(data, drawn=0):
     return {s: pictured.detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}
 
