@@ -42,8 +42,6 @@ def test_bad_files_stop_or_are_skipped_with_a_reason(tmp_path, caplog):
     (line,) = (r.getMessage() for r in caplog.records if "skipped" in r.getMessage())
     assert "8 of 11 scene files skipped" in line
     assert line.endswith("and 3 more)")
-    with pytest.raises(ValueError, match=r"7 of 7 scene files skipped \(bad0\.dng: "):
-        load(tmp_path / "bad*", on_error="skip")
     with pytest.raises(ValueError, match=r"bad1\.dng") as caught:
         load(bad[1])
     assert "skip" not in str(caught.value)  # which would not help with one file
@@ -337,7 +335,6 @@ def test_maps_are_sampled_where_they_have_the_photosites(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.png", b"", "must end in"),
         ("a.hdr", b"", "complete"),
         *(
             ("a.hdr", HDR_HEAD + size + b"\n" + 16 * 32 * b"\x80\x80\x80\x80", words)
@@ -347,7 +344,6 @@ def test_maps_are_sampled_where_they_have_the_photosites(tmp_path, caplog):
                 (b"-Y 17 +X 32", "complete"),
             )
         ),
-        ("a.exr", b"not an EXR file", ""),
         ("a.exr", (60_000, 60_000), "claims 60000 x 60000"),
         ("a.exr", (4_000, 4_000), "claims .*8192 a byte"),
     ],

@@ -189,21 +189,14 @@ DOUBLED = "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for 
     ("text", "parts"),
     [
         ("name: x\npart: {steps: 0}", ["part.steps (=0)", "greater than or equal to 1"]),
-        ("name: x\nprat: {steps: 2}", ["prat (={'steps': 2}): unknown", "did you mean `part`?"]),
         ("name: x\npart: {stesp: 2}", ["part.stesp (=2): unknown", "did you mean `steps`?"]),
         ("", ["is empty: it must map entries to values; known entries: name, part, parts"]),
-        ("- a\n- b", ["holds ['a', 'b']: it must map entries"]),
         ("name: x\npart: {steps: 2}\nname: y", ["): the entry 'name' is given twice, again in"]),
         ("name: " + "[" * 10**6, ["nested too deeply"]),
         ("- a\n" * 2**18, ["holds more than 65536 values"]),
         ("a: 0x" + "f" * 9999, ["one of more than 2048 characters"]),  # no text of decimals
         (DOUBLED, ["aliases stand for more than"]),
         ("name: &a {x: 1}\nb: {<<: [*a, *a]}", ["`<<` merges one mapping"]),
-        ("name: 2001-13-45", ["is not YAML"]),
-        ("name: x" + " " * 2**20, ["must not be larger than"]),
-        (b"name: \xff\xfe", ["is not YAML"]),
-        ("name: x\nparts: {a: {stesp: 3}}", ["parts.a.stesp (=3): unknown, the", "mean `steps`"]),
-        ("name: x\nrows: [{steps: 2}, {foo: 3}]", ["rows.1.foo (=3): unknown", "'steps'"]),
         ("name: !!python/object/apply:os.getcwd []", ["is not YAML"]),  # nothing is executed
     ],
 )
