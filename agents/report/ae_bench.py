@@ -90,8 +90,8 @@ def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
     if plan.hash is not None and (found := bench_hash(plan, scenes)) != plan.hash:
         raise ValueError(
             f"`hash` of {plan.name!r} is {plan.hash}, but the plan and the light of its scenes "
-            f"give {found}: something has changed, so results would not compare with the published "
-            "ones; a changed benchmark needs a new name and hash"
+            f"give {found}: results would not compare with the published ones. AE-Bench v1 and v2 "
+            "run with version 0.2 of ae-env; a changed benchmark needs a new name and hash"
         )
 
 
