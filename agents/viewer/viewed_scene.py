@@ -192,7 +192,6 @@ class View:
         clipping: Whether clipped pixels are marked.
         centre: Middle of the part shown pixel by pixel, down and to the right, as shares of the
             upright picture; None for the whole frame.
-        noise_seed: Seed of the capture's noise.
     """
 
     settings: CameraSettings
@@ -200,7 +199,6 @@ class View:
     defocus: float = 0.0
     clipping: bool = False
     centre: tuple[float, float] | None = None
-    noise_seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -267,7 +265,7 @@ class ViewedScene:
         with self._lock:
             begun = perf_counter()
             prepared = self._part(view)
-            (capture,) = prepared.expose([view.settings], seed=view.noise_seed)
+            (capture,) = prepared.expose([view.settings])
             taken = perf_counter()
             image = self._to_srgb(capture, view)
             jpeg = encoded(image, quality=88 if view.centre is None else 95)

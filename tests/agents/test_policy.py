@@ -50,6 +50,9 @@ def test_every_listed_name_makes_a_policy(context):
         *((f"recorded:{Path(__file__).parent}", "`path`"), ("spot?", "key=value")),  # holds no raw
         *(("regression?network=1", "`network`"), (f"spot?iso={'1' * 4096}", "YAML scalar")),
         ("spot?foresight=trend&damping=0.5", "`damping`"),
+        ("spot?damping=0&damping=0", "'damping'.* twice"),
+        ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\)"),
+        *(("spot?foresight=trends", "`foresight`"), ("spot?foresight=model", "`foresight`")),
     ],
 )
 def test_bad_names_and_options_say_what_is_wrong(context, name, message):
@@ -305,3 +308,16 @@ def test_a_meter_with_foresight_is_ahead_of_a_ramp(context, photograph, name, lo
         taken = photograph(np.ones((64, 64)), 14.0 - frame, asked[frame])
         asked.append(int(policy.act(taken)[0]))
     assert low < context.grid.ev100[asked[11 + 3]] - (14.0 - 11 - 3) < high
+
+
+def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "judge.md").read_text(encoding="utf-8")
+    file = tmp_path / "my_policy.py"
+    file.write_text(page.partition("```python\n")[2].partition("```")[0])
+    policy = make_policy(f"{file}:HalfGrey", context)
+    states, masks = np.array([0, 63]), np.ones((2, 64), bool)
+    for _ in range(6):
+        states = policy.act(photograph(np.ones((64, 64)), 9.0, states))
+    np.testing.assert_allclose(context.grid.ev100[states], 9.0, atol=0.2)
+    masks[:, states[0]] = False
+    assert policy.act(photograph(np.ones((64, 64)), 9.0, states), masks)[0] != states[0]

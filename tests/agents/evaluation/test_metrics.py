@@ -5,7 +5,8 @@ import pytest
 import scipy.stats
 
 from agents.evaluation import metrics
-from agents.evaluation.intervals import difference_interval, rank, score_interval
+from agents.evaluation.intervals import MIN_GROUPS, difference_interval, rank, score_interval
+from agents.evaluation.result import weighted_quantile
 
 EV = np.array([4.0, 4.05, 5.0, 6.0, 8.0])
 # One episode, two frames, five states.
@@ -121,6 +122,14 @@ def test_settling_and_overshoot_are_those_of_the_answer_to_a_step():
     assert found == [[2.0], [3.0]]
 
 
+def test_ev_error_percentiles_and_share_of_a_known_trajectory():
+    errors = np.array([[4, 2, 1, 1 / 3, 0, 0, 0, 0, 0, 0]], float)
+    weights = np.full(errors.shape, 0.1)
+    found = [weighted_quantile(errors, weights, share) for share in (0.95, 0.9, 0.5)]
+    assert found == [4.0, 2.0, 0.0]  # the first is the tenth of ten values
+    assert (errors <= metrics.THIRD_EV).mean() == pytest.approx(0.7)
+
+
 def test_flicker_counts_frames_of_the_same_light_and_jumps_all():
     means = np.array([[0.1, 0.2, 0.2, 0.5], [0.0, 0.0, 0.0, 0.0]])
     np.testing.assert_allclose(metrics.flicker(means, np.array([True])), [0.4 / 3, 0.0])
@@ -217,3 +226,14 @@ def test_more_policies_widen_the_intervals_as_tukeys_range_does():
     error = (gains[last] - gains[best]).std() / np.sqrt(400)
     half = np.ptp(found.to_best.iloc[-1]["simultaneous_ci95"]) / 2
     assert half == pytest.approx(factor * error, rel=0.06)
+
+
+def test_below_fifteen_groups_there_is_an_order_but_no_interval():
+    found = score_interval(*_data(MIN_GROUPS - 1))
+    assert (found.low, found.high, found.pair) == (None, None, None)
+    assert score_interval(*_data(MIN_GROUPS)).pair is not None
+    gains = {"a": np.full((1, MIN_GROUPS - 1), 0.9), "b": np.zeros((1, MIN_GROUPS - 1))}
+    found = rank(gains, np.ones(MIN_GROUPS - 1))
+    assert (found.policy.tolist(), found.tier.tolist()) == (["a", "b"], [None, None])
+    assert not found.to_best[1]["significant"]
+    assert found.to_best[1]["difference"] == pytest.approx(-0.9)

@@ -193,6 +193,14 @@ def test_outside_the_training_range_it_does_not_extrapolate():
     assert ((far > -0.2) & (far < 1.2)).all()
 
 
+def test_fit_picks_nearly_the_best_state_of_unseen_samples():
+    model = ScoreRegression.fit(*_samples())
+    features, scores, _ = _samples(seed=7)
+    picked = model.predict(features).argmax(axis=1)
+    regret = scores.max(axis=1) - scores[np.arange(len(scores)), picked]
+    assert regret.mean() < 0.01
+
+
 def test_save_and_load_give_the_same_regression(tmp_path):
     model = ScoreRegression.fit(*_samples(200))
     again = ScoreRegression.load(model.save(tmp_path / "deep" / "tuned.safetensors"))

@@ -92,6 +92,19 @@ def test_rows_have_the_values_of_their_episodes():
     assert low < expected < high
 
 
+def test_other_conditions_have_one_row_of_their_own_name():
+    results = {"static": made_result(), "sine": made_result()}
+    rows = result_rows(results, resamples=10)
+    own = rows[rows.policy == "ppo"]
+    assert own.condition.tolist() == ["all", "hard", "rest", "sine"]
+    assert own.regret_given_ev.iloc[0] == own.regret_given_ev.iloc[3]
+    ranking = made.overall_ranking(results, resamples=100)
+    assert ranking.policy.tolist() == ["spot:P", "matrix:P", "ppo"]  # oracle is told
+    assert ranking.place.tolist() == [1, 2, 3]
+    assert (ranking.to_best[1]["other"], ranking.to_next[2]) == ("spot:P", None)
+    assert ranking.to_best[1]["difference"] < 0
+
+
 def test_scenes_have_means_of_their_episodes():
     result = made_result()
     rows = made.scene_rows(result)

@@ -72,12 +72,22 @@ def test_every_step_runs_or_has_a_reason(settings, networks, tolerance):
         ({"nlf": ZERO}, CLEANER, "noise_reduction", "no noise"),
         ({}, OPENER, "noise_reduction", "at least as noisy"),
         ({"tolerance": 9}, CLEANER, "noise_reduction", "within the tolerance"),
+        ({"tolerance": 9, "noise": False}, OPENER, "noise_reduction", "small"),
         ({"denoised_lights": (network("bad", 9.0),)}, CLEANER, "noise_reduction", "smaller error"),
+        ({"networks": False}, OPENER, "aperture", "`depth`"),
         ({}, CLEANER, "aperture", "does not open"),
         ({"diameter": 0.0}, OPENER, "aperture", "in focus throughout"),
+        ({"tolerance": 900}, OPENER, "aperture", "up to 3.5 pixel"),
+        ({"aperture_blur": None}, CLEANER, "defocus", "far"),
         ({}, CLEANER, "defocus", "each pixel's"),
+        ({"defocus": 1e-4}, CLEANER, "defocus", "5e-05 pixel"),
         ({}, CLEANER, "motion_blur", "does not move"),
+        ({"image_speed": 1e-6}, CLEANER, "motion_blur", "4e-06 pixel"),
         ({"noise": False}, SOURCE, "noise", "only the light"),
+        ({}, OPENER, None, "adds blur (up to 3.5 pixel)"),
+        ({"defocus": 3}, CLEANER, None, "disc is 1.5 pixel"),
+        ({"image_speed": 0.25, "tolerance": 0}, CLEANER, None, "moves by 1 pixel"),
+        ({"networks": False}, CameraSettings(1600, 1 / 32, 8), None, "noise variance 2"),
         ({}, CameraSettings(12800, 1, 8), None, "1 stop beyond"),
     ],
 )
@@ -86,6 +96,27 @@ def test_reasons(changes: dict, settings: CameraSettings, left_out: str | None, 
     scene = {name: value for name, value in changes.items() if name != "noise"}
     plan = prepared(**scene).plan(settings, noise=changes.get("noise", True))
     assert word in (plan.details() if left_out is None else plan.left_out[left_out])
+
+
+def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
+    with_module, without = prepared().plan(CLEANER), prepared(networks=False).plan(CLEANER)
+    assert with_module.excess_noise == 0.0
+    light = LIGHT.double()
+    read, shot = (
+        [torch.tensor(getattr(Z6.nlf(iso), name)).double()[:, None, None] for iso in (1600, 100)]
+        for name in ("read", "shot")
+    )
+    given, wanted = (r + s * light for r, s in zip(read, shot, strict=True))
+    assert without.excess_noise == pytest.approx(float(((given - wanted) / wanted).mean()))
+
+
+def test_only_pixels_with_too_much_noise_count_as_excess() -> None:
+    """At 0 the source has 4 times the target's variance, at 0.5 a twelfth of it."""
+    light = torch.zeros(4, 2, 2)
+    light[:, 1] = 0.5
+    source, target = (NoiseLevelFunction((a,) * 4, (b,) * 4) for a, b in ((0, 4e-6), (1e-4, 1e-6)))
+    plan = PreparedScene(light, SOURCE, Z6.with_nlf(1600, target), source).plan(SOURCE)
+    assert plan.excess_noise == pytest.approx((3 + 0) / 2, rel=1e-5)
 
 
 def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:

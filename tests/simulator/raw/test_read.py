@@ -483,3 +483,15 @@ def test_structures_that_never_end_are_left_and_a_damaged_tag_costs_no_other():
     for magic, found in ((42, 1), (0x4F52, 1), (0x5352, 1), (0x55, 1), (0, 0)):
         file = io.BytesIO(content[:2] + struct.pack("<H", magic) + content[4:])
         assert read_directories(file) == found * [{"WhiteLevel": (4095,)}]
+
+
+def test_opcode_lists_of_another_frame_are_left_out(tmp_path):
+    tags = {"StripOffsets": (8,), "ImageLength": (64,), "ImageWidth": (96,)}
+    tags |= {"PhotometricInterpretation": (32803,), "OpcodeList1": (b"1",), "OpcodeList3": (b"3",)}
+    for area, origin, size, left in (
+        ((0, 0, 64, 96), (0, 0), (32, 48), ["OpcodeList1", "OpcodeList3"]),
+        ((2, 4, 64, 96), (2, 4), (31, 46), ["OpcodeList3"]),  # bad pixels: of the whole sensor
+        ((1, 1, 63, 95), (2, 2), (30, 46), []),  # as LibRaw begins an odd area
+    ):
+        found = read_module._passed_on(tmp_path, [tags | {"ActiveArea": area}], origin, size)
+        assert list(found.get("opcodes", (0, {}))[1]) == left
