@@ -23,13 +23,15 @@ import torch.nn.functional as F
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
-from simulator.utils.compute import kernel
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: Bins of about equal population per plane, and pixels of a plane that are sampled, at most.
 BINS = 64
 SAMPLES = 65_536
 #: Pixels of a plane that are sorted to find the bins, at most about this many.
 _SORTED = 4096
+#: Pixels from which another thread is worth waking.
+_WORTH_A_THREAD = 2**16
 #: Variance of the Laplacian of noise of variance 1: 4^2 + 4.
 _LAPLACIAN = 20.0
 #: Light is above white for sure where it is so by this many standard deviations of its noise.
@@ -57,29 +59,63 @@ _SUMS = {"reassoc", "nnan", "nsz", "contract"}
 # -- sums over pixels, and over bins of pixels ------------------------------------------------
 
 
-def _sums_by_bin(
-    light: np.ndarray, rows: np.ndarray, edges: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over the pixels of some rows of `light` (P, H, W), by their bins between `edges`.
+@kernel()
+def _find(values, limits, indices):  # type: ignore[no-untyped-def]
+    """Number of `limits` that each value reaches; they are a full tree, ascending.
 
-    (4, P, BINS): number, light of at least 0, square of the Laplacian, square of the second
-    difference along the row; and (2, P, BINS): least and most light, at least 0, of those.
+    Values come in any order: a branch would be mispredicted half of the time.
     """
-    sums, levels = np.zeros((4, len(light), BINS)), np.zeros((2, len(light), BINS))
-    levels[0] = np.inf
-    for plane, limits in enumerate(edges):
-        padded = np.pad(light[plane].astype(np.float64), 1, mode="edge")
-        centre = padded[1 + rows, 1:-1]
-        along = padded[1 + rows, :-2] + padded[1 + rows, 2:] - 2.0 * centre
-        across = padded[rows, 1:-1] + padded[2 + rows, 1:-1] - 2.0 * centre
-        bins = np.searchsorted(limits, centre.ravel(), "right")
-        level = np.maximum(centre, 0.0).ravel()
-        for kind, values in enumerate((None, level, (along + across) ** 2, along * along)):
-            weights = None if values is None else values.ravel()
-            sums[kind, plane] = np.bincount(bins, weights, BINS)
-        np.minimum.at(levels[0, plane], bins, level)
-        np.maximum.at(levels[1, plane], bins, level)
-    return sums, levels
+    indices[:] = 0
+    step = (len(limits) + 1) // 2
+    while step:
+        for x in range(len(values)):
+            reached = values[x] >= limits[indices[x] + np.uint32(step - 1)]
+            indices[x] += np.uint32(step) * np.uint32(reached)
+        step //= 2
+
+
+@kernel()
+def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[no-untyped-def]
+    """Adds each pixel of some rows of light (P, H, W) to the bin of its light, by `edges` (P, B-1).
+
+    `sums` (4, P, B): number, light of at least 0, square of the Laplacian, square of the second
+    difference along the row; `levels` (2, P, B): least and most light, at least 0.
+    """
+    _, height, width = light.shape
+    half = 1
+    while 2 * half <= edges.shape[1]:
+        half *= 2
+    limits = np.full(2 * half - 1, np.inf, np.float32)
+    indices = np.empty(width, np.uint32)
+    bins = np.empty((2 * half, 6))
+    for plane in range(first, last):
+        for index in range(edges.shape[1]):  # an array's copy takes a second more to compile
+            limits[index] = edges[plane, index]
+        bins[:] = 0.0  # what is known of a bin lies together
+        bins[:, 4] = np.inf
+        for y in rows:
+            centre = light[plane, y]
+            above, below = light[plane, max(y - 1, 0)], light[plane, min(y + 1, height - 1)]
+            _find(centre, limits, indices)
+            for x in range(width):
+                value = centre[x]
+                found = bins[indices[x]]
+                twice = 2.0 * np.float64(value)
+                left, right = centre[max(x - 1, 0)], centre[min(x + 1, width - 1)]
+                along = np.float64(left) + np.float64(right) - twice
+                across = np.float64(above[x]) + np.float64(below[x]) - twice
+                level = max(np.float64(value), 0.0)
+                found[0] += 1.0
+                found[1] += level
+                found[2] += (along + across) ** 2
+                found[3] += along * along
+                found[4] = min(found[4], level)
+                found[5] = max(found[5], level)
+        for index in range(sums.shape[2]):
+            for kind in range(4):
+                sums[kind, plane, index] += bins[index, kind]
+            levels[0, plane, index] = min(levels[0, plane, index], bins[index, 4])
+            levels[1, plane, index] = max(levels[1, plane, index], bins[index, 5])
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
@@ -245,7 +281,11 @@ class LightStatistics:
         light, rows = self._rows
         samples = len(rows) * light.shape[-1]
         edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
-        sums, levels = _sums_by_bin(light, rows, edges)
+        sums, levels = np.zeros((4, 4, BINS)), np.zeros((2, 4, BINS))
+        levels[0] = np.inf
+        least = 1 + _WORTH_A_THREAD // samples
+        fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
+        parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
         counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
         return _Bins(
             share=sums[0] / (4.0 * samples),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer, check_type
-from simulator.utils.compute import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 PLANES = ("R", "G1", "G2", "B")
 #: Packed rows from which a second thread helps, and that are packed at a time.
@@ -84,9 +85,15 @@ class RawImage:
     @property
     def saturated(self) -> torch.Tensor:
         """(H, W) bool: some plane of the pixel is within half a digital number of white."""
-        limits = torch.tensor([1.0 - 0.5 / s for s in self.camera.span]).to(self.data)
-        reached = self.data >= limits[:, None, None]
-        return reached[0] | reached[1] | reached[2] | reached[3]
+        limits = np.array([1.0 - 0.5 / s for s in self.camera.span], np.float32)
+        if self.data.device.type != "cpu":
+            return (self.data >= torch.tensor(limits).to(self.data)[:, None, None]).any(dim=0)
+
+        data = self.data.detach().contiguous().numpy()
+        marks = np.empty(data.shape[1:], np.bool_)
+        mark = functools.partial(mark_saturated, data, limits, marks)
+        parallel_ranges(mark, len(marks), least=_SHARE)
+        return torch.from_numpy(marks)
 
     def __repr__(self) -> str:
         _, height, width = self.data.shape
@@ -108,13 +115,15 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
     height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
     planes = np.empty((4, height, width), np.float32)
 
+    # One kernel for what files hold, and one for all else.
+    dtype = np.uint16 if mosaic.dtype == np.uint16 else np.float64
+    tile = _tile(camera)
+    black, span = (np.array(v, np.float64) for v in (camera.black_level, camera.span))
+
     def pack(first: int, last: int) -> None:
         for top in range(first, last, _ROWS):  # what has to be copied stays in the cache
-            part = slice(top, min(top + _ROWS, last))
-            for plane, (row, column) in enumerate(camera.cfa.offsets):
-                samples = mosaic[2 * top + row : 2 * part.stop : 2, column : 2 * width : 2]
-                signal = np.subtract(samples, camera.black_level[plane], dtype=np.float64)
-                planes[plane, part] = signal / camera.span[plane]
+            rows = mosaic[2 * top : 2 * min(top + _ROWS, last)]
+            pack_rows(np.ascontiguousarray(rows, dtype), tile, black, span, top, planes)
 
     parallel_ranges(pack, height, least=_SHARE)
     return torch.from_numpy(planes)
@@ -129,17 +138,23 @@ def unpack_mosaic(
     count = (height if last is None else last) - first
     mosaic = np.empty((2 * count, 2 * width), np.uint16)
 
+    tile, white = _tile(camera), np.float32(camera.white_level)
+    black, span = (np.array(v, np.float32) for v in (camera.black_level, camera.span))
+
     def unpack(top: int, bottom: int) -> None:
-        for start in range(top, bottom, _ROWS):
-            part = slice(first + start, first + min(start + _ROWS, bottom))
-            for plane, (row, column) in enumerate(camera.cfa.offsets):
-                black, span = (np.float32(v[plane]) for v in (camera.black_level, camera.span))
-                numbers = np.rint(planes[plane, part] * span + black)
-                own = mosaic[2 * start + row : 2 * (part.stop - first) : 2, column::2]
-                own[:] = numbers.clip(0.0, camera.white_level, out=numbers)
+        part = mosaic[2 * top : 2 * bottom]
+        unpack_rows(planes, tile, black, span, white, first + top, first + bottom, part)
 
     parallel_ranges(unpack, count, least=_SHARE)
     return mosaic
+
+
+def _tile(camera: CameraProfile) -> np.ndarray:
+    """(2, 2) plane at each position of the colour filter array."""
+    tile = np.empty((2, 2), np.int64)
+    for plane, position in enumerate(camera.cfa.offsets):
+        tile[position] = plane
+    return tile
 
 
 def new_frame(like: torch.Tensor) -> torch.Tensor:
@@ -173,3 +188,61 @@ def check_packed(name: str, data: object, *, ndim: int = 3) -> torch.Tensor:
         bad = int((~torch.isfinite(data)).sum())
         raise ValueError(f"`{name}` ({bad} values NaN or infinite) must be finite everywhere")
     return data
+
+
+# -- kernels of the CPU: a mosaic to planes and back in one pass --------------------------------
+
+
+# The two planes of a mosaic row are taken together: their columns alternate, and the compiler
+# vectorises whole rows only.
+@kernel()
+def _split(row, left_black, left_span, right_black, right_span, left, right):  # type: ignore[no-untyped-def]
+    for x in range(len(left)):
+        left[x] = np.float32((np.float64(row[2 * x]) - left_black) / left_span)
+        right[x] = np.float32((np.float64(row[2 * x + 1]) - right_black) / right_span)
+
+
+@kernel()
+def pack_rows(mosaic, tile, black, span, first, planes):  # type: ignore[no-untyped-def]
+    """Fill rows of `planes` (4, H, W) float32 from `first` on: ``(mosaic - black) / span``.
+
+    `mosaic` (2R, 2W or more) holds those rows, `tile` (2, 2) the plane at each position; `black`
+    and `span` are (4,) float64.
+    """
+    for y in range(len(mosaic) // 2):
+        for row in range(2):
+            p, q = tile[row]
+            left, right = planes[p, first + y], planes[q, first + y]
+            _split(mosaic[2 * y + row], black[p], span[p], black[q], span[q], left, right)
+
+
+@kernel()
+def _weave(left, left_black, left_span, right, right_black, right_span, white, row):  # type: ignore[no-untyped-def]
+    zero = np.float32(0)
+    for x in range(len(left)):
+        a = np.rint(left[x] * left_span + left_black)
+        b = np.rint(right[x] * right_span + right_black)
+        a, b = a if a > zero else zero, b if b > zero else zero
+        row[2 * x] = np.uint16(np.int32(a if a < white else white))
+        row[2 * x + 1] = np.uint16(np.int32(b if b < white else white))
+
+
+@kernel()
+def unpack_rows(planes, tile, black, span, white, first, last, mosaic):  # type: ignore[no-untyped-def]
+    """The inverse of `pack_rows`, rounded and clipped to [0, white], in float32 as captures are."""
+    for y in range(first, last):
+        for row in range(2):
+            p, q = tile[row]
+            left, right, out = planes[p, y], planes[q, y], mosaic[2 * (y - first) + row]
+            _weave(left, black[p], span[p], right, black[q], span[q], white, out)
+
+
+@kernel()
+def mark_saturated(planes, limits, marks, first, last):  # type: ignore[no-untyped-def]
+    """Set `marks` (H, W) in rows `first` to `last` where a plane reaches its limit (4,) float32."""
+    r, g1, g2, b = limits
+    for y in range(first, last):
+        row = marks[y]
+        for x in range(len(row)):
+            upper = (planes[0, y, x] >= r) | (planes[1, y, x] >= g1)
+            row[x] = upper | (planes[2, y, x] >= g2) | (planes[3, y, x] >= b)
