@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import tempfile
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
@@ -239,20 +240,20 @@ def warm_up() -> None:
                 envs.reset(seed=0)
                 for _ in range(4):
                     envs.step(np.arange(16))
-        task(len(_CASES), len(_CASES) + 1, "the viewer")
+        task(len(_CASES), len(_CASES) + 1, "raw files and the viewer")
         _use_rest()
         task(len(_CASES) + 1, len(_CASES) + 1)
     console.terminal.print("try next: ae-env quickstart")
 
 
 def _use_rest() -> None:
-    """Compiles what those environments do not use: the viewer, blur along rows."""
+    """Compiles what those environments do not use: raw files, the viewer, blur along rows."""
     import numpy as np
     import torch
 
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
-    from simulator import CameraSimulator
+    from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
     from simulator.optics.discs import Blur, blur_many, disc_blur
     from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw
@@ -260,8 +261,12 @@ def _use_rest() -> None:
     library = find_scenes(DEFAULT_SCENES)
     viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))
     view = View(viewed.best(), speed=5.0, defocus=4.0)
-    light = viewed.picture(view).capture
-    viewed.readout(view, light)
+    viewed.readout(view, viewed.picture(view).capture)
+    with tempfile.TemporaryDirectory() as folder:
+        raw = read_raw(viewed.write_dng(Path(folder, "any.dng"), view))
+    estimate_nlf(raw.data)
+    numbers = raw.to_mosaic().astype(np.float64)  # files hold integers
+    light = RawImage.from_mosaic(numbers, raw.settings, raw.camera).data
     disc_blur(motion_blur(light, 2.5), 2.5)
     blur_many([Blur(light, extent_px=2.5, moved=torch.empty_like(light))])
     draw("dead_leaves", np.random.default_rng(0))  # the scenes may all have been in the cache
