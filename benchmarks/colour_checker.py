@@ -71,12 +71,6 @@ def linear_srgb_to_lab(linear: np.ndarray) -> np.ndarray:
     return xyz2lab(linear @ to_d50.T / D50 * white, illuminant="D50")
 
 
-def lab_to_luminance(lab: np.ndarray) -> np.ndarray:
-    """CIE Y of L*, 1 for L* = 100."""
-    lightness = (lab[..., 0] + 16) / 116
-    return np.where(lab[..., 0] > 8, lightness**3, lab[..., 0] / 903.2963)
-
-
 def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
     means = {}
     for index, (x, y, half) in chart.patches().items():
@@ -106,15 +100,16 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
 
     neutral = [k for k, i in enumerate(order) if i >= 18]
     measured = (linear @ np.array(XYZ_FROM_SRGB)[1])[neutral]
-    scale = float(lab_to_luminance(lab[neutral]) @ measured / (measured @ measured))
+    published = lab2xyz(lab, "D50")[:, 1]
+    scale = float(published[neutral] @ measured / (measured @ measured))
 
     packed = torch.from_numpy(planes * scale).float().T.reshape(1, 4, -1, 1)
     encoded = develop(packed, tuple(gains), raw.camera.colour_matrix, tone="linear")
     shown = linear_srgb_to_lab(srgb_decode(encoded[0, :, :, 0].T.double()).numpy())
     # Each patch scaled to its published Y, which leaves errors of hue and chroma only: uneven
     # light, vignetting and the camera's linearity drop out; veiling glare does not.
-    luminance = lab_to_luminance(linear_srgb_to_lab(linear))
-    even = linear * (lab_to_luminance(lab) / luminance)[:, None]
+    luminance = lab2xyz(linear_srgb_to_lab(linear), "D50")[:, 1]
+    even = linear * (published / luminance)[:, None]
     delta_e: Any = deltaE_ciede2000
     errors = {
         "delta_e_2000": delta_e(shown, lab),

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from scipy.stats import bootstrap
+from scipy.stats import bootstrap, spearmanr
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -368,6 +368,12 @@ def interval(values: np.ndarray, seed: int = 0) -> list[float]:
     """95 % bootstrap interval of the mean of `values`."""
     found = bootstrap((values,), np.mean, method="percentile", rng=seed).confidence_interval
     return [float(found.low), float(found.high)]
+
+
+def correlation(first: np.ndarray, second: np.ndarray, measure: Any = spearmanr) -> float:
+    """A coefficient of `scipy.stats`, Spearman's; 0 where one of the two does not vary at all."""
+    varies = min(np.ptp(first), np.ptp(second)) >= 1e-12
+    return float(measure(first, second).statistic) if varies else 0.0
 
 
 def quartiles(values: Sequence[float]) -> list[float]:

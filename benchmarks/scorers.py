@@ -26,6 +26,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures, prepare_scene
+from benchmarks import harness
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, ssim, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
@@ -179,7 +180,8 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
             known = np.isfinite(near)
             row: Row = {"scorer": scorer, "reference": target}
             for name, measure in (("spearman", spearmanr), ("pearson", pearsonr)):
-                row[name] = _correlation(measure, scores[scorer][known], near[known])
+                pair = scores[scorer][known], near[known]
+                row[name] = harness.correlation(*pair, measure) if known.sum() > 2 else np.nan
             found.append(row)
     rows = []
     known_pairs = pd.DataFrame(found).dropna().groupby(["scorer", "reference"], sort=False)
@@ -189,14 +191,6 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
             row |= {key: own[key].mean(), f"{key}_sd": own[key].std(ddof=0)}
         rows.append(row | {"positive": float((own["spearman"] > 0).mean())})
     return {"rows": rows, "scenes": len(env.scenes), "states": len(env.grid)}
-
-
-def _correlation(measure: Callable[..., Any], scores: np.ndarray, closeness: np.ndarray) -> float:
-    """0 where one of the two does not vary at all, NaN for fewer than three states."""
-    if len(scores) < 3:
-        return np.nan
-    varies = min(np.ptp(scores), np.ptp(closeness)) >= 1e-12
-    return float(measure(scores, closeness).statistic) if varies else 0.0
 
 
 def _closeness(

@@ -35,9 +35,9 @@ from simulator.utils.checks import check_word
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
-    *("agents", "bracketing", "brackets", "cluster", "colour_checker", "defects", "denoising"),
-    *("features", "hdr", "onboard", "paper", "ptc", "recorded", "refocus", "scorers"),
-    *("simulator", "throughput", "transfer", "work_precision"),
+    *("agents", "bracketing", "cluster", "colour_checker", "defects", "denoising"),
+    *("features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
+    *("scorers", "simulator", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
