@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
+import colour
 import numpy as np
 import pandas as pd
 import torch
-from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
 from ae_env.scorers.measures import srgb_decode
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, real_files, rounded, table
@@ -23,14 +22,10 @@ from simulator.raw.develop import XYZ_FROM_SRGB, srgb_from_camera
 
 #: CIE L*a*b*, D50, 2 degree, of charts made after November 2014. X-Rite, "New color specifications
 #: for ColorChecker SG and Classic charts" (2016).
-_CHART = pd.read_csv(Path(__file__).with_name("colour_checker.csv"), index_col="patch")
-PUBLISHED, NAMES = _CHART.to_numpy(), tuple(_CHART.index)
-GREY = NAMES.index("neutral 5")
-
-D50 = np.array([0.9642, 1.0, 0.8249])  # ICC profile connection space
-BRADFORD = np.array(
-    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
-)
+_CHART = colour.CCS_COLOURCHECKERS["ColorChecker24 - After November 2014"]
+D50, NAMES = _CHART.illuminant, tuple(name.partition(" (")[0] for name in _CHART.data)
+_XYZ = np.array([colour.xyY_to_XYZ(value) for value in _CHART.data.values()])
+PUBLISHED, GREY = colour.XYZ_to_Lab(_XYZ, D50), NAMES.index("neutral 5")
 
 
 @dataclass(frozen=True)
@@ -63,12 +58,7 @@ FILES = {
 
 def linear_srgb_to_lab(linear: np.ndarray) -> np.ndarray:
     """Linear sRGB (N, 3) to CIE L*a*b* under D50, Bradford-adapted from sRGB's D65."""
-    matrix = np.array(XYZ_FROM_SRGB)
-    gains = (BRADFORD @ D50) / (BRADFORD @ matrix.sum(axis=1))
-    to_d50 = np.linalg.inv(BRADFORD) @ np.diag(gains) @ BRADFORD @ matrix
-    # scikit-image's own white, so that white is L* 100, a* 0, b* 0 to the last digit.
-    white = lab2xyz(np.array([100.0, 0.0, 0.0]), illuminant="D50")
-    return xyz2lab(linear @ to_d50.T / D50 * white, illuminant="D50")
+    return colour.XYZ_to_Lab(colour.RGB_to_XYZ(linear, "sRGB", D50, "Bradford"), D50)
 
 
 def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
@@ -100,7 +90,7 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
 
     neutral = [k for k, i in enumerate(order) if i >= 18]
     measured = (linear @ np.array(XYZ_FROM_SRGB)[1])[neutral]
-    published = lab2xyz(lab, "D50")[:, 1]
+    published = _XYZ[order, 1]
     scale = float(published[neutral] @ measured / (measured @ measured))
 
     packed = torch.from_numpy(planes * scale).float().T.reshape(1, 4, -1, 1)
@@ -108,13 +98,12 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
     shown = linear_srgb_to_lab(srgb_decode(encoded[0, :, :, 0].T.double()).numpy())
     # Each patch scaled to its published Y, which leaves errors of hue and chroma only: uneven
     # light, vignetting and the camera's linearity drop out; veiling glare does not.
-    luminance = lab2xyz(linear_srgb_to_lab(linear), "D50")[:, 1]
+    luminance = colour.RGB_to_XYZ(linear, "sRGB", D50, "Bradford")[:, 1]
     even = linear * (published / luminance)[:, None]
-    delta_e: Any = deltaE_ciede2000
     errors = {
-        "delta_e_2000": delta_e(shown, lab),
-        "delta_e_2000_without_gamut_clip": delta_e(linear_srgb_to_lab(linear * scale), lab),
-        "delta_e_2000_at_published_luminance": delta_e(linear_srgb_to_lab(even), lab),
+        "delta_e_2000": colour.delta_E(shown, lab),
+        "delta_e_2000_without_gamut_clip": colour.delta_E(linear_srgb_to_lab(linear * scale), lab),
+        "delta_e_2000_at_published_luminance": colour.delta_E(linear_srgb_to_lab(even), lab),
     }
     rows = []
     for k, i in enumerate(order):

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from benchmarks.fidelity.models import CONFIGS, baseline, scores
@@ -200,10 +199,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "published": table(published, of_paper),
         "networks": table(times.to_dict("records"), networks),
     }
-    figure = Figure(figsize=(9.0, 4.0), dpi=100, layout="constrained")
-    bars = means.pivot(index="group", columns="label", values="psnr_db")
-    bars.plot.bar(ax=figure.subplots(), ylabel="PSNR [dB]", rot=15, fontsize=8)
-    return Report([*means.to_dict("records"), *rows], tables, figures={"paper.png": figure})
+    return Report([*means.to_dict("records"), *rows], tables)
 
 
 run = benchmark("paper", parts, report)

@@ -244,7 +244,7 @@ def _closeness(
 _GAIN = """scorer = `{scorer}` | ISO 100 = {low_gain:.3f} | ISO 6400 = {high_gain:.3f} |
 change = {change:+.3f} ± {change_sd:.3f} | scenes in which it rises = {rises:.0%}"""
 _BEST = """scorer = `{scorer}` | median [EV] = {median:+.1f} |
-range = {lowest:+.1f} to {highest:+.1f} | scene by scene = {each}"""
+range = {lowest:+.1f} to {highest:+.1f}"""
 _CORRELATION = """Spearman = {spearman:.2f} ± {spearman_sd:.2f} |
 Pearson = {pearson:.2f} ± {pearson_sd:.2f} | positive = {positive:.0%}"""
 
@@ -254,9 +254,6 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     named = {**results, "correlation": correlations["rows"]}
     rows = [{"measure": name, **row} for name, own in named.items() for row in own]
     best = [row for row in results["best_ev"] if row["median"] is not None]
-    for row in best:
-        by_scene = row["by_scene"].values()
-        row["each"] = " ".join("=" if value is None else f"{value:+g}" for value in by_scene)
     why = [{"scorer": name, "why": text} for name, text in missing.items()]
     line = "scorer = `{scorer}`"
     tables = {

@@ -63,7 +63,7 @@ def bench(
     quick: Annotated[bool, Option(help="A short version, to try it out.")] = False,
     against: Annotated[
         Path | None,
-        Option(help="Of throughput: another checkout or commit, timed in turns with this."),
+        Option(help="Of throughput: another checkout, timed in turns with this."),
     ] = None,
     weights: Annotated[
         Path | None, Option(help="Of paper: measure these weights, and train nothing.")

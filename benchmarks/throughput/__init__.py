@@ -1,7 +1,7 @@
 """Steps per second against what the machine could do, and how cost grows.
 
     ae-env bench throughput
-    ae-env bench throughput --against ANOTHER_CHECKOUT_OR_COMMIT
+    ae-env bench throughput --against ANOTHER_CHECKOUT
 
 Parts: environment steps beside a fused kernel, copies of the environment; resets
 beside steps; the first episode after installation; growth of time and memory with pixels; a

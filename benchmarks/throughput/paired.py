@@ -33,19 +33,11 @@ frames differ by = {max_difference:.2g}"""
 
 
 def checkout(against: Path) -> Path:
-    """The folder of another checkout; of a commit, a worktree of it under ``runs``."""
-    if (against / "simulator" / "__init__.py").is_file():
-        return against.absolute()
-    find = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{against}^{{commit}}"]
-    found = subprocess.run(find, cwd=ROOT, capture_output=True, text=True, check=False)
-    if found.returncode:
-        rule = "must be a checkout of this project, or a commit"
+    """The folder of another checkout."""
+    if not (against / "simulator" / "__init__.py").is_file():
+        rule = "must be a checkout of this project (git worktree add makes one of a commit)"
         raise ValueError(f"`against` (={str(against)!r}) {rule}")
-    folder = ROOT / "runs" / "against" / found.stdout.strip()
-    if not folder.is_dir():
-        add = ["git", "worktree", "add", "--detach", str(folder), folder.name]
-        subprocess.run(add, cwd=ROOT, capture_output=True, check=True)
-    return folder
+    return against.absolute()
 
 
 class Worker:
