@@ -11,6 +11,7 @@ trainings lie under ``runs/bench_places``, named after the number, and one that 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -36,7 +37,7 @@ from agents.rollouts import make_envs
 from benchmarks.agents import CONFIGS, best_compensations, changed_config
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, side_by_side, table
 from benchmarks.isolated import ROOT
-from simulator import develop, exposure_ratio, get_camera, incident_ev100
+from simulator import develop, exposure_ratio, get_camera
 from simulator.radiance.incident_light import LARGEST_GAP, receptor_reading
 from simulator.radiance.light import reference_settings
 from simulator.raw.develop import srgb_encode
@@ -68,18 +69,17 @@ def posterior(split: Any, quick: bool) -> Row:
     for scene in polyhaven_scenes(request, views=4 if quick else MANY):
         known, told = scene.incident_light, replace(scene, illuminance=None).incident_light
         if (meter := told.reflected_ev100) is not None:
-            row: Row = {
-                "place": scene.group,
-                "deviations": (known.ev100 - told.ev100) / told.spread,
-            }
-            row |= {"light": known.ev100 - told.ev100, "light, meter": known.ev100 - meter}
-            row |= {"right": scene.ev100 - told.right_ev100.mean()}
-            rows.append(row | {"right, meter": scene.ev100 - meter})
-    frame = pd.DataFrame(rows)
+            errors = known.ev100 - told.ev100, known.ev100 - meter, scene.ev100 - meter
+            right = scene.ev100 - told.right_ev100.mean()
+            rows.append((scene.group, errors[0] / told.spread, *errors, right))
+    names = ("place", "deviation", "light", "light, meter", "right, meter", "right")
+    frame = pd.DataFrame(rows, columns=names)
     result: Row = {"split": split, "places": frame["place"].nunique(), "views": len(frame)}
-    result |= frame.filter(regex="light|right").pow(2).mean().pow(0.5).to_dict()
-    within = {f"{s:.0%}": frame["deviations"].abs() < norm.ppf(0.5 + s / 2) for s in SHARES}
-    return result | {name: float(inside.mean()) for name, inside in within.items()}
+    result |= {name: float(frame[name].pow(2).mean() ** 0.5) for name in names[2:]}
+    for share in SHARES:
+        within = frame["deviation"].abs() < norm.ppf(0.5 + share / 2)
+        result[f"{share:.0%}"] = float(within.mean())
+    return result
 
 
 def views_of_test_places(read: Any, count: int = VIEWS) -> Iterator[Scene]:
@@ -110,26 +110,28 @@ def _policies(seed: int, quick: bool) -> dict[str, Any]:
 
 def receptors(seed: int, quick: bool) -> list[Row]:
     """A row for each receptor and policy, and one for the right exposures of each receptor."""
-    policies, rows = _policies(seed, quick), []
+    policies, rows, count = _policies(seed, quick), list[Row](), 1 if quick else VIEWS
     for receptor, read in RECEPTORS.items():
-        scenes = [v.resized(RESOLUTION) for v in views_of_test_places(read, 1 if quick else VIEWS)]
-        exposed = [
-            (s.light * exposure_ratio(s.reference, reference_settings(s.ev100))).clamp(max=1.0)
-            for s in scenes
-        ]
-        lights = [s.incident_light for s in scenes]
-        gaps = np.array([i.ev100 - i.reflected_ev100 for i in lights if i.reflected_ev100])
-        row: Row = {"receptor": receptor, "above": -np.median(gaps), "views": len(scenes)}
-        row["moved"] = (np.abs(gaps) > LARGEST_GAP).mean()
-        row["white"] = np.mean([(x == 1.0).any(dim=0).float().mean() > WHITE for x in exposed])
-        row["black"] = np.mean([x[1:3].mean() < BLACK for x in exposed])
-        rows.append({name: getattr(v, "item", lambda v=v: v)() for name, v in row.items()})
+        scenes = [view.resized(RESOLUTION) for view in views_of_test_places(read, count)]
+        facts = pd.DataFrame(map(_right_exposure, scenes))
+        row: Row = {"receptor": receptor, "views": len(scenes), "above": facts["above"].median()}
+        rows.append(row | {name: facts[name].mean() for name in ("moved", "white", "black")})
         options = {"scenes": scenes, "split": "test", "resolution": RESOLUTION}
         result = evaluate(policies, options, episodes_per_scene=1 if quick else 4, seed=seed)
         gains = {name: result.group_gains(name) for name in policies}
         found = rank({name: own for name, (own, _) in gains.items()}, gains[METERS[0]][1])
         rows += [{"receptor": receptor, **own} for own in found.to_dict("records")]
     return rows
+
+
+def _right_exposure(scene: Scene) -> Row:
+    """How far above an average meter's it is [EV], before it is bounded, and what is shown."""
+    light, settings = scene.incident_light, reference_settings(scene.ev100)
+    signal = (scene.light * exposure_ratio(scene.reference, settings)).clamp(max=1.0)
+    above = None if light.reflected_ev100 is None else light.reflected_ev100 - light.ev100
+    row: Row = {"above": above, "moved": above is not None and abs(above) > LARGEST_GAP}
+    row["white"] = float((signal == 1.0).any(dim=0).float().mean()) > WHITE
+    return row | {"black": float(signal[1:3].mean()) < BLACK}
 
 
 def curve(places: int, seed: int, quick: bool) -> Row:
@@ -152,68 +154,70 @@ def curve(places: int, seed: int, quick: bool) -> Row:
 # -- pictures -------------------------------------------------------------------------------------
 
 
-def pictures(seed: int) -> tuple[Figure, Figure, list[Row]]:
-    """The contact sheet, the receptors in one of its views, and facts of its frames."""
-    read_at: list[Any] = []
+def pictures(seed: int) -> tuple[Figure, Figure]:
+    """The oracle's frames of some views, and the receptors where they disagree most of these."""
+    places: list[tuple[np.ndarray, float, float]] = []
+
+    def read(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
+        places.append((panorama, azimuth, pitch))
+        return dome_lux(panorama, azimuth, pitch)
+
     count = VIEWS * len(split_assets("polyhaven", "test"))
     drawn = np.random.default_rng(seed).choice(count, SHOWN, replace=False)
-    every = views_of_test_places(lambda *at: read_at.append(at) or dome_lux(*at))
-    views = [view for number, view in enumerate(every) if number in drawn]
-    options: Any = {"scenes": views, "split": "test", "resolution": SIZE, "observation": "linear"}
-    env: Any = gym.make("ae_env/AutoExposure-v0", render_mode="rgb_array", **options)
-    shown, rows = [], []
-    for number, (view, at) in enumerate(zip(views, np.sort(drawn), strict=True)):
-        env.reset(seed=seed, options={"scene": number})
-        state = env.unwrapped.score_table().oracle
-        raw, settings = env.step(state)[0]["raw"], env.unwrapped.grid[state]
-        row: Row = {"view": view.scene_id, "kind": view.kind, "settings": str(settings)}
-        row |= {"lux": view.illuminance, "off": view.ev100 + settings.log2_exposure}
-        row |= {"asked": view.incident_light.reflected_ev100 - view.ev100}
-        row |= {"white": float((raw >= 1.0).any(axis=0).mean()), "mean": float(raw[1:3].mean())}
-        shown.append(torch.from_numpy(env.render().copy()).permute(2, 0, 1))
-        rows.append(
-            row | {"flat": receptor_reading(*read_at[at], dome=False) / dome_lux(*read_at[at])}
-        )
-    titles = [f"{number}: {row['view']}" for number, row in enumerate(rows, 1)]
-    lines = [
-        dict(zip(titles[i : i + 4], shown[i : i + 4], strict=True)) for i in range(0, SHOWN, 4)
-    ]
-    most = int(np.argmax([abs(np.log2(row["flat"])) for row in rows]))
-    figure = receptor_figure(views[most], rows[most]["flat"], *read_at[np.sort(drawn)[most]])
-    return side_by_side(*lines), figure, rows
+    views = {n: view for n, view in enumerate(views_of_test_places(read)) if n in drawn}
+    options: Any = {"scenes": list(views.values()), "split": "test", "resolution": SIZE}
+    options |= {"observation": "linear", "render_mode": "rgb_array"}
+    env: Any = gym.make("ae_env/AutoExposure-v0", **options)
+    frames, flat = [], dict[int, float]()
+    for index, (number, view) in enumerate(views.items()):
+        env.reset(seed=seed, options={"scene": index})
+        raw = env.step(env.unwrapped.score_table().oracle)[0]["raw"]
+        white, mean = (raw >= 1.0).any(axis=0).mean(), raw[1:3].mean()
+        title = f"{view.scene_id}: {white:.0%} white, mean of green {mean:.2f}"
+        frames.append((title, torch.from_numpy(env.render().copy()).permute(2, 0, 1)))
+        readings = receptor_reading(*places[number], dome=False), dome_lux(*places[number])
+        flat[number] = math.log2(readings[0] / readings[1])
+    sheet = side_by_side(*(dict(frames[i : i + 4]) for i in range(0, SHOWN, 4)))
+    most = max(flat, key=lambda number: abs(flat[number]))
+    return sheet, receptor_figure(views[most], flat[most], *places[most])
 
 
 def receptor_figure(
     view: Scene, flat: float, panorama: np.ndarray, azimuth: float, pitch: float
 ) -> Figure:
-    """Both receptors, the dome over a panorama, and a view at the exposures that they ask for."""
+    """Both receptors, the dome over a panorama, and a view at the exposures that they ask for.
+
+    `flat` is how much more than the dome the flat receptor reads [EV].
+    """
     figure = Figure(figsize=(9.0, 5.6), dpi=100, layout="constrained")
-    polar = {"A": {"projection": "polar", "theta_offset": np.pi / 2}}
-    axes = figure.subplot_mosaic("ABB;CDE", per_subplot_kw=polar)  # type: ignore[arg-type]
+    polar: Any = {"A": {"projection": "polar", "theta_offset": np.pi / 2}}
+    axes = figure.subplot_mosaic("ABB;CDE", per_subplot_kw=polar)
     angles = np.linspace(0.0, 2.0 * np.pi, 361)
     axes["A"].plot(angles, (1.0 + np.cos(angles)) / 2.0, label="dome, (1 + cos) / 2")
     axes["A"].plot(angles, np.maximum(np.cos(angles), 0.0), "--", label="flat, cos")
     axes["A"].legend(fontsize=7, loc="lower center")
-    axes["A"].set_title("weight of light, by its angle to the camera", fontsize=9)
     light = torch.from_numpy(panorama / np.quantile(panorama, 0.95)).clamp(0.0, 1.0)
-    box = (-180.0, 180.0, -90.0, 90.0)
-    axes["B"].imshow(srgb_encode(light).permute(1, 2, 0).numpy(), extent=box)
-    longitude, latitude = np.meshgrid(np.linspace(-180, 180, 361), np.linspace(-90, 90, 181))
-    turned, up, tilt = (np.radians(v) for v in (longitude - azimuth, latitude, pitch))
-    cosine = np.cos(up) * np.cos(tilt) * np.cos(turned) + np.sin(up) * np.sin(tilt)
-    lines = axes["B"].contour(longitude, latitude, (1.0 + cosine) / 2.0, (0.25, 0.5, 0.75, 0.95))
-    axes["B"].clabel(lines, fontsize=7)
-    axes["B"].set_title("weight under a dome that points at the camera (inside 0.95)", fontsize=9)
-    ev100 = {"average meter": view.incident_light.reflected_ev100}
-    ev100["flat, C = 250"] = incident_ev100(view.illuminance * flat)
-    ev100["dome, C = 340"] = incident_ev100(view.illuminance)
-    for axis, (name, ev) in zip("CDE", ev100.items(), strict=True):
-        signal = view.light * exposure_ratio(view.reference, reference_settings(ev))
-        picture = develop(signal[None].clamp(0.0, 1.0), view.white_balance, CAMERA.colour_matrix)
-        axes[axis].imshow(picture[0].permute(1, 2, 0).numpy())
-        axes[axis].set_title(f"{name}: EV100 {ev:.1f}", fontsize=9)
-    for name in "BCDE":
+    shown, titles = {"B": srgb_encode(light)}, {"A": "weight of light by its angle to the camera"}
+    titles["B"] = "weight of light for a dome that points from the subject to the camera"
+    meter = view.incident_light.reflected_ev100 or view.ev100
+    dome = view.incident_light.ev100
+    asked = {"average meter": meter, "flat, C = 250": dome + flat, "dome, C = 340": dome}
+    for name, (title, ev100) in zip("CDE", asked.items(), strict=True):
+        signal = view.light * exposure_ratio(view.reference, reference_settings(ev100))
+        look = view.white_balance, CAMERA.colour_matrix
+        shown[name] = develop(signal.clamp(max=1.0)[None], *look)[0]
+        titles[name] = f"{title}: EV100 {ev100:.1f}"
+    for name, picture in shown.items():
+        box = (-180, 180, -90, 90) if name == "B" else None
+        axes[name].imshow(picture.permute(1, 2, 0).numpy(), extent=box)
         axes[name].set_axis_off()
+    across, up = np.meshgrid(np.linspace(-180, 180, 361), np.linspace(-90, 90, 181))
+    x, y, tilt = (np.radians(v) for v in (across - azimuth, up, pitch))
+    cosine = np.cos(y) * np.cos(tilt) * np.cos(x) + np.sin(y) * np.sin(tilt)
+    lines = axes["B"].contour(across, up, (1.0 + cosine) / 2.0, (0.25, 0.5, 0.75, 0.95))
+    axes["B"].clabel(lines, fontsize=7)
+    for name, title in titles.items():
+        axes[name].set_title(title, fontsize=9)
     return figure
 
 
@@ -223,10 +227,8 @@ def receptor_figure(
 def parts(seed: int, quick: bool, part: str | None = None) -> list[Part]:
     splits = ("validation", "test")
     found = [Part(f"posterior {s}", posterior, {"split": s}) for s in splits]
-    found += [
-        Part("receptors", receptors),
-        *(Part(f"curve {n}", curve, {"places": n}) for n in PLACES),
-    ]
+    found.append(Part("receptors", receptors))
+    found += [Part(f"curve {n}", curve, {"places": n}, threads=1) for n in PLACES]
     return [own for own in found if part is None or own.name.startswith(part)]
 
 
@@ -238,9 +240,6 @@ above an average meter's [EV] = {above:+.2f} | held by the bound = {moved:.0%} |
 white = {white:.0%} | black = {black:.1%}"""
 _CURVE = """places = {places} | those places = {train:.3f} | validation = {validation:.3f} |
 test = {test:.3f} | 95 % interval = {test_ci95[0]:.3f} to {test_ci95[1]:.3f}"""
-_SHEET = """view = {view} | kind = {kind} | light [lux] = {lux:.3g} | oracle = {settings} |
-above the right exposure [EV] = {off:+.2f} | right above average meter's [EV] = {asked:+.2f} |
-white = {white:.1%} | mean of green = {mean:.3f}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -248,7 +247,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     for name, own in results.items():
         kinds[name.partition(" ")[0]] += own if isinstance(own, list) else [own]
     covered, judged, curves = kinds.values()
-    sheet, figure, facts = pictures(meta["seed"])
+    sheet, figure = pictures(meta["seed"])
     shares = "".join(f" | {s:.0%} interval = {{{s:.0%}:.1%}}" for s in SHARES)
     score = "score = {normalised_score:.3f} | rank = {place} | tier = {tier}"
     ranked = pivot([r for r in judged if "policy" in r], "policy = {policy}", "{receptor}", score)
@@ -257,13 +256,11 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "asked": table([row for row in judged if "policy" not in row], _ASKED),
         "ranks": ranked if judged else "",
         "curve": table(curves, _CURVE),
-        "sheet": table(facts, _SHEET),
     }
     image: Any = "incident_light.webp" if meta["quick"] else IMAGE
     texts = {name: text or "Not measured in this run." for name, text in tables.items()}
-    return Report(
-        [*covered, *judged, *curves, *facts], texts, figures={"places.webp": sheet, image: figure}
-    )
+    figures = {"places.webp": sheet, image: figure}
+    return Report([*covered, *judged, *curves], texts, figures=figures)
 
 
 run = benchmark("places", parts, report)
