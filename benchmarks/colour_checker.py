@@ -67,10 +67,6 @@ def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
         rows = slice(round(y - half), round(y + half) + 1)
         columns = slice(round(x - half), round(x + half) + 1)
         square = raw.data[:, rows, columns].double()
-        # A patch, not its frame: the spread inside is noise and shading.
-        spread = float((square.std(dim=(1, 2)) / square.mean(dim=(1, 2)).clamp(min=0.01)).max())
-        if spread > 0.35:
-            raise ValueError(f"patch {NAMES[index]!r} is not flat (spread {spread:.2f})")
         means[index] = square.mean(dim=(1, 2)).numpy()
     return means
 

@@ -90,8 +90,7 @@ def views_of_test_places(read: Any, count: int = VIEWS) -> Iterator[Scene]:
 
 
 def _context() -> PolicyContext:
-    options = {"split": "test", "resolution": RESOLUTION}
-    with closing(make_envs(options, num_envs=1, frames=1)) as envs:
+    with closing(make_envs({"resolution": RESOLUTION}, num_envs=1, frames=1)) as envs:
         return PolicyContext.from_envs(envs)
 
 
@@ -120,7 +119,7 @@ def receptors(seed: int, quick: bool) -> list[Row]:
         result = evaluate(policies, options, episodes_per_scene=1 if quick else 4, seed=seed)
         gains = {name: result.group_gains(name) for name in policies}
         found = rank({name: own for name, (own, _) in gains.items()}, gains[METERS[0]][1])
-        rows += [{"receptor": receptor, **own} for own in found.to_dict("records")]
+        rows += found.assign(receptor=receptor).to_dict("records")
     return rows
 
 
@@ -250,17 +249,16 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     sheet, figure = pictures(meta["seed"])
     shares = "".join(f" | {s:.0%} interval = {{{s:.0%}:.1%}}" for s in SHARES)
     score = "score = {normalised_score:.3f} | rank = {place} | tier = {tier}"
-    ranked = pivot([r for r in judged if "policy" in r], "policy = {policy}", "{receptor}", score)
+    ranked = [row for row in judged if "policy" in row]
     tables = {
         "posterior": table(covered, _COVERED + shares),
         "asked": table([row for row in judged if "policy" not in row], _ASKED),
-        "ranks": ranked if judged else "",
+        "ranks": pivot(ranked, "policy = {policy}", "{receptor}", score),
         "curve": table(curves, _CURVE),
     }
     image: Any = "incident_light.webp" if meta["quick"] else IMAGE
-    texts = {name: text or "Not measured in this run." for name, text in tables.items()}
     figures = {"places.webp": sheet, image: figure}
-    return Report([*covered, *judged, *curves], texts, figures=figures)
+    return Report([*covered, *judged, *curves], tables, figures=figures)
 
 
 run = benchmark("places", parts, report)

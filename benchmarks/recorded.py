@@ -299,9 +299,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     every = [row | {"title": METHODS[row["method"]]} for row in rows]
     by_stops = " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS)
     line = "scene, frames = {scene}, {source_ms} to {target_ms} ms"
-    by_plane = pivot(steps, line, "{plane}", "{median:.3f} ({least_squares:.3f})")
     tables = {
-        "ratios": by_plane if steps else "Not measured in this run.",
+        "ratios": pivot(steps, line, "{plane}", "{median:.3f} ({least_squares:.3f})"),
         "sets": table(sets, of_set + method + number + _COLUMNS + same + _TIME),
         "regret": table([regret], _REGRET),
         "by_stops": table(stops, of_set + method + by_stops),

@@ -106,17 +106,15 @@ def best_ev(seed: int) -> list[Row]:
 
     Of equal exposures it is the nearest to the incident light's; None where all are equal.
     """
-    best: dict[str, dict[str, float | None]] = {}
-    for scene_id, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
+    best: dict[str, list[float]] = {}
+    for _, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
         equal = OFFSETS[scores >= scores.max() - _EQUAL]
         nearest = float(equal[np.argmin(np.abs(equal))])
-        best.setdefault(name, {})[scene_id] = None if np.ptp(scores) < _EQUAL else nearest
+        best.setdefault(name, []).extend([nearest] * (np.ptp(scores) >= _EQUAL))
     rows = []
-    for name, by_scene in best.items():
-        known = [value for value in by_scene.values() if value is not None]
+    for name, known in best.items():
         row: Row = {"scorer": name, "median": float(np.median(known)) if known else None}
-        row |= {"lowest": min(known, default=None), "highest": max(known, default=None)}
-        rows.append(row | {"by_scene": by_scene})
+        rows.append(row | {"lowest": min(known, default=None), "highest": max(known, default=None)})
     return rows
 
 

@@ -74,7 +74,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     contents = "time [ms] = {ms:.2f} | memory [MiB] = {mib:.1f}"
     by_x = pivot(growth, "pixels = {x:,.0f}", "{curve}", contents)
     tables = {
-        "before": table(paired, COLUMNS) if paired else "Not measured in this run.",
+        "before": table(paired, COLUMNS),
         "steps": sections(steps, "{title}", lambda own: table(own, _STEPS)),
         "resets": table(more["resets"], _RESETS),
         "first-episode": table(more["cold_start"], _COLD),

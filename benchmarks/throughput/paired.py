@@ -119,6 +119,6 @@ def measure_paired(against: str, threads: int, quick: bool) -> list[Row]:
         row: Row = {"case": case, "threads": threads, "ratio_to_before": middle}
         row |= {"steps_per_second": 1.0 / now, "steps_per_second_before": 1.0 / then}
         row |= {"ratio_quartiles": [low, high], "max_difference": differences[case]}
-        own = {"ratio_min": min(ratios), "ratio_max": max(ratios), "rounds": len(pairs)}
-        rows.append(row | own)
+        row |= {"ratio_min": min(ratios), "ratio_max": max(ratios)}
+        rows.append(row | {"rounds": len(pairs)})
     return rows
