@@ -141,9 +141,8 @@ def measure_file(file: str) -> dict[str, Any]:
 
 def parts(seed: int, quick: bool) -> list[Part]:
     real_files("canon_crw_cc0")  # raises before any work
-    return [
-        Part(file, measure_file, {"file": file}) for file in list(FILES)[: 1 if quick else None]
-    ]
+    files = list(FILES)[: 1 if quick else None]
+    return [Part(file, measure_file, {"file": file}) for file in files]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:

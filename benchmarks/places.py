@@ -109,7 +109,7 @@ def _policies(seed: int, quick: bool) -> dict[str, Any]:
 
 def receptors(seed: int, quick: bool) -> list[Row]:
     """A row for each receptor and policy, and one for the right exposures of each receptor."""
-    policies, rows, count = _policies(seed, quick), list[Row](), 1 if quick else VIEWS
+    policies, rows, count = _policies(seed, quick), list[Any](), 1 if quick else VIEWS
     for receptor, read in RECEPTORS.items():
         scenes = [view.resized(RESOLUTION) for view in views_of_test_places(read, count)]
         facts = pd.DataFrame(map(_right_exposure, scenes))
@@ -174,8 +174,8 @@ def pictures(seed: int) -> tuple[Figure, Figure]:
         white, mean = (raw >= 1.0).any(axis=0).mean(), raw[1:3].mean()
         title = f"{view.scene_id}: {white:.0%} white, mean of green {mean:.2f}"
         frames.append((title, torch.from_numpy(env.render().copy()).permute(2, 0, 1)))
-        readings = receptor_reading(*places[number], dome=False), dome_lux(*places[number])
-        flat[number] = math.log2(readings[0] / readings[1])
+        readings = (read(*places[number]) for read in RECEPTORS.values())
+        flat[number] = -math.log2(next(readings) / next(readings))
     sheet = side_by_side(*(dict(frames[i : i + 4]) for i in range(0, SHOWN, 4)))
     most = max(flat, key=lambda number: abs(flat[number]))
     return sheet, receptor_figure(views[most], flat[most], *places[most])
@@ -224,8 +224,7 @@ def receptor_figure(
 
 
 def parts(seed: int, quick: bool, part: str | None = None) -> list[Part]:
-    splits = ("validation", "test")
-    found = [Part(f"posterior {s}", posterior, {"split": s}) for s in splits]
+    found = [Part(f"posterior {s}", posterior, {"split": s}) for s in ("validation", "test")]
     found.append(Part("receptors", receptors))
     found += [Part(f"curve {n}", curve, {"places": n}, threads=1) for n in PLACES]
     return [own for own in found if part is None or own.name.startswith(part)]

@@ -129,11 +129,9 @@ def _boreal(grid: ExposureGrid) -> list[Scene]:
     scenes = []
     for name in BRACKETS:
         frames = _bracket(name)
-        found = [estimate_nlf(frame.data) for frame in frames.values()]
-        shot, read = (
-            tuple(np.median([getattr(one, key) for one in found], axis=0).tolist())
-            for key in ("shot", "read")
-        )
+        estimates = map(estimate_nlf, (frame.data for frame in frames.values()))
+        found = np.median([(one.shot, one.read) for one in estimates], axis=0)
+        shot, read = map(tuple, found.tolist())
         camera = _BOREAL.with_nlf(100, NoiseLevelFunction(shot, read, source="blind, median of 6"))
         raws = (replace(frame, camera=camera) for frame in frames.values())
         scenes.append(merged_scene(name, enumerate(raws), grid, camera))
