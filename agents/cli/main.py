@@ -68,9 +68,7 @@ def bench(
     weights: Annotated[
         Path | None, Option(help="Of paper: measure these weights, and train nothing.")
     ] = None,
-    part: Annotated[
-        str | None, Option(help="Of transfer: agents or tables; by default both.")
-    ] = None,
+    part: Annotated[str | None, Option(help="Of places and transfer: one part of it.")] = None,
 ) -> None:
     """Run one of the measurements whose results are in docs/results.
 
@@ -94,11 +92,12 @@ def bench(
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)
 
 
-#: Benchmarks that take an option.
+#: Parts that can be run alone, and benchmarks that take an option.
+_PARTS = {"places": ("posterior", "receptors", "curve"), "transfer": ("agents", "tables")}
 _TAKES = {
     "against": ("throughput",),
     "folder": ("paper", "recorded"),
-    "part": ("transfer",),
+    "part": tuple(_PARTS),
     "weights": ("paper",),
 }
 
@@ -110,7 +109,7 @@ def _check_options(name: str, **options: Any) -> None:
             rule = f"is for {' and '.join(_TAKES[option])} only"
             raise ValueError(f"`{option}` (={str(value)!r}) {rule}")
     if "part" in options:
-        check_word("part", options["part"], ("agents", "tables"))
+        check_word("part", options["part"], _PARTS[name])
     if name == "paper" and "folder" not in options:
         raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
 
