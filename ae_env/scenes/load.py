@@ -116,7 +116,8 @@ def load_scenes(
             or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
-    if split == "validation" and spec != "polyhaven":
+    named = isinstance(spec, str | Path | Mapping)
+    if split == "validation" and named and spec != "polyhaven":
         raise ValueError(
             f"`split` (={split!r}) needs `scenes='polyhaven'`: no others have places for it"
         )
