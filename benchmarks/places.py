@@ -44,7 +44,7 @@ from simulator.raw.develop import srgb_encode
 
 CAMERA, RESOLUTION = get_camera("nikon_z6"), 64
 #: Views of a map that tell what the posterior covers, and the intervals that are looked at.
-MANY, SHARES = 48, (0.5, 0.8, 0.9, 0.95)
+MANY, SHARES = 16, (0.5, 0.8, 0.9, 0.95)
 METERS = ("average:tuned", "centre_weighted:tuned", "matrix:tuned", "average:P")
 #: Receptors in a panorama: lux of a flat receptor that asks for the same exposure.
 RECEPTORS: dict[str, Any] = {
