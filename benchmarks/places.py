@@ -1,8 +1,5 @@
 """Real places: the posterior of unknown light, other receptors than a dome, more training places.
 
-    ae-env bench places
-    ae-env bench places --part posterior
-
 ``posterior`` says what `simulator.radiance.incident_light.POSTERIOR` covers in views that it was
 not fitted on. ``receptors`` judges the same policies on the same views where another receptor tells
 the right exposure. ``curve`` trains the regression agent on 5 to all training places: finished
@@ -11,7 +8,6 @@ trainings lie under ``runs/bench_places``, named after the number, and one that 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -52,6 +48,8 @@ RECEPTORS: dict[str, Any] = {
     "flat, C = 250": partial(receptor_reading, dome=False),
     "dome, C = 250": receptor_reading,
 }
+#: Where a receptor is: a panorama of luminances, and azimuth and pitch that it points at [degrees].
+Place = tuple[np.ndarray, float, float]
 #: At the right exposure a view counts as white with more than this share of its pixels above white,
 #: and as black with a mean of green below the other.
 WHITE, BLACK = 0.15, 0.01
@@ -82,11 +80,24 @@ def posterior(split: Any, quick: bool) -> Row:
     return result
 
 
-def views_of_test_places(read: Any, count: int = VIEWS) -> Iterator[Scene]:
-    """The views of `polyhaven`, of which a receptor tells the illuminance; 256 x 256."""
+def views_of_test_places(count: int = VIEWS) -> Iterator[tuple[Scene, Place]]:
+    """The views of `polyhaven`, 256 x 256, and where the receptor is that tells their light."""
+    places: list[Place] = []
+
+    def read(*place: Any) -> float:
+        places[:] = [place]
+        return dome_lux(*place)
+
     for asset in split_assets("polyhaven", "test"):
         for view in asset_views(asset, CAMERA, size=SIZE, views=count, read=read):
-            yield add_layout(view)
+            yield add_layout(view), places[0]
+
+
+def read_by(receptor: str, view: Scene, place: Place) -> Scene:
+    """The same view, whose light another receptor tells."""
+    assert view.illuminance is not None
+    ratio = RECEPTORS[receptor](*place) / dome_lux(*place)
+    return replace(view, illuminance=view.illuminance * ratio)
 
 
 def _context() -> PolicyContext:
@@ -109,9 +120,11 @@ def _policies(seed: int, quick: bool) -> dict[str, Any]:
 
 def receptors(seed: int, quick: bool) -> list[Row]:
     """A row for each receptor and policy, and one for the right exposures of each receptor."""
-    policies, rows, count = _policies(seed, quick), list[Any](), 1 if quick else VIEWS
-    for receptor, read in RECEPTORS.items():
-        scenes = [view.resized(RESOLUTION) for view in views_of_test_places(read, count)]
+    policies, rows = _policies(seed, quick), list[Any]()
+    every = views_of_test_places(1 if quick else VIEWS)
+    views = [(view.resized(RESOLUTION), place) for view, place in every]
+    for receptor in RECEPTORS:
+        scenes = [read_by(receptor, *own) for own in views]
         facts = pd.DataFrame(map(_right_exposure, scenes))
         row: Row = {"receptor": receptor, "views": len(scenes), "above": facts["above"].median()}
         rows.append(row | {name: facts[name].mean() for name in ("moved", "white", "black")})
@@ -155,39 +168,28 @@ def curve(places: int, seed: int, quick: bool) -> Row:
 
 def pictures(seed: int) -> tuple[Figure, Figure]:
     """The oracle's frames of some views, and the receptors where they disagree most of these."""
-    places: list[tuple[np.ndarray, float, float]] = []
-
-    def read(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
-        places.append((panorama, azimuth, pitch))
-        return dome_lux(panorama, azimuth, pitch)
-
     count = VIEWS * len(split_assets("polyhaven", "test"))
     drawn = np.random.default_rng(seed).choice(count, SHOWN, replace=False)
-    views = {n: view for n, view in enumerate(views_of_test_places(read)) if n in drawn}
-    options: Any = {"scenes": list(views.values()), "split": "test", "resolution": SIZE}
+    views = [own for number, own in enumerate(views_of_test_places()) if number in drawn]
+    options: Any = {"scenes": [view for view, _ in views], "split": "test", "resolution": SIZE}
     options |= {"observation": "linear", "render_mode": "rgb_array"}
     env: Any = gym.make("ae_env/AutoExposure-v0", **options)
-    frames, flat = [], dict[int, float]()
-    for index, (number, view) in enumerate(views.items()):
+    frames = []
+    for index, (view, _) in enumerate(views):
         env.reset(seed=seed, options={"scene": index})
         raw = env.step(env.unwrapped.score_table().oracle)[0]["raw"]
         white, mean = (raw >= 1.0).any(axis=0).mean(), raw[1:3].mean()
         title = f"{view.scene_id}: {white:.0%} white, mean of green {mean:.2f}"
         frames.append((title, torch.from_numpy(env.render().copy()).permute(2, 0, 1)))
-        readings = (read(*places[number]) for read in RECEPTORS.values())
-        flat[number] = -math.log2(next(readings) / next(readings))
     sheet = side_by_side(*(dict(frames[i : i + 4]) for i in range(0, SHOWN, 4)))
-    most = max(flat, key=lambda number: abs(flat[number]))
-    return sheet, receptor_figure(views[most], flat[most], *places[most])
+    flat = RECEPTORS["flat, C = 250"]
+    apart = [abs(np.log2(flat(*place) / dome_lux(*place))) for _, place in views]
+    return sheet, receptor_figure(*views[int(np.argmax(apart))])
 
 
-def receptor_figure(
-    view: Scene, flat: float, panorama: np.ndarray, azimuth: float, pitch: float
-) -> Figure:
-    """Both receptors, the dome over a panorama, and a view at the exposures that they ask for.
-
-    `flat` is how much more than the dome the flat receptor reads [EV].
-    """
+def receptor_figure(view: Scene, place: Place) -> Figure:
+    """Both receptors, the dome over a panorama, and a view at the exposures that they ask for."""
+    panorama, azimuth, pitch = place
     figure = Figure(figsize=(9.0, 5.6), dpi=100, layout="constrained")
     polar: Any = {"A": {"projection": "polar", "theta_offset": np.pi / 2}}
     axes = figure.subplot_mosaic("ABB;CDE", per_subplot_kw=polar)
@@ -198,9 +200,9 @@ def receptor_figure(
     light = torch.from_numpy(panorama / np.quantile(panorama, 0.95)).clamp(0.0, 1.0)
     shown, titles = {"B": srgb_encode(light)}, {"A": "weight of light by its angle to the camera"}
     titles["B"] = "weight of light for a dome that points from the subject to the camera"
-    meter = view.incident_light.reflected_ev100 or view.ev100
-    dome = view.incident_light.ev100
-    asked = {"average meter": meter, "flat, C = 250": dome + flat, "dome, C = 340": dome}
+    asked = {"average meter": view.incident_light.reflected_ev100 or view.ev100}
+    for receptor in ("flat, C = 250", "dome, C = 340"):
+        asked[receptor] = read_by(receptor, view, place).incident_light.ev100
     for name, (title, ev100) in zip("CDE", asked.items(), strict=True):
         signal = view.light * exposure_ratio(view.reference, reference_settings(ev100))
         look = view.white_balance, CAMERA.colour_matrix
@@ -241,10 +243,9 @@ test = {test:.3f} | 95 % interval = {test_ci95[0]:.3f} to {test_ci95[1]:.3f}"""
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    kinds: dict[str, list[Row]] = {"posterior": [], "receptors": [], "curve": []}
-    for name, own in results.items():
-        kinds[name.partition(" ")[0]] += own if isinstance(own, list) else [own]
-    covered, judged, curves = kinds.values()
+    judged: list[Row] = results.pop("receptors", [])
+    covered = [own for name, own in results.items() if name.startswith("posterior")]
+    curves = [own for name, own in results.items() if name.startswith("curve")]
     sheet, figure = pictures(meta["seed"])
     shares = "".join(f" | {s:.0%} interval = {{{s:.0%}:.1%}}" for s in SHARES)
     score = "score = {normalised_score:.3f} | rank = {place} | tier = {tier}"
