@@ -178,8 +178,7 @@ def pictures(seed: int) -> tuple[Figure, Figure]:
     for index, (view, _) in enumerate(views):
         env.reset(seed=seed, options={"scene": index})
         raw = env.step(env.unwrapped.score_table().oracle)[0]["raw"]
-        white, mean = (raw >= 1.0).any(axis=0).mean(), raw[1:3].mean()
-        title = f"{view.scene_id}: {white:.0%} white, mean of green {mean:.2f}"
+        title = f"{view.scene_id}: {(raw >= 1.0).any(axis=0).mean():.0%}"
         frames.append((title, torch.from_numpy(env.render().copy()).permute(2, 0, 1)))
     sheet = side_by_side(*(dict(frames[i : i + 4]) for i in range(0, SHOWN, 4)))
     flat = RECEPTORS["flat, C = 250"]
@@ -233,8 +232,8 @@ def parts(seed: int, quick: bool, part: str | None = None) -> list[Part]:
 
 
 _COVERED = """views of = {split} places | places = {places} | views = {views} |
-light: meter's rule [EV] = {light, meter:.2f} | posterior = {light:.2f} |
-right exposure: meter's rule [EV] = {right, meter:.2f} | posterior = {right:.2f}"""
+light: meter's rule [EV] = {light, meter:.2f} | light: posterior = {light:.2f} |
+right exposure: meter's rule = {right, meter:.2f} | right exposure: posterior = {right:.2f}"""
 _ASKED = """right exposure by = {receptor} | views = {views} |
 above an average meter's [EV] = {above:+.2f} | held by the bound = {moved:.0%} |
 white = {white:.0%} | black = {black:.1%}"""
