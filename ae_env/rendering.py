@@ -92,7 +92,8 @@ def contact_sheet(
 
     One panel per ISO; in it the exposure time grows to the right and the f-number downwards. The
     frame of each capture shows its expected score, a star marks the oracle, and numbered lines show
-    which states policies chose, frame by frame.
+    which states policies chose, frame by frame. A `ValueError` if the grid has more states, or a
+    path leaves it, or `scene` is none.
 
     Args:
         scene: The scene, of any size and shape; large ones are averaged down first.
@@ -102,9 +103,6 @@ def contact_sheet(
         speed, defocus, movement: See `ae_env.scorers.captures.prepare_scene`.
         path: States that a policy went through, the start state first; or several by name.
         seed: Seed of the noise.
-
-    Raises:
-        ValueError: If the grid has more states, or a path leaves it, or `scene` is none.
     """
     check_type("scene", scene, Scene)
     camera = scene.camera if camera is None else camera

@@ -138,10 +138,8 @@ class CameraProfile:
         Log-log interpolation between calibrated ISOs, inside a conversion-gain segment. Outside,
         shot noise scales with ISO and read noise with its square, but for the rounding to digital
         numbers (1/12 DN^2), which is the same at each ISO; beyond the table
-        `NoiseLevelFunction.extrapolation` says how far.
-
-        Raises:
-            ValueError: If the profile has no noise calibration or `iso` is not positive.
+        `NoiseLevelFunction.extrapolation` says how far. A `ValueError` if the profile has no noise
+        calibration or `iso` is not positive.
         """
         if not self.nlf_by_iso:
             raise ValueError(
@@ -168,10 +166,8 @@ class CameraProfile:
     def read_noise(self, iso: float, box_factor: int = 1) -> ReadNoise:
         """Rows and tails of the read noise at `iso`, of averages of `box_factor` squared pixels.
 
-        Interpolated over log ISO inside a conversion-gain segment; outside the table the nearest.
-
-        Raises:
-            ValueError: If the profile has no such calibration or `iso` is not positive.
+        Interpolated over log ISO inside a conversion-gain segment; outside the table the nearest. A
+        `ValueError` if the profile has no such calibration or `iso` is not positive.
         """
         if not self.read_noise_by_iso:
             raise ValueError(

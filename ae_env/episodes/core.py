@@ -272,11 +272,10 @@ class EpisodeCore:
     def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Advances the episodes of `env_indices` (K,) by one frame, each with its action.
 
+        A `ValueError` if there is no such action; no episode advances then.
+
         Returns:
             (K,) bool, which episodes have ended with it.
-
-        Raises:
-            ValueError: If there is no such action; no episode advances then.
         """
         self.check_begun(env_indices)
         wrong = (actions < 0) | (actions >= self.num_actions)

@@ -97,6 +97,9 @@ def load_scenes(
 ) -> list[Scene]:
     """The scenes that `spec` names, of one split, all at one resolution.
 
+    A `ValueError` if `spec` names nothing known or no scene of `split`, if a file cannot be read,
+    or if a scene is smaller than `resolution`.
+
     Args:
         spec: What to load; the head of this module lists it.
         split: ``"train"``, ``"test"``, ``"all"``, or of "polyhaven" ``"validation"``. Source groups
@@ -110,10 +113,6 @@ def load_scenes(
 
     Returns:
         At least one scene, in a stable order, with unique ids.
-
-    Raises:
-        ValueError: If `spec` names nothing known or no scene of `split`, if a file cannot be read,
-            or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
     if split == "validation" and spec != "polyhaven":
@@ -301,7 +300,8 @@ def simulate_source_raw(
 
     The reference camera takes the raw as an average meter would have it, at an ISO drawn between
     100 and 6400: noise, white highlights and all. Captures are simulated from it by the neural
-    simulator, as in the paper.
+    simulator, as in the paper. A `ValueError` if the scene carries noise, or is too dark for a
+    meter.
 
     Args:
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
@@ -309,9 +309,6 @@ def simulate_source_raw(
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
             default.
         iso_range: See `iso`.
-
-    Raises:
-        ValueError: If the scene carries noise, or is too dark for a meter.
     """
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")

@@ -289,6 +289,8 @@ class Scene:
     def resized(self, resolution: int | None, crop: Crop = "box") -> Scene:
         """The central square of this scene at `resolution` packed pixels a side.
 
+        A `ValueError` if the scene is smaller than `resolution` or an argument is invalid.
+
         Args:
             resolution: Packed pixels R; None keeps the scene as it is.
             crop: ``"box"`` averages ``k * k`` pixels per plane, ``k = min(H, W) // R``;
@@ -298,9 +300,6 @@ class Scene:
             The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
             was averaged into it was. `defocus_map` is the root mean square, as second moments add,
             divided by k. Of `layout` it is the mean; a pixel is what most of it was.
-
-        Raises:
-            ValueError: If the scene is smaller than `resolution` or an argument is invalid.
         """
         check_word("crop", crop, get_args(Crop))
         if resolution is None:

@@ -241,8 +241,7 @@ class EvaluationPlan(Configuration):
 def load_plan(name: str | Path) -> EvaluationPlan:
     """The plan of a preset of ``configs/evaluation``, or of a YAML file of one's own.
 
-    Raises:
-        ValueError: If there is none, or an entry is unknown, out of range or no JSON value.
+    A `ValueError` if there is none, or an entry is unknown, out of range or no JSON value.
     """
     plan = load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
     plan.protocol()

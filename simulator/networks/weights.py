@@ -65,10 +65,8 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
     """Writes ``path.safetensors`` and ``path.json``, the card with the hash of the weights.
 
     The `modules` are what `build_modules` makes of `preset`; the entries of `card`, JSON values,
-    say how they were trained and what they score.
-
-    Raises:
-        ValueError: If the weights are not finite; nothing is written then.
+    say how they were trained and what they score. A `ValueError` if the weights are not finite;
+    nothing is written then.
     """
     check_finite(modules.state_dict())
     content = save({k: v.detach().cpu().contiguous() for k, v in modules.state_dict().items()})
@@ -93,9 +91,8 @@ def write_pair(path: Path, content: bytes, card: dict[str, Any]) -> None:
 def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors and the card that `write_pair` wrote; a card without a hash is not compared.
 
-    Raises:
-        ValueError: If a file cannot be read or is damaged, the card is no JSON object, or its hash
-            is not that of the weights.
+    A `ValueError` if a file cannot be read or is damaged, the card is no JSON object, or its hash
+    is not that of the weights.
     """
     card_file, file = sibling(path, ".json"), sibling(path, ".safetensors")
     given = f"`weights` (={str(path)!r})"
@@ -169,10 +166,8 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     """Trained modules, in evaluation mode, and their model card.
 
     `name` is one of `list_pretrained()`, or the path of a ``.safetensors`` file with its ``.json``.
-
-    Raises:
-        ValueError: If there is no such file, its hash is not the card's, or its tensors are not
-            those of the preset's networks.
+    A `ValueError` if there is no such file, its hash is not the card's, or its tensors are not
+    those of the preset's networks.
     """
     check_type("weights", name, str, Path)
     known = list_pretrained()

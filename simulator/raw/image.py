@@ -26,6 +26,9 @@ _SHARE, _ROWS = 128, 32
 class RawImage:
     """A raw photograph: packed sensor data with the settings and camera that took it.
 
+    A `ValueError` if the data has the wrong shape or dtype or is not finite, or another argument is
+    of the wrong type or out of range.
+
     Args:
         data: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative
             values are real.
@@ -36,10 +39,6 @@ class RawImage:
         white_balance: Gains of R, G, B that make a grey card grey, green 1.
         box_factor: Sensor pixels averaged per side into one pixel of `data`.
         metadata: Whatever else is known: file name, how the NLF was found, excess noise.
-
-    Raises:
-        ValueError: If the data has the wrong shape or dtype or is not finite, or another argument
-            is of the wrong type or out of range.
     """
 
     data: torch.Tensor
@@ -76,8 +75,7 @@ class RawImage:
     def noise(self) -> NoiseLevelFunction:
         """NLF of this raw's pixels: its own or its camera's, after the box averaging.
 
-        Raises:
-            ValueError: If neither is known.
+        A `ValueError` if neither is known.
         """
         nlf = self.nlf if self.nlf is not None else self.camera.nlf(self.settings.iso)
         return nlf.scaled(1.0 / self.box_factor**2)

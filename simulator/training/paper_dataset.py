@@ -267,10 +267,8 @@ def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImag
 
     The table has the columns that the authors' script for the camera writes. It records an exposure
     time as a camera does: one within 3 % of a nominal stop is read back as that stop. All captures
-    must be of one `packed_camera`: the files do not state levels.
-
-    Raises:
-        ValueError: If `folder` holds something already, or `raws` is empty or of another camera.
+    must be of one `packed_camera`: the files do not state levels. A `ValueError` if `folder` holds
+    something already, or `raws` is empty or of another camera.
     """
     folder = Path(folder).expanduser()
     if folder.exists() and any(folder.iterdir()):
