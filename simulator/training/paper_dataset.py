@@ -16,7 +16,6 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -43,7 +42,7 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import read_bounded, refuse_bomb, sibling, write_atomically
+from simulator.utils.files import read_bounded, refuse_bomb, sibling
 
 logger = logging.getLogger(__name__)
 
@@ -61,9 +60,6 @@ TEST_SHARE = 0.1
 _GREY = 0.119
 #: Most bytes of captures in memory; one of 4 x 512 x 768 takes 6 million.
 _CACHED = 2**31
-
-#: What the files do not state of a camera.
-_LAYOUT = attrgetter("name", "cfa", "black_level", "white_level")
 
 Balance = tuple[float, float, float]
 
@@ -257,45 +253,6 @@ def _white_balances(table: Path) -> dict[PurePosixPath, Balance]:
         return {}
     values = {_path(row["path"]): _numbers(row["AsShotNeutral"]) for row in rows.to_dict("records")}
     return {p: (v[1] / v[0], 1.0, v[1] / v[2]) for p, v in values.items() if _positive(v)}
-
-
-# -- writing --------------------------------------------------------------------------------------
-
-
-def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImage]) -> None:
-    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``, in a new folder.
-
-    The table has the columns that the authors' script for the camera writes. It records an exposure
-    time as a camera does: one within 3 % of a nominal stop is read back as that stop. All captures
-    must be of one `packed_camera`: the files do not state levels. A `ValueError` if `folder` holds
-    something already, or `raws` is empty or of another camera.
-    """
-    folder = Path(folder).expanduser()
-    if folder.exists() and any(folder.iterdir()):
-        raise ValueError(f"`folder` (={str(folder)!r}) must be new or empty")
-    layouts = {_LAYOUT(raw.camera) for raw in raws}
-    if len(layouts) != 1 or layouts != {_LAYOUT(packed_camera(raws[0].camera.name))}:
-        raise ValueError(f"`raws` (of {layouts or None}) must be captures of one `packed_camera`")
-    nikon = raws[0].camera.name == "nikon_z6"
-    # The Nikon's noise profile has its greens averaged, the Canon's all planes.
-    groups: list[tuple[int, ...]] = [(0,), (1, 2), (3,)] if nikon else [(0, 1, 2, 3)]
-    rows: list[dict[str, object]] = []
-    for index, raw in enumerate(raws):
-        stem, settings, content = f"capture_{index:03d}", raw.settings, io.BytesIO()
-        np.save(content, raw.data.detach().cpu().numpy()[[0, 1, 3, 2]], allow_pickle=False)
-        write_atomically(folder / f"{stem}.npy", content.getvalue())
-        row: dict[str, object] = {"path": f"{folder.name}/{stem}.jpg"}
-        row |= {"time": settings.exposure_time, "iso": settings.iso, "aperture": settings.f_number}
-        if nikon:
-            row["wb"] = [*raw.white_balance, 0.0]
-        means = [
-            sum(values[i] for i in planes) / len(planes)
-            for planes in groups
-            for values in (raw.noise.shot, raw.noise.read)
-        ]
-        rows.append(row | {"noiseprofile": " ".join(map(repr, means))})
-    table = pd.DataFrame(rows).to_csv(index=False, lineterminator="\r\n")
-    write_atomically(folder / PARAMETERS, table)
 
 
 # -- training -------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file, save
 from torch import nn
 
+import examples.convert_ncs as convert_ncs
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks import weights
 from simulator.networks.network_cache import NetworkCache
@@ -283,7 +284,6 @@ def test_an_implausible_result_on_disk_is_made_again(wrong: torch.Tensor, folder
 #: Planes R, G1, G2, B as R, G1, B, G2, and back.
 SWAP = [0, 1, 3, 2]
 F11, F4 = 2.0 ** (7 / 2), 4.0
-DOCS = Path(__file__).parents[3] / "docs" / "networks.md"
 
 
 @pytest.fixture(scope="module")
@@ -293,15 +293,14 @@ def released() -> dict[str, nn.Module]:
 
 @pytest.fixture(scope="module")
 def converted(released: dict[str, nn.Module], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the script of docs/networks.md makes of the authors' checkpoints."""
+    """What `examples/convert_ncs.py` makes of the authors' checkpoints."""
     folder = tmp_path_factory.mktemp("demo")
     for name, module in released.items():
         held = nn.DataParallel(module) if name == "unet_model" else module
         torch.save({"model": held, "iteration": 544000}, folder / name)
-    script = re.search(r"needs the authors' files -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        exec(script[1], {})
+        convert_ncs.main()
     return folder / "ncs.safetensors"
 
 
