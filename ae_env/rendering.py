@@ -31,6 +31,7 @@ FRAME_PIXELS = 256
 MAX_SHEET_STATES, THUMB_PIXELS, CAPTURE_PIXELS = 256, 104, 192
 #: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
 PATH_COLOURS = ("#D55E00", "#56B4E9", "#FFFFFF", "#CC79A7", "#009E73", "#0072B2", "#E69F00")
+_font: Any = ImageFont.load_default
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
 _BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
 _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
@@ -65,15 +66,11 @@ def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
     band = Image.new("RGBA", (picture.width, height), (0, 0, 0, 150))
     draw = ImageDraw.Draw(band)
     for i, line in enumerate(lines):
-        font = _fitting_font(draw, line, size, picture.width - size, least=6)
+        font = fitting_font(draw, line, size, picture.width - size, least=6)
         draw.text((size // 2, size // 4 + int(1.35 * size * i)), line, _INK, font)
     captioned = picture.convert("RGBA")
     captioned.alpha_composite(band, (0, picture.height - height))
     return captioned.convert("RGB")
-
-
-def _font(size: int) -> Any:
-    return ImageFont.load_default(size)
 
 
 def contact_sheet(
@@ -226,9 +223,9 @@ class _Sheet:
         height = bottom - 2 * _LABEL_HEIGHT + 58
         sheet = Image.new("RGB", (width, height), _BACKGROUND)
         draw = ImageDraw.Draw(sheet)
-        font = _fitting_font(draw, title[0], 20, width - 2 * _MARGIN)
+        font = fitting_font(draw, title[0], 20, width - 2 * _MARGIN)
         draw.text((_MARGIN, 14), title[0], _INK, font)
-        font = _fitting_font(draw, title[1], int(font.size) - 2, width - 2 * _MARGIN)
+        font = fitting_font(draw, title[1], int(font.size) - 2, width - 2 * _MARGIN)
         draw.text((_MARGIN, 44), title[1], _FAINT, font)
         self._draw_labels(draw)
         allowed = self.table.allowed
@@ -335,9 +332,10 @@ def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
     return [(column, row) for column, row in corners.tolist()]
 
 
-def _fitting_font(
+def fitting_font(
     draw: ImageDraw.ImageDraw, line: str, size: int, width: int, *, least: int = 9
 ) -> Any:
+    """The font of at most `size` in which `line` is at most `width` wide, or that of `least`."""
     while size > least and draw.textlength(line, _font(size)) > width:
         size -= 1
     return _font(size)

@@ -47,39 +47,25 @@ _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": 
 
 @dataclass
 class Frames:
-    """Observations, info and rewards of n episodes after a reset or a step.
+    """Observations, info and rewards of n episodes after a reset or a step."""
 
-    Args:
-        observation: Arrays by name, n long; new ones every time.
-        info: Columns of numbers by name, n long.
-            ``scene_id`` and ``modules`` are indices into `EpisodeCore.scene_ids` and
-            `AutoExposureBase.module_names`.
-        reward: (n,) float64.
-        raw: (n, 4, R, R) the whole frames, also where less of them is observed.
-    """
-
-    observation: dict[str, np.ndarray]
+    observation: dict[str, np.ndarray]  # arrays by name, n long; new ones every time
+    #: Columns of numbers by name, n long. ``scene_id`` and ``modules`` are indices into
+    #: `EpisodeCore.scene_ids` and `AutoExposureBase.module_names`.
     info: dict[str, Any]
-    reward: np.ndarray
-    raw: np.ndarray
+    reward: np.ndarray  # (n,) float64
+    raw: np.ndarray  # (n, 4, R, R) the whole frames, also where less of them is observed
 
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Frames that were just recorded, of the B environments `env_indices`.
-
-    Args:
-        statistics: Of the frames.
-        outputs: The frames (B, 4, R, R), by the names of `Task.outputs`.
-        gains: (B,) light relative to the scenes' own.
-        rows: (B, R) light of each row relative to that, or None; see `Captures`.
-    """
+    """Frames that were just recorded, of the B environments `env_indices`."""
 
     env_indices: np.ndarray
     statistics: FrameStatistics
-    outputs: Mapping[str, np.ndarray]
-    gains: np.ndarray
-    rows: np.ndarray | None
+    outputs: Mapping[str, np.ndarray]  # the frames (B, 4, R, R), by the names of `Task.outputs`
+    gains: np.ndarray  # (B,) light relative to the scenes' own
+    rows: np.ndarray | None  # (B, R) light of each row relative to that, or None; see `Captures`
 
 
 class Task:

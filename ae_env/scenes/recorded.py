@@ -27,7 +27,7 @@ from PIL import ExifTags, ImageOps
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, merge
-from ae_env.scenes.folder import read_table, scenes_of_split, visible_files
+from ae_env.scenes.folder import scenes_of_split, visible_files
 from ae_env.scenes.scene import Scene, SceneRequest
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -37,7 +37,13 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import marks_stops, read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
 from simulator.utils.checks import check_key, check_number
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, open_picture, printable
+from simulator.utils.files import (
+    PICTURE_SUFFIXES,
+    RAW_SUFFIXES,
+    open_picture,
+    printable,
+    read_table,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -419,17 +425,15 @@ def _read_tables(folder: Path) -> dict[Path | str, dict[str, float]]:
 
 def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
     """Name and settings of each row of a table."""
-    rows, columns = read_table(table)
-    names = {
-        what: next((c for c in known if c in columns), None) for what, known in _COLUMNS.items()
-    }
+    rows = read_table(table)
+    names = {what: next((c for c in known if c in rows), None) for what, known in _COLUMNS.items()}
     if names["file"] is None or not any(names[what] for what in _SETTINGS):
         raise ValueError(
-            f"{str(table)!r} (columns {columns}) must have the column file and one or more of iso, "
+            f"{str(table)!r} (columns {[*rows]}) must have the column file and one or more of iso, "
             "exposure_time and f_number"
         )
-    for number, row in enumerate(rows, start=2):
-        values = {what: (row[column] or "").strip() for what, column in names.items() if column}
+    for number, row in enumerate(rows.to_dict("records"), start=2):
+        values = {what: row[column].strip() for what, column in names.items() if column}
         try:
             settings = {name: parse_number(values[name]) for name in _SETTINGS if values.get(name)}
             # The states of ImageNet-ES are numbered.

@@ -210,14 +210,8 @@ class Scene:
     ) -> Scene:
         """A scene from a packed raw in an array.
 
-        Args:
-            packed: (4, H, W) float, planes R, G1, G2, B; 1.0 at sensor white, may exceed it.
-            reference: Settings at which `packed` is.
-            camera: Camera in whose colour space it is.
-            scene_id: Unique name.
-            group: Source group; `scene_id` by default.
-            nlf: Noise left in `packed`; none by default.
-            illuminance, white_balance, kind, fields: As in `Scene`.
+        `packed` is (4, H, W) float, planes R, G1, G2, B, 1.0 at sensor white, which it may exceed;
+        `group` is `scene_id` by default, `nlf` no noise. The others are the fields of `Scene`.
         """
         scene = cls(
             scene_id=scene_id,

@@ -41,18 +41,13 @@ _LEAST = 1e-12
 
 
 class HdrPicture(NamedTuple):
-    """Result of `hdr_picture`.
+    """Result of `hdr_picture`."""
 
-    Args:
-        radiance: (4, H, W) float32 packed light with little noise, 1.0 is the raw's white; what
-            was saturated there is an estimate.
-        fused: (3, 2H, 2W) float32 in [0, 1], sRGB: the bracket fused.
-        exposures: EV of the bracket's pictures relative to the raw.
-    """
-
+    #: (4, H, W) float32 packed light with little noise, 1.0 is the raw's white; what was saturated
+    #: there is an estimate.
     radiance: Tensor
-    fused: Tensor
-    exposures: tuple[float, ...]
+    fused: Tensor  # (3, 2H, 2W) float32 in [0, 1], sRGB: the bracket fused
+    exposures: tuple[float, ...]  # EV of the bracket's pictures relative to the raw
 
 
 def hdr_picture(

@@ -185,9 +185,8 @@ def main() -> None:
             more = "; run the same command again to continue" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
             # What is kept is written: a second Ctrl-C need not wait for the workers' end.
-            quit_at_once = partial(_quit, stop.code)
-            signal.signal(signal.SIGINT, quit_at_once)
-            signal.signal(signal.SIGTERM, quit_at_once)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, partial(_quit, stop.code))
         raise
 
 

@@ -35,22 +35,17 @@ ROWS = 200
 
 
 class AgentConfig(Configuration):
-    """A training of an agent, in an environment of a task; a forecaster needs none.
-
-    Args:
-        environment: Arguments of the environment.
-        max_episode_steps: Actions of an episode; by default those of the task.
-        num_envs: Episodes side by side.
-        training: Hyperparameters: `RegressionTraining`, `PPOTraining` or `ForecasterTraining`.
-    """
+    """A training of an agent, in an environment of a task; a forecaster needs none."""
 
     agent: Literal["regression", "ppo", "forecaster"]
     task: Literal["ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0"] = (
         "ae_env/AutoExposure-v0"
     )
-    environment: dict[str, Any] = Field(default_factory=dict)
+    environment: dict[str, Any] = Field(default_factory=dict)  # arguments of the environment
+    #: Actions of an episode; by default those of the task.
     max_episode_steps: int | None = Field(default=None, ge=1, le=10**6)
-    num_envs: int = Field(default=64, ge=1, le=4096)
+    num_envs: int = Field(default=64, ge=1, le=4096)  # episodes side by side
+    #: Hyperparameters: `RegressionTraining`, `PPOTraining` or `ForecasterTraining`.
     training: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")

@@ -183,21 +183,14 @@ def _bundled() -> dict[str, Callable[[], OpenedScene]]:
 
 @dataclass(frozen=True)
 class View:
-    """State and marks of one picture.
+    """State and marks of one picture."""
 
-    Args:
-        settings: Of the camera.
-        speed: Image speed [frame heights per second].
-        defocus: Diameter of the defocus disc at f/4 [pixel of a 64-pixel frame].
-        clipping: Whether clipped pixels are marked.
-        centre: Middle of the part shown pixel by pixel, down and to the right, as shares of the
-            upright picture; None for the whole frame.
-    """
-
-    settings: CameraSettings
-    speed: float = 0.0
-    defocus: float = 0.0
-    clipping: bool = False
+    settings: CameraSettings  # of the camera
+    speed: float = 0.0  # image speed [frame heights per second]
+    defocus: float = 0.0  # diameter of the defocus disc at f/4 [pixel of a 64-pixel frame]
+    clipping: bool = False  # whether clipped pixels are marked
+    #: Middle of the part shown pixel by pixel, down and to the right, as shares of the upright
+    #: picture; None for the whole frame.
     centre: tuple[float, float] | None = None
 
 

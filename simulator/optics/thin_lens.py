@@ -35,14 +35,10 @@ _STEP, _STEP_SHARE = 0.5, 0.25
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens, focused at one distance.
+    """A thin lens, focused at one distance."""
 
-    Args:
-        focal_length: Focal length [m], > 0.
-        focus_distance: Distance of the plane in focus [m], above the focal length; inf allowed.
-    """
-
-    focal_length: float = 0.05
+    focal_length: float = 0.05  # [m], > 0
+    #: Distance of the plane in focus [m], above the focal length; inf allowed.
     focus_distance: float = math.inf
 
     def __post_init__(self) -> None:

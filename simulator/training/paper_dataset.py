@@ -10,10 +10,8 @@ aperture on the output of the stages before. The target is the capture itself, w
 
 from __future__ import annotations
 
-import io
 import logging
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -42,7 +40,7 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import read_bounded, refuse_bomb, sibling
+from simulator.utils.files import read_table, refuse_bomb, sibling
 
 logger = logging.getLogger(__name__)
 
@@ -160,7 +158,7 @@ def _tables(name: str, folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[CapturedSequence]:
-    rows = _cells(table)
+    rows = read_table(table)
     if not set(COLUMNS) <= set(rows.columns):
         found, needed = (", ".join(names) for names in (rows.columns, COLUMNS))
         raise ValueError(f"`{table}` (columns: {found}) must have the columns {needed}")
@@ -186,20 +184,6 @@ def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[
     if not captures:
         raise ValueError(f"`{table}` ({len(rows)} rows) must list .npy files that are there")
     return [CapturedSequence(name, tuple(own)) for name, own in captures.items()]
-
-
-def _cells(table: Path) -> pd.DataFrame:
-    """The cells of a table as text; no rows and no columns for an empty file."""
-    how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
-    try:
-        with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
-            content = io.BytesIO(read_bounded(table))
-            frame = pd.read_csv(content, index_col=False, **how)  # no cells beyond the columns
-    except pd.errors.EmptyDataError:
-        return pd.DataFrame()
-    except (pd.errors.ParserError, OSError, UnicodeError) as error:
-        raise ValueError(f"`{table}` must be a CSV file in UTF-8: {error}") from error
-    return frame.rename(columns=str.strip)
 
 
 def _path(text: str) -> PurePosixPath:
@@ -248,7 +232,7 @@ def _noise_profile(numbers: tuple[float, ...]) -> NoiseLevelFunction:
 
 def _white_balances(table: Path) -> dict[PurePosixPath, Balance]:
     """Gains by path, from AsShotNeutral, if there is such a table."""
-    rows = _cells(table) if table.is_file() else pd.DataFrame()
+    rows = read_table(table) if table.is_file() else pd.DataFrame()
     if not {"path", "AsShotNeutral"} <= set(rows.columns):
         return {}
     values = {_path(row["path"]): _numbers(row["AsShotNeutral"]) for row in rows.to_dict("records")}
