@@ -27,7 +27,7 @@ from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
-from agents.cli.show import film, scorers, view
+from agents.cli.show import film, judge, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 from simulator import __version__
@@ -144,7 +144,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
-    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
+    *(view, judge, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
@@ -152,7 +152,7 @@ app.add_typer(scenes, name="scenes")
 
 #: Commands that go on where they were stopped.
 _RESUMING = {"quickstart", "evaluate", "bench", "scenes", "score-tables"}
-_RESUMING |= {"train", "train-simulator"}
+_RESUMING |= {"train", "train-simulator", "judge"}
 #: Errors about the user's options and files.
 _USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 #: Exit status after Ctrl-C, and after SIGTERM.
