@@ -12,28 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simulator.capture.decision import PEDESTAL
+from simulator.capture.decision import PEDESTAL as PEDESTAL
 from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
     import torch
 
     from simulator.camera import CameraProfile
-
-__all__ = [
-    "PEDESTAL",
-    "SENSOR_NOISE",
-    "SENSOR_RANGES",
-    "SETTINGS_RANGES",
-    "decode_observation",
-    "decode_sensors",
-    "decode_settings",
-    "encode_observation",
-    "encode_sensors",
-    "encode_settings",
-    "frame_statistics",
-    "linear_signal",
-]
 
 #: Fixed ranges of Av, Tv and Sv that map to [-1, 1].
 SETTINGS_RANGES = np.array([[0.0, 10.0], [-5.0, 15.0], [4.0, 17.0]])

@@ -253,16 +253,8 @@ class Scene:
         """A noise-free scene from linear light, taken into the camera's colours.
 
         Args:
-            rgb: (3, H, W), or (3, 2H, 2W) with `sampled`: linear light; see `camera_light`.
-            camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
-            illuminance: Light on the subject [lux], under which 1.0 is a perfectly white surface;
-                None where the scale is unknown.
-            ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped
-                at white, is set to 0.12.
-            illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`.
+            rgb, camera, illuminance, ev100, illuminant, sampled: See `camera_light`.
             kind: Sort of scene.
-            sampled: Whether the pixels of `rgb` are photosites; otherwise each becomes a packed
-                pixel, all four planes of it at one place.
             **fields: Further arguments of `from_array`, at least `scene_id`.
         """
         light, reference, white_balance = camera_light(

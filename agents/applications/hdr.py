@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from simulator import CameraSimulator, RawImage, render_srgb
 from simulator.raw.develop import srgb_from_camera, upright
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_number, import_extra
 from simulator.utils.files import write_atomically
 
 #: Ends and step of the bracket [EV].
@@ -118,21 +118,12 @@ def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
 
 def write_exr(path: str | Path, image: np.ndarray) -> Path:
     """Writes linear light (H, W, 3) as an EXR of 32-bit floats, for which OpenEXR is needed."""
-    openexr = import_openexr()
+    openexr = import_extra("OpenEXR", "hdr", "an EXR file")
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     with tempfile.TemporaryDirectory() as folder:  # OpenEXR writes to a path only
         file = Path(folder, "image.exr")
         openexr.File(header, {"RGB": np.ascontiguousarray(image)}).write(str(file))
         return write_atomically(Path(path), file.read_bytes())
-
-
-def import_openexr() -> Any:
-    """The module OpenEXR, or an `ImportError` that names the extra."""
-    try:
-        import OpenEXR
-    except ImportError:
-        raise ImportError("EXR files need OpenEXR: pip install 'ae-env[hdr]'") from None
-    return OpenEXR
 
 
 # -- exposure fusion ------------------------------------------------------------------------------

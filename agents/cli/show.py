@@ -12,6 +12,7 @@ from typer import Argument, Option
 from agents.cli import console
 from agents.cli.console import print_files, print_line, progress_bars
 from agents.cli.simulate import make_simulator
+from simulator.utils.checks import import_extra
 
 #: What is shown where nothing is named; `ae-env warm-up` draws it.
 DEFAULT_SCENES = "bundled:small"
@@ -47,9 +48,10 @@ def view(
 
     Example: `ae-env view IMG_0001.CRW`
     """
-    free_port, serve = _server("view")
+    import_extra("nicegui", "view", "`ae-env view`")
     from ae_env.scorers import make_scorer
     from agents.viewer.page import Options, show_page
+    from agents.viewer.server import free_port, serve
     from agents.viewer.viewed_scene import find_scenes
     from simulator.capture.decision import check_tolerance
 
@@ -62,19 +64,6 @@ def view(
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
     serve("ae-env view", partial(show_page, options), options.folder, port, open_browser)
-
-
-def _server(command: str) -> tuple[Any, Any]:
-    """`free_port` and `serve` of the viewer, or an error that says what is missing."""
-    try:
-        from agents.viewer.server import free_port, serve
-    except ModuleNotFoundError as error:
-        if error.name not in ("nicegui", "fastapi"):
-            raise
-        raise ImportError(
-            f"`ae-env {command}` needs the extra view: pip install 'ae-env[view]'"
-        ) from None
-    return free_port, serve
 
 
 def judge(
@@ -112,9 +101,10 @@ def judge(
         print_line(files[1].read_text(encoding="utf-8"))
         print_files({file.name: file for file in files})
         return
-    free_port, serve = _server("judge")
+    import_extra("nicegui", "view", "`ae-env judge`")
     from agents.viewer.judge_page import show_pairs
     from agents.viewer.page import PictureStore
+    from agents.viewer.server import free_port, serve
 
     path, port = out or Path("choices.csv"), free_port(port)
     console.check_outputs(out=(path, ".csv"))

@@ -300,9 +300,10 @@ def hdr(
     """
     from agents.applications import hdr as applied
     from simulator import read_raw
+    from simulator.utils.checks import import_extra
 
     applied.bracket_exposures(stops, step)
-    applied.import_openexr()
+    import_extra("OpenEXR", "hdr", "an EXR file")
     check_outputs(raw, out=(out, ".exr"), png=(png, ".png"))
     simulator = make_simulator(weights, device, cache)
     source = read_raw(raw, settings=source)

@@ -21,7 +21,7 @@ from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.regression import RegressionTraining, train_regression
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
-from simulator.utils.checks import check_word
+from simulator.utils.checks import check_word, import_extra
 from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
@@ -168,10 +168,8 @@ def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
 @contextmanager
 def _tensorboard(folder: Path) -> Iterator[Progress]:
     """Takes each report for TensorBoard's log in `folder`."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ImportError("a TensorBoard log needs: pip install 'ae-env[tensorboard]'") from error
+    import_extra("tensorboard", "tensorboard", "a TensorBoard log")
+    from torch.utils.tensorboard import SummaryWriter
 
     def log(done: int, total: int, values: dict[str, float]) -> None:
         for name, value in values.items():

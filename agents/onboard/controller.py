@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
-from simulator.utils.checks import check_flag, check_integer, check_number
+from simulator.utils.checks import check_flag, check_integer, check_number, import_extra
 from simulator.utils.files import as_path, read_bounded
 
 #: Entry of the file's metadata that holds the description, and the form that it has.
@@ -119,11 +119,7 @@ class Controller:
     """
 
     def __init__(self, path: str | Path, num_cameras: int = 1) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            how = "pip install onnxruntime, or the extra 'ae-env[onnx]'"
-            raise ImportError(f"a Controller needs ONNX Runtime: {how}") from error
+        onnxruntime = import_extra("onnxruntime", "onnx", "a Controller")
         given, file = f"`path` (={str(path)!r})", as_path(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # the network is small: threads cost more than they bring

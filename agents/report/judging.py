@@ -101,7 +101,7 @@ def draw_pairs(
 def read_choices(path: Path) -> pd.DataFrame:
     """One judge's pairs in a file, as texts; a `ValueError` if it is damaged."""
     found = read_table(path)
-    sound = {*FILLED, *WON} <= set(found) and len(found) > 0
+    sound = {*FILLED, "left", "right"} <= set(found) and len(found) > 0
     if sound:
         waits = found.choice == ""
         known = set(found.choice) <= {*WON, ""} and waits.is_monotonic_increasing
@@ -199,9 +199,11 @@ def exposure_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
         drawn = group_weights(len(groups), RESAMPLES, 0)[:, group]
         found = bradley_terry(np.tensordot(drawn, wins, axes=1))
         ends = np.quantile(found, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0).T.tolist()
-    own = [group[(left == i) | (right == i)] for i in range(len(names))]
-    rows = zip([f"{stop:+.0f} EV" for stop in names], bradley_terry(wins.sum(0)), ends, own)
-    return [_row("exposure", *row) for row in rows]
+    values, rows = bradley_terry(wins.sum(0)), []
+    for i, stop in enumerate(names):
+        own = group[(left == i) | (right == i)]
+        rows.append(_row("exposure", f"{stop:+.0f} EV", values[i], ends[i], own))
+    return rows
 
 
 def scorer_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:

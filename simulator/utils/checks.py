@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import math
 import reprlib
 import sys
@@ -21,6 +22,14 @@ def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: fl
     """
     near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=cutoff)
     return f"; did you mean {mark}{near[0]}{mark}?" if near else ""
+
+
+def import_extra(name: str, extra: str, what: str) -> Any:
+    """The module `name`; an `ImportError` without it says which extra `what` needs."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(f"{what} needs {name}: pip install 'ae-env[{extra}]'") from error
 
 
 def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -> None:
