@@ -15,7 +15,6 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scorers.registry import describe_scorers, make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
-from agents.evaluation.evaluation_plan import digest
 from agents.evaluation.intervals import LEVEL, MIN_GROUPS, group_weights, score_interval
 from agents.evaluation.metrics import group_means
 from agents.policy import Floats
@@ -23,8 +22,8 @@ from agents.report.evaluation import to_markdown
 from simulator import __version__, get_camera
 from simulator.utils.files import read_table, result_meta, write_atomically, write_results
 
-#: Columns that a judge fills; the others, which `plan` is a digest of, make the pair again.
-FILLED = ("judge", "plan", "choice", "seconds", "version")
+#: Columns that a choice fills; the others make the pair again.
+FILLED = ["choice", "seconds", "version"]
 #: Camera that takes the frames, its states, and their EV100 in whole stops.
 CAMERA, GRID = "nikon_z6", ExposureGrid.default()
 STOPS = np.round(GRID.ev100).astype(int)
@@ -99,21 +98,12 @@ def draw_pairs(
 
 
 def read_choices(path: Path) -> pd.DataFrame:
-    """One judge's pairs in a file, as texts; a `ValueError` if it is damaged."""
+    """One judge's pairs in a file, as texts; a `ValueError` if it is none."""
     found = read_table(path)
-    sound = {*FILLED, "left", "right"} <= set(found) and len(found) > 0
-    if sound:
-        waits = found.choice == ""
-        known = set(found.choice) <= {*WON, ""} and waits.is_monotonic_increasing
-        sound = known and set(found.plan) == {_plan(found)} and found.judge.nunique() == 1
-    if not sound:
+    used = {*FILLED, "judge", "pair", "scene_id", "group", "content", "ev100", "left", "right"}
+    if not used <= set(found) or not set(found.choice) <= {*WON, ""} or found.judge.nunique() != 1:
         raise ValueError(f"`choices` (={str(path)!r}) must be a whole file of `ae-env judge`")
     return found
-
-
-def _plan(pairs: pd.DataFrame) -> str:
-    own = pairs.drop(columns=[*FILLED], errors="ignore")
-    return digest([*own], own.to_numpy().tolist())
 
 
 class Judging:
@@ -134,20 +124,17 @@ class Judging:
         if path.exists():
             self.pairs = read_choices(path)
         else:
-            pairs = draw()
-            self._write(
-                pairs.assign(judge=judge, plan=_plan(pairs), **dict.fromkeys(FILLED[2:], ""))
-            )
-        known = {scene_id: scene.content for scene_id, scene in library.items()}
-        shown = zip(self.pairs.scene_id, self.pairs.content, strict=True)
-        if self.pairs.judge[0] != judge or any(known.get(name) != own for name, own in shown):
+            self._write(draw().assign(judge=judge, **dict.fromkeys(FILLED, "")))
+        known = pd.Series({scene_id: scene.content for scene_id, scene in library.items()})
+        same = self.pairs.scene_id.map(known) == self.pairs.content
+        if self.pairs.judge[0] != judge or not same.all():
             rule = f"must have pairs of these scenes by {judge!r}, or not be there yet"
             raise ValueError(f"`out` (={str(path)!r}) {rule}")
 
     @property
     def done(self) -> int:
         """Pairs that are chosen from, and so the number of the next."""
-        return int((self.pairs.choice != "").sum())
+        return int((self.pairs.choice != "").cumprod().sum())
 
     def choose(self, number: int, choice: str, seconds: float) -> None:
         """Keeps the choice from pair `number`, unless that is no longer the next one."""
@@ -161,7 +148,7 @@ class Judging:
 
     def _fill(self, number: int, *values: str) -> None:
         pairs = self.pairs.copy()
-        pairs.loc[number, [*FILLED[2:]]] = values
+        pairs.loc[number, FILLED] = values
         self._write(pairs)
 
     def _write(self, pairs: pd.DataFrame) -> None:
@@ -191,18 +178,20 @@ def exposure_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
     stops = np.floor(choices.ev100.astype(float).to_numpy()[:, None] - shown + 0.5)
     names, items = np.unique(stops, return_inverse=True)  # brighter is more
     (left, right), won = items.reshape(stops.shape).T, choices.choice.map(WON).to_numpy()
-    wins, each = np.zeros((len(won), len(names), len(names))), np.arange(len(won))
-    wins[each, left, right], wins[each, right, left] = won, 1.0 - won
     groups, group = np.unique(choices.group, return_inverse=True)
-    ends: list[Any] = [None] * len(names)
+    wins = np.zeros((len(groups), len(names), len(names)))
+    np.add.at(wins, (group, left, right), won)
+    np.add.at(wins, (group, right, left), 1.0 - won)
+    values, ends = bradley_terry(wins.sum(0)), [None] * len(names)
     if len(groups) >= MIN_GROUPS:
-        drawn = group_weights(len(groups), RESAMPLES, 0)[:, group]
-        found = bradley_terry(np.tensordot(drawn, wins, axes=1))
-        ends = np.quantile(found, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0).T.tolist()
-    values, rows = bradley_terry(wins.sum(0)), []
+        drawn = np.tensordot(group_weights(len(groups), RESAMPLES, 0), wins, axes=1)
+        ends = np.quantile(
+            bradley_terry(drawn), [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0
+        ).T.tolist()
+    rows = []
     for i, stop in enumerate(names):
         own = group[(left == i) | (right == i)]
-        rows.append(_row("exposure", f"{stop:+.0f} EV", values[i], ends[i], own))
+        rows.append(_row(f"{stop:+.0f} EV", values[i], ends[i], own))
     return rows
 
 
@@ -212,41 +201,43 @@ def scorer_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
     Pairs judged equal are left out; two frames that a scorer rates alike are half an agreement.
     """
     decided = choices[choices.choice != "equal"]
-    if decided.empty:
-        raise ValueError("`choices` must have a pair that was not judged equal")
     won, groups, rows = decided.choice.map(WON).to_numpy(), decided.group.to_numpy(), []
     count = np.unique(groups, return_counts=True)[1].astype(float)
-    for name in (name.removesuffix(":left") for name in choices if name.endswith(":left")):
+    for name in choices.filter(like=":left").columns.str.removesuffix(":left"):
         gain = decided[f"{name}:left"].astype(float) - decided[f"{name}:right"].astype(float)
         agreed = 0.5 + np.where(np.abs(gain) > TIE, (won - 0.5) * np.sign(gain), 0.0)
         found = score_interval(group_means(agreed, groups) * count, count)
-        rows.append(_row("scorer", name, found.value, found.pair, groups))
+        rows.append(_row(name, found.value, found.pair, groups))
     return sorted(rows, key=lambda row: -row["value"])
 
 
-def _row(kind: str, name: str, value: float, ci95: Any, groups: Any) -> dict[str, Any]:
-    row = {"kind": kind, "name": name, "value": value, "ci95": ci95}
+def _row(name: str, value: float, ci95: Any, groups: Any) -> dict[str, Any]:
+    row = {"name": name, "value": value, "ci95": ci95}
     return {**row, "choices": len(groups), "num_groups": len(np.unique(groups))}
 
 
 def write_fit(files: Sequence[Path], out: Path, command: str) -> list[Path]:
     """Write what the choices in `files` tell: ``judging.json`` and ``judging.md``.
 
-    A `ValueError` if a file is damaged or given twice, or nothing is chosen in any.
+    A `ValueError` if a file is damaged or given twice, or holds no choice of one of two frames.
     """
     choices = pd.concat([read_choices(path) for path in files], ignore_index=True).dropna(axis=1)
+    twice = choices.duplicated(choices.columns.difference(FILLED)).any()
     choices = choices[choices.choice != ""]
-    if choices.empty or choices.duplicated(["plan", "judge", "pair"]).any():
-        rule = "must hold choices, and each of them once"
+    equal = int((choices.choice == "equal").sum())
+    if twice or equal == len(choices):
+        rule = "must hold choices that are not all equal, and each of them once"
         raise ValueError(f"`choices` (={[str(path) for path in files]}) {rule}")
-    told = {"strength": exposure_rows(choices), "agreement": scorer_rows(choices)}
-    judges, equal = sorted(set(choices.judge)), int((choices.choice == "equal").sum())
-    meta = {"judges": judges, "plans": sorted(set(choices.plan)), "equal": equal}
+    judges, rows = sorted(set(choices.judge)), []
     text = f"{len(choices)} choices by {', '.join(judges)}, {equal} of them equal.\n"
-    for value, rows in told.items():
-        columns = {rows[0]["kind"]: "{name}", value: "{value:.3f}", "95 % interval": "{ci95:.3f}"}
+    for kind, value, found in (
+        ("exposure", "strength", exposure_rows(choices)),
+        ("scorer", "agreement", scorer_rows(choices)),
+    ):
+        columns = {kind: "{name}", value: "{value:.3f}", "95 % interval": "{ci95:.3f}"}
         columns |= {"choices": "{choices}", "source groups": "{num_groups}"}
-        text += f"\n{to_markdown(rows, columns)}\n"
-    rows = [*told["strength"], *told["agreement"]]
-    results = write_results(out / "judging.json", rows, result_meta(command, None) | meta)
+        text += f"\n{to_markdown(found, columns)}\n"
+        rows += [{"kind": kind, **row} for row in found]
+    meta = result_meta(command, None) | {"judges": judges, "equal": equal}
+    results = write_results(out / "judging.json", rows, meta)
     return [results, write_atomically(out / "judging.md", text)]

@@ -33,7 +33,7 @@ async def show_pairs(judging: Judging, scenes: Mapping[str, Scene], store: Pictu
     ui.label("← left, → right, ↓ or space: equal, backspace: undo the last").classes("note")
 
     def developed(number: int) -> list[str]:
-        pair = judging.pairs.loc[number]
+        pair: Any = judging.pairs.loc[number]
         viewed = ViewedScene(OpenedScene(scenes[pair.scene_id]), CameraSimulator(device="cpu"))
         views = [View(GRID[int(pair[side])]) for side in ("left", "right")]
         return [store.address(viewed.picture(view).jpeg) for view in views]
