@@ -37,7 +37,7 @@ from simulator.training.crops import ReferencePairs
 from simulator.utils.files import sibling
 
 COMMANDS = (
-    *("bench", "cache", "evaluate", "export", "film", "hdr"),
+    *("bench", "cache", "evaluate", "export", "film", "hdr", "judge"),
     *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate", "sweep"),
     *("train", "train-simulator", "view", "warm-up"),
 )

@@ -348,7 +348,7 @@ def test_cells_that_are_no_value_and_files_that_are_no_raw_are_named(tmp_path):
             read_dataset(tmp_path)
     table = tmp_path / "camera_params.csv"
     table.write_text(table.read_text() + '"s/a.jpg,1\n')  # a quotation that does not end
-    with pytest.raises(ValueError, match=r"camera_params\.csv` must be a CSV"):
+    with pytest.raises(ValueError, match=r"camera_params\.csv' must be a CSV"):
         read_dataset(tmp_path)
     file, pickled = tmp_path / "a.npy", np.array([{}], dtype=object)  # nothing pickled is run
     author_table(table, NIKON, [*nikon_row("a.jpg"), ""])  # a comma at the end
