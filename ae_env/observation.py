@@ -51,10 +51,9 @@ def encode_array(signal: np.ndarray) -> np.ndarray:
 def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     """What an image processor hands to its auto exposure, from 8-bit codes (N, 4, R, R) of frames.
 
-    Returns:
-        ``raw`` (N, 4, 12, 16) uint8: codes of the mean signal of each zone of each plane, in 12
-        rows and 16 columns; ``histogram`` (N, 128) float32: shares of all samples by code, two
-        codes a bin; ``clipped`` (N, 2) float32: shares at white and black, first and last code.
+    ``raw`` (N, 4, 12, 16) uint8: codes of the mean signal of each zone of each plane, in 12 rows
+    and 16 columns; ``histogram`` (N, 128) float32: shares of all samples by code, two codes a bin;
+    ``clipped`` (N, 2) float32: shares at white and black, first and last code.
     """
     height, width = codes.shape[-2:]
     rows, columns = (

@@ -40,12 +40,10 @@ _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
 def render_frame(
     raw: np.ndarray, scene: Scene, camera: CameraProfile, settings: CameraSettings, score: float
 ) -> np.ndarray:
-    """A capture of `scene`, developed, with its settings and score written on it.
+    """A capture developed, with its settings and score written on it, (H, W, 3) uint8 sRGB.
 
-    `raw` is (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals.
-
-    Returns:
-        (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
+    `raw` is (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals. It
+    is enlarged by a whole factor to at least 256 pixels.
     """
     image = developed(torch.from_numpy(linear_signal(raw[None], camera)), scene)[0]
     factor = -(-FRAME_PIXELS // min(image.shape[:2]))

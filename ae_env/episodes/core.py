@@ -107,9 +107,8 @@ class Task:
     ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
         """Applies the actions (K,).
 
-        Returns:
-            (K,) bool, which of them take a frame, or None for all; the episodes whose `displaced`
-            changed; and (K,) bool, which have ended.
+        Returned are (K,) bool, which of them take a frame, or None for all; the episodes whose
+        `displaced` changed; and (K,) bool, which have ended.
         """
         return None, env_indices[:0], np.zeros(len(env_indices), bool)
 
@@ -256,12 +255,9 @@ class EpisodeCore:
         self.task.forget(lights)
 
     def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Advances the episodes of `env_indices` (K,) by one frame, each with its action.
+        """Advances the episodes of `env_indices` (K,) by one frame; which end with it, (K,) bool.
 
         A `ValueError` if there is no such action; no episode advances then.
-
-        Returns:
-            (K,) bool, which episodes have ended with it.
         """
         self.check_begun(env_indices)
         wrong = (actions < 0) | (actions >= self.num_actions)

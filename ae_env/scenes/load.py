@@ -95,7 +95,7 @@ def load_scenes(
     resize: Resize = Scene.resized,
     grid: ExposureGrid | None = None,
 ) -> list[Scene]:
-    """The scenes that `spec` names, of one split, all at one resolution.
+    """The scenes that `spec` names, of one split, in a stable order, with unique ids.
 
     A `ValueError` if `spec` names nothing known or no scene of `split`, if a file cannot be read,
     or if a scene is smaller than `resolution`.
@@ -110,9 +110,6 @@ def load_scenes(
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
         resize: Called with each scene at its finest resolution, `resolution` and `crop`.
         grid: States of recorded grids; by default all that their captures have.
-
-    Returns:
-        At least one scene, in a stable order, with unique ids.
     """
     check_word("split", split, get_args(Split))
     if split == "validation" and spec != "polyhaven":

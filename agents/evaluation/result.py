@@ -271,16 +271,9 @@ def result_rows(
     """A row per policy and condition: `ROW_COLUMNS` and `MORE_COLUMNS`.
 
     The static condition gives rows ``"all"``, ``"hard"`` and ``"rest"`` (see
-    `EvaluationResult.parts`), every other one a row with its own name.
-
-    Args:
-        source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
-        split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
-        resamples: Bootstrap resamples of the interval.
-
-    Returns:
-        `ci95` is the 95 % interval of `normalised_score`, None below 15 source groups;
-        `ms_per_decision` is amortised over a batch of cameras.
+    `EvaluationResult.parts`), every other one a row with its own name. `source` and `split` are
+    those of the plan by default. `ci95` is the 95 % bootstrap interval of `normalised_score`, None
+    below 15 source groups; `ms_per_decision` is amortised over a batch of cameras.
     """
     results = as_results(results)
     static, rows = static_condition(results), []

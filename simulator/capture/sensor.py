@@ -286,9 +286,6 @@ def missing_variance(
         signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
         table: (4, 4), rows 1 to 4 of `exposure_table`, or (4,), its column for that plane.
         remaining_variance: (H, W) share of the source's variance that a blur left; None for all.
-
-    Returns:
-        float32, of the shape of `signal`.
     """
     shot, read, source_shot, source_read = (
         plane_tensor(row, signal.device) if row.ndim else row.item() for row in table
