@@ -323,7 +323,6 @@ def _draw_pill(draw: ImageDraw.ImageDraw, centre: tuple[int, int], label: str, c
 
 
 def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
-    """Corners of a five-pointed star."""
     angles = np.arange(10) * np.pi / 5
     radii = np.where(np.arange(10) % 2, 0.4 * radius, radius)
     corners = np.stack([x + radii * np.sin(angles), y - radii * np.cos(angles)], axis=1)

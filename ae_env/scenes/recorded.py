@@ -36,7 +36,7 @@ from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import marks_stops, read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
-from simulator.utils.checks import check_key, check_number
+from simulator.utils.checks import UNITS, check_key, check_number, parse_number
 from simulator.utils.files import (
     PICTURE_SUFFIXES,
     RAW_SUFFIXES,
@@ -74,7 +74,6 @@ _IN_NAMES = (
     ("exposure_time", re.compile(rf"^[_\-. ]*(1)_{_NUMBER} ?s(?![a-z])", re.I)),
     ("exposure_time", re.compile(rf"(?<![\d.]){_NUMBER} ?(s|ms|us)(?![a-z])", re.I)),
 )
-_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _FRAME = re.compile(r"frame[_-]?(\d+)", re.I)
 
 
@@ -394,8 +393,8 @@ def settings_in_name(name: str) -> tuple[dict[str, float], str]:
             continue
         number, *more = match.groups()
         value = float(number)
-        if more and more[0].lower() in _UNITS:
-            value *= _UNITS[more[0].lower()]
+        if more and more[0].lower() in UNITS:
+            value *= UNITS[more[0].lower()]
         elif more:  # one over it; 0 is no setting, which is said where the settings are made
             value = value / float(more[0]) if float(more[0]) else 0.0
         found[setting] = value
@@ -441,17 +440,6 @@ def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
             yield f"param_{parse_number(name):g}" if names["file"] == "idx" else name, settings
         except ValueError as error:
             raise ValueError(f"{str(table)!r}, line {number}: {error}") from error
-
-
-def parse_number(text: str) -> float:
-    """The number of ``"1/20"``, ``'0"4'`` (0.4 s), ``"f5.6"``, ``"200"`` or ``"8ms"``."""
-    plain = text.lower().removeprefix("f").removeprefix("/").replace('"', ".")
-    unit = next((u for u in ("ms", "us", "s") if plain.endswith(u)), "")
-    top, _, bottom = plain.removesuffix(unit).strip(" .").partition("/")
-    try:
-        return float(top) / float(bottom or 1) * _UNITS.get(unit, 1.0)
-    except (ValueError, ZeroDivisionError):
-        raise ValueError(f"{text!r} must be a number, such as 200, 1/125 or f5.6") from None
 
 
 def _in_file(path: Path) -> dict[str, float]:

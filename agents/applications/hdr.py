@@ -130,16 +130,12 @@ def write_exr(path: str | Path, image: np.ndarray) -> Path:
 
 
 def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
-    """Fuses a bracket to a picture (3, H, W) in [0, 1].
+    """Fuses a bracket of two or more pictures (3, H, W) float32 in [0, 1], sRGB, to one.
 
     A picture counts where it is bright if it is one of the darker ones, and where it is dark if it
     is one of the brighter ones; and more where its brightnesses are rare, so that it has contrast
-    there: where a picture is black or white, all of it has the same one.
-
-    Args:
-        pictures: N >= 2 pictures (3, H, W) float32 in [0, 1], sRGB, or a function that yields
-            them, always the same ones, called several times: a bracket of large pictures need
-            not be held at once. Fewer than 2 are a `ValueError`.
+    there: where a picture is black or white, all of it has the same one. A function that yields
+    the pictures is called several times: a bracket of large ones need not be held at once.
     """
     every = pictures if callable(pictures) else lambda: iter(pictures)
     means = torch.tensor([float(_luma(picture).mean()) for picture in every()])

@@ -118,11 +118,6 @@ def _check_options(name: str, **options: Any) -> None:
 class _Commands(TyperGroup):
     """The commands; errors of options say the value."""
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args[:1] == ["report"]:
-            ctx.fail("No such command 'report': `ae-env evaluate` writes the report.")
-        return super().resolve_command(ctx, args)
-
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)

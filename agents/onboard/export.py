@@ -70,13 +70,8 @@ class _PPOGraph(nn.Module):
 def export_agent(policy: Policy, path: str | Path) -> Path:
     """Writes an agent as one ONNX file: the observation goes in as it is, for any batch.
 
-    Args:
-        policy: A `RegressionPolicy` without foresight, or a `PPOPolicy` without a history, that
-            looks at pixels.
-
-    Raises:
-        ImportError: If the extra ``onnx`` is not installed.
-        ValueError: If the agent cannot be exported.
+    A `ValueError` unless it is a `RegressionPolicy` without foresight or a `PPOPolicy` without a
+    history, and looks at pixels; an `ImportError` without the extra ``onnx``.
     """
     file = Path(path)
     if file.suffix != ".onnx":

@@ -110,10 +110,9 @@ def _read_raw(path: Path, name: str, **settings: float) -> OpenedScene:
 def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({})) -> Library:
     """The library of what ``ae-env view`` was asked to show.
 
-    Args:
-        what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
-            (of a recorded grid the light that its captures tell together), or a bundled scene's id.
-        settings: Of all raws, in place of their files'.
+    That is a raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them (of
+    a recorded grid the light that its captures tell together), or a bundled scene's id. `settings`
+    are of all raws, in place of their files'.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")

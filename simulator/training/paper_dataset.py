@@ -137,11 +137,8 @@ def read_dataset(
     alone if the files lie beside the table: they begin where the preprocessing ran.
 
     `camera` is a profile, or a name that `packed_camera` knows; without it a table with a column
-    ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors' scripts write them.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If there is no table, no file, no such column, or a cell is no number.
+    ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors' scripts write them. A
+    `ValueError` if there is no table, no file, no such column, or a cell is no number.
     """
     found = (s for table in _tables("root", root) for s in _read_table(table, camera))
     return sorted(found, key=lambda sequence: sequence.name)
@@ -248,11 +245,8 @@ def split_dataset(
     """The sequences below `folder` to train on, and those held out.
 
     Where some of several tables lie in a folder with "test" in its name, as in the authors' data,
-    theirs are held out; otherwise a tenth of all sequences, drawn by `seed`, as in the paper.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If there is no table, or fewer than two sequences of two captures or more.
+    theirs are held out; otherwise a tenth of all sequences, drawn by `seed`, as in the paper. A
+    `ValueError` if there are fewer than two sequences of two captures or more.
     """
     named: dict[bool, list[CapturedSequence]] = {False: [], True: []}
     for table in _tables("folder", folder):
