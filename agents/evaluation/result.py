@@ -350,7 +350,7 @@ def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
 def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], quantile: float) -> float:
     """Least value at which the cumulated weight reaches `quantile` of the whole.
 
-    >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.2, 0.6]), 0.5)
+    >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.2, 0.6]), 0.8)
     2.0
     """
     order = np.argsort(values, axis=None)

@@ -185,14 +185,6 @@ def test_rows_and_pixels_share_the_variance(capture, level, k):
     assert found == pytest.approx(kurtosis(-0.05) / k**2 * share**2, abs=0.15)
 
 
-def test_a_noisy_source_lacks_a_part_of_each() -> None:
-    source = NoiseLevelFunction((0.0,) * 4, (0.6 * READ,) * 4)
-    frame = by_engine(0.0, 1, source)  # its light has no noise: only what is added shows
-    between = frame.mean(axis=2).var(axis=1) - frame.var(axis=2).mean(axis=1) / WIDTH
-    assert between.mean() == pytest.approx(0.4 * READ * ROW**2, rel=5 / math.sqrt(HEIGHT))
-    assert frame.var() == pytest.approx(0.4 * READ, rel=5 * math.sqrt(2 / HEIGHT))
-
-
 def test_more_is_added_where_a_blur_has_left_less() -> None:
     """Half of the frame is behind a disc of the bank's, which averages the source's noise."""
     source, half = NoiseLevelFunction((0.0,) * 4, (0.6 * READ,) * 4), WIDTH // 2

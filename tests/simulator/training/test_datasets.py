@@ -362,18 +362,6 @@ def test_cells_that_are_no_value_and_files_that_are_no_raw_are_named(tmp_path):
         capture.read()
 
 
-def test_what_cannot_be_written(tmp_path):
-    nikon, canon = captures("nikon_z6"), captures("canon_70d")
-    (tmp_path / "a.txt").write_text("words")
-    other_levels = [RawImage(canon[0].data, SETTINGS[0], get_camera("canon_70d"))]
-    with pytest.raises(ValueError, match="`folder`"):
-        write_packed_sequence(tmp_path, nikon)
-    for raws in ([], [*nikon, canon[0]], other_levels):  # would come back as another camera's
-        with pytest.raises(ValueError, match="`raws`"):
-            write_packed_sequence(tmp_path / "b", raws)
-    assert not (tmp_path / "b").exists()
-
-
 @pytest.mark.parametrize(("read", "name"), [(read_dataset, "root"), (split_dataset, "folder")])
 def test_what_is_no_dataset_is_refused(tmp_path, read, name):
     with pytest.raises(FileNotFoundError, match=f"`{name}`"):
