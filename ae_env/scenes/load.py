@@ -112,7 +112,8 @@ def load_scenes(
         grid: States of recorded grids; by default all that their captures have.
     """
     check_word("split", split, get_args(Split))
-    if split == "validation" and spec != "polyhaven":
+    named = isinstance(spec, str | Path | Mapping)
+    if split == "validation" and named and spec != "polyhaven":
         raise ValueError(
             f"`split` (={split!r}) needs `scenes='polyhaven'`: no others have places for it"
         )

@@ -371,6 +371,10 @@ def test_real_scenes_alone_and_mixed(data_dir):
         assert (scene.light.shape, scene.box_factor) == ((4, 36, 36), 7)
         assert 1e-3 < scene.illuminance <= 2.0 * polyhaven.ILLUMINANCE[scene.kind][1]
     check_oracles_are_spread(real)
+    scenes = load_scenes(real, "validation", camera=CAMERA, resolution=36)  # as an evaluation does
+    assert [s.scene_id for s in scenes] == [s.scene_id for s in real]
+    with pytest.raises(ValueError, match="needs `scenes='polyhaven'`"):
+        load_scenes("mixed", "validation", camera=CAMERA)
     drawn = [replace(real[0], scene_id=f"drawn-{i}", source="") for i in range(10)]
     mixed = polyhaven.mixed_scenes(request, drawn, polyhaven.split_assets("polyhaven", "test"))
     kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
