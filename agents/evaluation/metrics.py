@@ -97,10 +97,6 @@ def frames_to_converge(
 
     Frames count from `since`, such as that after a step of the light, as 1. Beside them is whether
     an episode converged; one that never does has all its frames, T - `since`.
-
-    >>> frames, _ = frames_to_converge(np.array([[2.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 2.0]]))
-    >>> frames.tolist()
-    [4, 4]
     """
     outside = errors > tolerance
     frames = errors.shape[-1]

@@ -152,9 +152,9 @@ def camera(row: float = ROW, shape: float = -0.05) -> CameraProfile:
     return CameraProfile("round", "RGGB", 3000, 3000 + SPAN, 14, **tables)
 
 
-def by_engine(level: float, k: int, source: NoiseLevelFunction = ZERO) -> np.ndarray:
+def by_engine(level: float, k: int) -> np.ndarray:
     light = torch.full((4, HEIGHT, WIDTH), level)
-    scene = PreparedScene(light, BASE, camera(), source, box_factor=k)
+    scene = PreparedScene(light, BASE, camera(), ZERO, box_factor=k)
     return scene.expose([BASE], seed=5, noise="sensor")[0].double().numpy()
 
 
