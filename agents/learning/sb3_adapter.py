@@ -123,6 +123,29 @@ class ShiftedFrames(VecEnvWrapper):
         return {**observations, "raw": random_shift(observations["raw"], self.rng)}
 
 
+class WithRightExposure(VecEnvWrapper):
+    """Adds ``right_ev100`` (1,) to the observations, for a loss: no policy sees it."""
+
+    def __init__(self, venv: VecEnv) -> None:
+        assert isinstance(venv.observation_space, gym.spaces.Dict)
+        box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        space = gym.spaces.Dict({**venv.observation_space.spaces, "right_ev100": box})
+        super().__init__(venv, space)
+
+    def reset(self) -> Any:
+        """Begins an episode in every environment."""
+        return self._with(self.venv.reset())
+
+    def step_wait(self) -> Any:
+        """Takes the step."""
+        observations, *rest = self.venv.step_wait()
+        return self._with(observations), *rest
+
+    def _with(self, observations: Any) -> dict[str, np.ndarray]:
+        right = np.array(self.venv.env_method("right_ev100"), np.float32)
+        return {**observations, "right_ev100": right[:, None]}
+
+
 class WithHistory(VecEnvWrapper):
     """Adds the ``history`` of so many `frames` to the observations, see `MeterHistory`."""
 
