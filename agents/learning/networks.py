@@ -250,7 +250,7 @@ class StateHead(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """EV100 (B,) of the right exposure, and the standard deviation of what is likely [EV].
 
-        The features say by how much it differs from what an average meter reads.
+        The features say by how much it differs from what an average meter of all colours reads.
         """
         gap, spread = self.right(features).unbind(dim=1)
         metered = (light[:, : len(_BINS)] @ self.luminance).log2() - _MEAN_SIGNAL

@@ -101,13 +101,18 @@ class _WithLoss(torch.autograd.Function):
         return tensor.view_as(tensor)
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Gradients of `tensor` and `loss`."""
         return gradient, gradient.new_ones(())
 
 
 class ExposureActorCritic(MultiInputActorCriticPolicy):
-    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits."""
+    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits.
+
+    `ev_coef` is the weight of the loss of the right exposure.
+    """
+
+    action_net: _StateLogits
 
     def __init__(
         self,
@@ -118,10 +123,11 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         grid: ExposureGrid,
         width: int = 256,
         trained_on: ExposureGrid | None = None,
+        ev_coef: float = 0.0,
         use_sde: bool = False,
     ) -> None:
         self.grid, self.width, self.trained_on = grid, width, trained_on
-        self.ev_coef = 0.0
+        self.ev_coef = ev_coef
         super().__init__(
             observation_space,
             action_space,
@@ -151,7 +157,7 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         entropy = distribution.entropy()
         if self.ev_coef > 0.0 and entropy is not None:
             loss = self.action_net.loss(extracted, obs["right_ev100"][:, 0])
-            entropy = _WithLoss.apply(entropy, self.ev_coef * loss)
+            entropy = _WithLoss.apply(entropy, self.ev_coef * loss)  # type: ignore[no-untyped-call]
         return self.value_net(of_value), distribution.log_prob(actions), entropy
 
 
@@ -265,12 +271,15 @@ def train_ppo(
         ExposureActorCritic,
         WithRightExposure(seen) if training.ev_coef else seen,
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
-        policy_kwargs={"grid": context.grid, "width": training.width},
+        policy_kwargs={
+            "grid": context.grid,
+            "width": training.width,
+            "ev_coef": training.ev_coef,
+        },
         seed=seed,
         device=session.device,
         **training.model_dump(exclude=_OF_OURS),
     )
-    model.policy.ev_coef = training.ev_coef
     if past is not None:
         model.policy.load_state_dict(past["policy"])
         model.policy.optimizer.load_state_dict(past["optimizer"])
