@@ -42,19 +42,14 @@ class ExposureGrid:
 
     The index of a state is ``(iso_index * T + time_index) * N + aperture_index``.
 
-    Args:
-        isos: ISO speeds, ascending.
-        exposure_times: Exposure times [s], ascending (shortest first).
-        f_numbers: F-numbers, ascending.
-
     >>> grid = ExposureGrid.default()
     >>> len(grid), str(grid[0]), str(grid[63])
     (64, 'ISO 100, 1/1000 s, f/4', 'ISO 6400, 1/2 s, f/11')
     """
 
-    isos: tuple[float, ...]
-    exposure_times: tuple[float, ...]
-    f_numbers: tuple[float, ...]
+    isos: tuple[float, ...]  # ISO speeds, ascending
+    exposure_times: tuple[float, ...]  # exposure times [s], ascending (shortest first)
+    f_numbers: tuple[float, ...]  # F-numbers, ascending
 
     def __post_init__(self) -> None:
         for name in ("isos", "exposure_times", "f_numbers"):

@@ -12,28 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simulator.capture.decision import PEDESTAL
+from simulator.capture.decision import PEDESTAL as PEDESTAL
 from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
     import torch
 
     from simulator.camera import CameraProfile
-
-__all__ = [
-    "PEDESTAL",
-    "SENSOR_NOISE",
-    "SENSOR_RANGES",
-    "SETTINGS_RANGES",
-    "decode_observation",
-    "decode_sensors",
-    "decode_settings",
-    "encode_observation",
-    "encode_sensors",
-    "encode_settings",
-    "frame_statistics",
-    "linear_signal",
-]
 
 #: Fixed ranges of Av, Tv and Sv that map to [-1, 1].
 SETTINGS_RANGES = np.array([[0.0, 10.0], [-5.0, 15.0], [4.0, 17.0]])
@@ -66,10 +51,9 @@ def encode_array(signal: np.ndarray) -> np.ndarray:
 def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     """What an image processor hands to its auto exposure, from 8-bit codes (N, 4, R, R) of frames.
 
-    Returns:
-        ``raw`` (N, 4, 12, 16) uint8: codes of the mean signal of each zone of each plane, in 12
-        rows and 16 columns; ``histogram`` (N, 128) float32: shares of all samples by code, two
-        codes a bin; ``clipped`` (N, 2) float32: shares at white and black, first and last code.
+    ``raw`` (N, 4, 12, 16) uint8: codes of the mean signal of each zone of each plane, in 12 rows
+    and 16 columns; ``histogram`` (N, 128) float32: shares of all samples by code, two codes a bin;
+    ``clipped`` (N, 2) float32: shares at white and black, first and last code.
     """
     height, width = codes.shape[-2:]
     rows, columns = (

@@ -31,6 +31,7 @@ FRAME_PIXELS = 256
 MAX_SHEET_STATES, THUMB_PIXELS, CAPTURE_PIXELS = 256, 104, 192
 #: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
 PATH_COLOURS = ("#D55E00", "#56B4E9", "#FFFFFF", "#CC79A7", "#009E73", "#0072B2", "#E69F00")
+_font: Any = ImageFont.load_default
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
 _BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
 _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
@@ -39,12 +40,10 @@ _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
 def render_frame(
     raw: np.ndarray, scene: Scene, camera: CameraProfile, settings: CameraSettings, score: float
 ) -> np.ndarray:
-    """A capture of `scene`, developed, with its settings and score written on it.
+    """A capture developed, with its settings and score written on it, (H, W, 3) uint8 sRGB.
 
-    `raw` is (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals.
-
-    Returns:
-        (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
+    `raw` is (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals. It
+    is enlarged by a whole factor to at least 256 pixels.
     """
     image = developed(torch.from_numpy(linear_signal(raw[None], camera)), scene)[0]
     factor = -(-FRAME_PIXELS // min(image.shape[:2]))
@@ -65,15 +64,11 @@ def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
     band = Image.new("RGBA", (picture.width, height), (0, 0, 0, 150))
     draw = ImageDraw.Draw(band)
     for i, line in enumerate(lines):
-        font = _fitting_font(draw, line, size, picture.width - size, least=6)
+        font = fitting_font(draw, line, size, picture.width - size, least=6)
         draw.text((size // 2, size // 4 + int(1.35 * size * i)), line, _INK, font)
     captioned = picture.convert("RGBA")
     captioned.alpha_composite(band, (0, picture.height - height))
     return captioned.convert("RGB")
-
-
-def _font(size: int) -> Any:
-    return ImageFont.load_default(size)
 
 
 def contact_sheet(
@@ -92,7 +87,8 @@ def contact_sheet(
 
     One panel per ISO; in it the exposure time grows to the right and the f-number downwards. The
     frame of each capture shows its expected score, a star marks the oracle, and numbered lines show
-    which states policies chose, frame by frame.
+    which states policies chose, frame by frame. A `ValueError` if the grid has more states, or a
+    path leaves it, or `scene` is none.
 
     Args:
         scene: The scene, of any size and shape; large ones are averaged down first.
@@ -102,9 +98,6 @@ def contact_sheet(
         speed, defocus, movement: See `ae_env.scorers.captures.prepare_scene`.
         path: States that a policy went through, the start state first; or several by name.
         seed: Seed of the noise.
-
-    Raises:
-        ValueError: If the grid has more states, or a path leaves it, or `scene` is none.
     """
     check_type("scene", scene, Scene)
     camera = scene.camera if camera is None else camera
@@ -228,9 +221,9 @@ class _Sheet:
         height = bottom - 2 * _LABEL_HEIGHT + 58
         sheet = Image.new("RGB", (width, height), _BACKGROUND)
         draw = ImageDraw.Draw(sheet)
-        font = _fitting_font(draw, title[0], 20, width - 2 * _MARGIN)
+        font = fitting_font(draw, title[0], 20, width - 2 * _MARGIN)
         draw.text((_MARGIN, 14), title[0], _INK, font)
-        font = _fitting_font(draw, title[1], int(font.size) - 2, width - 2 * _MARGIN)
+        font = fitting_font(draw, title[1], int(font.size) - 2, width - 2 * _MARGIN)
         draw.text((_MARGIN, 44), title[1], _FAINT, font)
         self._draw_labels(draw)
         allowed = self.table.allowed
@@ -330,16 +323,16 @@ def _draw_pill(draw: ImageDraw.ImageDraw, centre: tuple[int, int], label: str, c
 
 
 def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
-    """Corners of a five-pointed star."""
     angles = np.arange(10) * np.pi / 5
     radii = np.where(np.arange(10) % 2, 0.4 * radius, radius)
     corners = np.stack([x + radii * np.sin(angles), y - radii * np.cos(angles)], axis=1)
     return [(column, row) for column, row in corners.tolist()]
 
 
-def _fitting_font(
+def fitting_font(
     draw: ImageDraw.ImageDraw, line: str, size: int, width: int, *, least: int = 9
 ) -> Any:
+    """The font of at most `size` in which `line` is at most `width` wide, or that of `least`."""
     while size > least and draw.textlength(line, _font(size)) > width:
         size -= 1
     return _font(size)

@@ -27,15 +27,6 @@ from gymnasium.vector.utils import batch_space
 from ae_env.episodes.core import check_actions
 from ae_env.grid import ExposureGrid
 
-__all__ = [
-    "ContinuousActions",
-    "ControlActions",
-    "RelativeActions",
-    "VectorContinuousActions",
-    "VectorControlActions",
-    "VectorRelativeActions",
-]
-
 #: Decimals to which distances in stops are compared, so that rounding decides no tie.
 _DISTANCE_DECIMALS = 9
 

@@ -106,13 +106,11 @@ class Recorded(Policy):
     Frame 0 is the one that `reset` returns, at a state that no policy chooses; a delay is allowed
     for. The raws count in the natural order of their names, from 0; after the last one its settings
     stay. The nearest of the grid's states is taken: the squares of the differences in aperture,
-    time, ISO and EV, in stops, add up.
+    time, ISO and EV, in stops, add up. A `ValueError` if there is no raw, or one cannot be read or
+    does not say its settings.
 
     Args:
         path: Folder of raws, or a single raw.
-
-    Raises:
-        ValueError: If there is none, or one cannot be read or does not say its settings.
     """
 
     def __init__(self, context: PolicyContext, path: str | os.PathLike[str]) -> None:

@@ -29,21 +29,16 @@ class BracketLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class PolicyContext:
-    """The camera that a policy drives; an action is an index into its `grid`.
-
-    Args:
-        observation_space: Observation of a single environment (a `Dict` with ``raw``,
-            ``settings`` and, where the camera has them, ``sensors``).
-        delays: Frames after the next until a decision's ISO, exposure time and aperture are in
-            effect.
-        bracket: None for tasks without a bracket.
-    """
+    """The camera that a policy drives; an action is an index into its `grid`."""
 
     grid: ExposureGrid
     camera: CameraProfile
+    #: Observation of a single environment (a `Dict` with ``raw``, ``settings`` and, where the
+    #: camera has them, ``sensors``).
     observation_space: gym.spaces.Dict
+    #: Frames after the next until a decision's ISO, exposure time and aperture are in effect.
     delays: tuple[int, int, int] = (0, 0, 0)
-    bracket: BracketLimits | None = None
+    bracket: BracketLimits | None = None  # None for tasks without a bracket
 
     @classmethod
     def from_envs(cls, envs: gym.vector.VectorEnv[Any, Any, Any]) -> PolicyContext:

@@ -131,10 +131,8 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
     """A policy's name without its options, and the options.
 
     They are ``key=value`` after a ``?`` with ``&`` between them, as in a URL. Values are YAML
-    scalars; a fraction such as ``1/60`` is a number too.
-
-    Raises:
-        ValueError: If an option has no value or a value that is no scalar, or is given twice.
+    scalars; a fraction such as ``1/60`` is a number too. A `ValueError` if an option has no value
+    or a value that is no scalar, or is given twice.
 
     >>> split_options("centre_weighted:P?compensation=-1&shutter_cap=1/50")
     ('centre_weighted:P', {'compensation': -1, 'shutter_cap': 0.02})
@@ -179,6 +177,9 @@ def make_policy(
 ) -> Policy:
     """The policy called `name`.
 
+    A `ValueError` if there is no such policy, its file cannot be loaded (the cause is chained), the
+    class found is not a policy or does not take an option.
+
     Args:
         name: One of `list_policies`, where a meter's program defaults to P; ``"recorded:FOLDER"``;
             ``"regression:PATH"`` or ``"ppo:PATH"``, weights of one's own; ``"bracket"``,
@@ -187,10 +188,6 @@ def make_policy(
             may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
-
-    Raises:
-        ValueError: If there is no such policy, its file cannot be loaded (the cause is chained),
-            the class found is not a policy or does not take an option.
     """
     base, named = split_options(name)
     base = base.removesuffix(":")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import shutil
@@ -10,6 +9,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ from filelock import FileLock, Timeout
 
 from agents.policy import Policy
 from agents.rollouts import checked_states, choose, errors_of
+from simulator.utils.checks import import_extra
 
+_minari = partial(import_extra, "minari", "minari", "a dataset")
 #: The variable that names Minari's folder.
 _ROOT = "MINARI_DATASETS_PATH"
 #: Minari's form of a name: namespaces (two letters or more), the dataset and its version.
@@ -194,12 +196,3 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
     columns = ("actions", "rewards", "terminations", "truncations")
     own = dict(zip(columns, map(list, zip(*steps, strict=True)), strict=True))
     return {"seed": seed, "options": {"scene": scene}, "observations": seen, **own}
-
-
-def _minari() -> Any:
-    try:
-        return importlib.import_module("minari")
-    except ImportError as error:
-        raise ImportError(
-            "datasets need Minari: install the extra with pip install 'ae-env[minari]'"
-        ) from error

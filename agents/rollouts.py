@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
+from ae_env.scenes.folder import FEWEST_GROUPS_TO_SPLIT
 from ae_env.scenes.load import BUNDLED, REAL, SceneSpec
 from ae_env.utils.user_files import UserCodeError
 from agents.policy import Bools, Floats, Ints, Observations, Policy
 
 ENV_ID = "ae_env:ae_env/AutoExposure-v0"
-#: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
-MIN_TRAINING_GROUPS = 15
 
 
 def make_envs(
@@ -41,7 +40,7 @@ def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[st
         return {"scenes": scenes}, False
     options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
     groups = {scene.group for scene in options.load_scenes()}
-    if len(groups) >= MIN_TRAINING_GROUPS:
+    if len(groups) >= FEWEST_GROUPS_TO_SPLIT:
         return {"scenes": scenes}, False
     found: dict[str, Any] = {"scenes": "bundled"}
     if options.recorded is not None:

@@ -48,45 +48,32 @@ class BayerPattern(StrEnum):
 
 @dataclass(frozen=True)
 class CameraProfile:
-    """A camera body.
+    """A camera body."""
 
-    Args:
-        name: Unique lower-case name, such as ``"nikon_z6"``.
-        make: Maker as EXIF spells it.
-        model: Model as EXIF spells it.
-        cfa: Order of the colour filter array.
-        black_level: Digital number of no light, per plane R, G1, G2, B.
-        white_level: Digital number at which the sensor saturates, whole.
-        bit_depth: Bits per sample of its raw files.
-        full_level: Share of white from which a photosite is full where another one of its pixel is
-            at white: photosites of some compact cameras differ by some percent.
-        nlf_by_iso: Calibrated noise level function by ISO; empty if unknown.
-        read_noise_by_iso: Rows and tails of the read noise by ISO, for ``noise="sensor"``; empty if
-            unknown.
-        segments: ISO at which a new conversion-gain segment begins; interpolation never crosses it.
-        colour_matrix: XYZ (D65) to camera RGB, row by row (3 x 3); None if unknown.
-        colour_matrix_source: Where the matrix comes from.
-        pixel_pitch_um: Distance between sensor pixels [micrometre]; None if unknown.
-        row_time: Read-out time of one sensor row [s].
-        source: Where the noise calibration comes from.
-    """
-
-    name: str
-    cfa: BayerPattern
+    name: str  # unique lower-case name, such as ``"nikon_z6"``
+    cfa: BayerPattern  # order of the colour filter array
+    #: Digital number of no light, per plane R, G1, G2, B.
     black_level: tuple[float, float, float, float]
-    white_level: float
-    bit_depth: int
+    white_level: float  # digital number at which the sensor saturates, whole
+    bit_depth: int  # bits per sample of its raw files
+    #: Share of white from which a photosite is full where another one of its pixel is at white:
+    #: photosites of some compact cameras differ by some percent.
     full_level: float = field(default=1.0, kw_only=True)
-    make: str = "unknown"
-    model: str = "unknown"
+    make: str = "unknown"  # maker as EXIF spells it
+    model: str = "unknown"  # model as EXIF spells it
+    #: Calibrated noise level function by ISO; empty if unknown.
     nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict, hash=False)
+    #: Rows and tails of the read noise by ISO, for ``noise="sensor"``; empty if unknown.
     read_noise_by_iso: Mapping[float, ReadNoise] = field(default_factory=dict, hash=False)
+    #: ISO at which a new conversion-gain segment begins; interpolation never crosses it.
     segments: tuple[float, ...] = field(default=(), hash=False)
+    #: XYZ (D65) to camera RGB, row by row (3 x 3); None if unknown.
     colour_matrix: tuple[tuple[float, float, float], ...] | None = field(default=None, hash=False)
-    colour_matrix_source: str = ""
+    colour_matrix_source: str = ""  # where the matrix comes from
+    #: Distance between sensor pixels [micrometre]; None if unknown.
     pixel_pitch_um: float | None = None
-    row_time: float = 0.0
-    source: str = ""
+    row_time: float = 0.0  # read-out time of one sensor row [s]
+    source: str = ""  # where the noise calibration comes from
 
     def __post_init__(self) -> None:
         check_word("cfa", self.cfa, tuple(p.value for p in BayerPattern))
@@ -138,10 +125,8 @@ class CameraProfile:
         Log-log interpolation between calibrated ISOs, inside a conversion-gain segment. Outside,
         shot noise scales with ISO and read noise with its square, but for the rounding to digital
         numbers (1/12 DN^2), which is the same at each ISO; beyond the table
-        `NoiseLevelFunction.extrapolation` says how far.
-
-        Raises:
-            ValueError: If the profile has no noise calibration or `iso` is not positive.
+        `NoiseLevelFunction.extrapolation` says how far. A `ValueError` if the profile has no noise
+        calibration or `iso` is not positive.
         """
         if not self.nlf_by_iso:
             raise ValueError(
@@ -168,10 +153,8 @@ class CameraProfile:
     def read_noise(self, iso: float, box_factor: int = 1) -> ReadNoise:
         """Rows and tails of the read noise at `iso`, of averages of `box_factor` squared pixels.
 
-        Interpolated over log ISO inside a conversion-gain segment; outside the table the nearest.
-
-        Raises:
-            ValueError: If the profile has no such calibration or `iso` is not positive.
+        Interpolated over log ISO inside a conversion-gain segment; outside the table the nearest. A
+        `ValueError` if the profile has no such calibration or `iso` is not positive.
         """
         if not self.read_noise_by_iso:
             raise ValueError(

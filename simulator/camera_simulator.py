@@ -186,6 +186,8 @@ class CameraSimulator:
     ) -> CameraSimulator:
         """A simulator with trained networks.
 
+        A `ValueError` if there are no such weights, or they are damaged.
+
         Args:
             name: Largest noise module that may run, ``"nano"``, ``"compact"`` or ``"large"``; which
                 one up to it does, `tolerance` decides. Or the path of weights that
@@ -194,9 +196,6 @@ class CameraSimulator:
             device, precision, cache: See `CameraSimulator`.
             body_correction: Whether to apply the exposure module's w and b. They make up for the
                 errors of the one body that was trained on and are wrong for any other.
-
-        Raises:
-            ValueError: If there are no such weights, or they are damaged.
         """
         from simulator.networks.weights import load_modules
 
@@ -230,7 +229,8 @@ class CameraSimulator:
     ) -> PreparedScene:
         """Everything that does not depend on the target settings, done once, when first needed.
 
-        The source's data must not be changed afterwards.
+        The source's data must not be changed afterwards. A `ValueError` if an argument is out of
+        range, or `depth` needs networks that are not here.
 
         Args:
             source: A raw, a prepared scene, or a scene.
@@ -243,9 +243,6 @@ class CameraSimulator:
             tolerance: Error that a capture may have, in units of the target's noise: the cheapest
                 steps that keep it are taken, or else, as at 0, those with the least error. By
                 default what the source was prepared with, `DEFAULT_TOLERANCE` for a raw or a scene.
-
-        Raises:
-            ValueError: If an argument is out of range, or `depth` needs networks that are not here.
         """
         check_word("depth", depth, get_args(Depth))
         if depth == "unknown" and self.aperture is None:
@@ -430,16 +427,14 @@ class CameraSimulator:
         """Runs the whole pipeline on one source, every module for this very transition.
 
         Nothing is left out and nothing shared: this is what `simulate` is an approximation of. The
-        presets ``"paper"`` and ``"ncs"`` clip to [0, 1] after the exposure, as the paper does.
+        presets ``"paper"`` and ``"ncs"`` clip to [0, 1] after the exposure, as the paper does. A
+        `ValueError` if this simulator has no networks, or an argument is out of range.
 
         Args:
             source, image_speed, defocus, depth: See `prepare`.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-
-        Raises:
-            ValueError: If this simulator has no networks, or an argument is out of range.
         """
         noise, aperture = _required("noise", self.noise), _required("aperture", self.aperture)
         check_word("depth", depth, get_args(Depth))

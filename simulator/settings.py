@@ -31,11 +31,6 @@ _NOMINAL_TIMES = (*(1.0 / n for n in _FRACTIONS), *_SECONDS)
 class CameraSettings:
     """The three settings that decide an exposure.
 
-    Args:
-        iso: ISO speed, in [0.001, 1e8].
-        exposure_time: Time the shutter is open, in seconds, in [1e-9, 1e5].
-        f_number: Aperture f-number as marked on the lens, in [0.5, 1024].
-
     The ranges keep every exposure ratio between two settings below 2**106, a finite float32.
 
     Attributes:
@@ -49,9 +44,9 @@ class CameraSettings:
     14.965784284662087
     """
 
-    iso: float
-    exposure_time: float
-    f_number: float
+    iso: float  # ISO speed, in [0.001, 1e8]
+    exposure_time: float  # time the shutter is open, in seconds, in [1e-9, 1e5]
+    f_number: float  # aperture f-number as marked on the lens, in [0.5, 1024]
     aperture_stop: int = field(init=False, repr=False, compare=False)
     effective_f_number: float = field(init=False, repr=False, compare=False)
     log2_exposure: float = field(init=False, repr=False, compare=False)

@@ -47,39 +47,25 @@ _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": 
 
 @dataclass
 class Frames:
-    """Observations, info and rewards of n episodes after a reset or a step.
+    """Observations, info and rewards of n episodes after a reset or a step."""
 
-    Args:
-        observation: Arrays by name, n long; new ones every time.
-        info: Columns of numbers by name, n long.
-            ``scene_id`` and ``modules`` are indices into `EpisodeCore.scene_ids` and
-            `AutoExposureBase.module_names`.
-        reward: (n,) float64.
-        raw: (n, 4, R, R) the whole frames, also where less of them is observed.
-    """
-
-    observation: dict[str, np.ndarray]
+    observation: dict[str, np.ndarray]  # arrays by name, n long; new ones every time
+    #: Columns of numbers by name, n long. ``scene_id`` and ``modules`` are indices into
+    #: `EpisodeCore.scene_ids` and `AutoExposureBase.module_names`.
     info: dict[str, Any]
-    reward: np.ndarray
-    raw: np.ndarray
+    reward: np.ndarray  # (n,) float64
+    raw: np.ndarray  # (n, 4, R, R) the whole frames, also where less of them is observed
 
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Frames that were just recorded, of the B environments `env_indices`.
-
-    Args:
-        statistics: Of the frames.
-        outputs: The frames (B, 4, R, R), by the names of `Task.outputs`.
-        gains: (B,) light relative to the scenes' own.
-        rows: (B, R) light of each row relative to that, or None; see `Captures`.
-    """
+    """Frames that were just recorded, of the B environments `env_indices`."""
 
     env_indices: np.ndarray
     statistics: FrameStatistics
-    outputs: Mapping[str, np.ndarray]
-    gains: np.ndarray
-    rows: np.ndarray | None
+    outputs: Mapping[str, np.ndarray]  # the frames (B, 4, R, R), by the names of `Task.outputs`
+    gains: np.ndarray  # (B,) light relative to the scenes' own
+    rows: np.ndarray | None  # (B, R) light of each row relative to that, or None; see `Captures`
 
 
 class Task:
@@ -121,9 +107,8 @@ class Task:
     ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
         """Applies the actions (K,).
 
-        Returns:
-            (K,) bool, which of them take a frame, or None for all; the episodes whose `displaced`
-            changed; and (K,) bool, which have ended.
+        Returned are (K,) bool, which of them take a frame, or None for all; the episodes whose
+        `displaced` changed; and (K,) bool, which have ended.
         """
         return None, env_indices[:0], np.zeros(len(env_indices), bool)
 
@@ -270,13 +255,9 @@ class EpisodeCore:
         self.task.forget(lights)
 
     def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Advances the episodes of `env_indices` (K,) by one frame, each with its action.
+        """Advances the episodes of `env_indices` (K,) by one frame; which end with it, (K,) bool.
 
-        Returns:
-            (K,) bool, which episodes have ended with it.
-
-        Raises:
-            ValueError: If there is no such action; no episode advances then.
+        A `ValueError` if there is no such action; no episode advances then.
         """
         self.check_begun(env_indices)
         wrong = (actions < 0) | (actions >= self.num_actions)

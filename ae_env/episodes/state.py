@@ -72,7 +72,8 @@ _COLUMNS = (*_FIELDS, "begun", "light_index", "previous", "pending", "image_mean
 class Episodes:
     """The episodes of n environments, as columns: a batch takes what it needs of them at once.
 
-    Facts of scenes that are drawn on demand are known once an episode shows them.
+    Facts of scenes that are drawn on demand are known once an episode shows them. A `ValueError` if
+    a scene was made for another number of states.
 
     Args:
         options: The environment's arguments.
@@ -97,9 +98,6 @@ class Episodes:
         image_mean: (n,) float64, mean code of the latest frame / 255, where a cost needs it.
 
     The others, (n,) each, are those of `Episode`.
-
-    Raises:
-        ValueError: If a scene was made for another number of states.
     """
 
     def __init__(
@@ -182,14 +180,12 @@ class Episodes:
     ) -> dict[str, np.ndarray]:
         """K episodes as columns (K,) by the names of `Episode`.
 
-        The draws do not depend on what is chosen, which only replaces them.
+        The draws do not depend on what is chosen, which only replaces them. A `ValueError` if there
+        is no such scene, state or frame.
 
         Args:
             rngs: K generators; each gives the same count of numbers for every episode.
             options: For each the ``scene``, ``state`` and ``frame`` that it shall have.
-
-        Raises:
-            ValueError: If there is no such scene, state or frame.
         """
         chosen = [self._chosen(one) for one in options or ()]  # errors come before any draw
         uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T

@@ -140,18 +140,15 @@ KIND_SETS = {
 class MovingLighting(Lighting):
     """Light that moves as the episode's phase draws it: a kind of `MOVES`, its size, its pace.
 
-    Args:
-        kinds: ``"train"`` or ``"test"`` (`KIND_SETS`), ``"all"``, or names of `MOVES`.
-        frame_rate: Frames per second, for lamps.
-
     >>> MovingLighting("test").kind(0.25) in KIND_SETS["test"]
     True
     """
 
     name: ClassVar[str] = "moving"
     within_frame: ClassVar[bool] = True
+    #: ``"train"`` or ``"test"`` (`KIND_SETS`), ``"all"``, or names of `MOVES`.
     kinds: str | Sequence[str] = "train"
-    frame_rate: float = 29.97
+    frame_rate: float = 29.97  # frames per second, for lamps
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,9 +9,7 @@ one that `group_shots` finds from its time and colours. No other names are read.
 
 from __future__ import annotations
 
-import csv
 import glob
-import io
 import logging
 import math
 import re
@@ -34,7 +32,7 @@ from simulator.raw.image import RawImage
 from simulator.raw.read import check_settings, read_raw
 from simulator.utils.checks import check_number, check_type, check_word
 from simulator.utils.compute import progress_bar
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, printable, read_bounded
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, printable, read_table
 
 logger = logging.getLogger(__name__)
 
@@ -53,29 +51,21 @@ _RAW_ENDINGS = f"{', '.join(RAW_SUFFIXES[:8])} ..."
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """Facts about the files that the caller knows, and the rule for files that cannot be read.
+    """Facts about the files that the caller knows, and the rule for files that cannot be read."""
 
-    Args:
-        illuminance: Light on the subject [lux] of every file, or by file name.
-        kind: Kind of the scenes; ``"raw"`` or ``"radiance"`` by default.
-        hard: Whether they count as hard.
-        median_speed: Median image speed of a moving episode [frame heights / s].
-        ev100: EV100 of the radiance maps, in place of the assumed one.
-        layer: Part or layer of the OpenEXR files, where several have R, G and B.
-        settings: Of every raw, in place of the file's: any of ``iso``, ``exposure_time`` [s] and
-            ``f_number``, as an adapted lens or some telephones do not state them.
-        on_error: What happens where a file cannot be read, or is black without `illuminance`:
-            ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
-            ``"skip"``, not for sequences, leaves it out: a warning says how many were and why.
-    """
-
+    #: Light on the subject [lux] of every file, or by file name.
     illuminance: float | Mapping[str, float] | None = None
-    kind: str | None = None
-    hard: bool | None = None
-    median_speed: float | None = None
-    ev100: float | None = None
-    layer: str | None = None
+    kind: str | None = None  # kind of the scenes; ``"raw"`` or ``"radiance"`` by default
+    hard: bool | None = None  # whether they count as hard
+    median_speed: float | None = None  # median image speed of a moving episode [frame heights / s]
+    ev100: float | None = None  # EV100 of the radiance maps, in place of the assumed one
+    layer: str | None = None  # part or layer of the OpenEXR files, where several have R, G and B
+    #: Of every raw, in place of the file's: any of ``iso``, ``exposure_time`` [s] and ``f_number``,
+    #: as an adapted lens or some telephones do not state them.
     settings: Mapping[str, float] | None = None
+    #: What happens where a file cannot be read, or is black without `illuminance`: ``"stop"``
+    #: raises an error that names it, so that nothing goes missing unseen; ``"skip"``, not for
+    #: sequences, leaves it out: a warning says how many were and why.
     on_error: OnError = "stop"
 
     def __post_init__(self) -> None:
@@ -424,26 +414,16 @@ def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
         table = folder / "groups.csv"
         if not table.is_file():
             continue
-        rows, columns = read_table(table)
-        if not {"file", "group"} <= set(columns):
-            raise ValueError(f"{str(table)!r} (columns {columns}) must have `file` and `group`")
-        for number, row in enumerate(rows, start=2):
-            name, group = ((row.get(column) or "").strip() for column in ("file", "group"))
+        rows = read_table(table)
+        if not {"file", "group"} <= set(rows):
+            raise ValueError(f"{str(table)!r} (columns {[*rows]}) must have `file` and `group`")
+        for number, (name, group) in enumerate(zip(rows.file, rows.group, strict=True), start=2):
+            name, group = name.strip(), group.strip()
             if not group or not name or not (folder / name).is_file():
                 given = f"{str(table)!r}, line {number} (={name!r}, {group!r})"
                 raise ValueError(f"{given} must name a file beside it, and its group")
             groups[(folder / name).resolve()] = group
     return groups
-
-
-def read_table(path: Path) -> tuple[list[dict[str, str]], list[str]]:
-    """Rows and column names of a CSV file; a `ValueError` if it cannot be read."""
-    try:
-        text = read_bounded(path).decode("utf-8-sig")
-        reader = csv.DictReader(io.StringIO(text, newline=""))
-        return list(reader), list(reader.fieldnames or ())
-    except (csv.Error, OSError, UnicodeError) as error:
-        raise ValueError(f"{str(path)!r} must be a CSV file in UTF-8: {error}") from error
 
 
 def split_groups(groups: Sequence[str]) -> dict[str, str]:

@@ -95,7 +95,10 @@ def load_scenes(
     resize: Resize = Scene.resized,
     grid: ExposureGrid | None = None,
 ) -> list[Scene]:
-    """The scenes that `spec` names, of one split, all at one resolution.
+    """The scenes that `spec` names, of one split, in a stable order, with unique ids.
+
+    A `ValueError` if `spec` names nothing known or no scene of `split`, if a file cannot be read,
+    or if a scene is smaller than `resolution`.
 
     Args:
         spec: What to load; the head of this module lists it.
@@ -107,13 +110,6 @@ def load_scenes(
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
         resize: Called with each scene at its finest resolution, `resolution` and `crop`.
         grid: States of recorded grids; by default all that their captures have.
-
-    Returns:
-        At least one scene, in a stable order, with unique ids.
-
-    Raises:
-        ValueError: If `spec` names nothing known or no scene of `split`, if a file cannot be read,
-            or if a scene is smaller than `resolution`.
     """
     check_word("split", split, get_args(Split))
     named = isinstance(spec, str | Path | Mapping)
@@ -302,7 +298,8 @@ def simulate_source_raw(
 
     The reference camera takes the raw as an average meter would have it, at an ISO drawn between
     100 and 6400: noise, white highlights and all. Captures are simulated from it by the neural
-    simulator, as in the paper.
+    simulator, as in the paper. A `ValueError` if the scene carries noise, or is too dark for a
+    meter.
 
     Args:
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
@@ -310,9 +307,6 @@ def simulate_source_raw(
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
             default.
         iso_range: See `iso`.
-
-    Raises:
-        ValueError: If the scene carries noise, or is too dark for a meter.
     """
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")

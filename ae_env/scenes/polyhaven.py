@@ -31,7 +31,7 @@ from simulator.radiance.incident_light import FLAT_LUX, receptor_reading
 from simulator.radiance.maps import native_size, perspective
 from simulator.radiance.reading import read_radiance
 from simulator.utils.cache import cache_dir, cache_key
-from simulator.utils.checks import check_integer
+from simulator.utils.checks import check_integer, import_extra
 from simulator.utils.config_file import Configuration, load_yaml
 from simulator.utils.files import data_folder
 
@@ -257,11 +257,7 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
         ValueError: If `url` is no address.
         ConnectionError: If a map cannot be fetched, or is not the one of the list.
     """
-    try:
-        import pooch
-        from pooch import file_hash
-    except ImportError:
-        raise ImportError("downloading scenes needs: pip install 'ae-env[hdr]'") from None
+    pooch = import_extra("pooch", "hdr", "downloading scenes")
     if not url.startswith(("http://", "https://")):
         raise ValueError(f"`url` (={url!r}) must begin with http:// or https://")
     pooch.get_logger().setLevel("ERROR")
@@ -279,7 +275,9 @@ def download(*, url: str = URL, progress: Callable[[int, int, str], None] | None
         if progress is not None:
             progress(done, total, asset.name)
         cached = folder / asset.file_name
-        whole = cached.is_file() and (asset.converted or file_hash(str(cached)) == asset.sha256)
+        whole = cached.is_file() and (
+            asset.converted or pooch.file_hash(str(cached)) == asset.sha256
+        )
         if asset.given is None and not whole:
             fetch = partial(_fetch, size=_LARGEST if asset.converted else asset.bytes)
             try:

@@ -27,7 +27,7 @@ from PIL import ExifTags, ImageOps
 
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, merge
-from ae_env.scenes.folder import read_table, scenes_of_split, visible_files
+from ae_env.scenes.folder import scenes_of_split, visible_files
 from ae_env.scenes.scene import Scene, SceneRequest
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -36,8 +36,14 @@ from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import marks_stops, read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
-from simulator.utils.checks import check_key, check_number
-from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES, open_picture, printable
+from simulator.utils.checks import UNITS, check_key, check_number, parse_number
+from simulator.utils.files import (
+    PICTURE_SUFFIXES,
+    RAW_SUFFIXES,
+    open_picture,
+    printable,
+    read_table,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +74,6 @@ _IN_NAMES = (
     ("exposure_time", re.compile(rf"^[_\-. ]*(1)_{_NUMBER} ?s(?![a-z])", re.I)),
     ("exposure_time", re.compile(rf"(?<![\d.]){_NUMBER} ?(s|ms|us)(?![a-z])", re.I)),
 )
-_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _FRAME = re.compile(r"frame[_-]?(\d+)", re.I)
 
 
@@ -388,8 +393,8 @@ def settings_in_name(name: str) -> tuple[dict[str, float], str]:
             continue
         number, *more = match.groups()
         value = float(number)
-        if more and more[0].lower() in _UNITS:
-            value *= _UNITS[more[0].lower()]
+        if more and more[0].lower() in UNITS:
+            value *= UNITS[more[0].lower()]
         elif more:  # one over it; 0 is no setting, which is said where the settings are made
             value = value / float(more[0]) if float(more[0]) else 0.0
         found[setting] = value
@@ -419,17 +424,15 @@ def _read_tables(folder: Path) -> dict[Path | str, dict[str, float]]:
 
 def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
     """Name and settings of each row of a table."""
-    rows, columns = read_table(table)
-    names = {
-        what: next((c for c in known if c in columns), None) for what, known in _COLUMNS.items()
-    }
+    rows = read_table(table)
+    names = {what: next((c for c in known if c in rows), None) for what, known in _COLUMNS.items()}
     if names["file"] is None or not any(names[what] for what in _SETTINGS):
         raise ValueError(
-            f"{str(table)!r} (columns {columns}) must have the column file and one or more of iso, "
+            f"{str(table)!r} (columns {[*rows]}) must have the column file and one or more of iso, "
             "exposure_time and f_number"
         )
-    for number, row in enumerate(rows, start=2):
-        values = {what: (row[column] or "").strip() for what, column in names.items() if column}
+    for number, row in enumerate(rows.to_dict("records"), start=2):
+        values = {what: row[column].strip() for what, column in names.items() if column}
         try:
             settings = {name: parse_number(values[name]) for name in _SETTINGS if values.get(name)}
             # The states of ImageNet-ES are numbered.
@@ -437,17 +440,6 @@ def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
             yield f"param_{parse_number(name):g}" if names["file"] == "idx" else name, settings
         except ValueError as error:
             raise ValueError(f"{str(table)!r}, line {number}: {error}") from error
-
-
-def parse_number(text: str) -> float:
-    """The number of ``"1/20"``, ``'0"4'`` (0.4 s), ``"f5.6"``, ``"200"`` or ``"8ms"``."""
-    plain = text.lower().removeprefix("f").removeprefix("/").replace('"', ".")
-    unit = next((u for u in ("ms", "us", "s") if plain.endswith(u)), "")
-    top, _, bottom = plain.removesuffix(unit).strip(" .").partition("/")
-    try:
-        return float(top) / float(bottom or 1) * _UNITS.get(unit, 1.0)
-    except (ValueError, ZeroDivisionError):
-        raise ValueError(f"{text!r} must be a number, such as 200, 1/125 or f5.6") from None
 
 
 def _in_file(path: Path) -> dict[str, float]:

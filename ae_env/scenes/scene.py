@@ -37,70 +37,61 @@ Resize = Callable[["Scene", int | None, Crop], "Scene"]
 class Scene:
     """The light before a camera, as the raw it would record at reference settings, not clipped.
 
-    Args:
-        scene_id: Unique and stable, such as ``"snow-012"``.
-        group: Source group: the photograph, panorama or physical subject. All scenes of a group
-            stay in one split and are resampled together.
-        light: (4, H, W) float32 packed light at `reference`, planes R, G1, G2, B, 1.0 at sensor
-            white; not clipped, so lamps exceed 1.
-        reference: Settings at which `light` is. With `illuminance` known, an 18 % grey card under
-            it has 0.119 of white in green there.
-        camera: Camera in whose colour space `light` is.
-        nlf: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
-        illuminance: Light on the subject as an incident-light meter with a dome reads it there, in
-            the lux of a flat receptor that asks for the same (`simulator.radiance.incident_light`);
-            None where unknown.
-        white_balance: Gains of R, G, B that make a grey card grey.
-        kind: Sort of scene, such as ``"snow"``.
-        hard: Whether it belongs to the hard part (back light, snow, night, spot light, motion).
-        median_speed: Median image speed of a moving episode [frame heights / s].
-        box_factor: Sensor pixels averaged per side into one pixel of `light`.
-        source: Provenance and licence in one line.
-        saturated: (H, W) bool, pixels whose light is a guess because the source raw was saturated
-            there (`simulator.raw.develop`); None if there are none.
-        denoised: (4, H, W) `light` with its noise removed by a noise module; None where there is
-            no noise, or no such module.
-        residual: What the network that made `denoised` gets wrong; None where that is not known.
-        defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
-            scene whose own defocus is to grow as the aperture opens; None where all is far.
-        layout: What is out of focus, by how much relative to an episode's defocus, and what is the
-            subject, which may move apart from the rest; None where the whole frame has one defocus
-            and one motion.
-        sampled: Whether each plane was sampled at its own place, as a sensor does. False: the four
-            share their places, G1 equals G2, as in every bundled scene; averaged by a large
-            `box_factor` there is hardly a difference.
-        recorded: (R, 4, H, W) float32, the real captures of the states that are `allowed`, in their
-            order, white is 1. With it nothing is simulated: environments show these frames, and
-            `light` is what they tell together. None where captures are simulated.
-        sequence: Video that it is a frame of; empty for a still scene.
-        allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
-            them; None for every state of any grid.
-
     `from_array`, `from_raw` and `from_radiance` make scenes and check all of this; the constructor
     itself trusts its caller.
     """
 
-    scene_id: str
+    scene_id: str  # unique and stable, such as ``"snow-012"``
+    #: Source group: the photograph, panorama or physical subject. All scenes of a group stay in one
+    #: split and are resampled together.
     group: str
+    #: (4, H, W) float32 packed light at `reference`, planes R, G1, G2, B, 1.0 at sensor white; not
+    #: clipped, so lamps exceed 1.
     light: torch.Tensor
+    #: Settings at which `light` is. With `illuminance` known, an 18 % grey card under it has 0.119
+    #: of white in green there.
     reference: CameraSettings
-    camera: CameraProfile
+    camera: CameraProfile  # camera in whose colour space `light` is
+    #: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
     nlf: NoiseLevelFunction
+    #: Light on the subject as an incident-light meter with a dome reads it there, in the lux of a
+    #: flat receptor that asks for the same (`simulator.radiance.incident_light`); None where
+    #: unknown.
     illuminance: float | None
-    white_balance: tuple[float, float, float]
-    kind: str
+    white_balance: tuple[float, float, float]  # gains of R, G, B that make a grey card grey
+    kind: str  # sort of scene, such as ``"snow"``
+    #: Whether it belongs to the hard part (back light, snow, night, spot light, motion).
     hard: bool = False
+    #: Median image speed of a moving episode [frame heights / s].
     median_speed: float = DEFAULT_SPEED
-    box_factor: int = 1
-    source: str = ""
+    box_factor: int = 1  # sensor pixels averaged per side into one pixel of `light`
+    source: str = ""  # provenance and licence in one line
+    #: (H, W) bool, pixels whose light is a guess because the source raw was saturated there
+    #: (`simulator.raw.develop`); None if there are none.
     saturated: torch.Tensor | None = None
+    #: (4, H, W) `light` with its noise removed by a noise module; None where there is no noise, or
+    #: no such module.
     denoised: torch.Tensor | None = None
+    #: What the network that made `denoised` gets wrong; None where that is not known.
     residual: Residual | None = None
+    #: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a scene whose
+    #: own defocus is to grow as the aperture opens; None where all is far.
     defocus_map: torch.Tensor | None = None
+    #: What is out of focus, by how much relative to an episode's defocus, and what is the subject,
+    #: which may move apart from the rest; None where the whole frame has one defocus and one
+    #: motion.
     layout: Layout | None = None
+    #: Whether each plane was sampled at its own place, as a sensor does. False: the four share
+    #: their places, G1 equals G2, as in every bundled scene; averaged by a large `box_factor` there
+    #: is hardly a difference.
     sampled: bool = False
+    #: (R, 4, H, W) float32, the real captures of the states that are `allowed`, in their order,
+    #: white is 1. With it nothing is simulated: environments show these frames, and `light` is what
+    #: they tell together. None where captures are simulated.
     recorded: torch.Tensor | None = None
-    sequence: str = ""
+    sequence: str = ""  # video that it is a frame of; empty for a still scene
+    #: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has them; None
+    #: for every state of any grid.
     allowed: np.ndarray | None = None
 
     @property
@@ -210,14 +201,8 @@ class Scene:
     ) -> Scene:
         """A scene from a packed raw in an array.
 
-        Args:
-            packed: (4, H, W) float, planes R, G1, G2, B; 1.0 at sensor white, may exceed it.
-            reference: Settings at which `packed` is.
-            camera: Camera in whose colour space it is.
-            scene_id: Unique name.
-            group: Source group; `scene_id` by default.
-            nlf: Noise left in `packed`; none by default.
-            illuminance, white_balance, kind, fields: As in `Scene`.
+        `packed` is (4, H, W) float, planes R, G1, G2, B, 1.0 at sensor white, which it may exceed;
+        `group` is `scene_id` by default, `nlf` no noise. The others are the fields of `Scene`.
         """
         scene = cls(
             scene_id=scene_id,
@@ -268,16 +253,8 @@ class Scene:
         """A noise-free scene from linear light, taken into the camera's colours.
 
         Args:
-            rgb: (3, H, W), or (3, 2H, 2W) with `sampled`: linear light; see `camera_light`.
-            camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
-            illuminance: Light on the subject [lux], under which 1.0 is a perfectly white surface;
-                None where the scale is unknown.
-            ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped
-                at white, is set to 0.12.
-            illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`.
+            rgb, camera, illuminance, ev100, illuminant, sampled: See `camera_light`.
             kind: Sort of scene.
-            sampled: Whether the pixels of `rgb` are photosites; otherwise each becomes a packed
-                pixel, all four planes of it at one place.
             **fields: Further arguments of `from_array`, at least `scene_id`.
         """
         light, reference, white_balance = camera_light(
@@ -289,6 +266,8 @@ class Scene:
     def resized(self, resolution: int | None, crop: Crop = "box") -> Scene:
         """The central square of this scene at `resolution` packed pixels a side.
 
+        A `ValueError` if the scene is smaller than `resolution` or an argument is invalid.
+
         Args:
             resolution: Packed pixels R; None keeps the scene as it is.
             crop: ``"box"`` averages ``k * k`` pixels per plane, ``k = min(H, W) // R``;
@@ -298,9 +277,6 @@ class Scene:
             The scene with ``nlf / k**2`` and ``box_factor * k``. A pixel is saturated if one that
             was averaged into it was. `defocus_map` is the root mean square, as second moments add,
             divided by k. Of `layout` it is the mean; a pixel is what most of it was.
-
-        Raises:
-            ValueError: If the scene is smaller than `resolution` or an argument is invalid.
         """
         check_word("crop", crop, get_args(Crop))
         if resolution is None:

@@ -41,11 +41,9 @@ def split_file_name(name: str) -> tuple[str, str] | None:
 def load_attribute(name: str, argument: str) -> Any:
     """The object that ``"package.module:name"`` names; ``name`` may have dots.
 
-    `argument` is how errors begin, such as ``"`scenes` (='my.module:scenes')"``.
-
-    Raises:
-        ValueError: If the module cannot be imported (the cause is chained), or lacks the name;
-            nothing is imported unless each part of the name is a Python identifier.
+    `argument` is how errors begin, such as ``"`scenes` (='my.module:scenes')"``. A `ValueError` if
+    the module cannot be imported (the cause is chained), or lacks the name; nothing is imported
+    unless each part of the name is a Python identifier.
     """
     module_name, _, attribute = name.partition(":")
     if not all(part.isidentifier() for part in attribute.split(".")):
@@ -69,15 +67,13 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
 
     The file is run once, and again after it has changed. It may import modules beside it at its
     top, not later in a function; files in different folders may have helpers of the same name, each
-    its own. A relative `path` is looked for in the current folder, ``~`` is the home.
+    its own. A relative `path` is looked for in the current folder, ``~`` is the home. A
+    `ValueError` if it cannot be loaded (the cause is chained), or has nothing of that name.
 
     Args:
         path, name: The file, and the object's name.
         argument: How errors begin, such as ``"`scorer` (='my_scorer.py:MyScore')"``.
         example: A name that the error proposes where there is none.
-
-    Raises:
-        ValueError: If it cannot be loaded (the cause is chained), or has nothing of that name.
     """
     if not name:
         raise ValueError(f"{argument} must name a class of the file: '{path}:{example}'")

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from simulator import CameraSimulator, RawImage, render_srgb
 from simulator.raw.develop import srgb_from_camera, upright
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_number, import_extra
 from simulator.utils.files import write_atomically
 
 #: Ends and step of the bracket [EV].
@@ -41,18 +41,13 @@ _LEAST = 1e-12
 
 
 class HdrPicture(NamedTuple):
-    """Result of `hdr_picture`.
+    """Result of `hdr_picture`."""
 
-    Args:
-        radiance: (4, H, W) float32 packed light with little noise, 1.0 is the raw's white; what
-            was saturated there is an estimate.
-        fused: (3, 2H, 2W) float32 in [0, 1], sRGB: the bracket fused.
-        exposures: EV of the bracket's pictures relative to the raw.
-    """
-
+    #: (4, H, W) float32 packed light with little noise, 1.0 is the raw's white; what was saturated
+    #: there is an estimate.
     radiance: Tensor
-    fused: Tensor
-    exposures: tuple[float, ...]
+    fused: Tensor  # (3, 2H, 2W) float32 in [0, 1], sRGB: the bracket fused
+    exposures: tuple[float, ...]  # EV of the bracket's pictures relative to the raw
 
 
 def hdr_picture(
@@ -123,7 +118,7 @@ def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
 
 def write_exr(path: str | Path, image: np.ndarray) -> Path:
     """Writes linear light (H, W, 3) as an EXR of 32-bit floats, for which OpenEXR is needed."""
-    openexr = import_openexr()
+    openexr = import_extra("OpenEXR", "hdr", "an EXR file")
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     with tempfile.TemporaryDirectory() as folder:  # OpenEXR writes to a path only
         file = Path(folder, "image.exr")
@@ -131,29 +126,16 @@ def write_exr(path: str | Path, image: np.ndarray) -> Path:
         return write_atomically(Path(path), file.read_bytes())
 
 
-def import_openexr() -> Any:
-    """The module OpenEXR, or an `ImportError` that names the extra."""
-    try:
-        import OpenEXR
-    except ImportError:
-        raise ImportError("EXR files need OpenEXR: pip install 'ae-env[hdr]'") from None
-    return OpenEXR
-
-
 # -- exposure fusion ------------------------------------------------------------------------------
 
 
 def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
-    """Fuses a bracket to a picture (3, H, W) in [0, 1].
+    """Fuses a bracket of two or more pictures (3, H, W) float32 in [0, 1], sRGB, to one.
 
     A picture counts where it is bright if it is one of the darker ones, and where it is dark if it
     is one of the brighter ones; and more where its brightnesses are rare, so that it has contrast
-    there: where a picture is black or white, all of it has the same one.
-
-    Args:
-        pictures: N >= 2 pictures (3, H, W) float32 in [0, 1], sRGB, or a function that yields
-            them, always the same ones, called several times: a bracket of large pictures need
-            not be held at once. Fewer than 2 are a `ValueError`.
+    there: where a picture is black or white, all of it has the same one. A function that yields
+    the pictures is called several times: a bracket of large ones need not be held at once.
     """
     every = pictures if callable(pictures) else lambda: iter(pictures)
     means = torch.tensor([float(_luma(picture).mean()) for picture in every()])

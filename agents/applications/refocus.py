@@ -140,6 +140,8 @@ def read_depth(
 ) -> np.ndarray:
     """Distances from the lens, of a depth camera's, a stereo matcher's or a network's file.
 
+    A `ValueError` if the file is no such map, or `kind` or `scale` is wrong.
+
     Args:
         path: A PNG of one channel (8 or 16 bit), an EXR (channel Z, Depth, V, Y, or R alone; an
             `ImportError` if OpenEXR is not installed) or a ``.npy`` array (H, W).
@@ -152,9 +154,6 @@ def read_depth(
     Returns:
         (H, W) float64 [m], all > 0. Where the file has no number (0 in a PNG, NaN, infinite or
         negative elsewhere; 0 is infinitely far in a disparity of floats), the nearest pixel's.
-
-    Raises:
-        ValueError: If the file is no such map, or `kind` or `scale` is wrong.
     """
     path = Path(path)
     check_word("kind", kind, get_args(DepthKind))

@@ -392,16 +392,12 @@ def run_brackets(
     most: int | None = None,
     name: str | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """`count` episodes of each scene of `envs`, of autoreset mode DISABLED, driven by `policy`.
+    """`count` episodes of each scene of `envs`, of `ExposureBracket-v0`, driven by `policy`.
 
-    Args:
-        policy, name: The policy, and its name in errors; by default its own.
-        envs: Environments of `ExposureBracket-v0`.
-        count, seed, most: See `RolloutPlan.of_each_scene`.
-
-    Returns:
-        ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each
-        episode, and the ``seconds`` that each decision took on average.
+    ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each episode,
+    and the ``seconds`` that each decision took on average. The autoreset mode of `envs` is
+    DISABLED; `count`, `seed` and `most` are those of `RolloutPlan.of_each_scene`; `name` is the
+    policy's in errors.
     """
     name = name or policy.name
     names = ("quality", "log_error", "unseen", "frames", "time_left")

@@ -19,6 +19,7 @@ from typing import Annotated, Any
 from rich.console import Console
 from typer import Argument, Option
 
+from simulator.utils.checks import parse_number
 from simulator.utils.files import printable
 
 terminal = Console()
@@ -134,23 +135,6 @@ def command_line() -> str:
 # -- checks of options ----------------------------------------------------------------------------
 
 
-def parse_seconds(text: str, name: str = "shutter") -> float:
-    """Seconds from ``"1/60"`` or ``"0.5"``, the option `name`."""
-    numerator, _, denominator = text.removesuffix("s").partition("/")
-    try:
-        return float(numerator) / float(denominator or 1)
-    except (ValueError, ZeroDivisionError):
-        raise ValueError(f"`{name}` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
-
-
-def parse_f_number(text: str, name: str = "aperture") -> float:
-    """F-number from ``"4"`` or ``"f/4"``, the option `name`."""
-    try:
-        return float(text.lower().removeprefix("f").removeprefix("/"))
-    except ValueError:
-        raise ValueError(f"`{name}` (={text!r}) must be an f-number, such as 4 or f/4") from None
-
-
 def trust_configuration(trust: bool) -> None:
     """With `trust`, the YAML files of this process, and of its workers, may name Python code."""
     from simulator.utils.config_file import TRUST_VARIABLE
@@ -167,9 +151,9 @@ def takes_source(command: Callable[..., None]) -> Callable[..., None]:
         iso, shutter, f_number = (given.pop(name) for name in _SOURCE)
         source = {} if iso is None else {"iso": iso}
         if shutter is not None:
-            source["exposure_time"] = parse_seconds(shutter, "source-shutter")
+            source["exposure_time"] = parse_number(shutter, "source-shutter")
         if f_number is not None:
-            source["f_number"] = parse_f_number(f_number, "source-aperture")
+            source["f_number"] = parse_number(f_number, "source-aperture")
         if source:
             from simulator.raw.read import check_settings
 

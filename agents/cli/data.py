@@ -162,13 +162,9 @@ def score_tables(
     from ae_env.scorers import make_scorer
     from agents.score_shards import ShardPlan, check_engine, run
     from simulator import get_camera
+    from simulator.utils.checks import import_extra
 
-    try:
-        import pyarrow  # noqa: F401
-    except ModuleNotFoundError:
-        raise ImportError(
-            "`ae-env score-tables` needs the extra tables: pip install 'ae-env[tables]'"
-        ) from None
+    import_extra("pyarrow", "tables", "`ae-env score-tables`")
     check_engine(on)
     ExposureGrid.from_spec(grid), make_scorer(scorer), get_camera(camera)
     if weights != "none":

@@ -27,7 +27,7 @@ from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
-from agents.cli.show import film, scorers, view
+from agents.cli.show import film, judge, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 from simulator import __version__
@@ -118,11 +118,6 @@ def _check_options(name: str, **options: Any) -> None:
 class _Commands(TyperGroup):
     """The commands; errors of options say the value."""
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args[:1] == ["report"]:
-            ctx.fail("No such command 'report': `ae-env evaluate` writes the report.")
-        return super().resolve_command(ctx, args)
-
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
@@ -144,7 +139,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
-    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
+    *(view, judge, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
@@ -152,7 +147,7 @@ app.add_typer(scenes, name="scenes")
 
 #: Commands that go on where they were stopped.
 _RESUMING = {"quickstart", "evaluate", "bench", "scenes", "score-tables"}
-_RESUMING |= {"train", "train-simulator"}
+_RESUMING |= {"train", "train-simulator", "judge"}
 #: Errors about the user's options and files.
 _USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 #: Exit status after Ctrl-C, and after SIGTERM.
@@ -185,9 +180,8 @@ def main() -> None:
             more = "; run the same command again to continue" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
             # What is kept is written: a second Ctrl-C need not wait for the workers' end.
-            quit_at_once = partial(_quit, stop.code)
-            signal.signal(signal.SIGINT, quit_at_once)
-            signal.signal(signal.SIGTERM, quit_at_once)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, partial(_quit, stop.code))
         raise
 
 

@@ -1,8 +1,9 @@
-"""Looking at scenes, episodes and scorers: ``ae-env view``, ``film``, ``scorers``."""
+"""Looking at scenes, episodes and scorers: ``ae-env view``, ``judge``, ``film``, ``scorers``."""
 
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,9 +12,12 @@ from typer import Argument, Option
 from agents.cli import console
 from agents.cli.console import print_files, print_line, progress_bars
 from agents.cli.simulate import make_simulator
+from simulator.utils.checks import import_extra
 
 #: What is shown where nothing is named; `ae-env warm-up` draws it.
 DEFAULT_SCENES = "bundled:small"
+Port = Annotated[int, Option(help="Port to serve at; 0 for any.", min=0, max=65535)]
+Opens = Annotated[bool, Option("--open/--no-open", help="Open the page in the default browser.")]
 #: Policies of a film where none is given.
 POLICIES = ("average:tuned", "average:tuned?foresight=model", "regression:video?foresight=learnt")
 
@@ -28,10 +32,8 @@ def view(
             "the id of a bundled scene.",
         ),
     ] = DEFAULT_SCENES,
-    port: Annotated[int, Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
-    open_browser: Annotated[
-        bool, Option("--open/--no-open", help="Open the page in the default browser.")
-    ] = True,
+    port: Port = 0,
+    open_browser: Opens = True,
     scorer: Annotated[str, Option(help="Scorer, as for `evaluate`.")] = "balanced",
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
@@ -46,16 +48,10 @@ def view(
 
     Example: `ae-env view IMG_0001.CRW`
     """
-    try:
-        from agents.viewer.server import free_port, serve
-    except ModuleNotFoundError as error:
-        if error.name not in ("nicegui", "fastapi"):
-            raise
-        raise ImportError(
-            "`ae-env view` needs the extra view: pip install 'ae-env[view]'"
-        ) from None
+    import_extra("nicegui", "view", "`ae-env view`")
     from ae_env.scorers import make_scorer
-    from agents.viewer.page import Options
+    from agents.viewer.page import Options, show_page
+    from agents.viewer.server import free_port, serve
     from agents.viewer.viewed_scene import find_scenes
     from simulator.capture.decision import check_tolerance
 
@@ -67,12 +63,59 @@ def view(
         library = find_scenes(what, source)
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
+    serve("ae-env view", partial(show_page, options), options.folder, port, open_browser)
 
-    def announce(address: str) -> None:
-        print_line(f"open {address}\nCtrl-C stops")
-        console.terminal.file.flush()
 
-    serve(options, port, open_browser, announce)
+def judge(
+    choices: Annotated[
+        list[Path] | None, Argument(metavar="[CSV]...", help="Of --fit: files of choices.")
+    ] = None,
+    fit: Annotated[bool, Option("--fit", help="Tell what the files say; ask nothing.")] = False,
+    scenes: Annotated[str, Option(help="'bundled', 'polyhaven', raws or maps.")] = "bundled",
+    split: Annotated[str, Option(help="train, test or all.")] = "test",
+    resolution: Annotated[int, Option(help="Packed pixels a side of a frame.", min=36)] = 256,
+    pairs: Annotated[int, Option(help="Pairs to choose from.", min=1, max=10_000)] = 60,
+    name: Annotated[str, Option("--judge", help="Name or id of who chooses.")] = "anonymous",
+    out: Annotated[
+        Path | None, Option(help="CSV of the choices (choices.csv); of --fit, a folder (judging).")
+    ] = None,
+    seed: console.Seed = 0,
+    port: Port = 0,
+    open_browser: Opens = True,
+) -> None:
+    """Choose the better of two frames, blind; with --fit, compare scorers with the choices.
+
+    The page is served to this machine alone, until Ctrl-C, and needs the extra `view`.
+
+    Example: `ae-env judge --judge ann --out ann.csv`, then `ae-env judge --fit ann.csv`
+    """
+    import tempfile
+
+    from agents.report.judging import Judging, draw_pairs, judged_scenes, write_fit
+
+    if fit != bool(choices):
+        raise ValueError(f"`choices` (={list(map(str, choices or ()))}) must come with --fit")
+    if choices:
+        console.make_folder(out or Path("judging"))
+        files = write_fit(choices, out or Path("judging"), console.command_line())
+        print_line(files[1].read_text(encoding="utf-8"))
+        print_files({file.name: file for file in files})
+        return
+    import_extra("nicegui", "view", "`ae-env judge`")
+    from agents.viewer.judge_page import show_pairs
+    from agents.viewer.page import PictureStore
+    from agents.viewer.server import free_port, serve
+
+    path, port = out or Path("choices.csv"), free_port(port)
+    console.check_outputs(out=(path, ".csv"))
+    source: dict[str, Any] = {"scenes": scenes, "split": split, "resolution": resolution}
+    with progress_bars() as progress, progress("pairs") as task:
+        found = judged_scenes(**source)
+        draw = partial(draw_pairs, found, pairs, seed, task, **source)
+        judging = Judging(path, name, found, draw)
+    print_line(f"{judging.done} of {len(judging.pairs)} pairs are chosen from in {path}")
+    show = partial(show_pairs, judging, found, PictureStore())
+    serve("ae-env judge", show, tempfile.TemporaryDirectory(), port, open_browser)
 
 
 @console.takes_source

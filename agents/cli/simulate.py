@@ -12,7 +12,7 @@ from typer import Option
 
 from agents.cli import console
 from agents.cli.console import check_outputs, print_files, print_line, progress_bars
-from simulator.utils.checks import check_number, check_word
+from simulator.utils.checks import check_number, check_word, import_extra, parse_number
 from simulator.utils.files import printable, write_picture
 
 if TYPE_CHECKING:
@@ -52,11 +52,10 @@ def simulate(
     from simulator import CameraSettings, read_raw
     from simulator.capture.decision import check_tolerance
     from simulator.capture.sensor import Noise
-    from simulator.utils.checks import check_word
 
     check_word("noise", noise, get_args(Noise))
     check_tolerance(tolerance)
-    seconds, f_number = console.parse_seconds(shutter), console.parse_f_number(aperture)
+    seconds, f_number = parse_number(shutter, "shutter"), parse_number(aperture, "aperture")
     with console.option_names(exposure_time="shutter", f_number="aperture"):
         settings = CameraSettings(iso, seconds, f_number)
     check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
@@ -212,7 +211,7 @@ def refocus(
     from simulator import read_raw
     from simulator.raw.develop import as_recorded
 
-    f_number = console.parse_f_number(aperture)
+    f_number = parse_number(aperture, "aperture")
     for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale}
     for_depth |= {"depth-layer": depth_layer, "focus": focus}
     for_depth |= {"focal-length": focal_length, "pixel-pitch": pixel_pitch}
@@ -302,7 +301,7 @@ def hdr(
     from simulator import read_raw
 
     applied.bracket_exposures(stops, step)
-    applied.import_openexr()
+    import_extra("OpenEXR", "hdr", "an EXR file")
     check_outputs(raw, out=(out, ".exr"), png=(png, ".png"))
     simulator = make_simulator(weights, device, cache)
     source = read_raw(raw, settings=source)

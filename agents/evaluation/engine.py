@@ -80,7 +80,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Run every policy over the same episodes, from starts that are drawn.
 
-    Scores are always the expected scores q, whatever the environment's reward.
+    Scores are always the expected scores q, whatever the environment's reward. A `UserCodeError` if
+    a policy raises (the cause is chained), or returns no allowed states.
 
     Args:
         policies: By name in the tables; a list holds the same agent from several training seeds.
@@ -93,9 +94,6 @@ def evaluate(
         other_scorers: Names of scorers that no policy was trained on; states that were chosen in
             some of the scenes are also rated by these.
         progress: Called with frames done, frames in all, and the name of the policy.
-
-    Raises:
-        UserCodeError: If a policy raises (the cause is chained), or returns no allowed states.
     """
     check_integer("episodes_per_scene", episodes_per_scene, 1)
     check_integer("frames", frames, 1)

@@ -46,18 +46,13 @@ _ONLY_OF = {
 
 
 class Condition(Configuration):
-    """Light and delay of some of the episodes, or the time of a bracket.
+    """Light and delay of some of the episodes, or the time of a bracket."""
 
-    Args:
-        lighting: As the environment's argument: a name, or a mapping with ``kind``.
-        delay: Frames from a decision to the first frame that has it, of all controls or by
-            control; as the environment's argument.
-        budget: Time of all frames of a bracket [s]; the plan's `budgets` set it.
-    """
-
-    lighting: Any = "static"
+    lighting: Any = "static"  # as the environment's argument: a name, or a mapping with ``kind``
+    #: Frames from a decision to the first frame that has it, of all controls or by control; as the
+    #: environment's argument.
     delay: Annotated[Any, AfterValidator(checked_delay)] = 0
-    budget: float | None = None
+    budget: float | None = None  # time of all frames of a bracket [s]; the plan's `budgets` set it
 
     @property
     def at_rest(self) -> bool:
@@ -70,50 +65,40 @@ class EvaluationPlan(Configuration):
 
     A plan with `budgets` is of ``ae_env/ExposureBracket-v0``: its measure is the quality of the
     merged picture, its conditions are the budgets, and it has no entries about frames.
-
-    Args:
-        name: Shown in the report.
-        environment: Arguments of the environment that all conditions share; `lighting` and `delay`
-            are those of the conditions.
-        scene_ids: Scenes to use, in this order; empty for all of the split.
-        max_scenes: Use at most so many scenes, source groups in turn; None for all.
-        delays: Each condition is run with each of these delays; except for the first, it is called
-            ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
-        starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
-        frames: Actions per episode.
-        budgets: Of brackets: times that all frames of an episode may take together [s].
-        max_frames: Of brackets: frames of an episode at most.
-        seeds: Each gives every scene another motion, defocus, phase of the light and noise.
-        policies: Names, as `agents.make_policy` takes them.
-        other_scorers: Names of scorers that no policy was trained on; chosen states are also rated
-            by these.
-        other_scorer_scenes: Scenes that they rate, source groups in turn.
-        task: Of a plan that is a part of a benchmark: which of its tables has the results.
-        suite: Presets of all plans of that benchmark, which have one hash.
-        hash: Of a benchmark: sha256 of the plan, or of all of its suite, and of the scenes' light,
-            which is checked.
     """
 
-    name: str = "evaluation"
+    name: str = "evaluation"  # shown in the report
+    #: Arguments of the environment that all conditions share; `lighting` and `delay` are those of
+    #: the conditions.
     environment: dict[str, Any] = Field(default_factory=dict)
-    scene_ids: tuple[str, ...] = ()
+    scene_ids: tuple[str, ...] = ()  # scenes to use, in this order; empty for all of the split
+    #: Use at most so many scenes, source groups in turn; None for all.
     max_scenes: int | None = Field(default=None, ge=1, le=MAX_SCENES)
     conditions: dict[str, Condition] = Field(
         default_factory=lambda: {"static": Condition()}, min_length=1
     )
+    #: Each condition is run with each of these delays; except for the first, it is called
+    #: ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
     delays: tuple[int, ...] = Field(default=(0,), min_length=1)
+    #: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
     starts: tuple[str, ...] = Field(default=("dark", "middle", "bright"), min_length=1)
-    frames: int = Field(default=24, ge=1, le=10_000)
+    frames: int = Field(default=24, ge=1, le=10_000)  # actions per episode
+    #: Of brackets: times that all frames of an episode may take together [s].
     budgets: tuple[Annotated[float, Field(ge=1e-5, le=3600.0)], ...] | None = Field(
         default=None, min_length=1
     )
-    max_frames: int = Field(default=3, ge=1, le=4)
+    max_frames: int = Field(default=3, ge=1, le=4)  # of brackets: frames of an episode at most
+    #: Each gives every scene another motion, defocus, phase of the light and noise.
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
-    policies: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()  # names, as `agents.make_policy` takes them
+    #: Names of scorers that no policy was trained on; chosen states are also rated by these.
     other_scorers: tuple[str, ...] = ()
+    #: Scenes that they rate, source groups in turn.
     other_scorer_scenes: int = Field(default=8, ge=1, le=MAX_SCENES)
-    task: str = ""
-    suite: tuple[str, ...] = ()
+    task: str = ""  # of a plan that is a part of a benchmark: which of its tables has the results
+    suite: tuple[str, ...] = ()  # presets of all plans of that benchmark, which have one hash
+    #: Of a benchmark: sha256 of the plan, or of all of its suite, and of the scenes' light, which
+    #: is checked.
     hash: str | None = None
 
     @field_validator(
@@ -241,8 +226,7 @@ class EvaluationPlan(Configuration):
 def load_plan(name: str | Path) -> EvaluationPlan:
     """The plan of a preset of ``configs/evaluation``, or of a YAML file of one's own.
 
-    Raises:
-        ValueError: If there is none, or an entry is unknown, out of range or no JSON value.
+    A `ValueError` if there is none, or an entry is unknown, out of range or no JSON value.
     """
     plan = load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
     plan.protocol()

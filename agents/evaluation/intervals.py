@@ -113,13 +113,11 @@ def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLE
     2008). A tier begins with the best policy that is left, and has those below it that are not
     significantly worse than that one.
 
-    Arguments are those of `score_interval`, gains by policy.
-
-    Returns:
-        A row for each policy: its ``place``, ``policy``, its ``tier`` (1 for the best; None below
-        15 source groups), ``normalised_score`` with its own (not simultaneous) interval ``ci95``;
-        ``to_best`` and ``to_next`` (None for the best and the last) have the ``other`` policy, the
-        ``difference`` to it, its ``simultaneous_ci95`` and whether that is ``significant``.
+    Arguments are those of `score_interval`, gains by policy. A row has a policy's ``place``,
+    ``policy``, its ``tier`` (1 for the best; None below 15 source groups), ``normalised_score``
+    with its own (not simultaneous) interval ``ci95``; ``to_best`` and ``to_next`` (None for the
+    best and the last) have the ``other`` policy, the ``difference`` to it, its
+    ``simultaneous_ci95`` and whether that is ``significant``.
     """
     scores = {name: score_interval(own, span, resamples=resamples) for name, own in gains.items()}
     names = sorted(scores, key=lambda name: -scores[name].value)  # ties keep the given order

@@ -93,20 +93,10 @@ def settling(scores: Floats) -> Ints:
 def frames_to_converge(
     errors: Floats, tolerance: float = THIRD_EV, since: Ints | int = 0
 ) -> tuple[Ints, Any]:
-    """First frame from which the EV error stays within `tolerance` until the episode's end.
+    """First frame from which errors (..., T) stay within `tolerance` [EV] to the episode's end.
 
-    Args:
-        errors: EV errors after each action, ``(..., T)``.
-        tolerance: Largest error that counts as converged [EV].
-        since: Frame that counts as the first, such as that after a step of the light.
-
-    Returns:
-        Frames, ``(...)``, 1 for the first, and whether it converged; an episode that never does has
-        all its frames, T - `since`.
-
-    >>> frames, _ = frames_to_converge(np.array([[2.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 2.0]]))
-    >>> frames.tolist()
-    [4, 4]
+    Frames count from `since`, such as that after a step of the light, as 1. Beside them is whether
+    an episode converged; one that never does has all its frames, T - `since`.
     """
     outside = errors > tolerance
     frames = errors.shape[-1]

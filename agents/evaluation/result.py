@@ -60,23 +60,17 @@ class Track:
     """States and measurements of one policy in all episodes.
 
     Leading axis K: training seeds (1 where there is nothing to train).
-
-    Args:
-        arrays: By name. Of frames, ``(K, E, T)``: ``states`` of the frames after each action (with
-            a delay those that were chosen earlier); ``image_mean``, their mean linear signal;
-            ``code_mean``, the mean of the companded frame in [0, 1]; ``clipped_high`` and
-            ``clipped_low``, shares of saturated and of black pixels. Of brackets, ``(K, E)``:
-            `BRACKET_METRICS`.
-        ms_per_decision: Time in `act` per camera and frame [ms], in batches.
-        captures_per_decision: Frames taken for one decision.
-        privileged: Whether the policy was told the best states.
-        ms_alone: Time in `act` for one camera alone [ms]; None where it was not measured.
     """
 
+    #: By name. Of frames, ``(K, E, T)``: ``states`` of the frames after each action (with a delay
+    #: those that were chosen earlier); ``image_mean``, their mean linear signal; ``code_mean``, the
+    #: mean of the companded frame in [0, 1]; ``clipped_high`` and ``clipped_low``, shares of
+    #: saturated and of black pixels. Of brackets, ``(K, E)``: `BRACKET_METRICS`.
     arrays: Mapping[str, NDArray[Any]]
-    ms_per_decision: float
-    captures_per_decision: float
-    privileged: bool
+    ms_per_decision: float  # time in `act` per camera and frame [ms], in batches
+    captures_per_decision: float  # frames taken for one decision
+    privileged: bool  # whether the policy was told the best states
+    #: Time in `act` for one camera alone [ms]; None where it was not measured.
     ms_alone: float | None = None
 
     @property
@@ -107,37 +101,28 @@ class EvaluationResult:
     """Everything measured in one condition; `E` episodes, `T` frames, `S` states.
 
     Scene, source group and kind of each episode are ``(E,)``; tracks are by policy.
-
-    Args:
-        hard: Whether the episode's scene is in the hard part, ``(E,)``.
-        start_states: State of the reset frame; empty for brackets, as `scores` and `allowed`.
-        scores: q of every state, ``(E, T, S)``.
-        allowed: Action masks of every frame, ``(E, T, S)``.
-        delays: Frames between a decision and the frame that has its ISO, its exposure time and
-            its aperture.
-        plan: The plan that the condition belongs to.
-        speed: Image speed of each episode [frame heights per second], ``(E,)``.
-        defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
-        movement: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
-        other_scores: Mean score of the states that each policy chose under scorers that nothing was
-            trained on: by scorer, then by policy.
     """
 
     grid: ExposureGrid
     scene_ids: NDArray[Any]
     groups: NDArray[Any]
     kinds: NDArray[Any]
-    hard: Bools
-    start_states: Ints
-    scores: Floats
-    allowed: Bools
+    hard: Bools  # whether the episode's scene is in the hard part, ``(E,)``
+    start_states: Ints  # state of the reset frame; empty for brackets, as `scores` and `allowed`
+    scores: Floats  # q of every state, ``(E, T, S)``
+    allowed: Bools  # action masks of every frame, ``(E, T, S)``
     tracks: dict[str, Track]
-    plan: EvaluationPlan
+    plan: EvaluationPlan  # the plan that the condition belongs to
+    #: Frames between a decision and the frame that has its ISO, its exposure time and its aperture.
     delays: tuple[int, int, int] = (0, 0, 0)
     scenes: Sequence[Scene] = ()
-    speed: Floats | None = None
+    speed: Floats | None = None  # image speed of each episode [frame heights per second], ``(E,)``
+    #: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
     defocus: Floats | None = None
+    #: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
     movement: Floats | None = None
+    #: Mean score of the states that each policy chose under scorers that nothing was trained on: by
+    #: scorer, then by policy.
     other_scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
@@ -286,16 +271,9 @@ def result_rows(
     """A row per policy and condition: `ROW_COLUMNS` and `MORE_COLUMNS`.
 
     The static condition gives rows ``"all"``, ``"hard"`` and ``"rest"`` (see
-    `EvaluationResult.parts`), every other one a row with its own name.
-
-    Args:
-        source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
-        split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
-        resamples: Bootstrap resamples of the interval.
-
-    Returns:
-        `ci95` is the 95 % interval of `normalised_score`, None below 15 source groups;
-        `ms_per_decision` is amortised over a batch of cameras.
+    `EvaluationResult.parts`), every other one a row with its own name. `source` and `split` are
+    those of the plan by default. `ci95` is the 95 % bootstrap interval of `normalised_score`, None
+    below 15 source groups; `ms_per_decision` is amortised over a batch of cameras.
     """
     results = as_results(results)
     static, rows = static_condition(results), []
@@ -372,7 +350,7 @@ def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
 def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], quantile: float) -> float:
     """Least value at which the cumulated weight reaches `quantile` of the whole.
 
-    >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.2, 0.6]), 0.5)
+    >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.2, 0.6]), 0.8)
     2.0
     """
     order = np.argsort(values, axis=None)

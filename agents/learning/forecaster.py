@@ -42,30 +42,21 @@ _LARGEST, _LEAST_SPREAD = 8.0, 0.02
 
 
 class ForecasterTraining(Configuration):
-    """Hyperparameters of a forecaster.
+    """Hyperparameters of a forecaster."""
 
-    Args:
-        steps: Optimiser steps.
-        batch_size: Sequences of a step.
-        learning_rate: At its highest, of a one-cycle schedule.
-        weight_decay: Of AdamW.
-        width: Units of the recurrent network.
-        traces: Traces of light that are drawn.
-        mixed: Share of the light that is a sum of two to four kinds.
-        bent: Share of the light that is cut at a level above or below, as light is that comes
-            through gaps; likewise the share whose pace varies, and the share that is smoothed.
-        seed: Seed of light, frames and weights.
-    """
-
-    steps: int = Field(default=10_000, ge=2, le=10**9)
-    batch_size: int = Field(default=64, ge=1, le=10**6)
+    steps: int = Field(default=10_000, ge=2, le=10**9)  # optimiser steps
+    batch_size: int = Field(default=64, ge=1, le=10**6)  # sequences of a step
+    #: At its highest, of a one-cycle schedule.
     learning_rate: float = Field(default=4e-3, ge=1e-9, le=1.0)
-    weight_decay: float = Field(default=1e-3, ge=0.0, le=1e3)
-    width: int = Field(default=64, ge=1, le=MAX_WIDTH)
-    traces: int = Field(default=4096, ge=1, le=10**6)
+    weight_decay: float = Field(default=1e-3, ge=0.0, le=1e3)  # of AdamW
+    width: int = Field(default=64, ge=1, le=MAX_WIDTH)  # units of the recurrent network
+    traces: int = Field(default=4096, ge=1, le=10**6)  # traces of light that are drawn
+    #: Share of the light that is a sum of two to four kinds.
     mixed: float = Field(default=0.5, ge=0.0, le=1.0)
+    #: Share of the light that is cut at a level above or below, as light is that comes through
+    #: gaps; likewise the share whose pace varies, and the share that is smoothed.
     bent: float = Field(default=0.4, ge=0.0, le=1.0)
-    seed: int = Field(default=0, ge=0, le=2**32 - 1)
+    seed: int = Field(default=0, ge=0, le=2**32 - 1)  # seed of light, frames and weights
 
 
 class LightForecaster(nn.Module):

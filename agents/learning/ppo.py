@@ -34,12 +34,7 @@ from agents.learning.networks import (
     with_history,
 )
 from agents.learning.policy_file import MAX_HISTORY, MAX_WIDTH, NetworkPolicy, trained_grid
-from agents.learning.sb3_adapter import (
-    SB3VectorAdapter,
-    ShiftedFrames,
-    WithHistory,
-    WithRightExposure,
-)
+from agents.learning.sb3_adapter import SB3VectorAdapter, TrainingFrames, WithHistory
 from agents.policy import Bools, Ints, Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
@@ -166,42 +161,30 @@ _OF_OURS = {"total_timesteps", "learning_rate", "ev_coef", "width", "history", "
 
 
 class PPOTraining(Configuration):
-    """Hyperparameters of PPO, named as in Stable-Baselines3.
+    """Hyperparameters of PPO, named as in Stable-Baselines3."""
 
-    Args:
-        total_timesteps: Frames in all environments together.
-        n_steps: Frames per environment and update.
-        batch_size: Frames of a gradient step.
-        n_epochs: Passes over each rollout.
-        learning_rate: At the start; falls linearly to a tenth.
-        gamma: Discount; 0 because a static scene is a contextual bandit.
-        gae_lambda: Of the advantage estimate.
-        clip_range: Of the probability ratio.
-        ent_coef: Weight of the entropy at the start; falls linearly to a tenth.
-        vf_coef: Weight of the value loss.
-        max_grad_norm: Gradient clipping.
-        ev_coef: Weight of the loss of the right exposure's EV100, see `StateHead`.
-        width: Hidden features of the network.
-        history: Frames of which the network sees what a light meter read and what was asked for
-            (`MeterHistory`); 0 for none.
-        seed: Seed of scenes, noise, weights and actions.
-    """
-
+    #: Frames in all environments together.
     total_timesteps: int = Field(default=200_000, ge=1, le=10**12)
-    n_steps: int = Field(default=16, ge=1, le=10**6)
-    batch_size: int = Field(default=256, ge=2, le=10**9)
-    n_epochs: int = Field(default=4, ge=1, le=10**4)
+    n_steps: int = Field(default=16, ge=1, le=10**6)  # frames per environment and update
+    batch_size: int = Field(default=256, ge=2, le=10**9)  # frames of a gradient step
+    n_epochs: int = Field(default=4, ge=1, le=10**4)  # passes over each rollout
+    #: At the start; falls linearly to a tenth.
     learning_rate: float = Field(default=1e-3, ge=1e-9, le=1.0)
+    #: Discount; 0 because a static scene is a contextual bandit.
     gamma: float = Field(default=0.0, ge=0.0, le=1.0)
-    gae_lambda: float = Field(default=1.0, ge=0.0, le=1.0)
-    clip_range: float = Field(default=0.2, ge=1e-6, le=1e6)
+    gae_lambda: float = Field(default=1.0, ge=0.0, le=1.0)  # of the advantage estimate
+    clip_range: float = Field(default=0.2, ge=1e-6, le=1e6)  # of the probability ratio
+    #: Weight of the entropy at the start; falls linearly to a tenth.
     ent_coef: float = Field(default=0.02, ge=0.0, le=1e6)
-    vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)
-    max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)
+    vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)  # weight of the value loss
+    max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)  # gradient clipping
+    #: Weight of the loss of the right exposure's EV100, see `StateHead`.
     ev_coef: float = Field(default=0.05, ge=0.0, le=100.0)
-    width: int = Field(default=256, ge=1, le=MAX_WIDTH)
+    width: int = Field(default=256, ge=1, le=MAX_WIDTH)  # hidden features of the network
+    #: Frames of which the network sees what a light meter read and what was asked for
+    #: (`MeterHistory`); 0 for none.
     history: int = Field(default=0, ge=0, le=MAX_HISTORY)
-    seed: int = Field(default=0, ge=0, le=2**32 - 1)
+    seed: int = Field(default=0, ge=0, le=2**32 - 1)  # seed of scenes, noise, weights and actions
 
     def check_batch(self, num_envs: int) -> None:
         """Raises a `ValueError` unless `num_envs` rollouts divide into gradient steps."""
@@ -266,16 +249,11 @@ def train_ppo(
     seed = training.seed
     if done:  # a training that resumes must not repeat its first draws
         seed = int(np.random.SeedSequence([seed, done]).generate_state(1)[0])
-    seen = ShiftedFrames(seen, np.random.default_rng([training.seed, done]))
     model = PPO(
         ExposureActorCritic,
-        WithRightExposure(seen) if training.ev_coef else seen,
+        TrainingFrames(seen, np.random.default_rng([training.seed, done])),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
-        policy_kwargs={
-            "grid": context.grid,
-            "width": training.width,
-            "ev_coef": training.ev_coef,
-        },
+        policy_kwargs={"grid": context.grid, **training.model_dump(include={"width", "ev_coef"})},
         seed=seed,
         device=session.device,
         **training.model_dump(exclude=_OF_OURS),

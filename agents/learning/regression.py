@@ -243,32 +243,24 @@ class RegressionPolicy(NetworkPolicy):
 
 
 class RegressionTraining(Configuration):
-    """Hyperparameters of the regression agent.
+    """Hyperparameters of the regression agent."""
 
-    Args:
-        frames: Frames to take.
-        learning_rate: Peak of the one-cycle schedule of AdamW.
-        weight_decay: Of AdamW.
-        replay: Frames of the recent past that each optimiser step sees again, per new frame.
-        memory: Frames that are remembered for it.
-        explore: Share of random actions; the others are the agent's own, so that it learns from
-            the frames it will meet.
-        width: Hidden features of the network.
-        dropout: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
-        ev_coef: Weight of the loss of the right exposure's EV100.
-        seed: Seed of scenes, noise and weights.
-    """
-
-    frames: int = Field(default=100_000, ge=1, le=10**12)
+    frames: int = Field(default=100_000, ge=1, le=10**12)  # to take
+    #: Peak of the one-cycle schedule of AdamW.
     learning_rate: float = Field(default=5e-3, ge=1e-9, le=1.0)
-    weight_decay: float = Field(default=1e-3, ge=0.0, le=1.0)
+    weight_decay: float = Field(default=1e-3, ge=0.0, le=1.0)  # of AdamW
+    #: Frames of the recent past that each optimiser step sees again, per new frame.
     replay: int = Field(default=2, ge=0, le=64)
-    memory: int = Field(default=8192, ge=1, le=10**9)
+    memory: int = Field(default=8192, ge=1, le=10**9)  # frames that are remembered for it
+    #: Share of random actions; the others are the agent's own, so that it learns from the frames it
+    #: will meet.
     explore: float = Field(default=0.5, ge=0.0, le=1.0)
-    width: int = Field(default=256, ge=1, le=MAX_WIDTH)
+    width: int = Field(default=256, ge=1, le=MAX_WIDTH)  # hidden features of the network
+    #: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
     dropout: float = Field(default=0.1, ge=0.0, le=0.99)
+    #: Weight of the loss of the right exposure's EV100, see `StateHead`.
     ev_coef: float = Field(default=0.01, ge=0.0, le=100.0)
-    seed: int = Field(default=0, ge=0, le=2**63)
+    seed: int = Field(default=0, ge=0, le=2**63)  # of scenes, noise and weights
 
 
 def train_regression(

@@ -21,7 +21,7 @@ from agents.learning.policy_file import load_agent, save_agent
 from agents.learning.regression import RegressionTraining, train_regression
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
-from simulator.utils.checks import check_word
+from simulator.utils.checks import check_word, import_extra
 from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
@@ -35,22 +35,17 @@ ROWS = 200
 
 
 class AgentConfig(Configuration):
-    """A training of an agent, in an environment of a task; a forecaster needs none.
-
-    Args:
-        environment: Arguments of the environment.
-        max_episode_steps: Actions of an episode; by default those of the task.
-        num_envs: Episodes side by side.
-        training: Hyperparameters: `RegressionTraining`, `PPOTraining` or `ForecasterTraining`.
-    """
+    """A training of an agent, in an environment of a task; a forecaster needs none."""
 
     agent: Literal["regression", "ppo", "forecaster"]
     task: Literal["ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0"] = (
         "ae_env/AutoExposure-v0"
     )
-    environment: dict[str, Any] = Field(default_factory=dict)
+    environment: dict[str, Any] = Field(default_factory=dict)  # arguments of the environment
+    #: Actions of an episode; by default those of the task.
     max_episode_steps: int | None = Field(default=None, ge=1, le=10**6)
-    num_envs: int = Field(default=64, ge=1, le=4096)
+    num_envs: int = Field(default=64, ge=1, le=4096)  # episodes side by side
+    #: Hyperparameters: `RegressionTraining`, `PPOTraining` or `ForecasterTraining`.
     training: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -173,10 +168,8 @@ def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
 @contextmanager
 def _tensorboard(folder: Path) -> Iterator[Progress]:
     """Takes each report for TensorBoard's log in `folder`."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ImportError("a TensorBoard log needs: pip install 'ae-env[tensorboard]'") from error
+    import_extra("tensorboard", "tensorboard", "a TensorBoard log")
+    from torch.utils.tensorboard import SummaryWriter
 
     def log(done: int, total: int, values: dict[str, float]) -> None:
         for name, value in values.items():

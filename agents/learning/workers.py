@@ -66,7 +66,6 @@ def send_progress(*message: object) -> None:
 
 
 def _start_worker(messages: Any, threads: int) -> None:
-    """Prepares a worker process."""
     global _messages
     _messages = messages
     # Ctrl-C reaches every process of a terminal. Only the one that waits decides what it means.

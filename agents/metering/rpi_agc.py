@@ -124,11 +124,9 @@ class LibcameraAgc:
     ) -> Floats:
         """Takes in one frame of each camera; returns the exposure [s] that is wanted, ``(N,)``.
 
-        Args:
-            zones: Mean signal of each zone, ``(N, 15)``; white is 1.
-            histogram: Of the signals of all pixels, from 0 to 1, ``(N, bins)`` counts.
-            exposure: Exposure time x gain that the frame was taken with [s], ``(N,)``.
-            lux: Illuminance, of each or of all.
+        Of the frame are the mean signal of each of `zones` ``(N, 15)``, where white is 1; the
+        `histogram` of all signals from 0 to 1, counts ``(N, bins)``; the `exposure` ``(N,)`` that
+        it was taken with, time x gain [s]; and the illuminance.
         """
         brighter, count = 2.0**self.compensation, len(zones)
         aimed = np.broadcast_to(np.interp(lux, TARGET_LUX, TARGET_SIGNALS), count)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
-from simulator.utils.checks import check_flag, check_integer, check_number
+from simulator.utils.checks import check_flag, check_integer, check_number, import_extra
 from simulator.utils.files import as_path, read_bounded
 
 #: Entry of the file's metadata that holds the description, and the form that it has.
@@ -119,11 +119,7 @@ class Controller:
     """
 
     def __init__(self, path: str | Path, num_cameras: int = 1) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            how = "pip install onnxruntime, or the extra 'ae-env[onnx]'"
-            raise ImportError(f"a Controller needs ONNX Runtime: {how}") from error
+        onnxruntime = import_extra("onnxruntime", "onnx", "a Controller")
         given, file = f"`path` (={str(path)!r})", as_path(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # the network is small: threads cost more than they bring
@@ -190,16 +186,15 @@ class Controller:
     ) -> NDArray[np.int64]:
         """Indices into `states` (N,) for the next frame of N cameras; `reasons` says which held.
 
+        A `ValueError` if an array has the wrong shape or dtype, a setting or a sensor is out of
+        range, or a mask allows nothing.
+
         Args:
             raw: (N, *`frame_shape`) uint8 as the environment observes it, see `encode_frame`.
             settings: (N, 3) in [-1, 1] that the frames were taken with, see `encode_settings`.
             sensors: (N, 2) in [-1, 1], where the agent was trained with them, see `encode_sensors`;
                 a camera whose reading is not finite keeps its state.
             action_masks: (N, S) bool, False where a state is not allowed.
-
-        Raises:
-            ValueError: If an array has the wrong shape or dtype, a setting or a sensor is out of
-                range, or a mask allows nothing.
         """
         shown = {"raw": _array("raw", raw), "settings": _array("settings", settings, np.float64)}
         if sensors is not None:
@@ -239,6 +234,9 @@ class Controller:
     ) -> Decision:
         """The next exposure of one camera.
 
+        A `ValueError` if `planes` is no signal (integers, digital numbers) or is masked, a reading
+        is negative, or `current` is not positive and finite.
+
         Args:
             planes: (4, H, W) signal of R, G1, G2, B, 0 at black and 1 at white; of any size that is
                 at least that of `frame_shape`. None for a frame that was dropped.
@@ -252,10 +250,6 @@ class Controller:
             The state, and a reason where the last one is held: a dropped frame, a value that is not
             finite, of the frame, of a sensor that the agent uses or of the network's output, or a
             frame below black.
-
-        Raises:
-            ValueError: If `planes` is no signal (integers, digital numbers) or is masked, a reading
-                is negative, or `current` is not positive and finite.
         """
         check_flag("fixed_aperture", fixed_aperture)
         state, masks = _exposure("current", current), None

@@ -20,6 +20,7 @@ from agents.learning.regression import SAME_LIGHT_EV, RegressionPolicy
 from agents.metering.reading import BLACK_SIGNAL, SATURATED_STEP_EV, TARGET_SIGNAL, WHITE_SIGNAL
 from agents.onboard.controller import FORMAT, METADATA, NO_DIGEST
 from agents.policy import Policy
+from simulator.utils.checks import import_extra
 from simulator.utils.files import write_atomically
 
 
@@ -69,23 +70,15 @@ class _PPOGraph(nn.Module):
 def export_agent(policy: Policy, path: str | Path) -> Path:
     """Writes an agent as one ONNX file: the observation goes in as it is, for any batch.
 
-    Args:
-        policy: A `RegressionPolicy` without foresight, or a `PPOPolicy` without a history, that
-            looks at pixels.
-
-    Raises:
-        ImportError: If the extra ``onnx`` is not installed.
-        ValueError: If the agent cannot be exported.
+    A `ValueError` unless it is a `RegressionPolicy` without foresight or a `PPOPolicy` without a
+    history, and looks at pixels; an `ImportError` without the extra ``onnx``.
     """
     file = Path(path)
     if file.suffix != ".onnx":
         raise ValueError(f"`out` (={str(path)!r}) must end in .onnx")
     graph = _graph(policy)
-    try:
-        import onnx
-        import onnxscript  # noqa: F401  (torch's exporter needs it)
-    except ImportError as error:
-        raise ImportError("the export needs ONNX: pip install 'ae-env[onnx]'") from error
+    import_extra("onnxscript", "onnx", "the export")  # by torch's exporter
+    onnx = import_extra("onnx", "onnx", "the export")
     context = policy.context
     shape = context.observation_space["raw"].shape or ()
     arguments = {"raw": torch.zeros(2, *shape, dtype=torch.uint8), "settings": torch.zeros(2, 3)}

@@ -116,10 +116,9 @@ def check_append(
 ) -> None:
     """Checks that rows of `policies` can be added to a table, before they are measured.
 
-    Raises:
-        ValueError: If `plan` is of no benchmark that takes rows, `table` is no benchmark's table or
-            has rows of another hash, no policy gets a row, two would get the same one, or a row
-            without an author would be replaced.
+    A `ValueError` if `plan` is of no benchmark that takes rows, `table` is no benchmark's table or
+    has rows of another hash, no policy gets a row, two would get the same one, or a row without an
+    author would be replaced.
     """
     table = _followed(table)
     if plan.task not in _TASKS:

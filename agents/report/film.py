@@ -9,8 +9,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from ae_env.rendering import fitting_font
 from agents.policy import Policy
 from agents.rollouts import choose, errors_of
 from simulator.utils.files import write_picture
@@ -98,9 +99,7 @@ def _panel(recording: Recording, frame: int) -> Image.Image:
     draw = ImageDraw.Draw(panel)
     score = float(np.mean(recording.scores[1 : frame + 1])) if frame else recording.scores[0]
     for i, text in enumerate((recording.name, f"mean score so far {score:.2f}")):
-        font: Any = ImageFont.load_default(12)
-        while draw.textlength(text, font) > PICTURE and font.size > 7:
-            font = ImageFont.load_default(int(font.size) - 1)
+        font = fitting_font(draw, text, 12, PICTURE, least=7)
         draw.text((0, 2 + 15 * i), text, _INK, font)
     panel.paste(Image.fromarray(recording.pictures[frame]).resize((PICTURE, PICTURE)), (0, TITLE))
     bottom, height = TITLE + PICTURE + CHART - 4, CHART - 8

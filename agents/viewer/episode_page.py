@@ -158,7 +158,6 @@ class EpisodePage(Tab):
 
     @property
     def _last(self) -> int:
-        """The last frame."""
         return len(self._recordings[0].states) - 1
 
     def _show_frame(self) -> None:

@@ -30,7 +30,8 @@ LARGEST_UPLOAD = 300_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
 _TABS = ("Exposure", "Episode", "Refocus, HDR")
-_STYLE = Path(__file__).with_name("page.css")
+#: The looks of all pages.
+STYLE = Path(__file__).with_name("page.css")
 
 
 class PictureStore:
@@ -94,7 +95,7 @@ def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
 
 async def show_page(options: Options) -> None:
     """Puts the page together, for one tab of the browser, and opens the first scene."""
-    ui.add_css(_STYLE.read_text())
+    ui.add_css(STYLE.read_text())
     client = ui.context.client
     await client.connected()
     if not client.is_deleted:  # a page that nobody looks at costs nothing

@@ -19,7 +19,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketClose
 
-from agents.viewer.page import LARGEST_UPLOAD, Options, show_page
+from agents.viewer.page import LARGEST_UPLOAD
 
 HOST = "127.0.0.1"
 #: Largest request: a file, and what a browser sends around it [byte].
@@ -50,7 +50,7 @@ class TokenGuard:
         own = asked.headers.get("host") in self._hosts and self._is_own(asked.headers.get("origin"))
         by_query = own and self._is_token(asked.query_params.get("token", ""))
         if not by_query and not (own and any(map(self._is_token, self._cookies(asked)))):
-            text = "Open the address that `ae-env view` printed: it contains the token."
+            text = "Open the address that ae-env printed: it contains the token."
             refusal: Any = PlainTextResponse(text, 403)
             if scope["type"] == "websocket":
                 refusal = WebSocketClose(1008)
@@ -112,18 +112,21 @@ def free_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def serve(options: Options, port: int, open_browser: bool, announce: Callable[[str], None]) -> None:
-    """Serves the page at a free port until it is stopped; `announce` gets the address then."""
+def serve(title: str, show: Callable[[], Any], files: Any, port: int, open_browser: bool) -> None:
+    """Serves a page at a free port until it is stopped, and prints the address then.
+
+    `show` puts the page together, `files` is a folder for the program's own files.
+    """
     token = secrets.token_urlsafe(16)
     path = f"/?token={token}"
     app.add_middleware(TokenGuard, token=token, port=port)
     address = f"http://{HOST}:{port}{path}"
-    ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
+    ui.page("/", title=title, dark=True)(show)
     # Uploads and downloads are gone with the program, however its pages were left.
-    with options.folder as folder:
+    with files as folder:
 
         def served() -> None:
-            announce(address)
+            print(f"open {address}\nCtrl-C stops", flush=True)
             if open_browser:
                 webbrowser.open(_page_that_leads_to(address, Path(folder)))
 

@@ -110,10 +110,9 @@ def _read_raw(path: Path, name: str, **settings: float) -> OpenedScene:
 def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({})) -> Library:
     """The library of what ``ae-env view`` was asked to show.
 
-    Args:
-        what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
-            (of a recorded grid the light that its captures tell together), or a bundled scene's id.
-        settings: Of all raws, in place of their files'.
+    That is a raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them (of
+    a recorded grid the light that its captures tell together), or a bundled scene's id. `settings`
+    are of all raws, in place of their files'.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
@@ -183,21 +182,14 @@ def _bundled() -> dict[str, Callable[[], OpenedScene]]:
 
 @dataclass(frozen=True)
 class View:
-    """State and marks of one picture.
+    """State and marks of one picture."""
 
-    Args:
-        settings: Of the camera.
-        speed: Image speed [frame heights per second].
-        defocus: Diameter of the defocus disc at f/4 [pixel of a 64-pixel frame].
-        clipping: Whether clipped pixels are marked.
-        centre: Middle of the part shown pixel by pixel, down and to the right, as shares of the
-            upright picture; None for the whole frame.
-    """
-
-    settings: CameraSettings
-    speed: float = 0.0
-    defocus: float = 0.0
-    clipping: bool = False
+    settings: CameraSettings  # of the camera
+    speed: float = 0.0  # image speed [frame heights per second]
+    defocus: float = 0.0  # diameter of the defocus disc at f/4 [pixel of a 64-pixel frame]
+    clipping: bool = False  # whether clipped pixels are marked
+    #: Middle of the part shown pixel by pixel, down and to the right, as shares of the upright
+    #: picture; None for the whole frame.
     centre: tuple[float, float] | None = None
 
 

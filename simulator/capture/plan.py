@@ -66,29 +66,22 @@ class SimulationPlan:
     be, over the noise of the source and of the capture: root mean square over the pixels of
     ``sqrt(dm^2 + ds^2) / s``, where the mean moves by dm, the standard deviation by ds, and s is
     the standard deviation that the target's noise should have.
-
-    Args:
-        settings: Settings to simulate.
-        exposure: The exposure that was decided for them.
-        errors: The parts of the error by what they come from; ``"left out"``, ``"network"``,
-            ``"clipped highlights"``, ``"unknown depth"``, ``"ISO"``, ``"rounding"``.
-        excess_noise: Variance of the source's noise beyond the target's, relative to the target's:
-            mean over the pixels. 0 means that the noise is exact.
-        lacks_noise: Whether any pixel has less noise than the target.
-        clipped_source: Share of the pixels that are saturated in the source: what they would show
-            at a darker exposure is unknown.
-        tolerance: Error that the capture may have.
-        samples: Samples of the raw.
     """
 
-    settings: CameraSettings
-    exposure: Exposure
+    settings: CameraSettings  # to simulate
+    exposure: Exposure  # the exposure that was decided for them
+    #: The parts of the error by what they come from; ``"left out"``, ``"network"``, ``"clipped
+    #: highlights"``, ``"unknown depth"``, ``"ISO"``, ``"rounding"``.
     errors: Mapping[str, float]
+    #: Variance of the source's noise beyond the target's, relative to the target's: mean over the
+    #: pixels. 0 means that the noise is exact.
     excess_noise: float
-    lacks_noise: bool
+    lacks_noise: bool  # whether any pixel has less noise than the target
+    #: Share of the pixels that are saturated in the source: what they would show at a darker
+    #: exposure is unknown.
     clipped_source: float
-    tolerance: float
-    samples: int
+    tolerance: float  # error that the capture may have
+    samples: int  # of the raw
 
     @functools.cached_property
     def steps(self) -> tuple[Step, ...]:

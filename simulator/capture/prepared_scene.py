@@ -45,15 +45,12 @@ class Shares(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where a scene is out of focus, and where its subject is.
+    """Where a scene is out of focus, and where its subject is."""
 
-    Args:
-        defocus: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's
-            `defocus`; 0 is the plane of focus.
-        subject: (H, W) bool, the subject's pixels, which may move apart from the rest, or None.
-    """
-
+    #: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's `defocus`; 0 is
+    #: the plane of focus.
     defocus: torch.Tensor
+    #: (H, W) bool, the subject's pixels, which may move apart from the rest, or None.
     subject: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -145,50 +142,42 @@ class HasPrepared(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PreparedScene:
-    """Light of a scene at reference settings, ready to be exposed at any others.
+    """Light of a scene at reference settings, ready to be exposed at any others."""
 
-    Args:
-        light: (4, H, W) float32, linear, not clipped: above 1 where highlights are known.
-        reference: Settings at which `light` is on the scale where sensor white is 1.
-        camera: The body that takes the captures.
-        nlf: Noise left in `light`, at the reference settings.
-        saturated: (H, W) bool, pixels that were white in the source: their light is a guess; None
-            if there are none.
-        white_balance: Gains of R, G, B of the scene's light.
-        box_factor: Sensor pixels averaged per side into one pixel of `light`.
-        image_speed: Speed of the image [frame heights per second], at most 1000; along the rows,
-            unless `movement` says otherwise.
-        defocus: Diameter of the defocus disc at f/4 [pixel of `light`], with a `layout` that of the
-            largest; 0 for a scene that is far or in focus throughout. No disc may be wider than
-            both the frame and 512 pixel; with a `layout`, it stays at 32.
-        movement: In which directions the image moves, and the subject of `layout` of its own.
-        layout: What is out of focus, and what is the subject; None for one disc everywhere.
-        gain: Light relative to `light`, where it changes over time.
-        denoised_lights: `light` with its noise removed by each noise module, the cheapest first,
-            for targets that are cleaner than the source; none where there is no module or no noise.
-        aperture_blur: Adds the blur of apertures wider than the reference's to a scene whose depth
-            is not known; None takes it as far.
-        tolerance: Error that a capture may have, in units of the target's noise: the cheapest
-            steps that keep it are taken, or else, as at 0, those with the least error.
-        blurred_light: Blurs the light and caches what it has blurred. It is made here, and copies
-            (`dataclasses.replace`) with the same light, `nlf` and `aperture_blur` share it.
-    """
-
+    #: (4, H, W) float32, linear, not clipped: above 1 where highlights are known.
     light: torch.Tensor
-    reference: CameraSettings
-    camera: CameraProfile
-    nlf: NoiseLevelFunction
+    reference: CameraSettings  # settings at which `light` is on the scale where sensor white is 1
+    camera: CameraProfile  # the body that takes the captures
+    nlf: NoiseLevelFunction  # noise left in `light`, at the reference settings
+    #: (H, W) bool, pixels that were white in the source: their light is a guess; None if there are
+    #: none.
     saturated: torch.Tensor | None = None
+    #: Gains of R, G, B of the scene's light.
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_factor: int = 1
+    box_factor: int = 1  # sensor pixels averaged per side into one pixel of `light`
+    #: Speed of the image [frame heights per second], at most 1000; along the rows, unless
+    #: `movement` says otherwise.
     image_speed: float = 0.0
+    #: Diameter of the defocus disc at f/4 [pixel of `light`], with a `layout` that of the largest;
+    #: 0 for a scene that is far or in focus throughout. No disc may be wider than both the frame
+    #: and 512 pixel; with a `layout`, it stays at 32.
     defocus: float = 0.0
-    gain: float = 1.0
+    gain: float = 1.0  # light relative to `light`, where it changes over time
+    #: `light` with its noise removed by each noise module, the cheapest first, for targets that are
+    #: cleaner than the source; none where there is no module or no noise.
     denoised_lights: tuple[DenoisedLight, ...] = ()
+    #: Adds the blur of apertures wider than the reference's to a scene whose depth is not known;
+    #: None takes it as far.
     aperture_blur: ApertureBlur | None = None
+    #: In which directions the image moves, and the subject of `layout` of its own.
     movement: Movement = ALONG_ROWS
+    #: What is out of focus, and what is the subject; None for one disc everywhere.
     layout: Layout | None = None
+    #: Error that a capture may have, in units of the target's noise: the cheapest steps that keep
+    #: it are taken, or else, as at 0, those with the least error.
     tolerance: float = DEFAULT_TOLERANCE
+    #: Blurs the light and caches what it has blurred. It is made here, and copies
+    #: (`dataclasses.replace`) with the same light, `nlf` and `aperture_blur` share it.
     blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
 
     def __post_init__(self) -> None:

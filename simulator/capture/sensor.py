@@ -186,18 +186,14 @@ def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> n
 
 @dataclass
 class Transitions:
-    """All that B frames depend on, except for their noise.
+    """All that B frames depend on, except for their noise."""
 
-    Args:
-        light: (4, H, W) each, contiguous float32: blurred already, at the exposure of its
-            prepared scene. Several may be the same.
-        table: (B, 5, 4) of `exposure_table`.
-        remaining_variance: `Exposure.remaining_variance` of each, contiguous float32; None for
-            all of the variance. None in place of the sequence where no frame has any.
-    """
-
+    #: (4, H, W) each, contiguous float32: blurred already, at the exposure of its prepared scene.
+    #: Several may be the same.
     light: Sequence[torch.Tensor]
-    table: np.ndarray
+    table: np.ndarray  # (B, 5, 4) of `exposure_table`
+    #: `Exposure.remaining_variance` of each, contiguous float32; None for all of the variance. None
+    #: in place of the sequence where no frame has any.
     remaining_variance: Sequence[torch.Tensor | None] | None = None
 
     @classmethod
@@ -290,9 +286,6 @@ def missing_variance(
         signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
         table: (4, 4), rows 1 to 4 of `exposure_table`, or (4,), its column for that plane.
         remaining_variance: (H, W) share of the source's variance that a blur left; None for all.
-
-    Returns:
-        float32, of the shape of `signal`.
     """
     shot, read, source_shot, source_read = (
         plane_tensor(row, signal.device) if row.ndim else row.item() for row in table

@@ -61,13 +61,10 @@ class ApertureModule(nn.Module):
     def forward(
         self, image: Tensor, deviation: Tensor, f_source: Tensor, f_target: Tensor
     ) -> Tensor:
-        """The image with the aperture's defocus at `f_target`, at unchanged exposure.
+        """The raw (B, 4, H, W), of little noise, with the defocus of `f_target`, as exposed.
 
-        Args:
-            image: (B, 4, H, W) raw with little noise.
-            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
-            f_source: (B,) effective f-number of `image`.
-            f_target: (B,) effective f-number wanted; where it is not smaller, the image stays.
+        `deviation` (B, 4, H, W) is that of the noise which was removed from `image`. F-numbers (B,)
+        are effective ones; where that wanted is not smaller, the image stays.
         """
         if not self.has_map:
             opens = (f_target < f_source)[:, None, None, None]

@@ -42,15 +42,9 @@ class NetworkCache:
     ) -> Tensor:
         """The result of `make`, or an earlier one of the same inputs: the same values, bit by bit.
 
-        A stored result that is not finite, or not of `shape`, is made again.
-
-        Args:
-            kind: Of the result, part of its key.
-            modules: The networks that `make` runs; their weights may change in between.
-            inputs: Tensors that the result depends on; None where there is none.
-            make: Makes the result.
-            shape: Shape of the result, where it is known beforehand.
-            numbers: JSON values that the result depends on.
+        It depends on its `kind`, on the `modules` that `make` runs, whose weights may change in
+        between, on the tensors `inputs` and the JSON values `numbers`. A stored result that is not
+        finite, or not of `shape`, where that is known beforehand, is made again.
         """
         if self.where is None:
             return make()

@@ -115,12 +115,10 @@ class Denoiser(nn.Module):
         nn.init.zeros_(self.tail.weight)  # it starts by changing nothing
 
     def forward(self, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """Noise-reduced image (B, 4, H, W), float32.
+        """Noise-reduced raw (B, 4, H, W), float32, of any exposure.
 
-        Args:
-            image: (B, 4, H, W) noisy raw, any exposure; H, W >= 1.
-            shot: (B, 4) slope of the noise variance, on the same scale.
-            read: (B, 4) noise variance at zero signal.
+        `shot` (B, 4) is the slope of the noise variance, on the same scale, `read` (B, 4) the
+        variance at zero signal.
         """
         clean = self.uncorrected(image, self.surroundings(image, shot, read), shot, read)
         # In training a residual that is the same everywhere must cost something.
@@ -262,10 +260,8 @@ class NoiseModule(nn.Module):
     def forward(self, exposed: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """The raw with little noise, float32; one without noise (shot = read = 0) as it is.
 
-        Args:
-            exposed: (B, 4, H, W) raw on the scale of the target.
-            shot: (B, 4) slope of its noise variance on that scale.
-            read: (B, 4) noise variance at zero signal.
+        `exposed` (B, 4, H, W) is on the scale of the target, as are the slope `shot` (B, 4) of its
+        noise variance and the variance `read` (B, 4) at zero signal.
         """
         if self.commutes:
             result = self.network(exposed, shot, read)

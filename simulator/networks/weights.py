@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -65,10 +65,8 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
     """Writes ``path.safetensors`` and ``path.json``, the card with the hash of the weights.
 
     The `modules` are what `build_modules` makes of `preset`; the entries of `card`, JSON values,
-    say how they were trained and what they score.
-
-    Raises:
-        ValueError: If the weights are not finite; nothing is written then.
+    say how they were trained and what they score. A `ValueError` if the weights are not finite;
+    nothing is written then.
     """
     check_finite(modules.state_dict())
     content = save({k: v.detach().cpu().contiguous() for k, v in modules.state_dict().items()})
@@ -93,9 +91,8 @@ def write_pair(path: Path, content: bytes, card: dict[str, Any]) -> None:
 def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors and the card that `write_pair` wrote; a card without a hash is not compared.
 
-    Raises:
-        ValueError: If a file cannot be read or is damaged, the card is no JSON object, or its hash
-            is not that of the weights.
+    A `ValueError` if a file cannot be read or is damaged, the card is no JSON object, or its hash
+    is not that of the weights.
     """
     card_file, file = sibling(path, ".json"), sibling(path, ".safetensors")
     given = f"`weights` (={str(path)!r})"
@@ -169,10 +166,8 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     """Trained modules, in evaluation mode, and their model card.
 
     `name` is one of `list_pretrained()`, or the path of a ``.safetensors`` file with its ``.json``.
-
-    Raises:
-        ValueError: If there is no such file, its hash is not the card's, or its tensors are not
-            those of the preset's networks.
+    A `ValueError` if there is no such file, its hash is not the card's, or its tensors are not
+    those of the preset's networks.
     """
     check_type("weights", name, str, Path)
     known = list_pretrained()
@@ -188,8 +183,6 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
                 )
     tensors, card = read_pair(path)
     _check_card(card, name)
-    if card["preset"] == "ncs":
-        tensors = _from_authors(tensors)
     modules = build_modules(card["preset"])
     load_into(modules, tensors, f"`weights` (={str(name)!r})")
     if "noise" in modules and card.get("residual") is not None:
@@ -200,7 +193,7 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
 
 def _hint(name: str, known: list[str]) -> str:
     if name == "ncs":
-        return "; docs/networks.md says how to convert the authors' files"
+        return "; examples/convert_ncs.py converts the authors' files"
     if name in BUILDERS or name in ("pc", "dl"):
         program = "ae-env" if name in BUILDERS else "python -m benchmarks.paper_baselines"
         return f"; train it: {program} train-simulator configs/simulator/{name}.yaml"
@@ -215,76 +208,3 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
         rule = f"the .json must be a model card of {known}, with the hash `sha256`"
         got = reprlib.repr(card.get(wrong[0]))
         raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {got}")
-
-
-# -- the weights that the paper's authors released ------------------------------------------------
-
-#: Planes R, G1, B, G2 of the authors' pictures in the order of ours, R, G1, G2, B.
-_PLANES = [0, 1, 3, 2]
-#: Tensors by our name: along which dimension they have planes, and in which order these come.
-_PLANAR = {
-    "exposure.b": (0, _PLANES),
-    "noise.network.encoder.0.0.weight": (1, [*_PLANES, *(4 + p for p in _PLANES)]),
-    "noise.network.tail.weight": (0, _PLANES),
-    "noise.network.tail.bias": (0, _PLANES),
-    "aperture.network.encoder.0.first.convolution.weight": (1, [*_PLANES, 4, 5]),
-    "aperture.network.tail.weight": (0, _PLANES),
-    "aperture.network.tail.bias": (0, _PLANES),
-}
-
-
-def _from_authors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors by our names, planes in our order; those that have our names already as they are.
-
-    The file holds the state of the authors' modules as ``exposure.``, ``noise.`` and ``aperture.``
-    (docs/networks.md has the script that writes it).
-    """
-    if "exposure.w" in tensors:
-        return tensors
-    scalars = {"exposure.linear.weight": "exposure.w", "exposure.bias": "exposure.b"}
-    ours, found = dict(_layers()), {}
-    for theirs, tensor in tensors.items():
-        layer, _, entry = theirs.rpartition(".")
-        name = scalars.get(theirs, f"{ours.get(layer, layer)}.{entry}")
-        if name in _PLANAR:
-            dimension, order = _PLANAR[name]
-            if tensor.ndim > dimension and tensor.shape[dimension] == len(order):
-                tensor = tensor.index_select(dimension, torch.tensor(order))
-        found[name] = tensor.reshape(()) if name == "exposure.w" else tensor
-    return found
-
-
-def _layers() -> Iterator[tuple[str, str]]:
-    """The authors' and our names of the layers of both U-Nets."""
-    noise, aperture = "noise.network", "aperture.network"
-    for index in (0, 1, 3, 4):  # two convolutions, each with its normalisation
-        yield f"noise.inc.conv.conv.{index}", f"{noise}.encoder.0.{index}"
-        for level in range(4):
-            down, up = f"down{level + 1}.mpconv.1.conv", f"up{level + 1}.conv.conv"
-            yield f"noise.{down}.{index}", f"{noise}.encoder.{level + 1}.{index}"
-            yield f"noise.{up}.{index}", f"{noise}.decoder.{level}.{index}"
-    yield "noise.outc.conv", f"{noise}.tail"
-
-    def normalised(theirs: str, ours: str) -> Iterator[tuple[str, str]]:
-        convolution, norm = (f"aperture.{theirs}".replace("*", kind) for kind in ("conv", "norm"))
-        yield convolution, f"{aperture}.{ours}.convolution"
-        yield f"{norm}.style.linear", f"{aperture}.{ours}.norm.affine"
-
-    def level_of(theirs: str, ours: str) -> Iterator[tuple[str, str]]:
-        yield from normalised(f"{theirs}.*1", f"{ours}.first")
-        yield from normalised(f"{theirs}.*2", f"{ours}.second")
-
-    for index in range(5):
-        yield from level_of(f"Conv{index + 1}", f"encoder.{index}")
-    for index, level in enumerate((5, 4, 3, 2)):
-        yield from normalised(f"Up{level}.*", f"upward.{index}")
-        yield from level_of(f"Up_conv{level}", f"decoder.{index}")
-        theirs, ours = f"Att{level}", f"attention.{index}"
-        yield from normalised(f"{theirs}.W_g_*1", f"{ours}.from_gate")
-        yield from normalised(f"{theirs}.W_x_*1", f"{ours}.from_skip")
-        yield from normalised(f"{theirs}.psi_*", f"{ours}.to_map")
-        yield from normalised(f"{theirs}.W_g_*2", f"{ours}.mean_gate")
-        yield from normalised(f"{theirs}.W_x_*2", f"{ours}.mean_skip")
-        yield f"aperture.{theirs}.conv_down", f"{aperture}.{ours}.excite.0"
-        yield f"aperture.{theirs}.conv_up", f"{aperture}.{ours}.excite.2"
-    yield "aperture.Conv", f"{aperture}.tail"

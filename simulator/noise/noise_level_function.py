@@ -29,20 +29,15 @@ _ROW_OF_PLANE = (0, 0, 1, 1)
 
 @dataclass(frozen=True)
 class NoiseLevelFunction:
-    """Variance of a pixel as a function of its signal: ``read + shot * max(signal, 0)``.
+    """Variance of a pixel as a function of its signal: ``read + shot * max(signal, 0)``."""
 
-    Args:
-        shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1, >= 0.
-        read: Variance at zero signal per plane, >= 0.
-        extrapolation: Stops by which the ISO lies above the calibrated table, negative where it
-            lies below; 0 inside.
-        source: Where the numbers come from.
-    """
-
+    #: Slope per plane R, G1, G2, B, on the scale where sensor white is 1, >= 0.
     shot: tuple[float, float, float, float]
-    read: tuple[float, float, float, float]
+    read: tuple[float, float, float, float]  # variance at zero signal per plane, >= 0
+    #: Stops by which the ISO lies above the calibrated table, negative where it lies below; 0
+    #: inside.
     extrapolation: float = 0.0
-    source: str = ""
+    source: str = ""  # where the numbers come from
 
     def __post_init__(self) -> None:
         for name in ("shot", "read"):
@@ -106,19 +101,15 @@ def noise_variance(signal: Tensor, nlf: NoiseLevelFunction) -> Tensor:
 
 @dataclass(frozen=True)
 class ReadNoise:
-    """Distribution of the read noise of averages of k x k sensor pixels.
+    """Distribution of the read noise of averages of k x k sensor pixels."""
 
-    Args:
-        row: Standard deviation of the part that a row shares, relative to that of all read noise of
-            one sensor pixel; in [0, 1).
-        shape: Tukey's lambda of the rest; 0.135 is nearly normal, less has longer tails. In
-            (-0.25, 1], where the kurtosis is finite.
-        box_factor: k.
-    """
-
+    #: Standard deviation of the part that a row shares, relative to that of all read noise of one
+    #: sensor pixel; in [0, 1).
     row: float
+    #: Tukey's lambda of the rest; 0.135 is nearly normal, less has longer tails. In (-0.25, 1],
+    #: where the kurtosis is finite.
     shape: float
-    box_factor: int = 1
+    box_factor: int = 1  # k
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.row < 1.0:

@@ -55,12 +55,8 @@ class Lamp:
     ) -> np.ndarray:
         """Mean light (rows,) float64 of each row of a packed raw behind a rolling shutter.
 
-        Args:
-            start: When the first sensor row begins its exposure [s].
-            exposure_time: How long each row is exposed [s].
-            rows: Their number.
-            row_time: From one sensor row's begin to the next one's [s].
-            sensor_rows: Sensor rows that one packed row is the mean of.
+        The first sensor row begins its exposure at `start`, the next one `row_time` later [s]. A
+        packed row is the mean of `sensor_rows` of them.
         """
         check_integer("rows", rows, 1, 2**20)
         check_integer("sensor_rows", sensor_rows, 1, 2**12)

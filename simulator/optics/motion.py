@@ -156,16 +156,14 @@ def motion_kernel(extent_px: float) -> np.ndarray:
 def motion_blur(
     light: Tensor, extent_px: float, out: Tensor | None = None, *, limit: float = math.inf
 ) -> Tensor:
-    """Uniform motion along the rows during the exposure.
+    """Linear light (..., H, W) in uniform motion along the rows during the exposure.
+
+    The cost of long streaks hardly depends on the extent.
 
     Args:
-        light: (..., H, W) linear light.
         extent_px: Distance that the image moves, in pixels, >= 0.
         out: Contiguous float32 tensor on the CPU to write to, instead of a new one.
         limit: Light beyond it, on either side of 0, is clipped before the blur; float32, CPU only.
-
-    Returns:
-        (..., H, W), the same dtype. The cost of long streaks hardly depends on the extent.
     """
     n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
     if not n and not end:

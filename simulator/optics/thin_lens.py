@@ -35,14 +35,10 @@ _STEP, _STEP_SHARE = 0.5, 0.25
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens, focused at one distance.
+    """A thin lens, focused at one distance."""
 
-    Args:
-        focal_length: Focal length [m], > 0.
-        focus_distance: Distance of the plane in focus [m], above the focal length; inf allowed.
-    """
-
-    focal_length: float = 0.05
+    focal_length: float = 0.05  # [m], > 0
+    #: Distance of the plane in focus [m], above the focal length; inf allowed.
     focus_distance: float = math.inf
 
     def __post_init__(self) -> None:
@@ -54,17 +50,11 @@ class Lens:
             )
 
     def circle_of_confusion(self, depth: _Length, f_number: float) -> _Length:
-        """Diameter on the sensor of the image of a point.
+        """Diameter on the sensor of the image of a point [m]; < 0 in front of the plane in focus.
 
-        ``f^2 / N * (1 / s - 1 / z) / (1 - f / s)``, focal length f, f-number N, focus distance s,
-        depth z: the aperture f / N seen from the point, at the magnification of the focus plane.
-
-        Args:
-            depth: Distance from the lens [m], > 0; inf allowed.
-            f_number: Exact f-number.
-
-        Returns:
-            Metres, the type and shape of `depth`; > 0 behind the plane in focus, < 0 in front.
+        ``f^2 / N * (1 / s - 1 / z) / (1 - f / s)``, focal length f, exact f-number N, focus
+        distance s, depth z > 0 (inf allowed) from the lens [m]: the aperture f / N seen from the
+        point, at the magnification of the focus plane.
 
         >>> lens = Lens(focal_length=0.05, focus_distance=2.0)
         >>> round(1e6 * lens.circle_of_confusion(4.0, 4.0), 1)  # micrometres
@@ -103,15 +93,11 @@ def _cut(diameter: np.ndarray) -> _Layers:
 
 
 def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
-    """Light on the sensor behind a lens.
+    """Light on the sensor behind a lens, of linear light (C, H, W) as a pinhole at its centre sees.
 
-    Args:
-        light: (C, H, W) linear light as a pinhole at the centre of the lens sees it, unclipped.
-        diameter: (H, W) circle of confusion [px], smaller if nearer (`Lens.circle_of_confusion`).
-
-    Returns:
-        (C, H, W), the same dtype. Borders are replicated. A pixel in focus (up to 0.1 px) with
-        nothing nearer around comes out as it is, bit for bit.
+    `diameter` is the circle of confusion (H, W) [px], smaller if nearer
+    (`Lens.circle_of_confusion`). Borders are replicated. A pixel in focus (up to 0.1 px) with
+    nothing nearer around comes out as it is, bit for bit.
     """
     layers = _cut(diameter.detach().cpu().double().numpy())
     if len(layers.diameters) == 1:

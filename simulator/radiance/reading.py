@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from simulator.utils.checks import import_extra
 from simulator.utils.files import MAX_PIXELS, MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
@@ -112,10 +113,7 @@ def _refuse_lies(path: Path, height: int, width: int) -> None:
 
 def _read_hdr(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     """Light (3, H, W), upright, and its primaries; OpenCV reads the usual header only."""
-    try:
-        import cv2
-    except ImportError:
-        raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
+    cv2 = import_extra("cv2", "hdr", f"reading {path.name!r}")
     with path.open("rb") as stream:
         content = stream.read(5 * MAX_PIXELS)  # run lengths may make it longer than it would be
     found = re.match(rb"(#\?.*?\n)\r?\n([-+][XY] [^\n]*\n)", content[:65536], re.DOTALL)
@@ -206,10 +204,7 @@ def read_exr(
         RadianceError: If there is no such layer, several have the channels and none is named, or
             the file is damaged, a cube map, or has pixels that are not square.
     """
-    try:
-        import OpenEXR
-    except ImportError:
-        raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
+    OpenEXR = import_extra("OpenEXR", "hdr", f"reading {path.name!r}")
     try:
         with _silence(), OpenEXR.File(os.fsencode(path), header_only=True) as file:
             headers = [dict(part.header) for part in file.parts]  # it empties its own

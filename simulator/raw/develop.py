@@ -64,6 +64,8 @@ def develop(
 ) -> torch.Tensor:
     """Develop a batch of packed raws to sRGB at half the sensor's resolution.
 
+    A `ValueError` if an argument has the wrong shape, dtype or range, or is not finite.
+
     Args:
         images: (B, 4, H, W) floating point, planes R, G1, G2, B, 1.0 at sensor white. Negative
             values and values above 1 are allowed.
@@ -75,9 +77,6 @@ def develop(
 
     Returns:
         (B, 3, H, W) float32 in [0, 1], sRGB-encoded, on the device of `images`.
-
-    Raises:
-        ValueError: If an argument has the wrong shape, dtype or range, or is not finite.
 
     >>> grey_card = torch.full((1, 4, 1, 1), 0.18 * 0.6635)
     >>> develop(grey_card).flatten()
@@ -102,6 +101,8 @@ def render_srgb(
 ) -> torch.Tensor:
     """Develop one raw for looking at, with its own white balance and its camera's matrix.
 
+    A `ValueError` if `raw` is no `RawImage`, a name is unknown or `exposure_ev` is out of range.
+
     Args:
         raw: The raw, 1.0 at sensor white.
         demosaic: ``"malvar"`` at the sensor's resolution, ``"half"`` at half of it.
@@ -111,9 +112,6 @@ def render_srgb(
 
     Returns:
         (3, 2H, 2W) uint8 for ``"malvar"``, (3, H, W) for ``"half"``, sRGB.
-
-    Raises:
-        ValueError: If `raw` is no `RawImage`, a name is unknown or `exposure_ev` is out of range.
     """
     check_type("raw", raw, RawImage)
     check_word("demosaic", demosaic, DEMOSAICS)
@@ -230,7 +228,6 @@ def srgb_from_camera(colour_matrix: Matrix) -> torch.Tensor:
     because white balance has already mapped the illuminant to equal values; then it is inverted.
     So (1, 1, 1) maps to (1, 1, 1). This is what dcraw's ``cam_xyz_coeff`` does, and what the DNG
     specification 1.4, chapter 6, does for a scene lit by the matrix's own illuminant.
-
     """
     matrix = torch.as_tensor(colour_matrix, dtype=torch.float64)
     if matrix.shape != (3, 3) or not bool(torch.isfinite(matrix).all()):

@@ -199,7 +199,6 @@ def _exif_tags(raw: RawImage) -> dict[str, Tag]:
 
 
 def _date(raw: RawImage) -> str:
-    """When the photograph was taken, as EXIF spells it."""
     try:
         moment = datetime.fromisoformat(str(raw.metadata.get("datetime", "")))
     except ValueError:

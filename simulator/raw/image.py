@@ -26,28 +26,22 @@ _SHARE, _ROWS = 128, 32
 class RawImage:
     """A raw photograph: packed sensor data with the settings and camera that took it.
 
-    Args:
-        data: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative
-            values are real.
-        settings: ISO, exposure time and f-number of the exposure.
-        camera: The body that recorded it.
-        nlf: Noise of this very raw, where the file states it (DNG NoiseProfile) or it was
-            estimated; by default the camera's at this ISO.
-        white_balance: Gains of R, G, B that make a grey card grey, green 1.
-        box_factor: Sensor pixels averaged per side into one pixel of `data`.
-        metadata: Whatever else is known: file name, how the NLF was found, excess noise.
-
-    Raises:
-        ValueError: If the data has the wrong shape or dtype or is not finite, or another argument
-            is of the wrong type or out of range.
+    A `ValueError` if the data has the wrong shape or dtype or is not finite, or another argument is
+    of the wrong type or out of range.
     """
 
+    #: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative values
+    #: are real.
     data: torch.Tensor
-    settings: CameraSettings
-    camera: CameraProfile
+    settings: CameraSettings  # ISO, exposure time and f-number of the exposure
+    camera: CameraProfile  # the body that recorded it
+    #: Noise of this very raw, where the file states it (DNG NoiseProfile) or it was estimated; by
+    #: default the camera's at this ISO.
     nlf: NoiseLevelFunction | None = None
+    #: Gains of R, G, B that make a grey card grey, green 1.
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_factor: int = 1
+    box_factor: int = 1  # sensor pixels averaged per side into one pixel of `data`
+    #: Whatever else is known: file name, how the NLF was found, excess noise.
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -76,8 +70,7 @@ class RawImage:
     def noise(self) -> NoiseLevelFunction:
         """NLF of this raw's pixels: its own or its camera's, after the box averaging.
 
-        Raises:
-            ValueError: If neither is known.
+        A `ValueError` if neither is known.
         """
         nlf = self.nlf if self.nlf is not None else self.camera.nlf(self.settings.iso)
         return nlf.scaled(1.0 / self.box_factor**2)

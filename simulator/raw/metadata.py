@@ -398,14 +398,9 @@ def read_black_level(
     BlackLevelRepeatDim are a tile of 2 x 2 (several writers of DNGs leave it out), one value is
     that of all pixels whatever the tile, and values beyond those of the tile count for nothing.
 
-    Args:
-        tags: Of the directory that describes the mosaic.
-        cfa: The order at `origin`.
-        origin: Row and column of the file's array where the mosaic begins.
-        shape: Height and width of the mosaic.
-
-    Returns:
-        None where the file does not say, or says what cannot be.
+    `tags` are those of the directory that describes the mosaic, which begins with the order `cfa`
+    at row and column `origin` of the file's array. None where the file does not say, or says what
+    cannot be.
     """
     values = numbers(tags, "BlackLevel")
     corner, tile = numbers(tags, "ActiveArea")[:2] or (0, 0), numbers(tags, "BlackLevelRepeatDim")

@@ -10,13 +10,10 @@ aperture on the output of the stages before. The target is the capture itself, w
 
 from __future__ import annotations
 
-import io
 import logging
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -43,7 +40,7 @@ from simulator.training.trainer import (
 )
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import read_bounded, refuse_bomb, sibling, write_atomically
+from simulator.utils.files import read_table, refuse_bomb, sibling
 
 logger = logging.getLogger(__name__)
 
@@ -61,9 +58,6 @@ TEST_SHARE = 0.1
 _GREY = 0.119
 #: Most bytes of captures in memory; one of 4 x 512 x 768 takes 6 million.
 _CACHED = 2**31
-
-#: What the files do not state of a camera.
-_LAYOUT = attrgetter("name", "cfa", "black_level", "white_level")
 
 Balance = tuple[float, float, float]
 
@@ -143,11 +137,8 @@ def read_dataset(
     alone if the files lie beside the table: they begin where the preprocessing ran.
 
     `camera` is a profile, or a name that `packed_camera` knows; without it a table with a column
-    ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors' scripts write them.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If there is no table, no file, no such column, or a cell is no number.
+    ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors' scripts write them. A
+    `ValueError` if there is no table, no file, no such column, or a cell is no number.
     """
     found = (s for table in _tables("root", root) for s in _read_table(table, camera))
     return sorted(found, key=lambda sequence: sequence.name)
@@ -164,7 +155,7 @@ def _tables(name: str, folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[CapturedSequence]:
-    rows = _cells(table)
+    rows = read_table(table)
     if not set(COLUMNS) <= set(rows.columns):
         found, needed = (", ".join(names) for names in (rows.columns, COLUMNS))
         raise ValueError(f"`{table}` (columns: {found}) must have the columns {needed}")
@@ -190,20 +181,6 @@ def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[
     if not captures:
         raise ValueError(f"`{table}` ({len(rows)} rows) must list .npy files that are there")
     return [CapturedSequence(name, tuple(own)) for name, own in captures.items()]
-
-
-def _cells(table: Path) -> pd.DataFrame:
-    """The cells of a table as text; no rows and no columns for an empty file."""
-    how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
-    try:
-        with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
-            content = io.BytesIO(read_bounded(table))
-            frame = pd.read_csv(content, index_col=False, **how)  # no cells beyond the columns
-    except pd.errors.EmptyDataError:
-        return pd.DataFrame()
-    except (pd.errors.ParserError, OSError, UnicodeError) as error:
-        raise ValueError(f"`{table}` must be a CSV file in UTF-8: {error}") from error
-    return frame.rename(columns=str.strip)
 
 
 def _path(text: str) -> PurePosixPath:
@@ -252,52 +229,11 @@ def _noise_profile(numbers: tuple[float, ...]) -> NoiseLevelFunction:
 
 def _white_balances(table: Path) -> dict[PurePosixPath, Balance]:
     """Gains by path, from AsShotNeutral, if there is such a table."""
-    rows = _cells(table) if table.is_file() else pd.DataFrame()
+    rows = read_table(table) if table.is_file() else pd.DataFrame()
     if not {"path", "AsShotNeutral"} <= set(rows.columns):
         return {}
     values = {_path(row["path"]): _numbers(row["AsShotNeutral"]) for row in rows.to_dict("records")}
     return {p: (v[1] / v[0], 1.0, v[1] / v[2]) for p, v in values.items() if _positive(v)}
-
-
-# -- writing --------------------------------------------------------------------------------------
-
-
-def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImage]) -> None:
-    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``, in a new folder.
-
-    The table has the columns that the authors' script for the camera writes. It records an exposure
-    time as a camera does: one within 3 % of a nominal stop is read back as that stop. All captures
-    must be of one `packed_camera`: the files do not state levels.
-
-    Raises:
-        ValueError: If `folder` holds something already, or `raws` is empty or of another camera.
-    """
-    folder = Path(folder).expanduser()
-    if folder.exists() and any(folder.iterdir()):
-        raise ValueError(f"`folder` (={str(folder)!r}) must be new or empty")
-    layouts = {_LAYOUT(raw.camera) for raw in raws}
-    if len(layouts) != 1 or layouts != {_LAYOUT(packed_camera(raws[0].camera.name))}:
-        raise ValueError(f"`raws` (of {layouts or None}) must be captures of one `packed_camera`")
-    nikon = raws[0].camera.name == "nikon_z6"
-    # The Nikon's noise profile has its greens averaged, the Canon's all planes.
-    groups: list[tuple[int, ...]] = [(0,), (1, 2), (3,)] if nikon else [(0, 1, 2, 3)]
-    rows: list[dict[str, object]] = []
-    for index, raw in enumerate(raws):
-        stem, settings, content = f"capture_{index:03d}", raw.settings, io.BytesIO()
-        np.save(content, raw.data.detach().cpu().numpy()[[0, 1, 3, 2]], allow_pickle=False)
-        write_atomically(folder / f"{stem}.npy", content.getvalue())
-        row: dict[str, object] = {"path": f"{folder.name}/{stem}.jpg"}
-        row |= {"time": settings.exposure_time, "iso": settings.iso, "aperture": settings.f_number}
-        if nikon:
-            row["wb"] = [*raw.white_balance, 0.0]
-        means = [
-            sum(values[i] for i in planes) / len(planes)
-            for planes in groups
-            for values in (raw.noise.shot, raw.noise.read)
-        ]
-        rows.append(row | {"noiseprofile": " ".join(map(repr, means))})
-    table = pd.DataFrame(rows).to_csv(index=False, lineterminator="\r\n")
-    write_atomically(folder / PARAMETERS, table)
 
 
 # -- training -------------------------------------------------------------------------------------
@@ -309,11 +245,8 @@ def split_dataset(
     """The sequences below `folder` to train on, and those held out.
 
     Where some of several tables lie in a folder with "test" in its name, as in the authors' data,
-    theirs are held out; otherwise a tenth of all sequences, drawn by `seed`, as in the paper.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If there is no table, or fewer than two sequences of two captures or more.
+    theirs are held out; otherwise a tenth of all sequences, drawn by `seed`, as in the paper. A
+    `ValueError` if there are fewer than two sequences of two captures or more.
     """
     named: dict[bool, list[CapturedSequence]] = {False: [], True: []}
     for table in _tables("folder", folder):

@@ -7,7 +7,6 @@ same place, subject or photographer's series is in one split only (`detail_split
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 import logging
@@ -48,7 +47,7 @@ from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
 from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_integer, check_word
-from simulator.utils.files import open_picture, printable, refuse_bomb
+from simulator.utils.files import open_picture, printable, read_table, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -216,9 +215,9 @@ def _groups(data: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for name, column in _GROUPS.items():
         if (data / name).is_file():
-            with (data / name).open(newline="", encoding="utf-8") as stream:
-                rows = list(csv.DictReader(stream))
-            found |= {Path(row["file"]).name: row[column] for row in rows if row[column]}
+            rows = read_table(data / name)
+            pairs = zip(rows.file, rows[column], strict=True)
+            found |= {Path(file).name: group for file, group in pairs if group}
     return found
 
 

@@ -56,6 +56,7 @@ from simulator.training.scenes import (
     reference_scenes,
 )
 from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.checks import import_extra
 from simulator.utils.compute import check_bfloat16
 from simulator.utils.config_file import Configuration
 from simulator.utils.files import DATA_VARIABLE, data_folder, result_meta, sibling
@@ -296,11 +297,9 @@ def save_trained(
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:
     """Accelerate's plumbing for this training; an `ImportError` without the extra ``train``."""
-    try:
-        from accelerate import Accelerator
-        from accelerate.state import AcceleratorState
-    except ImportError as error:
-        raise ImportError("training the simulator needs: pip install 'ae-env[train]'") from error
+    Accelerator = import_extra("accelerate", "train", "training the simulator").Accelerator
+    from accelerate.state import AcceleratorState
+
     # Device and precision are global there: those of an earlier training in this process would
     # stay in force, or be refused.
     AcceleratorState._reset_state(reset_partial_state=True)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import math
 import reprlib
 import sys
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
+
+#: Units of times [s].
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
@@ -21,6 +25,26 @@ def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: fl
     """
     near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=cutoff)
     return f"; did you mean {mark}{near[0]}{mark}?" if near else ""
+
+
+def import_extra(name: str, extra: str, what: str) -> Any:
+    """The module `name`; an `ImportError` without it says which extra `what` needs."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(f"{what} needs {name}: pip install 'ae-env[{extra}]'") from error
+
+
+def parse_number(text: str, name: str = "") -> float:
+    """The number of ``"1/20"``, ``'0"4'`` (0.4 s), ``"f/5.6"``, ``"200"`` or ``"8ms"``."""
+    plain = text.lower().removeprefix("f").removeprefix("/").replace('"', ".")
+    unit = next((u for u in ("ms", "us", "s") if plain.endswith(u)), "")
+    top, _, bottom = plain.removesuffix(unit).strip(" .").partition("/")
+    try:
+        return float(top) / float(bottom or 1) * UNITS.get(unit, 1.0)
+    except (ValueError, ZeroDivisionError):
+        found = f"`{name}` (={text!r})" if name else repr(text)
+        raise ValueError(f"{found} must be a number, such as 200, 1/125 or f5.6") from None
 
 
 def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -> None:

@@ -69,11 +69,9 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
     """The values in a YAML file from anybody; None for an empty file.
 
     No tag runs code, and no value may name code to run, unless `TRUST_VARIABLE` has the file's
-    folder; `name` is the argument that gave the path, for error messages.
-
-    Raises:
-        ValueError: If the file is missing, unreadable, not YAML, larger than one of the bounds
-            above, gives an entry twice, or names Python code.
+    folder; `name` is the argument that gave the path, for error messages. A `ValueError` if the
+    file is missing, unreadable, not YAML, larger than one of the bounds above, gives an entry
+    twice, or names Python code.
     """
     file = Path(path).expanduser()
     cause: Exception | None = None

@@ -109,6 +109,25 @@ def read_bounded(path: Path, most: int = 2**26) -> bytes:
     return content
 
 
+def read_table(path: Path) -> Any:
+    """The cells of a CSV file in UTF-8 as a frame of texts; an empty one for an empty file.
+
+    A `ValueError` if it is none, or cannot be read.
+    """
+    import pandas as pd
+
+    how: Any = {"dtype": str, "keep_default_na": False, "encoding": "utf-8-sig"}
+    try:
+        with warnings.catch_warnings(category=pd.errors.ParserWarning, action="ignore"):
+            content = io.BytesIO(read_bounded(path))
+            frame = pd.read_csv(content, index_col=False, **how)  # no cells beyond the columns
+    except pd.errors.EmptyDataError:
+        return pd.DataFrame()
+    except (pd.errors.ParserError, OSError, UnicodeError) as error:
+        raise ValueError(f"{str(path)!r} must be a CSV file in UTF-8: {error}") from error
+    return frame.fillna("").rename(columns=str.strip)
+
+
 def refuse_bomb(
     height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE, large: int = 64
 ) -> str:

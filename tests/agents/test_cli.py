@@ -37,7 +37,7 @@ from simulator.training.crops import ReferencePairs
 from simulator.utils.files import sibling
 
 COMMANDS = (
-    *("bench", "cache", "evaluate", "export", "film", "hdr"),
+    *("bench", "cache", "evaluate", "export", "film", "hdr", "judge"),
     *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate", "sweep"),
     *("train", "train-simulator", "view", "warm-up"),
 )
@@ -103,7 +103,7 @@ def test_help_and_usage_errors_load_nothing_heavy() -> None:
     asked = [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)]
     wrong = [["nonsense"], ["simulate", "a.dng"], ["sweep", "a.dng", "--nonsense"]]
     wrong += [["evaluate", "--frames", "0"], ["bench", "throughput", "--seed", str(2**63)]]
-    wrong += [["report"], ["hdr", "a.dng", "--step", "half"]]
+    wrong += [["hdr", "a.dng", "--step", "half"]]
     code = f"""
 import importlib.metadata, sys
 importlib.metadata.version = None  # a source tree need not be installed
@@ -122,7 +122,7 @@ print("loaded", *sys.modules)
     statuses = re.findall(r"^status (\d)$", run.stdout, re.MULTILINE)
     assert statuses == ["0"] * len(asked) + ["2"] * len(wrong)
     assert run.stderr.count("Usage: ae-env") == len(wrong)
-    for said in ("--frames.* '?0", f"--seed.*{2**63}", "`ae-env evaluate`", "--step.*'half'"):
+    for said in ("--frames.* '?0", f"--seed.*{2**63}", "--step.*'half'"):
         assert re.search(said, run.stderr)
     listed, _, *helps = run.stdout.split("status 0\n")
     assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", listed, re.MULTILINE)) == list(COMMANDS)

@@ -181,23 +181,6 @@ def test_sharpness_is_the_mean_over_the_pixels(defocus: float, movement: Movemen
     np.testing.assert_allclose(table.parts["sharpness"], wanted, rtol=2e-3)
 
 
-def test_captures_of_several_scenes_are_those_of_each() -> None:
-    scenes = [laid_out(), replace(laid_out(), scene_id="plain", layout=None), laid_out()]
-    given = {"speed": (0.2, 0.1, 0.0), "defocus": (3.0, 3.0, 0.0), "gain": (1.0, 1.0, 1.0)}
-    captures = describe_captures(
-        scenes,
-        list(BLUR_GRID)[-3:],
-        CAMERA,
-        movements=[MOVEMENT, MOVEMENT, replace(MOVEMENT, subject_speed=0.0)],
-        **{name: np.array(values) for name, values in given.items()},
-    )
-    found = Sharpness()(None, captures).numpy()
-    alone = 1.0 / (1.0 + (captures.blur_px[1] * 64.0 / SIZE) ** 2)
-    wanted = [_wanted(laid_out(), 0.2, 3.0, MOVEMENT)[-3], float(alone), 1.0]
-    np.testing.assert_allclose(found, wanted, rtol=2e-3)
-    assert captures.blur_px[2] == 0.0
-
-
 def test_the_extent_is_the_root_mean_square() -> None:
     scene, tables = laid_out(), ScoreTables(BLUR_GRID, CAMERA, make_scorer("balanced"))
     prepared = prepare_scene(scene, CAMERA, defocus=5.0)

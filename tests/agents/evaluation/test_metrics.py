@@ -6,7 +6,6 @@ import scipy.stats
 
 from agents.evaluation import metrics
 from agents.evaluation.intervals import MIN_GROUPS, difference_interval, rank, score_interval
-from agents.evaluation.result import weighted_quantile
 
 EV = np.array([4.0, 4.05, 5.0, 6.0, 8.0])
 # One episode, two frames, five states.
@@ -58,6 +57,8 @@ def test_frames_to_converge(errors, frames, converged):
     assert (int(found[0]), bool(found[1])) == (frames, converged)
     found = metrics.frames_to_converge(np.array([1.0, 0.5, 0.5]), tolerance=0.5)
     assert int(found[0]) == 2  # the largest error that counts
+    found = metrics.frames_to_converge(np.array([[0.0, 0, 0, 4, 2, 1, 0]]), since=np.array([4]))
+    assert found[0].tolist() == [3]  # of those after a step that frame 4 shows
 
 
 @pytest.mark.parametrize(
@@ -76,22 +77,6 @@ def test_overshoot_and_reversals(evs, over, turns):
     for own in (evs, np.stack([evs, evs])):  # (E, T), (K, E, T)
         np.testing.assert_allclose(metrics.overshoot(own), np.full(own.shape[:-1], over), atol=1e-9)
         np.testing.assert_array_equal(metrics.reversals(own), np.full(own.shape[:-1], turns))
-
-
-def test_convergence_after_a_step_counts_from_the_step():
-    # The light steps in frame 4 (index 3), which is the first that shows it: the answer to it is
-    # frame 5. It is right for good from frame 7 on: the third frame that knows.
-    light = np.array([[0, 0, 0, 1, 1, 1, 1, 1, 1, 1]], float)[..., None]
-    since = metrics.settling(light)
-    assert since.tolist() == [4]
-    for errors, frames, known in (
-        ([2, 0, 0, 4, 2, 1, 0, 0, 0, 0], 3, True),
-        ([0, 0, 0, 4, 0, 0, 0, 0, 0, 0], 1, True),
-        ([0] * 10, 1, True),
-        ([1] * 10, 6, False),  # never: as many frames as there are after the step, not T
-    ):
-        found, converged = metrics.frames_to_converge(np.array([errors], float), since=since)
-        assert (found.tolist(), converged.tolist()) == ([frames], [known])
 
 
 @pytest.mark.parametrize(
@@ -120,14 +105,6 @@ def test_settling_and_overshoot_are_those_of_the_answer_to_a_step():
     evs = np.array([[9.0, 5.0, 5.0, 5.0, 10.0, 8.0]])
     found = [metrics.overshoot(evs, since=since).tolist() for since in (np.array([3]), 0)]
     assert found == [[2.0], [3.0]]
-
-
-def test_ev_error_percentiles_and_share_of_a_known_trajectory():
-    errors = np.array([[4, 2, 1, 1 / 3, 0, 0, 0, 0, 0, 0]], float)
-    weights = np.full(errors.shape, 0.1)
-    found = [weighted_quantile(errors, weights, share) for share in (0.95, 0.9, 0.5)]
-    assert found == [4.0, 2.0, 0.0]  # the first is the tenth of ten values
-    assert (errors <= metrics.THIRD_EV).mean() == pytest.approx(0.7)
 
 
 def test_flicker_counts_frames_of_the_same_light_and_jumps_all():

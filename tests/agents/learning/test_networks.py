@@ -16,12 +16,7 @@ from agents.learning import forecaster, networks, ppo
 from agents.learning.forecaster import ForecasterTraining, LightForecaster, metered
 from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, MeterHistory, StateHead
 from agents.learning.regression import observation_tensors
-from agents.learning.sb3_adapter import (
-    SB3VectorAdapter,
-    ShiftedFrames,
-    WithHistory,
-    WithRightExposure,
-)
+from agents.learning.sb3_adapter import SB3VectorAdapter, TrainingFrames, WithHistory
 from agents.metering.meters import make_meter
 from agents.metering.reading import Reading
 from agents.policy import PolicyContext
@@ -272,31 +267,28 @@ def test_attributes_methods_and_pictures_of_a_wrapped_batch(make_tiny_envs) -> N
             SB3VectorAdapter(make_tiny_envs(autoreset_mode=mode))
 
 
-def test_shifted_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
+def test_training_frames_differ_in_the_raw_and_tell_the_right_exposure(make_tiny_envs) -> None:
     plain, inner = (SB3VectorAdapter(make_tiny_envs(num_envs=2)) for _ in range(2))
-    shifted = ShiftedFrames(inner, np.random.default_rng(0))
+    shifted = TrainingFrames(inner, np.random.default_rng(0))
     for envs in (plain, shifted):
         envs.seed(3)
+        envs.set_options([{"scene": 2}, {"scene": 0}])
+    right = [[inner.envs.unwrapped.scenes[i].ev100] for i in (2, 0)]
     resets = plain.reset(), shifted.reset()
     one, other = (envs.step(np.full(2, 5)) for envs in (plain, shifted))
     np.testing.assert_array_equal(one[1], other[1])
     for seen, moved in (resets, (one[0], other[0])):
+        np.testing.assert_allclose(moved["right_ev100"], right, rtol=1e-5)
         assert not np.array_equal(seen["raw"], moved["raw"])
         assert seen["raw"].mean() == pytest.approx(moved["raw"].mean(), rel=0.2)
         for name in ("settings", "sensors"):
             np.testing.assert_array_equal(seen[name], moved[name])
 
 
-def test_a_loss_joins_the_gradient_and_its_target_the_frames(make_tiny_envs) -> None:
+def test_a_loss_joins_the_gradient() -> None:
     tensor, weight = torch.ones(3, requires_grad=True), torch.tensor(3.0, requires_grad=True)
     (2.0 * ppo._WithLoss.apply(tensor, weight.square())).sum().backward()
     assert [tensor.grad.tolist(), weight.grad] == [[2.0] * 3, 6.0]
-    envs = make_tiny_envs(num_envs=2)
-    seen = WithRightExposure(SB3VectorAdapter(envs))
-    seen.set_options([{"scene": 2}, {"scene": 0}])
-    right = [[envs.unwrapped.scenes[i].ev100] for i in (2, 0)]
-    for frames in (seen.reset(), seen.step(np.full(2, 5))[0]):
-        np.testing.assert_allclose(frames["right_ev100"], right, rtol=1e-5)
 
 
 def test_it_holds_readings_exposures_and_what_was_asked_for(context, photograph):

@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from urllib.parse import urlsplit
 
@@ -21,6 +22,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from ae_env.scenes import Scene
+from agents.report.judging import read_choices
 from agents.viewer import tab
 from agents.viewer.one_raw_page import opened, wider_f_numbers
 from agents.viewer.server import TokenGuard
@@ -190,8 +192,8 @@ def test_only_wider_f_numbers_than_the_raw_s_are_offered():
         assert wider_f_numbers(raw) == wider[len(wider) - offered :]
 
 
-def _view(log):
-    """Runs as `ae-env view`."""
+def _run(log, *arguments):
+    """Runs as `ae-env`."""
     from agents.cli.main import main
 
     # NiceGUI serves itself differently where it finds itself under test, or in a process's child.
@@ -200,16 +202,15 @@ def _view(log):
     multiprocessing.current_process().name = "MainProcess"
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     sys.stdout = sys.stderr = log.open("w")
-    sys.argv = ["ae-env", "view", "bundled:small", "--weights", "none", "--no-open"]
+    sys.argv = ["ae-env", *arguments, "--no-open"]
     main()
 
 
-@pytest.fixture(scope="module")
-def address(forkserver, tmp_path_factory):
-    """Address of the page that `ae-env view` serves, until it is stopped."""
-    log = tmp_path_factory.mktemp("view") / "log.txt"
+@contextmanager
+def served(forkserver, log, *arguments):
+    """Address of the page that `ae-env` serves, until it is stopped."""
     log.touch()
-    process = forkserver.Process(target=_view, args=(log,), daemon=True)
+    process = forkserver.Process(target=_run, args=(log, *arguments), daemon=True)
     process.start()
     deadline = time.monotonic() + PATIENCE
     while not (found := re.search(r"open (http\S+)", log.read_text())):
@@ -221,6 +222,13 @@ def address(forkserver, tmp_path_factory):
     process.join(PATIENCE)
     assert not process.is_alive()
     assert "Traceback" not in log.read_text()
+
+
+@pytest.fixture(scope="module")
+def address(forkserver, tmp_path_factory):
+    log = tmp_path_factory.mktemp("view") / "log.txt"
+    with served(forkserver, log, "view", "bundled:small", "--weights", "none") as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
@@ -418,6 +426,25 @@ def test_takes_a_raw_and_gives_files_back(page, expect, tmp_path):
         assert file.channels()["RGB"].pixels.shape == (96, 144, 3)
     with Image.open(saved(page, "save PNG", tmp_path)) as fused:
         assert fused.size == (288, 192)
+
+
+@pytest.mark.slow
+def test_a_judge_chooses_by_keys_and_knows_nothing(browser, expect, forkserver, tmp_path):
+    asked = ("--scenes", "bundled:small", "--pairs", "2", "--out", str(tmp_path / "ann.csv"))
+    keys = {"Tab": 0, "ArrowLeft": 1, "Backspace": 0, "ArrowRight": 1, "Space": 2}
+    with served(forkserver, tmp_path / "log.txt", "judge", *asked) as address:
+        page = browser.new_page()
+        page.goto(address)
+        for key, number in keys.items():
+            page.keyboard.press(key)
+            expect(page.get_by_text(f"{number} of 2")).to_be_visible()
+            expect(page.locator("img[src^='/frame/']")).to_have_count(2 * (number < 2))
+            if key == "Tab":
+                texts = re.sub("\n+", "\n", page.locator("body").inner_text()).strip()
+        page.close()
+    told = "← left, → right, ↓ or space: equal, backspace: undo the last"
+    assert texts == f"Which picture is better?\n0 of 2\n{told}"
+    assert read_choices(tmp_path / "ann.csv").choice.tolist() == ["right", "equal"]
 
 
 def test_whoever_lacks_the_token_or_has_another_name_is_refused():

@@ -139,24 +139,6 @@ def test_limits_of_light_and_signal() -> None:
     assert prepared.exposure(CameraSettings(100, 1, 4)).ratio == 2.0**107
 
 
-def test_blur_averages_the_noise_of_the_source() -> None:
-    """Noise already in the light is blurred with it; the top-up makes up for what the blur took."""
-    noise = NoiseLevelFunction((0.0,) * 4, (1e-4,) * 4)
-    generator = np.random.default_rng(1)
-    light = torch.from_numpy(generator.normal(0.3, 1e-2, (4, 96, 96)).astype(np.float32))
-    settings = CameraSettings(100, 1.0, 4.0)
-    camera = replace(Z6, nlf_by_iso={100.0: noise}, segments=())
-    prepared = PreparedScene(light, settings, camera, noise, image_speed=4 / 96, defocus=3.0)
-    blurred = prepared.expected(settings)
-    left = prepared.exposure(settings).source_noise.read[0]
-    # neighbours are correlated over about 4 * 3 pixels: that many fewer independent samples
-    error = 5 * math.sqrt(2 * 12 / blurred.numel())
-    assert float(blurred.double().var()) == pytest.approx(left, rel=error)
-    capture, excess = prepared.capture(settings, 1)
-    assert excess == 0.0
-    assert float(capture.double().var()) == pytest.approx(1e-4 + 1 / 12 / SPAN**2, rel=error)
-
-
 def test_bands_come_before_the_noise() -> None:
     """Each row's light, and of a noisy source each row's share of its variance, by both ways."""
     light, rows = torch.full((4, 2, 5000), 0.3), np.array([[0.5, 1.5]])

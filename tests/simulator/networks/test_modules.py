@@ -269,14 +269,11 @@ def test_the_generalised_anscombe_transform_exact_for_any_shot(shot: float, read
     np.testing.assert_allclose(found.double().numpy(), exact, rtol=1e-5, atol=cancelled)
 
 
-def test_the_inverse_and_other_exposures() -> None:
+def test_the_inverse() -> None:
     y = torch.tensor([-3.0, -1e-4, 0.0, 1e-6, 0.02, 1.0, 300.0]).expand(1, 4, 1, -1)
     for shot, read in ((1e-3, 1e-6), (1e-6, 1e-3), (1e-4, 0.0), (0.0, 1e-5)):
         made = stabiliser(shot, read)
         torch.testing.assert_close(made.inverse(made.forward(y)), y, rtol=2e-6, atol=1e-9)
-        for c in (1 / 83, 0.3, 64.0):
-            other = stabiliser(c * shot, c * c * read).forward(c * y)
-            torch.testing.assert_close(other, made.forward(y), rtol=3e-6, atol=0)
     assert float(stabiliser(0.0, 1e-4).linearity[0, 0]) == 1.0
     assert float(stabiliser(1e-2, 1e-12).linearity[0, 0]) < 0.5
 

@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file, save
 from torch import nn
 
+import examples.convert_ncs as convert_ncs
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks import weights
 from simulator.networks.network_cache import NetworkCache
@@ -283,7 +284,6 @@ def test_an_implausible_result_on_disk_is_made_again(wrong: torch.Tensor, folder
 #: Planes R, G1, G2, B as R, G1, B, G2, and back.
 SWAP = [0, 1, 3, 2]
 F11, F4 = 2.0 ** (7 / 2), 4.0
-DOCS = Path(__file__).parents[3] / "docs" / "networks.md"
 
 
 @pytest.fixture(scope="module")
@@ -293,15 +293,14 @@ def released() -> dict[str, nn.Module]:
 
 @pytest.fixture(scope="module")
 def converted(released: dict[str, nn.Module], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the script of docs/networks.md makes of the authors' checkpoints."""
+    """What `examples/convert_ncs.py` makes of the authors' checkpoints."""
     folder = tmp_path_factory.mktemp("demo")
     for name, module in released.items():
         held = nn.DataParallel(module) if name == "unet_model" else module
         torch.save({"model": held, "iteration": 544000}, folder / name)
-    script = re.search(r"needs the authors' files -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        exec(script[1], {})
+        convert_ncs.main()
     return folder / "ncs.safetensors"
 
 
@@ -324,22 +323,6 @@ def test_parameters_are_as_many_as_published(ncs: nn.ModuleDict) -> None:
 def close(ours, theirs, tolerance=1e-5):
     assert float(theirs.std()) > 1e-3
     torch.testing.assert_close(ours, theirs, rtol=0, atol=tolerance * float(theirs.abs().max()))
-
-
-@torch.no_grad()
-def test_networks_compute_what_the_released_ones_do(ncs: nn.ModuleDict, released) -> None:
-    """In float64: in float32, the rounding alone grows to 4e-5 over eighteen normalisations."""
-    generator = torch.Generator().manual_seed(1)
-    image = torch.rand(2, 8, 32, 48, generator=generator, dtype=torch.float64)
-    planes = [*SWAP, *(4 + p for p in SWAP)]
-    unet, ours = (copy.deepcopy(n).double() for n in (released["unet_model"], ncs["noise"].network))
-    close(ours(image), unet(image[:, planes])[:, SWAP], 1e-9)
-    apertures = torch.tensor([[4.0, 32.0], [1.0, 16.0]]).double()  # f/11 to f/4, f/22 to f/5.6
-    f_numbers = torch.tensor([[F11, F4], [2.0**4.5, 2.0**2.5]], dtype=torch.float64)
-    attention = copy.deepcopy(released["ap_model"]).double()
-    ours = copy.deepcopy(ncs["aperture"].network).double()
-    opened = attention(image[:, SWAP], apertures)[:, SWAP]
-    close(ours(image[:, :4], f_numbers), opened, 1e-9)
 
 
 @torch.no_grad()

@@ -152,9 +152,9 @@ def camera(row: float = ROW, shape: float = -0.05) -> CameraProfile:
     return CameraProfile("round", "RGGB", 3000, 3000 + SPAN, 14, **tables)
 
 
-def by_engine(level: float, k: int, source: NoiseLevelFunction = ZERO) -> np.ndarray:
+def by_engine(level: float, k: int) -> np.ndarray:
     light = torch.full((4, HEIGHT, WIDTH), level)
-    scene = PreparedScene(light, BASE, camera(), source, box_factor=k)
+    scene = PreparedScene(light, BASE, camera(), ZERO, box_factor=k)
     return scene.expose([BASE], seed=5, noise="sensor")[0].double().numpy()
 
 
@@ -183,14 +183,6 @@ def test_rows_and_pixels_share_the_variance(capture, level, k):
     found = (elsewhere**4).mean() / (elsewhere**2).mean() ** 2 - 3
     share = (1 - ROW**2) * READ / k**2 / pixels  # fourth cumulants: shot noise has hardly any
     assert found == pytest.approx(kurtosis(-0.05) / k**2 * share**2, abs=0.15)
-
-
-def test_a_noisy_source_lacks_a_part_of_each() -> None:
-    source = NoiseLevelFunction((0.0,) * 4, (0.6 * READ,) * 4)
-    frame = by_engine(0.0, 1, source)  # its light has no noise: only what is added shows
-    between = frame.mean(axis=2).var(axis=1) - frame.var(axis=2).mean(axis=1) / WIDTH
-    assert between.mean() == pytest.approx(0.4 * READ * ROW**2, rel=5 / math.sqrt(HEIGHT))
-    assert frame.var() == pytest.approx(0.4 * READ, rel=5 * math.sqrt(2 / HEIGHT))
 
 
 def test_more_is_added_where_a_blur_has_left_less() -> None:
