@@ -34,19 +34,12 @@ TIE = 1e-7
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Expected scores of S states.
+    """Expected scores of S states."""
 
-    Args:
-        mean: (S,) float64, q of each state.
-        standard_error: (S,) float64, 0 where the closed form was used.
-        parts: (S,) float64 of each part of the scorer.
-        allowed: (S,) bool, states that the scene allows; None for all of them.
-    """
-
-    mean: np.ndarray
-    standard_error: np.ndarray
-    parts: dict[str, np.ndarray]
-    allowed: np.ndarray | None = None
+    mean: np.ndarray  # (S,) float64, q of each state
+    standard_error: np.ndarray  # (S,) float64, 0 where the closed form was used
+    parts: dict[str, np.ndarray]  # (S,) float64 of each part of the scorer
+    allowed: np.ndarray | None = None  # (S,) bool, states that the scene allows; None for all
 
     @property
     def nbytes(self) -> int:
