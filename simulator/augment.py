@@ -212,13 +212,9 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
 class AugmentedDataset(Dataset[Any]):
     """A data set whose pictures are augmented where they are loaded, in the workers.
 
-    Neither the order of the samples nor the number of workers matters.
-
-    Args:
-        dataset: Map-style data set of pictures (C, H, W), or of tuples and lists that begin with
-            one. All that `ExposureAugmentation` takes.
-        augmentation: What photographs them.
-        seed: Of the training, >= 0.
+    Neither the order of the samples nor the number of workers matters. `dataset` is a map-style one
+    of pictures (C, H, W) that `augmentation` takes, or of tuples and lists that begin with one;
+    `seed` is that of the training, >= 0.
     """
 
     def __init__(

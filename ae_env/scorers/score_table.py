@@ -64,9 +64,6 @@ class ScoreTables:
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
         tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.
-
-    Attributes:
-        term_scores: The scorer's parts, and how each is evaluated.
     """
 
     def __init__(
@@ -84,6 +81,7 @@ class ScoreTables:
         self.states, self.camera, self.scorer = grid.states, camera, scorer
         self.noise, self.noise_seeds = noise, noise_seeds if noise else 1
         self.tolerance = tolerance
+        #: The scorer's parts, and how each is evaluated.
         self.term_scores = TermScores(scorer, camera, grid.states, noise=noise)
 
     def table(
