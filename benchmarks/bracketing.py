@@ -6,7 +6,6 @@ trained on. The last row knows what no camera does: the light of the scene and t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from itertools import product
@@ -15,14 +14,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from agents.bracketing.policies import BINS, Planner, bin_of, run_brackets
 from agents.evaluation.intervals import difference_interval
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
-from benchmarks.harness import Part, Report, Row, benchmark, panels, table
+from benchmarks.harness import Part, Report, Row, benchmark, table
 from simulator.utils.files import data_folder
 
 #: Policies, and what a page calls them.
@@ -101,20 +99,8 @@ def rows_of(results: dict[str, Any]) -> list[Row]:
             base = np.array(own[scenes, budget, BASELINE]["quality"])
             difference = difference_interval(quality, base, span)
             row |= {"to_baseline": difference.value, "to_ci95": difference.pair}
-        rows.append(row | {"each": np.sort(1.0 - quality.mean(axis=0)).tolist()})
+        rows.append(row)
     return rows
-
-
-def distributions(rows: Sequence[Row]) -> Figure:
-    curves = []
-    for row in (row for row in rows if row["budget"] == BUDGETS[-1]):
-        count, known = len(row["each"]), row["policy"] == "known"
-        style = {"drawstyle": "steps-pre"} | ({"c": "k", "ls": ":"} if known else {})
-        curve: Row = {"panel": f"{row['scenes']}, {row['budget']:g} s", "label": row["name"]}
-        y = (np.arange(count) + 1.0) / count
-        curves.append(curve | {"x": row["each"], "y": y, "style": style})
-    labels: Row = {"xlabel": "1 - quality (left is better)", "ylabel": "share of the source groups"}
-    return panels(curves, width=5.0, xscale="log", **labels)
 
 
 _COLUMNS = """policy = {name} | quality = {quality:.4f} | 95 % interval = {ci95:.4f} |
@@ -130,10 +116,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     for scenes, budget in product(SETS, BUDGETS):
         own = [row for row in rows if (row["scenes"], row["budget"]) == (scenes, budget)]
         tables[f"{scenes}-{1e3 * budget:.0f}ms"] = table(own, _COLUMNS)
-    figure = distributions(rows)
-    for row in rows:
-        del row["each"]
-    return Report(rows, tables, figures={"bracketing.png": figure})
+    return Report(rows, tables)
 
 
 run = benchmark("bracketing", parts, report)

@@ -47,7 +47,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 _COLUMNS = """on = {on}, workers: {workers} | raws = {files} | time [s] = {seconds:.1f} |
 raws / s = {rate:.1f} | times one process = {speedup:.2f} |
-of it no shard was made [s] = {overhead:.1f} | raws / s without that = {steady_rate:.1f} |
+of it no shard was made [s] = {overhead:.1f} |
 core hours for a million raws = {core_hours:.1f}"""
 
 
@@ -57,7 +57,6 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         row["rate"] = row["files"] / row["seconds"]
         row["speedup"] = rows[0]["seconds"] / row["seconds"]
         row["overhead"] = row["seconds"] - row["busy"] / row["workers"]
-        row["steady_rate"] = row["workers"] * row["files"] / row["busy"]
         row["core_hours"] = 1e6 * row["busy"] / row["files"] / 3600
     return Report(rows, {"runs": table(rows, _COLUMNS)})
 

@@ -13,13 +13,12 @@ import numpy as np
 import pandas as pd
 import torch
 from scipy.optimize import nnls
-from scipy.stats import spearmanr
 
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.measures import luma_of
 from agents.cli.console import print_line
-from benchmarks.harness import Part, Report, Row, benchmark, interval, pivot, table
+from benchmarks.harness import Part, Report, Row, benchmark, correlation, interval, pivot, table
 from simulator import develop, exposure_ratio, get_camera
 from simulator.optics.discs import disc_blur
 from simulator.raw.develop import GREY_CARD_SIGNAL
@@ -127,20 +126,14 @@ def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str,
     rendered = np.broadcast_to(LEVELS[defect], estimated.shape)[chosen]
     values, groups = estimated[chosen], np.array([scene.group for scene in scenes])[chosen]
     errors = pd.Series(np.abs(values - rendered).mean(axis=1)).groupby(groups).mean().to_numpy()
-    within = np.mean([_spearman(v, r) for v, r in zip(values, rendered, strict=True)])
+    within = np.mean([correlation(v, r) for v, r in zip(values, rendered, strict=True)])
     row: Row = {"part": "own", "measure": f"analytic_{defect}", "scenes": which}
     row |= {"resolution": scenes[0].light.shape[-1], "num_scenes": len(values)}
     row |= {"num_groups": len(errors), "mae": float(errors.mean())}
-    row |= {"spearman": _spearman(values.ravel(), rendered.ravel())}
+    row |= {"spearman": correlation(values.ravel(), rendered.ravel())}
     row |= {"spearman_within_scene": float(within), "mae_ci95": interval(errors, seed)}
     constant = np.abs(rendered - np.median(LEVELS[defect])).mean()
     return row | {"mae_of_a_constant": float(constant)}
-
-
-def _spearman(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's coefficient; 0 where one of the two does not vary."""
-    varies = min(np.ptp(first), np.ptp(second)) >= 1e-12
-    return float(spearmanr(first, second).statistic) if varies else 0.0
 
 
 def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from scipy.stats import bootstrap
+from scipy.stats import bootstrap, spearmanr
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -106,7 +106,8 @@ class Report:
     Args:
         rows: Rows of the result file.
         tables: What stands between the marks ``<!-- NAME -->`` and ``<!-- end -->`` of the page, by
-            name: Markdown of `table` and `pivot`. All else on a page is written by hand.
+            name: Markdown of `table` and `pivot`, empty where a part was not measured. All else on
+            a page is written by hand.
         meta: Entries of the result file besides its origin.
         figures: Pictures by file name beside the page (``"throughput.png"``), or by path.
     """
@@ -203,7 +204,8 @@ def filled_page(stem: str, tables: Mapping[str, str], figures: Iterable[str | Pa
         raise ValueError(f"{path} must have the marks of {sorted(tables)}, not of {marked}")
 
     def fill(found: re.Match[str]) -> str:
-        return f"<!-- {found[1]} -->\n{tables[found[1]].strip()}\n<!-- end -->"
+        text = tables[found[1]].strip() or "Not measured in this run."
+        return f"<!-- {found[1]} -->\n{text}\n<!-- end -->"
 
     # A table that was there may hold anything but the end mark.
     return re.sub(r"^<!-- ((?!end)[\w-]+) -->\n.*?^<!-- end -->$", fill, page, flags=re.M | re.S)
@@ -331,7 +333,8 @@ def table(rows: Iterable[Mapping[Any, Any]], columns: Columns) -> str:
 
     Columns that are empty in every row are left out; what is true or false is "yes" or "no".
     """
-    return to_markdown(map(_words, rows), columns_of(columns), missing="")
+    shown = list(map(_words, rows))
+    return to_markdown(shown, columns_of(columns), missing="") if shown else ""
 
 
 def pivot(rows: Iterable[Mapping[Any, Any]], line: Columns, group: Cell, contents: Columns) -> str:
@@ -368,6 +371,12 @@ def interval(values: np.ndarray, seed: int = 0) -> list[float]:
     """95 % bootstrap interval of the mean of `values`."""
     found = bootstrap((values,), np.mean, method="percentile", rng=seed).confidence_interval
     return [float(found.low), float(found.high)]
+
+
+def correlation(first: np.ndarray, second: np.ndarray, measure: Any = spearmanr) -> float:
+    """A coefficient of `scipy.stats`, Spearman's; 0 where one of the two does not vary at all."""
+    varies = min(np.ptp(first), np.ptp(second)) >= 1e-12
+    return float(measure(first, second).statistic) if varies else 0.0
 
 
 def quartiles(values: Sequence[float]) -> list[float]:

@@ -109,15 +109,10 @@ class GeneratedConvolution(nn.Module):
         nn.init.normal_(self.generator.bias, std=deviation)
         nn.init.normal_(self.generator.weight, std=0.3 * deviation / math.sqrt(NUM_PARAMETERS))
 
-    def kernels(self, parameters: Tensor) -> Tensor:
-        """(B, outputs, inputs, k, k) from scaled parameters (B, 6); transposed if it upsamples."""
-        values: Tensor = self.generator(parameters)
-        return values.reshape(-1, *self.shape)
-
     def forward(self, x: Tensor, parameters: Tensor) -> Tensor:
         """(B, inputs, H, W) and scaled parameters (B, 6), to (B, outputs, H', W')."""
         batch, channels, height, width = x.shape
-        kernels = self.kernels(parameters).flatten(0, 1)  # a group for each sample
+        kernels = self.generator(parameters).reshape(-1, *self.shape[1:])  # a group a sample
         x = x.reshape(1, batch * channels, height, width)
         if self.upsample:
             x = F.conv_transpose2d(x, kernels, stride=2, padding=1, groups=batch)

@@ -6,21 +6,26 @@
 Of every scene of a recorded grid one capture is kept, the one that an average meter would have
 taken, and all other states are simulated from it. Each is compared with the capture that was
 really taken, and so are the scores. Without a folder: grids that the reference camera takes of
-held-out radiance maps, written to files and read back, and the real bracket of
-``boreal_brackets``. The alternative is the same capture, scaled by the exposure ratio and clipped.
+held-out radiance maps, written to files and read back, and the real brackets of
+``boreal_brackets``, 1 to 32 ms in whole stops, whose exposure ratios are measured, too. The
+alternative is the same capture, scaled by the exposure ratio and clipped.
 """
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
+from skimage.io import imread
+from skimage.measure import block_reduce
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import load_scenes
@@ -29,13 +34,15 @@ from ae_env.scenes.recorded import PREFIX, RecordedOptions, merged_scene
 from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
-from benchmarks import brackets
-from benchmarks.brackets import texture
 from benchmarks.fidelity.models import radiance_views
-from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, real_files, table
+from benchmarks.harness import Part, Report, Row, benchmark, clipped, pivot, psnr, real_files, table
 from benchmarks.isolated import median_seconds
-from simulator import RawImage, exposure_ratio, get_camera, write_dng
+from simulator import CameraSettings, RawImage, exposure_ratio, get_camera, write_dng
+from simulator.camera import BayerPattern, CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import MEAN_SIGNAL
+from simulator.raw.image import PLANES
+from simulator.raw.noise_estimation import estimate_nlf
 from simulator.reference.reference_camera import ReferenceCamera
 
 CAMERA = "nikon_z6"
@@ -90,13 +97,65 @@ def _of_folder(folder: str) -> list[Scene]:
     return load_scenes(_options(folder), "all", **options)
 
 
+# -- real brackets --------------------------------------------------------------------------------
+
+#: The first is static, the second moves.
+BRACKETS, TIMES_MS = ("left_c0", "left_c5"), (1, 2, 4, 8, 16, 32)
+#: Above this level the published response curve is not linear any more (see the ratios).
+LINEAR_BELOW = 0.4
+#: Side of the blocks that exposure ratios are measured on [packed pixel].
+BLOCK = 8
+_SOURCE = "measurement only: BorealHDR, left camera"
+#: The largest code that the files hold is 4094: saturation, 4089 after linearising.
+_BOREAL = CameraProfile("boreal_left", BayerPattern.RGGB, (0.0,) * 4, 4089, 12, source=_SOURCE)
+
+
+def _bracket(name: str) -> dict[int, RawImage]:
+    """Frames by time [ms], linearised as the data's README says; gain and aperture are fixed."""
+    folder = real_files(BOREAL)
+    (curve_path,) = folder.glob("pcalib*.txt")
+    curve = 16.0 * np.loadtxt(curve_path).ravel()
+    curve[0], curve[-1] = 0.0, 4095.0
+    frames = {}
+    for time in TIMES_MS:
+        (path,) = folder.glob(f"{name}_{time:04.1f}ms_*.png")
+        linear = np.interp(imread(path), np.linspace(0, 4095, 256), curve)
+        linear = np.minimum(linear, _BOREAL.white_level)
+        frames[time] = RawImage.from_mosaic(linear, CameraSettings(100, time / 1000, 4), _BOREAL)
+    return frames
+
+
 def _boreal(grid: ExposureGrid) -> list[Scene]:
-    folder, scenes = real_files(BOREAL), []
-    for name in brackets.SCENES:
-        taken = {t: brackets.load(folder, name, t) for t in brackets.TIMES_MS}
-        frames, _ = brackets.calibrated(taken)
-        scenes.append(merged_scene(name, enumerate(frames.values()), grid, frames[1].camera))
+    scenes = []
+    for name in BRACKETS:
+        frames = _bracket(name)
+        estimates = map(estimate_nlf, (frame.data for frame in frames.values()))
+        found = np.median([(one.shot, one.read) for one in estimates], axis=0)
+        shot, read = map(tuple, found.tolist())
+        camera = _BOREAL.with_nlf(100, NoiseLevelFunction(shot, read, source="blind, median of 6"))
+        raws = (replace(frame, camera=camera) for frame in frames.values())
+        scenes.append(merged_scene(name, enumerate(raws), grid, camera))
     return [scene.resized(RESOLUTION) for scene in scenes]
+
+
+def ratios() -> list[Row]:
+    """Exposure ratio of consecutive frames, per plane, on block means.
+
+    Averaging blocks takes out noise and the frames' small shifts; blocks are selected by the mean
+    of both frames, because selecting by one would favour its noise.
+    """
+    rows, reduced = [], partial(block_reduce, block_size=(1, BLOCK, BLOCK))
+    for name in BRACKETS:
+        data = {t: frame.data.double().numpy() for t, frame in _bracket(name).items()}
+        for shorter, longer in itertools.pairwise(TIMES_MS):
+            x, y = (reduced(data[t], func=np.mean) for t in (shorter, longer))
+            level, peak = x + y / 2, reduced(data[longer], func=np.max)
+            chosen = (level > 0.02) & (level < LINEAR_BELOW) & (peak < KNOWN_BELOW)
+            for plane, a, b, use in zip(PLANES, x, y, chosen, strict=True):
+                row: Row = {"part": "ratio", "scene": name, "source_ms": shorter, "plane": plane}
+                row |= {"target_ms": longer, "median": np.median(b[use] / a[use])}
+                rows.append(row | {"least_squares": a[use] @ b[use] / (a[use] @ a[use])})
+    return rows
 
 
 # -- measuring ------------------------------------------------------------------------------------
@@ -110,8 +169,8 @@ def measure(source: str, seed: int, quick: bool, folder: str | None = None) -> l
     elif source == REFERENCE:
         scenes, grid = _reference_grids(quick, seed), ExposureGrid.default()
     else:
-        grid = ExposureGrid((100,), tuple(t / 1000 for t in brackets.TIMES_MS), (4,))
-        scenes, linear_below = _boreal(grid), brackets.LINEAR_BELOW
+        grid = ExposureGrid((100,), tuple(t / 1000 for t in TIMES_MS), (4,))
+        scenes, linear_below = _boreal(grid), LINEAR_BELOW
     networks = SceneNetworks(DEFAULT_SIMULATOR, cache=False)
     found = [(s, _compared(s, grid, networks, seed, linear_below)) for s in scenes]
     return [{"source": source, "scene": s.scene_id, **row} for s, rows in found for row in rows]
@@ -177,6 +236,15 @@ def _compared(
         yield row | {"ceiling_by_stops": by_stops["ceiling_db"].to_dict()}
 
 
+def texture(image: torch.Tensor, use: torch.Tensor) -> float:
+    """Mean square of the diagonal difference of 2 x 2 neighbours: noise, and detail alike.
+
+    `use` (H - 1, W - 1) chooses them; 0 where it is nowhere true.
+    """
+    a, b, c, d = (image[:, i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
+    return float(((a - b - c + d) / 2.0)[:, use].square().mean()) if use.any() else 0.0
+
+
 def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -> float:
     """PSNR of two captures of the same light, each with the camera's noise [dB]."""
     assert scene.recorded is not None
@@ -192,7 +260,8 @@ def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -
 
 def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
     if folder is None:
-        return [Part(name, measure, {"source": name}) for name in (REFERENCE, BOREAL)]
+        sets = [Part(name, measure, {"source": name}) for name in (REFERENCE, BOREAL)]
+        return [Part("ratios", ratios), *sets]
     assert _options(str(folder)).grid  # raises before any work
     name = folder.resolve().name.partition("?")[0]
     return [Part(name, measure, {"source": name, "folder": str(folder.resolve())})]
@@ -207,6 +276,7 @@ _REGRET = "mean = {mean:.3f} | upper quartile = {upper:.3f} | largest = {most:.3
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    steps = results.pop("ratios", [])
     rows = [row for own in results.values() for row in own]
     frame = pd.json_normalize(rows)  # columns such as "psnr_by_stops.as bright"
     sets, stops = [], []
@@ -226,13 +296,15 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     same, number = " | same oracle = {same_oracle:.0%}", "number = {number} | "
     every = [row | {"title": METHODS[row["method"]]} for row in rows]
     by_stops = " | ".join(f"{name} = {{{name}:.1f}}" for name in STOPS)
+    line = "scene, frames = {scene}, {source_ms} to {target_ms} ms"
     tables = {
+        "ratios": pivot(steps, line, "{plane}", "{median:.3f} ({least_squares:.3f})"),
         "sets": table(sets, of_set + method + number + _COLUMNS + same + _TIME),
         "regret": table([regret], _REGRET),
         "by_stops": table(stops, of_set + method + by_stops),
         "scenes": table(every, each + method + _COLUMNS + _TIME),
     }
-    return Report(rows, tables)
+    return Report([*steps, *rows], tables)
 
 
 run = benchmark("recorded", parts, report)

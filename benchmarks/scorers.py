@@ -26,6 +26,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures, prepare_scene
+from benchmarks import harness
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, ssim, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
@@ -105,17 +106,15 @@ def best_ev(seed: int) -> list[Row]:
 
     Of equal exposures it is the nearest to the incident light's; None where all are equal.
     """
-    best: dict[str, dict[str, float | None]] = {}
-    for scene_id, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
+    best: dict[str, list[float]] = {}
+    for _, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
         equal = OFFSETS[scores >= scores.max() - _EQUAL]
         nearest = float(equal[np.argmin(np.abs(equal))])
-        best.setdefault(name, {})[scene_id] = None if np.ptp(scores) < _EQUAL else nearest
+        best.setdefault(name, []).extend([nearest] * (np.ptp(scores) >= _EQUAL))
     rows = []
-    for name, by_scene in best.items():
-        known = [value for value in by_scene.values() if value is not None]
+    for name, known in best.items():
         row: Row = {"scorer": name, "median": float(np.median(known)) if known else None}
-        row |= {"lowest": min(known, default=None), "highest": max(known, default=None)}
-        rows.append(row | {"by_scene": by_scene})
+        rows.append(row | {"lowest": min(known, default=None), "highest": max(known, default=None)})
     return rows
 
 
@@ -179,7 +178,8 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
             known = np.isfinite(near)
             row: Row = {"scorer": scorer, "reference": target}
             for name, measure in (("spearman", spearmanr), ("pearson", pearsonr)):
-                row[name] = _correlation(measure, scores[scorer][known], near[known])
+                pair = scores[scorer][known], near[known]
+                row[name] = harness.correlation(*pair, measure) if known.sum() > 2 else np.nan
             found.append(row)
     rows = []
     known_pairs = pd.DataFrame(found).dropna().groupby(["scorer", "reference"], sort=False)
@@ -189,14 +189,6 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
             row |= {key: own[key].mean(), f"{key}_sd": own[key].std(ddof=0)}
         rows.append(row | {"positive": float((own["spearman"] > 0).mean())})
     return {"rows": rows, "scenes": len(env.scenes), "states": len(env.grid)}
-
-
-def _correlation(measure: Callable[..., Any], scores: np.ndarray, closeness: np.ndarray) -> float:
-    """0 where one of the two does not vary at all, NaN for fewer than three states."""
-    if len(scores) < 3:
-        return np.nan
-    varies = min(np.ptp(scores), np.ptp(closeness)) >= 1e-12
-    return float(measure(scores, closeness).statistic) if varies else 0.0
 
 
 def _closeness(
@@ -250,7 +242,7 @@ def _closeness(
 _GAIN = """scorer = `{scorer}` | ISO 100 = {low_gain:.3f} | ISO 6400 = {high_gain:.3f} |
 change = {change:+.3f} ± {change_sd:.3f} | scenes in which it rises = {rises:.0%}"""
 _BEST = """scorer = `{scorer}` | median [EV] = {median:+.1f} |
-range = {lowest:+.1f} to {highest:+.1f} | scene by scene = {each}"""
+range = {lowest:+.1f} to {highest:+.1f}"""
 _CORRELATION = """Spearman = {spearman:.2f} ± {spearman_sd:.2f} |
 Pearson = {pearson:.2f} ± {pearson_sd:.2f} | positive = {positive:.0%}"""
 
@@ -260,9 +252,6 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     named = {**results, "correlation": correlations["rows"]}
     rows = [{"measure": name, **row} for name, own in named.items() for row in own]
     best = [row for row in results["best_ev"] if row["median"] is not None]
-    for row in best:
-        by_scene = row["by_scene"].values()
-        row["each"] = " ".join("=" if value is None else f"{value:+g}" for value in by_scene)
     why = [{"scorer": name, "why": text} for name, text in missing.items()]
     line = "scorer = `{scorer}`"
     tables = {

@@ -287,8 +287,6 @@ def test_the_papers_table_in_one_command(ae_env, benchmarks_here, monkeypatch):
     page = (benchmarks_here / "results" / "paper.md").read_text()
     assert "|EXP`paper`|" in page.replace(" ", "")
     assert "36.10 / 0.923" in page  # what the paper publishes
-    with Image.open(benchmarks_here / "results" / "paper.png") as picture:
-        assert picture.width > 300
     # The exposure of w = 1, b = 0 by hand, on the pairs that were measured.
     _, held_out = split_dataset(benchmarks_here / "data")
     captures = {str(c.settings): c for c in held_out[0].captures}

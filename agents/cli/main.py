@@ -35,9 +35,9 @@ from simulator.utils.checks import check_word
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
-    *("agents", "bracketing", "brackets", "cluster", "colour_checker", "defects", "denoising"),
-    *("features", "hdr", "onboard", "paper", "ptc", "recorded", "refocus", "scorers"),
-    *("simulator", "throughput", "transfer", "work_precision"),
+    *("agents", "bracketing", "cluster", "colour_checker", "defects", "denoising"),
+    *("features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
+    *("scorers", "simulator", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -63,14 +63,12 @@ def bench(
     quick: Annotated[bool, Option(help="A short version, to try it out.")] = False,
     against: Annotated[
         Path | None,
-        Option(help="Of throughput: another checkout or commit, timed in turns with this."),
+        Option(help="Of throughput: another checkout, timed in turns with this."),
     ] = None,
     weights: Annotated[
         Path | None, Option(help="Of paper: measure these weights, and train nothing.")
     ] = None,
-    part: Annotated[
-        str | None, Option(help="Of transfer: agents or tables; by default both.")
-    ] = None,
+    part: Annotated[str | None, Option(help="Of places and transfer: one part of it.")] = None,
 ) -> None:
     """Run one of the measurements whose results are in docs/results.
 
@@ -94,11 +92,12 @@ def bench(
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)
 
 
-#: Benchmarks that take an option.
+#: Parts that can be run alone, and benchmarks that take an option.
+_PARTS = {"places": ("posterior", "receptors", "curve"), "transfer": ("agents", "tables")}
 _TAKES = {
     "against": ("throughput",),
     "folder": ("paper", "recorded"),
-    "part": ("transfer",),
+    "part": tuple(_PARTS),
     "weights": ("paper",),
 }
 
@@ -110,7 +109,7 @@ def _check_options(name: str, **options: Any) -> None:
             rule = f"is for {' and '.join(_TAKES[option])} only"
             raise ValueError(f"`{option}` (={str(value)!r}) {rule}")
     if "part" in options:
-        check_word("part", options["part"], ("agents", "tables"))
+        check_word("part", options["part"], _PARTS[name])
     if name == "paper" and "folder" not in options:
         raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
 

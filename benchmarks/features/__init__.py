@@ -248,8 +248,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         differences, "{pair}", lambda own: pivot(own, "measure = {judged}", "{at}", _DIFFERENCE)
     )
     curves = [
-        {"panel": JUDGED[measure], "label": _plain(arm), "x": gaps, "style": {"marker": "."}}
+        {"panel": JUDGED[measure], "x": gaps, "style": {"marker": "."}}
         | {"y": [row[measure] for row in means if row["arm"] == arm]}
+        | {"label": LABELS[arm].strip("*")}
         for measure in ("repeatability", "accuracy", "auc_5")
         for arm in arms
     ]
@@ -267,10 +268,6 @@ def _frame(runs: list[Row]) -> pd.DataFrame:
     for px in CORNER_ERRORS:  # the mean is the area under the curve
         frame[f"auc_{px}"] = np.clip(1.0 - errors / px, 0.0, 1.0)
     return frame
-
-
-def _plain(arm: str) -> str:
-    return LABELS[arm].replace("*", "")
 
 
 def _at(gaps: list[float]) -> str:
@@ -300,7 +297,7 @@ def _difference(
     found = score_interval(first - second, np.ones(first.shape[1]), seed=seed)
     row: Row = {"part": "difference", "arm": pair[0], "against": pair[1], "gaps": gaps}
     row |= {"measure": measure, "difference": found.value, "interval": found.pair}
-    row |= {"pair": " against ".join(map(_plain, pair)), "at": _at(gaps)}
+    row |= {"pair": " against ".join(LABELS[arm].strip("*") for arm in pair), "at": _at(gaps)}
     beyond = found.pair is not None and not found.pair[0] <= 0.0 <= found.pair[1]
     return row | {"judged": JUDGED[measure], "mark": "**" * beyond, "beyond": beyond}
 

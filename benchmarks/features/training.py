@@ -18,14 +18,14 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from ae_env.scorers.measures import srgb_decode
-from benchmarks.harness import RUNS
+from benchmarks.harness import RUNS, real_files
 from benchmarks.isolated import ROOT
 from simulator import develop
 from simulator.augment import ExposureAugmentation, sample_seeds
 from simulator.radiance.reading import read_radiance
 from simulator.raw.develop import GREY_CARD_SIGNAL, srgb_encode
 from simulator.training.scenes import Split, photograph_pictures, radiance_files, recorded_mosaics
-from simulator.utils.files import data_folder, write_atomically
+from simulator.utils.files import write_atomically
 
 # -- pictures, and pairs of views of them with a known homography ---------------------------------
 
@@ -55,10 +55,7 @@ class View(NamedTuple):
 
 
 def sources(split: Split, *, raws: bool, limit: int | None = None) -> list[Source]:
-    data = data_folder()
-    if data is None:
-        raise FileNotFoundError("set AE_ENV_DATA to the folder of real files (photo_pool, maps)")
-    found = []
+    data, found = real_files("photo_pool").parent, []
     for picture in islice(photograph_pictures(data, split), limit):
         found.append(Source(picture.name, picture.group, _metered(picture.light)))
     for path, group in islice(radiance_files(data, split), limit):

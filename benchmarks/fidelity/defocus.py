@@ -182,10 +182,7 @@ def tables(rows: list[Row]) -> dict[str, str]:
     opened, sharp = ([r for r in rows if r["part"] == part] for part in ("defocus", "in focus"))
     small = np.mean([row["change"] < ASKED for row in sharp])
     share = {"pictures": len(sharp), "small": small, "asked": ASKED_SHARE}
-    most = sorted(sharp, key=lambda row: -row["change"])[:8]
-    columns = "picture = {picture} | kind = {kind} | change [noise] = {change:.2f}"
     return {
         "defocus": sections(opened, "{set}", lambda own: pivot(own, line, "ISO {iso}", _CONTENTS)),
         "in-focus": table([share], _SHARE),
-        "most-changed": table(most, columns),
     }

@@ -8,7 +8,6 @@ mean. Everything is clipped to [-pedestal, 1] first.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -186,11 +185,8 @@ def _rows(scored: list[tuple[Case, dict[Method, Row]]], camera: str) -> Iterator
 
 def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
     """Standard error of the mean, the pairs of a source group taken as one draw."""
-    names, index = np.unique(subjects, return_inverse=True)
-    if len(names) < 2:
-        return None
-    sums = np.bincount(index, values - values.mean())
-    return float(math.sqrt(len(names) / (len(names) - 1) * (sums**2).sum()) / len(values))
+    sums = pd.Series(values - values.mean()).groupby(subjects).sum()
+    return float(len(sums) * sums.var()) ** 0.5 / len(values) if len(sums) > 1 else None
 
 
 # -- report ---------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Steps per second against what the machine could do, and how cost grows.
 
     ae-env bench throughput
-    ae-env bench throughput --against ANOTHER_CHECKOUT_OR_COMMIT
+    ae-env bench throughput --against ANOTHER_CHECKOUT
 
 Parts: environment steps beside a fused kernel, copies of the environment; resets
 beside steps; the first episode after installation; growth of time and memory with pixels; a
@@ -74,7 +74,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     contents = "time [ms] = {ms:.2f} | memory [MiB] = {mib:.1f}"
     by_x = pivot(growth, "pixels = {x:,.0f}", "{curve}", contents)
     tables = {
-        "before": table(paired, COLUMNS) if paired else "Not measured in this run.",
+        "before": table(paired, COLUMNS),
         "steps": sections(steps, "{title}", lambda own: table(own, _STEPS)),
         "resets": table(more["resets"], _RESETS),
         "first-episode": table(more["cold_start"], _COLD),

@@ -140,7 +140,7 @@ STAGES = ("read", "prepare", "simulate", "write")
 
 
 def frame_parts(quick: bool) -> Iterator[Part]:
-    synthetic = RUNS / "throughput" / f"frame{'_quick' * quick}.dng"
+    synthetic = RUNS / "throughput" / f"synthetic{'_quick' * quick}.dng"
     synthetic.parent.mkdir(parents=True, exist_ok=True)
     _write_foreign_dng(synthetic, *(QUICK if quick else FULL))
     data = data_folder()
@@ -189,15 +189,10 @@ def simulate(path: str, case: str, passes: int) -> Row:
             megapixels = 4e-6 * raw.data[0].numel()
             modules, peak = ", ".join(prepared.plan(settings).modules), peak_memory()
             del raw, prepared, result
-    row: Row = {"case": case, "file": _shown(path), "modules": modules}
+    row: Row = {"case": case, "file": Path(path).name, "modules": modules}
     row |= {"megapixels": megapixels, "first": seconds[1], "peak_mib": peak}
     row |= {"seconds": statistics.median(seconds[2:] or seconds[1:])}
     return row | {"stages": {name: clock[i + 1] - clock[i] for i, name in enumerate(STAGES)}}
-
-
-def _shown(path: str) -> str:
-    name = Path(path).name
-    return "synthetic DNG" if name.startswith("frame") else name
 
 
 def libraw(path: str) -> Row:
@@ -220,6 +215,6 @@ def libraw(path: str) -> Row:
         unpacking = [timed(unpack) for _ in range(PASSES)]
         content = os.urandom(unpack())
         writing = [timed(lambda: file.write_bytes(content)) for _ in range(PASSES)]
-    row: Row = {"file": _shown(path), "first": unpacking[0] + writing[0], "develop": timed(develop)}
+    row: Row = {"file": Path(path).name, "first": unpacking[0] + writing[0]}
     unpacked, written = (statistics.median(times[1:]) for times in (unpacking, writing))
-    return row | {"unpack": unpacked, "write": written}
+    return row | {"develop": timed(develop), "unpack": unpacked, "write": written}

@@ -29,23 +29,15 @@ QUICK, FULL = (1, 4, 0.1), (3, 12, 0.3)
 COLUMNS = """case = {case} | threads = {threads} | before [1/s] = {steps_per_second_before:,.1f} |
 now [1/s] = {steps_per_second:,.1f} | ratio = {ratio_to_before:.3f} |
 quartiles = {ratio_quartiles:.3f} | smallest to largest = {ratio_min:.2f} to {ratio_max:.2f} |
-of processor time = {ratio_cpu:.3f} | frames differ by = {max_difference:.2g}"""
+frames differ by = {max_difference:.2g}"""
 
 
 def checkout(against: Path) -> Path:
-    """The folder of another checkout; of a commit, a worktree of it under ``runs``."""
-    if (against / "simulator" / "__init__.py").is_file():
-        return against.absolute()
-    find = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{against}^{{commit}}"]
-    found = subprocess.run(find, cwd=ROOT, capture_output=True, text=True, check=False)
-    if found.returncode:
-        rule = "must be a checkout of this project, or a commit"
+    """The folder of another checkout."""
+    if not (against / "simulator" / "__init__.py").is_file():
+        rule = "must be a checkout of this project (git worktree add makes one of a commit)"
         raise ValueError(f"`against` (={str(against)!r}) {rule}")
-    folder = ROOT / "runs" / "against" / found.stdout.strip()
-    if not folder.is_dir():
-        add = ["git", "worktree", "add", "--detach", str(folder), folder.name]
-        subprocess.run(add, cwd=ROOT, capture_output=True, check=True)
-    return folder
+    return against.absolute()
 
 
 class Worker:
@@ -72,12 +64,12 @@ class Worker:
                 self.stop()
                 raise RuntimeError(f"{package} was imported from {file}, not {self.checkout}")
 
-    def time(self, case: str, seconds: float) -> dict[str, float]:
-        """Time per frame of `case` [s], ``wall`` and ``cpu``, run for `seconds`."""
+    def time(self, case: str, seconds: float) -> float:
+        """Time per frame of `case` [s], run for `seconds`."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"case": case, "seconds": seconds}) + "\n")
         self._process.stdin.flush()
-        return self._answer()
+        return float(self._answer()["seconds"])
 
     def first_frames(self) -> np.ndarray:
         """Frames that the case timed for the first time made with fixed seeds and states."""
@@ -102,7 +94,7 @@ def measure_paired(against: str, threads: int, quick: bool) -> list[Row]:
     """One row per case: speeds of both checkouts and their ratio."""
     launches, rounds, seconds = QUICK if quick else FULL
     # Times per frame (before, now) of every case, and by how much its frames differ.
-    times: dict[str, list[tuple[dict[str, float], dict[str, float]]]] = {}
+    times: dict[str, list[tuple[float, float]]] = {}
     differences: dict[str, float] = {}
     for _ in range(launches):
         own, other = (Worker(path, threads) for path in (ROOT, Path(against)))
@@ -113,26 +105,20 @@ def measure_paired(against: str, threads: int, quick: bool) -> list[Row]:
                 apart = np.abs(own.first_frames() - other.first_frames()).max()
                 differences[case] = float(apart)
                 for turn in range(rounds):
-                    if turn % 2:
-                        after, before = own.time(case, seconds), other.time(case, seconds)
-                    else:
-                        before, after = other.time(case, seconds), own.time(case, seconds)
-                    times.setdefault(case, []).append((before, after))
+                    turns = (own, other) if turn % 2 else (other, own)
+                    found = {worker: worker.time(case, seconds) for worker in turns}
+                    times.setdefault(case, []).append((found[other], found[own]))
         finally:
             own.stop()
             other.stop()
     rows = []
     for case, pairs in times.items():
-        then, now = ([pair[side]["wall"] for pair in pairs] for side in (0, 1))
-        ratios = [old / new for old, new in zip(then, now, strict=True)]
+        then, now = map(statistics.median, zip(*pairs, strict=True))
+        ratios = [old / new for old, new in pairs]
         low, middle, high = quartiles(ratios)
-        row: Row = {"case": case, "num_envs": STEPS[case][0] if case in STEPS else None}
-        row |= {"threads": threads, "size": SWEEPS[case][0] if case in SWEEPS else 64}
-        row |= {"steps_per_second": 1.0 / statistics.median(now)}
-        row |= {"steps_per_second_before": 1.0 / statistics.median(then)}
-        row |= {"ratio_to_before": middle, "ratio_quartiles": [low, high]}
-        row |= {"ratio_min": min(ratios), "ratio_max": max(ratios), "rounds": len(pairs)}
-        # Processor time suffers less from other programs.
-        row["ratio_cpu"] = statistics.median(old["cpu"] / new["cpu"] for old, new in pairs)
-        rows.append(row | {"max_difference": differences[case]})
+        row: Row = {"case": case, "threads": threads, "ratio_to_before": middle}
+        row |= {"steps_per_second": 1.0 / now, "steps_per_second_before": 1.0 / then}
+        row |= {"ratio_quartiles": [low, high], "max_difference": differences[case]}
+        row |= {"ratio_min": min(ratios), "ratio_max": max(ratios)}
+        rows.append(row | {"rounds": len(pairs)})
     return rows

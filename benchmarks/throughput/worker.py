@@ -12,6 +12,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,8 @@ STEPS: dict[str, tuple[int, dict[str, Any]]] = {
     "steps, one environment, cached scene": (1, CACHED),
     "steps, one environment, motion and defocus": (1, {}),
 }
-#: Name -> height and width of the raw, kind of noise, and what is repeated.
-SWEEPS: dict[str, tuple[int, str, str]] = {
-    f"sweep, {side} x {side}, {noise} noise{more}": (side, noise, kind)
-    for kind, more, sides in (
-        ("expose", "", (128, 256)),
-        ("simulate", ", state by state", (128,)),
-        ("blurred", ", prepared with motion and defocus", (128,)),
-    )
-    for side in sides
-    for noise in ("exact", "bank")
-}
+#: Name -> kind of noise of the 64 states of the default grid, of a raw of 128 x 128 packed pixels.
+SWEEPS = {f"sweep, 128 x 128, {noise} noise": noise for noise in ("exact", "bank")}
 #: What is timed, environment steps or sweeps of one call, and frames that checkouts must agree on.
 Case = tuple[Callable[[], Any], int, np.ndarray]
 
@@ -86,52 +78,34 @@ def _steps(num_envs: int, options: dict[str, Any]) -> Case:
     return episode, _EPISODE * num_envs, np.stack(frames)
 
 
-def _sweep(side: int, noise: Any, kind: str) -> Case:
-    """The 64 states of the default grid, of a raw of `side` x `side` packed pixels."""
-    raw, camera_simulator = _raw(side), CameraSimulator(device="cpu")
+def _sweep(noise: Any) -> Case:
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 4, 9, 9, generator=generator)
+    light = torch.nn.functional.interpolate(coarse, (128, 128), mode="bilinear")[0] * 0.3
+    camera, settings = get_camera("nikon_z6"), CameraSettings(400, 1 / 64, 8.0)
+    nlf = camera.nlf(settings.iso)
+    shot, read = (torch.tensor(values).view(4, 1, 1) for values in (nlf.shot, nlf.read))
+    normals = torch.randn(light.shape, generator=generator)
+    data = (light + (light * shot + read).sqrt() * normals).clamp(-0.05, 1.0)
+    raw = RawImage(data.contiguous(), settings, camera)
     grid = [
         CameraSettings(iso, seconds, f_number)
         for iso in (100, 400, 1600, 6400)
         for seconds in (1 / 1024, 1 / 128, 1 / 16, 1 / 2)
         for f_number in (4, 5.6, 8, 11)
     ]
-    prepared = camera_simulator.prepare(raw)
-
-    def expose() -> torch.Tensor:
-        return prepared.expose(grid, noise=noise)
-
-    def simulate() -> torch.Tensor:
-        frames = (camera_simulator.simulate(raw, s, noise=noise).data for s in grid)
-        return torch.stack(list(frames))
-
-    def blurred() -> torch.Tensor:
-        again = camera_simulator.prepare(raw, image_speed=0.2, defocus=6.0)
-        return again.expose(grid, noise=noise)
-
-    call = {"expose": expose, "simulate": simulate, "blurred": blurred}[kind]
+    prepared = CameraSimulator(device="cpu").prepare(raw)
+    call = partial(prepared.expose, grid, noise=noise)
     return call, 1, call().numpy()
 
 
-def _raw(side: int) -> RawImage:
-    generator = torch.Generator().manual_seed(0)
-    coarse = torch.rand(1, 4, 9, 9, generator=generator)
-    light = torch.nn.functional.interpolate(coarse, (side, side), mode="bilinear")[0] * 0.3
-    camera, settings = get_camera("nikon_z6"), CameraSettings(400, 1 / 64, 8.0)
-    nlf = camera.nlf(settings.iso)
-    shot, read = (torch.tensor(values).view(4, 1, 1) for values in (nlf.shot, nlf.read))
-    noise = torch.randn(light.shape, generator=generator)
-    data = (light + (light * shot + read).sqrt() * noise).clamp(-0.05, 1.0)
-    return RawImage(data.contiguous(), settings, camera)
-
-
 def _timed(call: Callable[[], Any], frames: int, seconds: float) -> dict[str, float]:
-    """Wall and processor time per frame [s], over `seconds` or a little more."""
-    begin, begin_cpu, calls = time.perf_counter(), time.process_time(), 0
+    """Time per frame [s], over `seconds` or a little more."""
+    begin, calls = time.perf_counter(), 0
     while (elapsed := time.perf_counter() - begin) < seconds or not calls:
         call()
         calls += 1
-    frames *= calls
-    return {"wall": elapsed / frames, "cpu": (time.process_time() - begin_cpu) / frames}
+    return {"seconds": elapsed / (frames * calls)}
 
 
 def _answers(folder: Path) -> Iterator[dict[str, Any]]:
@@ -142,7 +116,7 @@ def _answers(folder: Path) -> Iterator[dict[str, Any]]:
         request = json.loads(line)
         name = request["case"]
         if name not in cases:
-            cases[name] = _steps(*STEPS[name]) if name in STEPS else _sweep(*SWEEPS[name])
+            cases[name] = _steps(*STEPS[name]) if name in STEPS else _sweep(SWEEPS[name])
             np.save(folder / "first.npy", cases[name][2])
         yield _timed(*cases[name][:2], request["seconds"])
 

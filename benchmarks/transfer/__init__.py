@@ -34,8 +34,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     used = [*plan.worlds, *(name for one in plan.tables for name in one.simulators)]
     more = {"plan": asdict(plan), "training_set": agents.training_set(plan)}
     more["left_out"] = [name for name in dict.fromkeys(used) if not agents.has_weights(name)]
-    texts = {name: text or "Not measured in this run." for name, text in found.items()}
-    return Report([*judged, *predicted], texts, meta=more)
+    return Report([*judged, *predicted], found, meta=more)
 
 
 run = benchmark("transfer", parts, report)

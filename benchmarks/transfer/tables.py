@@ -9,11 +9,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import rankdata, spearmanr
 
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
@@ -22,7 +21,7 @@ from ae_env.scenes.scene import Crop
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.rollouts import RolloutPlan, make_envs
-from benchmarks.harness import Row, cell, pivot, sections, table
+from benchmarks.harness import Row, cell, correlation, pivot, sections, table
 from benchmarks.transfer import agents as worlds
 
 #: What is measured of a predicted table, each the better the smaller but the first.
@@ -93,9 +92,7 @@ def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:
     allowed = np.ones(len(true.mean), bool) if true.allowed is None else true.allowed
     right, row = totals(true.parts), Measured()
     pair = table.mean[allowed], true.mean[allowed]
-    # Where all states of one table score alike, nothing is told.
-    varies = min(np.ptp(rankdata(own)) for own in pair) > 0.0
-    row["rank_correlation"] = float(cast(Any, spearmanr(*pair)).statistic) if varies else 0.0
+    row["rank_correlation"] = correlation(*pair)
     row["regret"] = float(true.mean[true.oracle] - true.mean[table.oracle])
     row["absolute_error"] = float(np.abs(pair[0] - pair[1]).mean())
     row["terms"] = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -32,25 +32,20 @@ DEFAULT = DEFAULT_TOLERANCE
 FAMILY = ("nano", "compact", "large")
 
 
-class Prepared(Protocol):
-    """A raw, ready to be exposed: a capture per state (S, 4, H, W), and one without noise."""
-
-    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor: ...  # noqa: D102
-    def expected(self, settings: CameraSettings) -> Tensor: ...  # noqa: D102
-
-
 @dataclass(frozen=True, eq=False)
 class Method:
     """One way from a raw to captures at other settings; either `prepare` or `shoot` is there.
 
-    `prepare` is what is done once per raw; `shoot` makes one capture (4, H, W) from a raw, settings
-    and a seed, and the same without noise. `tolerance` is that of the simulator's plan, if any.
+    `prepare` is what is done once per raw: its result has ``expose(states, seed=)``, a capture of
+    each state (S, 4, H, W), and ``expected(settings)``, one without noise. `shoot` makes a capture
+    (4, H, W) of a raw, settings and a seed, and the same without noise. `tolerance` is that of the
+    simulator's plan, if any.
     """
 
     name: str
     dtype: Dtype = "float32"
     tolerance: float | None = None
-    prepare: Callable[[RawImage], Prepared] | None = None
+    prepare: Callable[[RawImage], Any] | None = None
     shoot: Callable[[RawImage, CameraSettings, int], tuple[Tensor, Tensor]] | None = None
 
     @property
@@ -110,7 +105,7 @@ class _Exposed:
 def _denoised_by(name: str, denoise: Denoiser, bare: CameraSimulator) -> Method:
     """A denoiser, once, then as a simulator without networks."""
 
-    def prepare(raw: RawImage) -> Prepared:
+    def prepare(raw: RawImage) -> PreparedScene:
         prepared, clean = bare.prepare(raw), NoiseLevelFunction.zero()
         return replace(prepared, light=denoise(prepared.light, prepared.nlf), nlf=clean)
 

@@ -201,12 +201,9 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
                 white = (truth > 1.0 - 1e-6) & (light.mean(dim=0) >= 1.0 - wanted.sqrt())
                 shows = torch.where(white, torch.inf, wanted)
                 row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
-                row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
-                row |= {
-                    "settings": str(settings),
-                    "tolerance": tolerance,
-                    "place": trial.scene.group,
-                }
+                row |= {"scene": trial.scene.scene_id, "place": trial.scene.group}
+                row |= {"source": str(trial.source), "settings": str(settings)}
+                row |= {"tolerance": tolerance}
                 row |= {"network": plan.network, "errors": dict(plan.errors)}
                 row |= {"predicted": plan.predicted_error, "bound": plan.error_bound}
                 rows.append(row | {"measured": distance(light, added, truth, wanted, shows)})
