@@ -91,9 +91,8 @@ def contact_sheet(
     path leaves it, or `scene` is none.
 
     Args:
-        scene: The scene, of any size and shape; large ones are averaged down first.
-        camera: The body; that of the scene by default.
-        grid: The states, at most 256; the default grid's 64 by default.
+        scene: Of any size and shape; large ones are averaged down first.
+        camera, grid: By default the scene's, and the default grid; at most 256 states.
         scorer: Scorer of the captures, as `make_scorer` takes it.
         speed, defocus, movement: See `ae_env.scorers.captures.prepare_scene`.
         path: States that a policy went through, the start state first; or several by name.

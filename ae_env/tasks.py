@@ -134,11 +134,9 @@ class _Truth:
 class ExposureBracket(Task):
     """Merges the frames of an episode, and rewards what each adds to the quality.
 
-    See `ExposureBracketEnv`, which has the limits. What else a task is given is not used. A
-    `ValueError` if the scenes are recorded.
-
-    Attributes:
-        stop: The action that ends an episode, behind those of the states.
+    See `ExposureBracketEnv`, which has the limits. What else a task is given is not used. The
+    action `stop`, behind those of the states, ends an episode. A `ValueError` if the scenes are
+    recorded.
     """
 
     outputs = ("numbers",)

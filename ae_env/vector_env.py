@@ -89,6 +89,14 @@ class AutoExposureVectorEnv(
         """(N, S) float64: expected score of every state in the current frame of each episode."""
         return np.stack([self.score_table(i).mean for i in range(self.num_envs)])
 
+    def right_ev100(self) -> np.ndarray:
+        """(N,) float64: EV100 of the right exposure of the current frame; its mean if unknown."""
+        episodes = self.core.episodes
+        scenes = [episodes.scenes[i].ev100 for i in episodes.scene.tolist()]
+        times = [self.grid[state].exposure_time for state in episodes.state.tolist()]
+        gains = [episodes.gain(i, time)[0] for i, time in enumerate(times)]
+        return np.array(scenes) + np.log2(gains)
+
     def reset(
         self,
         *,

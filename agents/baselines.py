@@ -102,15 +102,12 @@ class Oracle(Policy):
 class Recorded(Policy):
     """The settings of a real camera: frame k of an episode takes those of the k-th raw of a folder.
 
-    With the same folder as a scene (``scenes={"sequence": FOLDER}``) it replays the recording.
-    Frame 0 is the one that `reset` returns, at a state that no policy chooses; a delay is allowed
-    for. The raws count in the natural order of their names, from 0; after the last one its settings
-    stay. The nearest of the grid's states is taken: the squares of the differences in aperture,
-    time, ISO and EV, in stops, add up. A `ValueError` if there is no raw, or one cannot be read or
-    does not say its settings.
-
-    Args:
-        path: Folder of raws, or a single raw.
+    `path` is a folder of raws, or a single raw. With the same folder as a scene
+    (``scenes={"sequence": FOLDER}``) it replays the recording. Frame 0 is the one that `reset`
+    returns, at a state that no policy chooses; a delay is allowed for. The raws count in the
+    natural order of their names, from 0; after the last one its settings stay. The nearest of the
+    grid's states is taken: the squares of the differences in aperture, time, ISO and EV, in stops,
+    add up. A `ValueError` if there is no raw, or one cannot be read or does not say its settings.
     """
 
     def __init__(self, context: PolicyContext, path: str | os.PathLike[str]) -> None:

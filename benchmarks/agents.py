@@ -9,7 +9,6 @@ run side by side and show their own progress, so this one is no `benchmarks.harn
 from __future__ import annotations
 
 import json
-import time
 from ast import literal_eval
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
@@ -103,6 +102,12 @@ def best_compensations(context: PolicyContext, seed: int, episodes: int) -> dict
     return {m: float(max(COMPENSATIONS, key=lambda c: score[m, c])) for m in COMPENSATED}
 
 
+def context_of(options: dict[str, Any]) -> PolicyContext:
+    """What policies know in an environment with these options."""
+    with closing(make_envs(options, num_envs=1, frames=1)) as envs:
+        return PolicyContext.from_envs(envs)
+
+
 def changed_config(
     config: AgentConfig, environment: dict[str, Any], training: dict[str, Any]
 ) -> AgentConfig:
@@ -121,14 +126,10 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
             TrainingJob(f"{name}, seed {s}", config.with_seed(s), folder / f"{name}-{s}")
             for s in SEEDS
         ]
-    began = time.perf_counter()
     _train(jobs)
     meta: dict[str, Any] = {"training_seeds": list(SEEDS)}
     meta["training"] = {name: own[0].config.card() for name, own in jobs.items()}
-    meta["training_seconds_this_run"] = time.perf_counter() - began
-
-    with closing(make_envs({"split": "test", "resolution": 64}, num_envs=1, frames=1)) as envs:
-        context = PolicyContext.from_envs(envs)
+    context = context_of({"resolution": 64})
     policies = _comparators(context, jobs["regression"][0].config.environment, seed, quick)
     meta["compensated"] = [name for name in policies if "compensation" in name]
     for name, own in jobs.items():

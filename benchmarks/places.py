@@ -2,14 +2,15 @@
 
 ``posterior`` says what `simulator.radiance.incident_light.POSTERIOR` covers in views that it was
 not fitted on. ``receptors`` judges the same policies on the same views where another receptor tells
-the right exposure. ``curve`` trains the regression agent on 5 to all training places: finished
-trainings lie under ``runs/bench_places``, named after the number, and one that was stopped goes on.
+the right exposure. ``curve`` trains the regression agent on 5 to all training places, and on all
+without one thing or another: finished trainings lie under ``runs/bench_places``, and one that was
+stopped goes on.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -27,10 +28,8 @@ from ae_env.scenes.scene import Scene, SceneRequest
 from agents.evaluation.engine import evaluate, fit_policies
 from agents.evaluation.intervals import rank, score_interval
 from agents.learning.training import load_config, train_agent
-from agents.policy import PolicyContext
 from agents.policy_names import make_policy, training_seeds
-from agents.rollouts import make_envs
-from benchmarks.agents import CONFIGS, best_compensations, changed_config
+from benchmarks.agents import CONFIGS, best_compensations, changed_config, context_of
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, side_by_side, table
 from benchmarks.isolated import ROOT
 from simulator import develop, exposure_ratio, get_camera
@@ -53,8 +52,14 @@ Place = tuple[np.ndarray, float, float]
 #: At the right exposure a view counts as white with more than this share of its pixels above white,
 #: and as black with a mean of green below the other.
 WHITE, BLACK = 0.15, 0.01
-#: Training places of the learning curve, the last of them all.
-PLACES = (5, 10, 20, 30)
+#: Trainings of the regression agent: what differs in the environment and in the hyperparameters.
+VARIANTS: dict[str, tuple[Row, Row]] = {
+    **{f"{n} places": ({"scenes": f"mixed:{n}"}, {}) for n in (5, 10, 20)},
+    "30 places, all": ({}, {}),
+    "no loss of the right exposure": ({}, {"ev_coef": 0.0}),
+    "no sensors": ({"sensors": False}, {}),
+    "drawn scenes alone": ({"scenes": "bundled:large"}, {}),
+}
 #: Views of the contact sheet, and packed pixels a side of each.
 SHOWN, SIZE = 12, 256
 #: The picture of the page of the incident light; a quick run leaves it alone.
@@ -100,14 +105,9 @@ def read_by(receptor: str, view: Scene, place: Place) -> Scene:
     return replace(view, illuminance=view.illuminance * ratio)
 
 
-def _context() -> PolicyContext:
-    with closing(make_envs({"resolution": RESOLUTION}, num_envs=1, frames=1)) as envs:
-        return PolicyContext.from_envs(envs)
-
-
 def _policies(seed: int, quick: bool) -> dict[str, Any]:
     """Meters and agents, all of which learnt under the dome."""
-    context, names = _context(), list(METERS[: 1 if quick else None])
+    context, names = context_of({"resolution": RESOLUTION}), list(METERS[: 1 if quick else None])
     if not quick:
         found = best_compensations(context, seed, episodes=2)
         names += [f"{name}?compensation={stops:g}" for name, stops in found.items()]
@@ -146,21 +146,23 @@ def _right_exposure(scene: Scene) -> Row:
     return row | {"black": float(signal[1:3].mean()) < BLACK}
 
 
-def curve(places: int, seed: int, quick: bool) -> Row:
-    """The regression agent, one seed, trained on views of so many places, which are drawn."""
-    changes = {"seed": seed} | ({"frames": 2_000} if quick else {})
-    config = load_config(CONFIGS["regression"])
-    config = changed_config(config, {"scenes": f"mixed:{places}"}, changes)
-    out = ROOT / "runs" / f"bench_places{'_quick' * quick}" / str(places)
-    agent, row = make_policy(f"regression:{train_agent(config, out)}", _context()), Row()
-    for split, number in (("train", places), ("validation", None), ("test", None)):
-        request: Any = SceneRequest(split, CAMERA, RESOLUTION)  # type: ignore[arg-type]
-        scenes = polyhaven_scenes(request, assets=split_assets("polyhaven", split, number))
-        options = {"scenes": scenes, "resolution": RESOLUTION}
-        result = evaluate({"own": agent}, options, episodes_per_scene=1 if quick else 4, seed=seed)
+def curve(variant: str, seed: int, quick: bool) -> Row:
+    """The regression agent, one seed, trained as `VARIANTS` says."""
+    environment, training = VARIANTS[variant]
+    training = training | {"seed": seed} | ({"frames": 2_000} if quick else {})
+    config = changed_config(load_config(CONFIGS["regression"]), environment, training)
+    out = ROOT / "runs" / f"bench_places{'_quick' * quick}" / re.sub(r"\W+", "_", variant)
+    options = {"resolution": RESOLUTION, "sensors": environment.get("sensors", True)}
+    agent = make_policy(f"regression:{train_agent(config, out)}", context_of(options))
+    row, own = Row(training=variant), re.findall(r"mixed:(\d+)", environment.get("scenes", ""))
+    for split in ("train", "validation", "test"):
+        request: Any = SceneRequest(split, CAMERA, RESOLUTION)
+        assets = split_assets("polyhaven", split, int(own[0]) if own and split == "train" else None)
+        given = {"scenes": polyhaven_scenes(request, assets=assets), **options}
+        result = evaluate({"own": agent}, given, episodes_per_scene=1 if quick else 4, seed=seed)
         found = score_interval(*result.group_gains("own"))
         row |= {split: found.value, f"{split}_ci95": found.pair}
-    return {"places": places, **row}
+    return row
 
 
 # -- pictures -------------------------------------------------------------------------------------
@@ -227,7 +229,7 @@ def receptor_figure(view: Scene, place: Place) -> Figure:
 def parts(seed: int, quick: bool, part: str | None = None) -> list[Part]:
     found = [Part(f"posterior {s}", posterior, {"split": s}) for s in ("validation", "test")]
     found.append(Part("receptors", receptors))
-    found += [Part(f"curve {n}", curve, {"places": n}, threads=1) for n in PLACES]
+    found += [Part(f"curve {own}", curve, {"variant": own}, threads=1) for own in VARIANTS]
     return [own for own in found if part is None or own.name.startswith(part)]
 
 
@@ -237,7 +239,7 @@ right exposure: meter's rule = {right, meter:.2f} | right exposure: posterior = 
 _ASKED = """right exposure by = {receptor} | views = {views} |
 above an average meter's [EV] = {above:+.2f} | held by the bound = {moved:.0%} |
 white = {white:.0%} | black = {black:.1%}"""
-_CURVE = """places = {places} | those places = {train:.3f} | validation = {validation:.3f} |
+_CURVE = """training = {training} | its places = {train:.3f} | validation = {validation:.3f} |
 test = {test:.3f} | 95 % interval = {test_ci95[0]:.3f} to {test_ci95[1]:.3f}"""
 
 

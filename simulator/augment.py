@@ -58,20 +58,8 @@ class ExposureAugmentation:
     """Photographs pictures again at settings drawn at random.
 
     Seeds decide everything: the same seed gives the same picture, bit for bit on one device, alone
-    or in a batch, in any process and on any number of threads. It can be pickled.
-
-    Args:
-        camera: The body whose noise, black level and digital numbers the pictures get: a
-            `CameraProfile` with a noise calibration, or the name of a built-in one.
-        stops: Range of the exposure relative to the picture's [EV], drawn uniformly.
-        isos: Range of the ISO speed, drawn uniformly in its logarithm.
-        defocus: Range of the diameter of the defocus disc [pixel], in [0, 64], drawn uniformly.
-        motion: Range of the length of the motion blur [pixel], in [0, 64], drawn uniformly; its
-            direction is random.
-        highlights: Range by which clipped light of an RGB picture is raised above white [EV],
-            drawn uniformly, so that it is not grey in a darker picture; raws hold what is known.
-        modules: Which of ``"exposure"``, ``"blur"`` and ``"noise"`` act. What is drawn does not
-            depend on it. With none, pictures are returned as they are.
+    or in a batch, in any process and on any number of threads. It can be pickled. Ranges are drawn
+    from uniformly, that of the ISO speed in its logarithm.
 
     >>> augment = ExposureAugmentation(stops=(-2.0, -2.0), modules=("exposure",))
     >>> grey = torch.full((1, 4, 2, 2), 0.4)
@@ -79,12 +67,19 @@ class ExposureAugmentation:
     tensor(0.1000)
     """
 
+    #: The body whose noise, black level and digital numbers the pictures get: a `CameraProfile`
+    #: with a noise calibration, or the name of a built-in one.
     camera: CameraProfile | str = "nikon_z6"
-    stops: tuple[float, float] = (-4.0, 4.0)
-    isos: tuple[float, float] = (100.0, 12800.0)
-    defocus: tuple[float, float] = (0.0, 2.0)
+    stops: tuple[float, float] = (-4.0, 4.0)  #: exposure relative to the picture's [EV]
+    isos: tuple[float, float] = (100.0, 12800.0)  #: ISO speed
+    defocus: tuple[float, float] = (0.0, 2.0)  #: diameter of the defocus disc [pixel], in [0, 64]
+    #: Length of the motion blur [pixel], in [0, 64]; its direction is random.
     motion: tuple[float, float] = (0.0, 3.0)
+    #: By how much clipped light of an RGB picture is raised above white [EV], so that it is not
+    #: grey in a darker picture; raws hold what is known.
     highlights: tuple[float, float] = (0.0, 2.5)
+    #: Which of ``"exposure"``, ``"blur"`` and ``"noise"`` act. What is drawn does not depend on it.
+    #: With none, pictures are returned as they are.
     modules: tuple[str, ...] = MODULES
 
     def __post_init__(self) -> None:
@@ -217,13 +212,9 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
 class AugmentedDataset(Dataset[Any]):
     """A data set whose pictures are augmented where they are loaded, in the workers.
 
-    Neither the order of the samples nor the number of workers matters.
-
-    Args:
-        dataset: Map-style data set of pictures (C, H, W), or of tuples and lists that begin with
-            one. All that `ExposureAugmentation` takes.
-        augmentation: What photographs them.
-        seed: Of the training, >= 0.
+    Neither the order of the samples nor the number of workers matters. `dataset` is a map-style one
+    of pictures (C, H, W) that `augmentation` takes, or of tuples and lists that begin with one;
+    `seed` is that of the training, >= 0.
     """
 
     def __init__(

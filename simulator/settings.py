@@ -33,13 +33,6 @@ class CameraSettings:
 
     The ranges keep every exposure ratio between two settings below 2**106, a finite float32.
 
-    Attributes:
-        aperture_stop: Aperture in sixths of the f-number's octave (thirds of a stop):
-            ``round(6 log2 N)``.
-        effective_f_number: The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper,
-            section 3.1).
-        log2_exposure: log2 of the exposure by `effective_f_number`, relative to ISO 100, 1 s, f/1.
-
     >>> CameraSettings(iso=100, exposure_time=1 / 125, f_number=16).ev100
     14.965784284662087
     """
@@ -47,8 +40,11 @@ class CameraSettings:
     iso: float  # ISO speed, in [0.001, 1e8]
     exposure_time: float  # time the shutter is open, in seconds, in [1e-9, 1e5]
     f_number: float  # aperture f-number as marked on the lens, in [0.5, 1024]
+    #: Aperture in sixths of the f-number's octave (thirds of a stop): ``round(6 log2 N)``.
     aperture_stop: int = field(init=False, repr=False, compare=False)
+    #: The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper, section 3.1).
     effective_f_number: float = field(init=False, repr=False, compare=False)
+    #: log2 of the exposure by `effective_f_number`, relative to ISO 100, 1 s, f/1.
     log2_exposure: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

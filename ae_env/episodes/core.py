@@ -73,18 +73,14 @@ class Task:
 
     Here every action takes a frame, moves nothing else, and no episode ends by itself; a task gives
     at least `measure`, `reward` and `score_table`.
-
-    Attributes:
-        num_actions: Number of actions; those below the number of states take a frame there.
-        outputs: Outputs of `FrameSource.record` that `measure` reads.
-        in_chunks: Whether `measure` reads so much that it takes small batches.
     """
 
-    outputs: tuple[str, ...] = ()
-    in_chunks = False
+    outputs: tuple[str, ...] = ()  # of `FrameSource.record`, that `measure` reads
+    in_chunks = False  # whether `measure` reads so much that it takes small batches
 
     def __init__(self, episodes: Episodes) -> None:
         self.episodes = episodes
+        #: Those below the number of states take a frame there.
         self.num_actions = len(episodes.grid)
 
     def spaces(self) -> dict[str, gym.Space[Any]]:

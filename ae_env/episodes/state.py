@@ -76,16 +76,11 @@ class Episodes:
     a scene was made for another number of states.
 
     Args:
-        options: The environment's arguments.
-        count: Number of environments, n.
+        options, count: The environment's arguments, and n.
         scenes: Those of `options` where they are loaded already; of sequences, all frames.
 
     Attributes:
-        grid: The states.
-        camera: The body.
-        lighting: How the light changes.
-        static: Whether it never does.
-        scene_ids: Names of the scenes.
+        static: Whether the light never changes.
         allowed: (scenes, S) bool, the states that each allows.
         box_factor: (scenes,) `Scene.box_factor`.
         begun: (n,) bool, whether there is an episode.

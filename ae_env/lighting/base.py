@@ -225,16 +225,14 @@ class LensCapLighting(Lighting):
 class ScheduleLighting(Lighting):
     """The light changes by `ev[n]` stops in frame n, relative to the scene's; the last one holds.
 
-    Args:
-        ev: One number per frame, within +- `MAX_STOPS`: a list, tuple or one-dimensional array.
-        file: In place of `ev`, a text file with one number per line, or a CSV with a column ``ev``.
-
     >>> ScheduleLighting(ev=[0, -1, 2]).gain(7, 0.01, 0.0)
     4.0
     """
 
     name: ClassVar[str] = "schedule"
+    #: One number per frame, within +- `MAX_STOPS`: a list, tuple or one-dimensional array.
     ev: Sequence[float] | np.ndarray | None = None
+    #: In place of `ev`, a text file with one number per line, or a CSV with a column ``ev``.
     file: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -300,24 +298,22 @@ class FlickerLighting(Lighting):
     (`simulator.optics.flicker_integral`). Rows begin one after the other, so unless the
     exposure lasts whole periods, the frame has bands.
 
-    Args:
-        frequency: Of the light [Hz]: twice that of the mains, or of the pulses. 0.001 to 1e6.
-        depth: Share of the light that flickers, 0 to 1; the rest is steady. `MAINS_DEPTH` by
-            default, 1 where `duty` is given.
-        duty: Share of a period that a pulsed lamp is on, 1e-6 to 1; None for a lamp on the mains,
-            ``1 + depth cos(2 pi (frequency t + phase))``.
-        frame_rate: Frames per second, 0.001 to 1e6: frame n begins at n / frame_rate, at the
-            episode's own phase of the lamp.
-
     >>> FlickerLighting(frequency=100.0).gain(3, 1 / 50, 0.3)
     1.0
     """
 
     name: ClassVar[str] = "flicker"
     within_frame: ClassVar[bool] = True
+    #: Of the light [Hz]: twice that of the mains, or of the pulses. 0.001 to 1e6.
     frequency: float = 100.0
+    #: Share of the light that flickers, 0 to 1; the rest is steady. `MAINS_DEPTH` by default, 1
+    #: where `duty` is given.
     depth: float | None = None
+    #: Share of a period that a pulsed lamp is on, 1e-6 to 1; None for a lamp on the mains,
+    #: ``1 + depth cos(2 pi (frequency t + phase))``.
     duty: float | None = None
+    #: Frames per second, 0.001 to 1e6: frame n begins at n / frame_rate, at the episode's own phase
+    #: of the lamp.
     frame_rate: float = 30.0
 
     def lamp(self, phase: float) -> Lamp:

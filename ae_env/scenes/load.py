@@ -303,10 +303,9 @@ def simulate_source_raw(
 
     Args:
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
-        iso: ISO of the raw; drawn by default from `iso_range`, log-uniformly.
+        iso, iso_range: ISO of the raw; drawn by default from the range, log-uniformly.
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
             default.
-        iso_range: See `iso`.
     """
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")

@@ -252,10 +252,8 @@ class Scene:
     ) -> Scene:
         """A noise-free scene from linear light, taken into the camera's colours.
 
-        Args:
-            rgb, camera, illuminance, ev100, illuminant, sampled: See `camera_light`.
-            kind: Sort of scene.
-            **fields: Further arguments of `from_array`, at least `scene_id`.
+        See `camera_light` for the first six arguments; `fields`, at least `scene_id`, are further
+        ones of `from_array`, as `kind` is.
         """
         light, reference, white_balance = camera_light(
             rgb, camera, illuminance, ev100, illuminant, sampled=sampled

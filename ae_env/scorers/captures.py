@@ -67,45 +67,35 @@ class PixelBlur(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Captures:
-    """The facts about a batch of B captures besides their pixels.
+    """The facts about a batch of B captures besides their pixels."""
 
-    Args:
-        settings: Settings of each capture, B long.
-        scene_ids: Scene of each capture, B long.
-        scene_light: (B, 4, H, W) linear light of the scenes at their reference settings.
-        ratio: (B,) float64, exposure ratio from that reference to the capture.
-        nlf: Noise of a native sensor pixel at the settings, B long.
-        proper_ev: (B,) float64, EV100 of the right exposure: that of the incident light, or the
-            mean of what is likely where this is unknown.
-        blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the
-            root mean square over the pixels, where they differ.
-        white_balance: (B, 3) gains of R, G, B.
-        colour_matrices: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where
-            unknown.
-        row_gain: (B, H) float64, light of each row relative to the frame's mean, which is in
-            `ratio` and `proper_ev`: the bands of flickering light. None where every row of every
-            capture has the same.
-        source_noise: Noise that the source of each capture has, of a native pixel, B long; None
-            where all come from light without noise.
-        noisy: Whether the captures have noise.
-        pixel_blur: How many pixels have which extent of blur; None where all have `blur_px`.
-        likely_ev: (B, K) float64, EV100s that are equally likely the right one; None where the
-            incident light of all is known.
-    """
-
-    settings: Sequence[CameraSettings]
-    scene_ids: Sequence[str]
+    settings: Sequence[CameraSettings]  #: of each capture, B long
+    scene_ids: Sequence[str]  #: scene of each capture, B long
+    #: (B, 4, H, W) linear light of the scenes at their reference settings.
     scene_light: torch.Tensor
-    ratio: torch.Tensor
-    nlf: Sequence[NoiseLevelFunction]
+    ratio: torch.Tensor  #: (B,) float64, exposure ratio from that reference to the capture
+    nlf: Sequence[NoiseLevelFunction]  #: of a native sensor pixel at the settings, B long
+    #: (B,) float64, EV100 of the right exposure: that of the incident light, or the mean of what is
+    #: likely where this is unknown.
     proper_ev: torch.Tensor
+    #: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the root mean
+    #: square over the pixels, where they differ.
     blur_px: torch.Tensor
-    white_balance: torch.Tensor
+    white_balance: torch.Tensor  #: (B, 3) gains of R, G, B
+    #: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where unknown.
     colour_matrices: Sequence[ColourMatrix | None]
+    #: (B, H) float64, light of each row relative to the frame's mean, which is in `ratio` and
+    #: `proper_ev`: the bands of flickering light. None where every row of every capture has the
+    #: same.
     row_gain: torch.Tensor | None = None
+    #: Noise that the source of each capture has, of a native pixel, B long; None where all come
+    #: from light without noise.
     source_noise: Sequence[NoiseLevelFunction] | None = None
-    noisy: bool = True
+    noisy: bool = True  #: whether the captures have noise
+    #: How many pixels have which extent of blur; None where all have `blur_px`.
     pixel_blur: PixelBlur | None = None
+    #: (B, K) float64, EV100s that are equally likely the right one; None where the incident light
+    #: of all is known.
     likely_ev: torch.Tensor | None = None
 
     def __len__(self) -> int:

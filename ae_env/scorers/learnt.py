@@ -236,12 +236,10 @@ class Classifier:
             probabilities. By default the file that ``AE_ENV_CLASSIFIER`` names, else
             ``classifier.onnx`` in the cache folder.
         size: S [pixel]; by default the file's own, else 224.
-        mean: Subtracted from R, G, B in [0, 1].
-        std: What the differences are divided by.
+        mean, std: Subtracted from R, G, B in [0, 1]; what the differences are divided by.
 
-    Raises:
-        ValueError: If there is no such file, or it is no classifier.
-        ImportError: If it is a file and ONNX Runtime is not installed.
+    A `ValueError` if there is no such file, or it is no classifier; an `ImportError` if it is a
+    file and ONNX Runtime is not installed.
 
     >>> from ae_env.scorers import make_scorer
     >>> scorer = make_scorer(Classifier(lambda pictures: pictures.mean(dim=(2, 3)), size=64))
@@ -291,8 +289,7 @@ class Classifier:
     def __call__(self, images: Tensor, captures: Captures) -> Tensor:
         """Scores (B,) of sRGB `images` (B, 3, H, W).
 
-        Raises:
-            UserCodeError: If the network raises, or returns anything but numbers (B, classes).
+        A `UserCodeError` if the network raises, or returns anything but numbers (B, classes).
         """
         mean, std = (torch.tensor(v)[:, None, None] for v in (self.mean, self.std))
         scores = []
@@ -386,12 +383,8 @@ class PyiqaMetric:
     Score = (value - low) / (high - low), clipped, or 1 minus that where lower is better. The range
     is the metric's own ``score_range``, which pyiqa calls a rough estimate.
 
-    Args:
-        metric: Its name, as ``pyiqa.create_metric`` takes it.
-
-    Raises:
-        ImportError: If pyiqa is not installed.
-        ValueError: If pyiqa has no such metric, or it needs a reference or has no finite range.
+    An `ImportError` if pyiqa is not installed; a `ValueError` if it has no such metric as
+    ``pyiqa.create_metric`` takes, or that needs a reference or has no finite range.
     """
 
     domain: Domain = "srgb"

@@ -64,8 +64,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
 def register_scorer(name: str) -> Callable[[Factory], Factory]:
     """Class decorator that makes a scorer known as `name`; the latest one counts (notebooks).
 
-    Raises:
-        ValueError: If `name` is not an identifier or belongs to a built-in scorer.
+    A `ValueError` if `name` is not an identifier or belongs to a built-in scorer.
 
     >>> @register_scorer("constant")
     ... class Constant:

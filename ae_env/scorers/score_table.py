@@ -34,19 +34,12 @@ TIE = 1e-7
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Expected scores of S states.
+    """Expected scores of S states."""
 
-    Args:
-        mean: (S,) float64, q of each state.
-        standard_error: (S,) float64, 0 where the closed form was used.
-        parts: (S,) float64 of each part of the scorer.
-        allowed: (S,) bool, states that the scene allows; None for all of them.
-    """
-
-    mean: np.ndarray
-    standard_error: np.ndarray
-    parts: dict[str, np.ndarray]
-    allowed: np.ndarray | None = None
+    mean: np.ndarray  # (S,) float64, q of each state
+    standard_error: np.ndarray  # (S,) float64, 0 where the closed form was used
+    parts: dict[str, np.ndarray]  # (S,) float64 of each part of the scorer
+    allowed: np.ndarray | None = None  # (S,) bool, states that the scene allows; None for all
 
     @property
     def nbytes(self) -> int:
@@ -71,9 +64,6 @@ class ScoreTables:
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
         tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.
-
-    Attributes:
-        term_scores: The scorer's parts, and how each is evaluated.
     """
 
     def __init__(
@@ -91,6 +81,7 @@ class ScoreTables:
         self.states, self.camera, self.scorer = grid.states, camera, scorer
         self.noise, self.noise_seeds = noise, noise_seeds if noise else 1
         self.tolerance = tolerance
+        #: The scorer's parts, and how each is evaluated.
         self.term_scores = TermScores(scorer, camera, grid.states, noise=noise)
 
     def table(

@@ -64,16 +64,7 @@ _jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
 
 
 class TermScores:
-    """Scores of one scorer at the states of a grid, part by part; see `ScoreTables`.
-
-    Attributes:
-        parts: Parts that are made of the terms of `ae_env.scorers.terms` alone, composites
-            included, and measured on frames; by name. Their expectation has a closed form.
-        torch_terms: All other parts, which torch evaluates; None if there are none.
-        reads_captures: Whether `parts` need `Captures` besides the means.
-        closed_form: Whether every part's expectation has one, so that no noise is drawn for it.
-        captures: Describes captures of a scene at the states.
-    """
+    """Scores of one scorer at the states of a grid, part by part; see `ScoreTables`."""
 
     def __init__(
         self,
@@ -84,10 +75,15 @@ class TermScores:
         noise: bool,
     ) -> None:
         self.camera, self.states, self.noise = camera, states, noise
+        #: Parts that are made of the terms of `ae_env.scorers.terms` alone, composites included,
+        #: and measured on frames; by name. Their expectation has a closed form.
         self.parts = {n: p for n, p in scorer.parts.items() if _is_known(p) and _has_pixels(p)}
         others = {n: p for n, p in scorer.parts.items() if n not in self.parts}
+        #: All other parts, which torch evaluates; None if there are none.
         self.torch_terms = CompositeScorer(others) if others else None
+        #: Whether `parts` need `Captures` besides the means.
         self.reads_captures = any(type(part) not in _COLUMNS for part in self.parts.values())
+        #: Whether every part's expectation has one, so that no noise is drawn for it.
         self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
         # Scorers of one's own get a copy of the light, lest they write to the scene.
         self.captures = SceneCaptures(camera, states, noisy=noise, copies=is_own(scorer))

@@ -41,10 +41,8 @@ def depends_on(scorer: Scorer) -> DependsOn:
 class CompositeScorer:
     """Weighted mean of several scorers by name, equally weighted by default.
 
-    The weights, which must be positive, are divided by their sum.
-
-    Raises:
-        ValueError: If a part is no scorer, or a weight is missing or not positive.
+    The weights are divided by their sum. A `ValueError` if a part is no scorer, or a weight is
+    missing or not positive.
     """
 
     domain: Domain = "raw"
@@ -163,11 +161,9 @@ def scores_of(
 ) -> torch.Tensor:
     """Scores (B,) float64 in [0, 1] of one scorer, which may be the user's own.
 
-    Errors call it `name`; `images` are (B, C, H, W), or None where it has a closed form.
-
-    Raises:
-        UserCodeError: If it raises (the cause is chained), returns anything but B numbers in
-            [0, 1], or changes `captures`.
+    Errors call it `name`; `images` are (B, C, H, W), or None where it has a closed form. A
+    `UserCodeError` if it raises (the cause is chained), returns anything but B numbers in [0, 1],
+    or changes `captures`.
     """
     if not is_own(scorer):
         return _checked(name, scorer(images, captures), len(captures))

@@ -47,7 +47,9 @@ def refocus(
 
     Where depth is not known, the circle of confusion of each pixel is estimated from how soft it
     is, and everything that is out of focus is taken to lie behind what is in focus. The estimate
-    cannot see blur below about 1.5 pixels: a picture that is sharp throughout stays as it is.
+    cannot see blur below about 1.5 pixels: a picture that is sharp throughout stays as it is. A
+    `ValueError`, before any work, if the aperture closes, if `depth` and `lens` do not come
+    together or fit `raw`, or if pixel pitch or networks are needed and missing.
 
     Args:
         f_number: As marked, at most the raw's own; down to 0.5.
@@ -62,10 +64,6 @@ def refocus(
         The raw; its exposure time is shorter as the aperture is wider. ``metadata["depth"]`` is
         ``"given"`` or ``"estimated"``, ``metadata["largest_disc_px"]`` the widest disc of
         confusion at `f_number` [packed pixel].
-
-    Raises:
-        ValueError: Before any work, if the aperture closes, if `depth` and `lens` do not come
-            together or fit `raw`, or if pixel pitch or networks are needed and missing.
     """
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)

@@ -44,6 +44,12 @@ _HISTOGRAMS, LIGHT_NUMBERS = 2, 2 * len(_BINS)
 #: the steps at them [stops].
 _LEVELS = torch.tensor([1.0, 0.0, -1.0, -2.0, -3.0, -4.5, -6.0, -7.5, -9.0])
 _SOFTNESS = 0.25
+#: Likely values of the right exposure [standard deviations] and how likely each is (Gauss-Hermite),
+#: and bounds of the log of their spread.
+_LIKELY = torch.tensor(np.stack(np.polynomial.hermite_e.hermegauss(5))).float()
+_LOG_SPREAD = (-2.0, 1.0)
+#: log2 of the mean signal that an average meter exposes for.
+_MEAN_SIGNAL = math.log2(0.12)
 #: Numbers of a frame: metered EV against the newest frame's, exposure, clipping, what was asked for
 #: after the frame before it (Av, Tv, Sv).
 NUMBERS = 6
@@ -191,7 +197,8 @@ class StateHead(nn.Module):
     histogram of the frame as the state would expose it: which share of the light it puts above
     white and above so many stops below. So what is learnt about one state serves its neighbours,
     and any grid within the same ranges; and what a capture's own light decides need not be learnt
-    place by place.
+    place by place. Beside it stands what the features tell of the right exposure: how bright the
+    state's frame is expected to look, and by how much it is too dark or too bright.
 
     Args:
         grid: The states.
@@ -226,22 +233,45 @@ class StateHead(nn.Module):
         self.exposed: torch.Tensor
         self.register_buffer("exposed", torch.sigmoid(over), persistent=False)
         self.from_features = nn.Linear(features, width)
-        self.from_light = nn.Linear(_HISTOGRAMS * len(_LEVELS), width, bias=False)
+        self.from_light = nn.Linear(_HISTOGRAMS * len(_LEVELS) + 2, width, bias=False)
+        self.ev100: torch.Tensor
+        self.luminance: torch.Tensor
+        self.likely: torch.Tensor
+        self.register_buffer("ev100", table[:, :1], persistent=False)
+        self.register_buffer("luminance", torch.exp2(_BINS), persistent=False)
+        self.register_buffer("likely", _LIKELY / _LIKELY[:, 1:].sum(), persistent=False)
+        self.right = nn.Linear(features, 2)
         self.from_state = nn.Linear(table.shape[1] + (2 if has_sensors else 0), width, bias=False)
         self.hidden = nn.Linear(width, width)
         self.values = nn.Linear(width, outputs)
+
+    def right_ev100(
+        self, features: torch.Tensor, light: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """EV100 (B,) of the right exposure, and the standard deviation of what is likely [EV].
+
+        The features say by how much it differs from what an average meter of all colours reads.
+        """
+        gap, spread = self.right(features).unbind(dim=1)
+        metered = (light[:, : len(_BINS)] @ self.luminance).log2() - _MEAN_SIGNAL
+        return metered + gap, torch.exp(spread.clamp(*_LOG_SPREAD))
 
     def forward(
         self, features: torch.Tensor, light: torch.Tensor, sensors: torch.Tensor | None
     ) -> torch.Tensor:
         """Values (B, S, outputs), from what `ExposureFeatures` says of the frame."""
+        mean, spread = self.right_ev100(features, light)
+        wrong = mean[:, None, None] - self.ev100  # (B, S, 1)
+        likely = wrong + spread[:, None, None] * self.likely[0]
+        brightness = torch.exp(1.0 - torch.sqrt(1.0 + likely.square())) @ self.likely[1]
+        exposure = torch.stack([brightness, torch.tanh(wrong[..., 0] / 3.0)], dim=2)
         states = self.states.expand(features.shape[0], -1, -1)  # (B, S, 4)
         if self.has_sensors:
             assert sensors is not None
             states = torch.cat([states, self._blur(sensors)], dim=2)
         histograms = light.view(light.shape[0], _HISTOGRAMS, len(_BINS))
         shares = torch.einsum("bhi,isl->bshl", histograms, self.exposed).flatten(2)
-        of_state = self.from_state(states) + self.from_light(shares)  # (B, S, width)
+        of_state = self.from_state(states) + self.from_light(torch.cat([shares, exposure], dim=2))
         hidden = torch.relu(self.from_features(features)[:, None] + of_state)
         values: torch.Tensor = self.values(torch.relu(self.hidden(hidden)))
         return values
@@ -256,6 +286,16 @@ class StateHead(nn.Module):
         squared = motion_px.square() + defocus_px.square()
         loss = torch.log1p(squared)
         return torch.stack([squared.log2() / 8.0, loss / 2.0], dim=2)
+
+
+def exposure_loss(ev100: torch.Tensor, spread: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """Loss of what a `StateHead` says of the right exposure, whose EV100 is `right`; all (B,).
+
+    The mean learns from the squared error, the spread from the likelihood with that error held
+    fixed.
+    """
+    off = (ev100 - right).square()
+    return (off + 0.5 * off.detach() / spread.square() + spread.log()).mean()
 
 
 # -- what networks see beside a frame, and frames that look different each time --------------------

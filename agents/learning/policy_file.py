@@ -148,11 +148,9 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
 class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
-    Give `weights`, a file that a training wrote, for the torch `device`; or `network`, in memory.
-
-    Raises:
-        ValueError: Unless the network was trained for such an observation, and for a grid whose
-            ranges hold that of the context.
+    Give `weights`, a file that a training wrote, for the torch `device`; or `network`, in memory. A
+    `ValueError` unless the network was trained for such an observation, and for a grid whose ranges
+    hold that of the context.
     """
 
     #: The name of this kind of agent in its files.

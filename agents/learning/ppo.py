@@ -30,10 +30,11 @@ from agents.learning.networks import (
     MeterHistory,
     Session,
     StateHead,
+    exposure_loss,
     with_history,
 )
 from agents.learning.policy_file import MAX_HISTORY, MAX_WIDTH, NetworkPolicy, trained_grid
-from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
+from agents.learning.sb3_adapter import SB3VectorAdapter, TrainingFrames, WithHistory
 from agents.policy import Bools, Ints, Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
@@ -77,9 +78,36 @@ class _StateLogits(nn.Module):
         values: torch.Tensor = self.head(features, light, sensors if sensors.shape[1] else None)
         return values[..., 0]
 
+    def loss(self, extracted: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        """Loss of what the head says of the right exposure, whose EV100 is `right` (B,)."""
+        features, light, _ = torch.split(extracted, self.sizes, dim=1)
+        return exposure_loss(*self.head.right_ev100(features, light), right)
+
+
+class _WithLoss(torch.autograd.Function):
+    """A tensor as it is; in the backward pass the gradient of a `loss` (scalar) joins its own.
+
+    Stable-Baselines3's PPO has no place for a loss of another kind.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, tensor: torch.Tensor, loss: torch.Tensor) -> torch.Tensor:
+        """`tensor`."""
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gradients of `tensor` and `loss`."""
+        return gradient, gradient.new_ones(())
+
 
 class ExposureActorCritic(MultiInputActorCriticPolicy):
-    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits."""
+    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits.
+
+    `ev_coef` is the weight of the loss of the right exposure.
+    """
+
+    action_net: _StateLogits
 
     def __init__(
         self,
@@ -90,9 +118,11 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         grid: ExposureGrid,
         width: int = 256,
         trained_on: ExposureGrid | None = None,
+        ev_coef: float = 0.0,
         use_sde: bool = False,
     ) -> None:
         self.grid, self.width, self.trained_on = grid, width, trained_on
+        self.ev_coef = ev_coef
         super().__init__(
             observation_space,
             action_space,
@@ -112,9 +142,22 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
+    def evaluate_actions(
+        self, obs: Any, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Values, log probabilities of `actions`, and entropy, which brings the exposure's loss."""
+        extracted: Any = self.extract_features(obs)
+        latent, of_value = self.mlp_extractor(extracted)
+        distribution = self._get_action_dist_from_latent(latent)
+        entropy = distribution.entropy()
+        if self.ev_coef > 0.0 and entropy is not None:
+            loss = self.action_net.loss(extracted, obs["right_ev100"][:, 0])
+            entropy = _WithLoss.apply(entropy, self.ev_coef * loss)  # type: ignore[no-untyped-call]
+        return self.value_net(of_value), distribution.log_prob(actions), entropy
+
 
 #: Hyperparameters that are not arguments of Stable-Baselines3's PPO.
-_OF_OURS = {"total_timesteps", "learning_rate", "width", "history", "seed"}
+_OF_OURS = {"total_timesteps", "learning_rate", "ev_coef", "width", "history", "seed"}
 
 
 class PPOTraining(Configuration):
@@ -135,6 +178,8 @@ class PPOTraining(Configuration):
     ent_coef: float = Field(default=0.02, ge=0.0, le=1e6)
     vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)  # weight of the value loss
     max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)  # gradient clipping
+    #: Weight of the loss of the right exposure's EV100, see `StateHead`.
+    ev_coef: float = Field(default=0.05, ge=0.0, le=100.0)
     width: int = Field(default=256, ge=1, le=MAX_WIDTH)  # hidden features of the network
     #: Frames of which the network sees what a light meter read and what was asked for
     #: (`MeterHistory`); 0 for none.
@@ -206,9 +251,9 @@ def train_ppo(
         seed = int(np.random.SeedSequence([seed, done]).generate_state(1)[0])
     model = PPO(
         ExposureActorCritic,
-        ShiftedFrames(seen, np.random.default_rng([training.seed, done])),
+        TrainingFrames(seen, np.random.default_rng([training.seed, done])),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
-        policy_kwargs={"grid": context.grid, "width": training.width},
+        policy_kwargs={"grid": context.grid, **training.model_dump(include={"width", "ev_coef"})},
         seed=seed,
         device=session.device,
         **training.model_dump(exclude=_OF_OURS),

@@ -29,6 +29,7 @@ from agents.learning.networks import (
     Optimisation,
     Session,
     StateHead,
+    exposure_loss,
     random_shift,
 )
 from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
@@ -53,8 +54,8 @@ SAME_LIGHT_EV = 0.35
 HYSTERESIS = 0.01
 #: Past frames come in so many parts, each from another step.
 _CHUNKS = 4
-#: Observed frames, and the scores of all states in them.
-Batch = tuple[dict[str, NDArray[Any]], Floats]
+#: Observed frames; the scores of all states in them, and the EV100 of the right exposure.
+Batch = tuple[dict[str, NDArray[Any]], Floats, Floats]
 
 
 class ScoreRegressor(nn.Module):
@@ -82,10 +83,18 @@ class ScoreRegressor(nn.Module):
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Expected score and log variance of the prediction, both (B, S)."""
+        scores, log_variance, _, _ = self.predict(codes, settings, sensors)
+        return scores, log_variance
+
+    def predict(
+        self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
+    ) -> tuple[torch.Tensor, ...]:
+        """As `forward`, and the right exposure (`StateHead.right_ev100`): its EV100, its spread."""
         features = self.dropout(self.features(codes, settings, sensors))
-        values = self.states(features, self.features.light(codes, settings), sensors)
-        scores, log_variance = values.unbind(dim=2)
-        return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE)
+        light = self.features.light(codes, settings)
+        scores, log_variance = self.states(features, light, sensors).unbind(dim=2)
+        right = self.states.right_ev100(features, light)
+        return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE), *right
 
 
 def observation_tensors(
@@ -234,30 +243,24 @@ class RegressionPolicy(NetworkPolicy):
 
 
 class RegressionTraining(Configuration):
-    """Hyperparameters of the regression agent.
+    """Hyperparameters of the regression agent."""
 
-    Args:
-        frames: Frames to take.
-        learning_rate: Peak of the one-cycle schedule of AdamW.
-        weight_decay: Of AdamW.
-        replay: Frames of the recent past that each optimiser step sees again, per new frame.
-        memory: Frames that are remembered for it.
-        explore: Share of random actions; the others are the agent's own, so that it learns from
-            the frames it will meet.
-        width: Hidden features of the network.
-        dropout: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
-        seed: Seed of scenes, noise and weights.
-    """
-
-    frames: int = Field(default=100_000, ge=1, le=10**12)
+    frames: int = Field(default=100_000, ge=1, le=10**12)  # to take
+    #: Peak of the one-cycle schedule of AdamW.
     learning_rate: float = Field(default=5e-3, ge=1e-9, le=1.0)
-    weight_decay: float = Field(default=1e-3, ge=0.0, le=1.0)
+    weight_decay: float = Field(default=1e-3, ge=0.0, le=1.0)  # of AdamW
+    #: Frames of the recent past that each optimiser step sees again, per new frame.
     replay: int = Field(default=2, ge=0, le=64)
-    memory: int = Field(default=8192, ge=1, le=10**9)
+    memory: int = Field(default=8192, ge=1, le=10**9)  # frames that are remembered for it
+    #: Share of random actions; the others are the agent's own, so that it learns from the frames it
+    #: will meet.
     explore: float = Field(default=0.5, ge=0.0, le=1.0)
-    width: int = Field(default=256, ge=1, le=MAX_WIDTH)
+    width: int = Field(default=256, ge=1, le=MAX_WIDTH)  # hidden features of the network
+    #: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
     dropout: float = Field(default=0.1, ge=0.0, le=0.99)
-    seed: int = Field(default=0, ge=0, le=2**63)
+    #: Weight of the loss of the right exposure's EV100, see `StateHead`.
+    ev_coef: float = Field(default=0.01, ge=0.0, le=100.0)
+    seed: int = Field(default=0, ge=0, le=2**63)  # of scenes, noise and weights
 
 
 def train_regression(
@@ -274,11 +277,11 @@ def train_regression(
     frames = rollout(envs, RegressionPolicy(context, network=network), training, run.done)
     with run.store:
         while run.done < steps:
-            observations, target = next(frames)
+            batch = next(frames)
             network.train()
             # Dropout draws from the global generator.
             with _seeded(session.device, training.seed, run.done):
-                loss, seen = _loss(network, observations, target)
+                loss, seen = _loss(network, batch, training.ev_coef)
             run.step(loss)
             network.eval()
             session.report(run.done * envs.num_envs, steps * envs.num_envs, seen)
@@ -299,7 +302,7 @@ def rollout(
     observations, _ = envs.reset(seed=int(rng.integers(2**31)))
     policy.reset(envs.num_envs)
     while True:
-        yield replay.batch(observations, base.expected_scores())
+        yield replay.batch(observations, base.expected_scores(), base.right_ev100())
         actions = policy.act(observations)
         random = rng.random(len(actions)) < training.explore
         others = rng.integers(len(policy.context.grid), size=len(actions))
@@ -315,23 +318,23 @@ class Replay:
         self.training, self.rng = training, rng
         self.memory: list[dict[str, NDArray[Any]]] = []
 
-    def batch(self, observations: Observations, target: Floats) -> Batch:
+    def batch(self, observations: Observations, scores: Floats, right_ev100: Floats) -> Batch:
         """The new frames and some old ones; remembers the new ones and forgets the oldest."""
-        new = {**observations, "target": target}
+        new = {**observations, "scores": scores, "right_ev100": right_ev100}
         parts = [new]
         for _ in range(_CHUNKS * min(self.training.replay, len(self.memory))):
             past = self.memory[self.rng.integers(len(self.memory))]
-            rows = self.rng.integers(len(target), size=max(1, len(target) // _CHUNKS))
+            rows = self.rng.integers(len(scores), size=max(1, len(scores) // _CHUNKS))
             seen = {name: values[rows] for name, values in past.items()}
             parts.append({**seen, "raw": random_shift(seen["raw"], self.rng)})
-        steps = max(1, self.training.memory // len(target))
+        steps = max(1, self.training.memory // len(scores))
         self.memory = [*self.memory, new][-steps:]
         merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
-        return merged, merged.pop("target")
+        return merged, merged.pop("scores"), merged.pop("right_ev100")
 
 
 def _loss(
-    network: ScoreRegressor, observations: Observations, target: Floats
+    network: ScoreRegressor, batch: Batch, ev_coef: float
 ) -> tuple[torch.Tensor, dict[str, float]]:
     """Loss to minimise; the mean squared error, and what the states that seem best lose [score].
 
@@ -339,13 +342,17 @@ def _loss(
     error held fixed: a large predicted variance cannot excuse a poor mean.
     """
     device = next(network.parameters()).device
-    scores, log_variance = network(*observation_tensors(observations, device))
-    known = torch.from_numpy(target).float().to(device)
+    observations, *targets = batch
+    scores, log_variance, ev100, spread = network.predict(
+        *observation_tensors(observations, device)
+    )
+    known, right = (torch.from_numpy(target).float().to(device) for target in targets)
     error = (scores - known).square()
     regret = known.amax(dim=1) - known.gather(1, scores.argmax(dim=1, keepdim=True))[:, 0]
     likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
-    loss = error.mean() + 0.01 * likelihood
-    return loss, {"mse": error.mean().item(), "regret": regret.mean().item()}
+    loss = error.mean() + 0.01 * likelihood + ev_coef * exposure_loss(ev100, spread, right)
+    seen = {"mse": error, "regret": regret, "ev": (ev100 - right).abs()}
+    return loss, {name: values.mean().item() for name, values in seen.items()}
 
 
 @contextmanager

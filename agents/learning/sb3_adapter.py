@@ -103,11 +103,17 @@ class SB3VectorAdapter(VecEnv):
         return [int(i) for i in named]
 
 
-class ShiftedFrames(VecEnvWrapper):
-    """Shows frames shifted by `random_shift`, those of each step otherwise."""
+class TrainingFrames(VecEnvWrapper):
+    """Shows frames shifted by `random_shift`, those of each step otherwise.
+
+    With them comes ``right_ev100`` (1,), for a loss: no policy sees it.
+    """
 
     def __init__(self, venv: VecEnv, rng: np.random.Generator) -> None:
-        super().__init__(venv)
+        assert isinstance(venv.observation_space, gym.spaces.Dict)
+        right = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        spaces = {**venv.observation_space.spaces, "right_ev100": right}
+        super().__init__(venv, gym.spaces.Dict(spaces))
         self.rng = rng
 
     def reset(self) -> Any:
@@ -120,7 +126,9 @@ class ShiftedFrames(VecEnvWrapper):
         return self._shown(observations), *rest
 
     def _shown(self, observations: Any) -> dict[str, np.ndarray]:
-        return {**observations, "raw": random_shift(observations["raw"], self.rng)}
+        right = np.array(self.venv.env_method("right_ev100"), np.float32)
+        raw = random_shift(observations["raw"], self.rng)
+        return {**observations, "raw": raw, "right_ev100": right[:, None]}
 
 
 class WithHistory(VecEnvWrapper):

@@ -70,10 +70,8 @@ class ProgramOptions:
 class StateChooser:
     """How well each state of a grid fits an EV and what is set by hand.
 
-    Args:
-        grid, options: The exposure states, what is set by hand, and the shutter cap.
-        program: ``"P"``, ``"A"``, ``"S"`` or ``"M"``; nothing is set by hand in any other.
-        ceiling: Whether the EV wanted is the most exposure that may be given.
+    In the programs ``"A"``, ``"S"`` and ``"M"`` the `options` say what is set by hand; in any other
+    nothing is. `ceiling` says whether the EV wanted is the most exposure that may be given.
     """
 
     def __init__(

@@ -92,25 +92,18 @@ class LibcameraAgc:
     or darkest pixels may change; the gain and the exposure *of that frame* give the target; a
     filter moves a continuous exposure towards it; the ladder of the exposure mode splits that into
     shutter and gain. Settings reach a sensor frames later, which the algorithm allows for as it
-    counts from what each frame was taken with.
-
-    Args:
-        metering, constraint: Names of `ZONE_WEIGHTS` and of `CONSTRAINTS`.
-        ladder: An exposure mode, of `LADDERS` or of one's own.
-        max_exposure_time: Longest that the sensor or the user allows [s].
-        exposure_time, gain: Fixed ones [s], in place of the ladder's.
-        compensation, flicker_period, speed, startup_frames: As of `RpiAgc`.
+    counts from what each frame was taken with. What has no comment is as of `RpiAgc`.
     """
 
     num_cameras: int
     _: KW_ONLY
-    metering: str = "centre_weighted"
-    constraint: str = "normal"
-    ladder: Ladder = LADDERS["normal"]
+    metering: str = "centre_weighted"  # name of `ZONE_WEIGHTS`
+    constraint: str = "normal"  # name of `CONSTRAINTS`
+    ladder: Ladder = LADDERS["normal"]  # an exposure mode, of `LADDERS` or of one's own
     compensation: float = 0.0
-    max_exposure_time: float = np.inf
-    exposure_time: float | None = None
-    gain: float | None = None
+    max_exposure_time: float = np.inf  # longest that the sensor or the user allows [s]
+    exposure_time: float | None = None  # a fixed one [s], in place of the ladder's
+    gain: float | None = None  # a fixed one, in place of the ladder's
     flicker_period: float | None = None
     speed: float = SPEED
     startup_frames: int = STARTUP_FRAMES

@@ -114,11 +114,7 @@ class Judging:
     """
 
     def __init__(
-        self,
-        path: Path,
-        judge: str,
-        library: Mapping[str, Scene],
-        draw: Callable[[], pd.DataFrame],
+        self, path: Path, judge: str, library: Mapping[str, Scene], draw: Callable[[], pd.DataFrame]
     ) -> None:
         self.path = path
         if path.exists():
@@ -185,14 +181,12 @@ def exposure_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
     values, ends = bradley_terry(wins.sum(0)), [None] * len(names)
     if len(groups) >= MIN_GROUPS:
         drawn = np.tensordot(group_weights(len(groups), RESAMPLES, 0), wins, axes=1)
-        ends = np.quantile(
-            bradley_terry(drawn), [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0
-        ).T.tolist()
-    rows = []
-    for i, stop in enumerate(names):
-        own = group[(left == i) | (right == i)]
-        rows.append(_row(f"{stop:+.0f} EV", values[i], ends[i], own))
-    return rows
+        levels = (1 - LEVEL) / 2, (1 + LEVEL) / 2
+        ends = np.quantile(bradley_terry(drawn), levels, axis=0).T.tolist()
+    return [
+        _row(f"{stop:+.0f} EV", value, pair, choices.group[(stops == stop).any(axis=1)])
+        for stop, value, pair in zip(names, values, ends, strict=True)
+    ]
 
 
 def scorer_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
@@ -207,13 +201,13 @@ def scorer_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
         gain = decided[f"{name}:left"].astype(float) - decided[f"{name}:right"].astype(float)
         agreed = 0.5 + np.where(np.abs(gain) > TIE, (won - 0.5) * np.sign(gain), 0.0)
         found = score_interval(group_means(agreed, groups) * count, count)
-        rows.append(_row(name, found.value, found.pair, groups))
+        rows.append(_row(name, found.value, found.pair, decided.group))
     return sorted(rows, key=lambda row: -row["value"])
 
 
-def _row(name: str, value: float, ci95: Any, groups: Any) -> dict[str, Any]:
-    row = {"name": name, "value": value, "ci95": ci95}
-    return {**row, "choices": len(groups), "num_groups": len(np.unique(groups))}
+def _row(name: str, value: float, ci95: Any, groups: pd.Series[str]) -> dict[str, Any]:
+    count = {"choices": len(groups), "num_groups": groups.nunique()}
+    return {"name": name, "value": value, "ci95": ci95, **count}
 
 
 def write_fit(files: Sequence[Path], out: Path, command: str) -> list[Path]:

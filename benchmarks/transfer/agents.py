@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,10 +20,8 @@ from agents.evaluation.evaluation_plan import groups_in_turn
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.evaluation.result import EvaluationResult
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
-from agents.policy import PolicyContext
 from agents.policy_names import make_policy
-from agents.rollouts import make_envs
-from benchmarks.agents import changed_config
+from benchmarks.agents import changed_config, context_of
 from benchmarks.fidelity.models import weights
 from benchmarks.harness import RUNS, Row, sections, table
 from benchmarks.isolated import ROOT
@@ -249,8 +246,7 @@ def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult
     """Every agent on the same episodes on held-out scenes, in the truth."""
     scenes = held_out(plan, plan.judged_scenes, CROP)
     options = {"scenes": scenes, "split": "test", **common_options(plan)}
-    with closing(make_envs(options, num_envs=1, frames=1)) as envs:
-        context = PolicyContext.from_envs(envs)
+    context = context_of(options)
     policies = {
         f"{agent} in {world}": [make_policy(f"{agent}:{job.out}", context) for job in own]
         for (agent, world), own in jobs.items()

@@ -96,16 +96,9 @@ class FrameSource(Protocol):
 class CaptureBatch:
     """`FrameSource` that simulates the frames, on the CPU.
 
-    A pickled copy works everything out again.
-
-    Args:
-        prepared: Returns the scene of an index, in its own light, when it is first photographed.
-        num_scenes: Number of scenes, n.
-        states: The settings of the S states.
-        camera: The body.
-        noise: How the noise is made; None for no noise.
-        cache_light: Whether the defocused light of every f-number is cached until a scene is
-            forgotten; else only that of the latest f-number.
+    `prepared` returns the scene of an index, in its own light, when it is first photographed. With
+    `cache_light` the defocused light of every f-number is cached until a scene is forgotten; else
+    only that of the latest f-number. A pickled copy works everything out again.
     """
 
     def __init__(

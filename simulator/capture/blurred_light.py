@@ -41,9 +41,8 @@ CACHE_BYTES, OPENED_BYTES = 512 * 2**20, 256 * 2**20
 class ApertureBlur(ABC):
     """Opens the aperture of one scene's light; results are cached, as f-numbers are few.
 
-    Args:
-        f_number: Effective f-number at which the light was recorded.
-        everywhere: Whether it opens also where a positive tolerance needs no network.
+    The light was recorded at the effective `f_number`. `everywhere` says whether it opens also
+    where a positive tolerance needs no network.
     """
 
     #: Whether it works on the noise-reduced light only.
@@ -209,13 +208,9 @@ class BlurredLight:
     Sweeps call `blurred`. In a batch `begin` says what has to be done, so that many scenes are
     blurred side by side, into memory that is used again.
 
-    Args:
-        light: (4, H, W) as recorded.
-        nlf: Noise of `light`.
-        aperture_blur: Blur that wider apertures add, or None.
-        statistics: Statistics of `light`, where they are at hand.
-        cache_bytes: Memory of the cache; the light that was used longest ago goes first.
-        pool: Memory of a batch.
+    `light` is (4, H, W) as recorded, `nlf` its noise. Wider apertures add the `aperture_blur`. The
+    cache takes `cache_bytes`; the light that was used longest ago goes first. `pool` is the memory
+    of a batch.
     """
 
     def __init__(

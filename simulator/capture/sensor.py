@@ -93,10 +93,8 @@ def _fold(keys, bits):  # type: ignore[no-untyped-def]
 def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndarray:
     """(B,) uint64 keys of B frames, each a function of its seed and numbers and of nothing else.
 
-    Args:
-        seeds: (B,) or a single integer, >= 0.
-        numbers: Numbers that the noise of the frames differs by, each (B,) or a single one: the
-            frame of an episode, the settings of a capture.
+    `seeds` are (B,) or a single integer, >= 0. The noise of the frames also differs by `numbers`,
+    each (B,) or a single one: the frame of an episode, the settings of a capture.
     """
     given = np.asarray(seeds)
     if given.dtype.kind not in "iu" or (given.dtype.kind == "i" and given.min(initial=0) < 0):
@@ -209,14 +207,11 @@ class Transitions:
     def in_bands(self, row_gain: np.ndarray) -> Transitions:
         """The same where rows have light of their own: the bands of flickering light.
 
-        The light of each row multiplies the blurred light before there is noise: exact for motion
-        along the rows; other motion blurs across rows that do not share their light. The source's
-        own noise is multiplied with its light, its variance by the square of the row's gain, r^2.
-        What the top-up takes away for it has the variance times r: exact for shot noise, and off by
-        r (1 - r) of the source's read noise.
-
-        Args:
-            row_gain: (B, H) light of each row relative to the frame's.
+        `row_gain` (B, H), light of each row relative to the frame's, multiplies the blurred light
+        before there is noise: exact for motion along the rows; other motion blurs across rows that
+        do not share their light. The source's own noise is multiplied with its light, its variance
+        by the square of the row's gain, r^2. What the top-up takes away for it has the variance
+        times r: exact for shot noise, and off by r (1 - r) of the source's read noise.
         """
         lights, width = list(self.light), self.light[0].shape[-1]
         shares = self.shares()

@@ -42,11 +42,10 @@ LARGEST = 12.0
 class ApertureModule(nn.Module):
     """Opens the aperture of a photograph with little noise; it never closes it.
 
-    Args:
-        preset: ``"compact"``: estimates a map of the circle of confusion once per scene and blurs
-            with a bank of discs; ``"paper"``: the residual attention U-Net of the paper's section
-            3.3, run for every pair of f-numbers; ``"ncs"``: that of the authors' released code,
-            which does not commute with exposure and is not exact on pictures without detail.
+    The preset ``"compact"`` estimates a map of the circle of confusion once per scene and blurs
+    with a bank of discs; ``"paper"`` is the residual attention U-Net of the paper's section 3.3,
+    run for every pair of f-numbers; ``"ncs"`` is that of the authors' released code, which does not
+    commute with exposure and is not exact on pictures without detail.
     """
 
     def __init__(self, preset: AperturePreset = "compact") -> None:

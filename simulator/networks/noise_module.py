@@ -216,12 +216,11 @@ class ResidualBlock(nn.Module):
 class NoiseModule(nn.Module):
     """Denoises an exposed raw of known noise level function.
 
-    Args:
-        preset: ``"nano"``, ``"compact"`` or ``"large"``: a `Denoiser` of that size, which commutes
-            with exposure; ``"paper"``: the U-Net of Brooks et al. 2019 with a noise-level map, as
-            the paper uses it (section 3.2); ``"ncs"``: the U-Net of the authors' released code,
-            whose second input is a sample of the noise in place of its level. The sample is
-            always the same, so that results can be shared between captures.
+    The presets ``"nano"``, ``"compact"`` and ``"large"`` are a `Denoiser` of that size, which
+    commutes with exposure; ``"paper"`` is the U-Net of Brooks et al. 2019 with a noise-level map,
+    as the paper uses it (section 3.2); ``"ncs"`` is the U-Net of the authors' released code, whose
+    second input is a sample of the noise in place of its level. The sample is always the same, so
+    that results can be shared between captures.
     """
 
     def __init__(self, preset: Preset = "compact") -> None:

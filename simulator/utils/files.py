@@ -155,10 +155,9 @@ def open_picture(
 ) -> Iterator[Image.Image]:
     """A developed picture, of `formats` of Pillow only; pixels are decoded when they are asked for.
 
-    Raises:
-        ValueError: Here and within, naming the file, if it is missing (a link that leads nowhere),
-            no whole picture, larger than `MAX_PICTURE_PIXELS` or `MAX_FLAT_PIXELS`, or has colours
-            of more than `bits`: Pillow reads the upper 8 of 16, which others decode.
+    A `ValueError`, here and within, names the file if it is missing (a link that leads nowhere), no
+    whole picture, larger than `MAX_PICTURE_PIXELS` or `MAX_FLAT_PIXELS`, or has colours of more
+    than `bits`: Pillow reads the upper 8 of 16, which others decode.
     """
     from PIL import Image
 

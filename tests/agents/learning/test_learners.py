@@ -182,9 +182,10 @@ def test_replay_memory_is_bounded(memory: int) -> None:
     replay = regression.Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
     for step in range(12):
         new = {"raw": np.full((4, 4, 2, 2), step, np.uint8), "settings": np.zeros((4, 3))}
-        batch, target = replay.batch(new, np.full((4, 64), float(step)))
+        batch, target, right = replay.batch(new, np.full((4, 64), float(step)), np.full(4, step))
         assert (batch["raw"][:4] == step).all()
         assert (batch["raw"][:, 0, 0, 0] == target[:, 0]).all()  # frames keep their own scores
+        assert (right == target[:, 0]).all()
     assert len(replay.memory) == max(1, memory // 4)
 
 

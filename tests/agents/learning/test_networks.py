@@ -12,11 +12,12 @@ from torch import nn
 from ae_env.grid import ExposureGrid
 from ae_env.lighting.moving import MOVES
 from ae_env.observation import encode_sensors
-from agents.learning import forecaster, networks
+from agents.learning import forecaster, networks, ppo
 from agents.learning.forecaster import ForecasterTraining, LightForecaster, metered
 from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, MeterHistory, StateHead
 from agents.learning.regression import observation_tensors
-from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
+from agents.learning.sb3_adapter import SB3VectorAdapter, TrainingFrames, WithHistory
+from agents.metering.meters import make_meter
 from agents.metering.reading import Reading
 from agents.policy import PolicyContext
 from tests.ae_env.environments import assert_equal, make_env
@@ -100,7 +101,8 @@ def test_foretold_shares_are_those_of_the_captures(exposed) -> None:
     head.from_light.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
     with torch.no_grad():
         head(torch.zeros(1, 6), features.light(codes, settings), sensors)
-    shares = given[0].view(len(grid), 2, -1)  # of all samples, of the brightest of each pixel
+    # Of all samples, and of the brightest of each pixel; the last two say what the features tell.
+    shares = given[0][0, :, :-2].view(len(grid), 2, -1)
     exposures = 2.0 ** (-scene.reference.log2_exposure - ev100)  # of each state, to the scene's
     signal = scene.light[None] * torch.from_numpy(exposures).float()[:, None, None, None]
     for level, stops in enumerate((1.0, 0.0, -1.0, -2.0, -3.0)):
@@ -110,6 +112,21 @@ def test_foretold_shares_are_those_of_the_captures(exposed) -> None:
             error = (shares[:, row, level] - counted.float().mean(dim=(1, 2, 3))).abs()
             assert error.max() < 0.15
             assert error.mean() < 0.03
+
+
+def test_the_right_exposure_is_told_against_an_average_meter(exposed) -> None:
+    base, _, frames = exposed(-1.5)
+    features, head = ExposureFeatures(base.single_observation_space), StateHead(base.grid, 6, True)
+    light = features.light(*observation_tensors(frames)[:2])
+    nn.init.zeros_(head.right.weight)
+    head.right.bias.data[:] = torch.tensor([0.5, -1.0])
+    ev100, spread = head.right_ev100(torch.zeros(1, 6), light)
+    metered = make_meter("average", base.camera)(frames).ev100
+    np.testing.assert_allclose(ev100.detach(), metered + 0.5, atol=0.3)  # of all colours
+    networks.exposure_loss(ev100, spread, ev100.detach() + 2.0).backward()
+    # d/dm (m - r)^2 = 2 (m - r); d/ds (e^2 / 2 s^2 + ln s) = 1 / s - e^2 / s^3, and ds/dln s = s.
+    wanted = [-4.0, 1.0 - 4.0 / spread.item() ** 2]
+    np.testing.assert_allclose(head.right.bias.grad, wanted, rtol=1e-4)
 
 
 def test_statistics_tell_the_light_as_pixels_do(make_tiny_envs) -> None:
@@ -250,19 +267,28 @@ def test_attributes_methods_and_pictures_of_a_wrapped_batch(make_tiny_envs) -> N
             SB3VectorAdapter(make_tiny_envs(autoreset_mode=mode))
 
 
-def test_shifted_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
+def test_training_frames_differ_in_the_raw_and_tell_the_right_exposure(make_tiny_envs) -> None:
     plain, inner = (SB3VectorAdapter(make_tiny_envs(num_envs=2)) for _ in range(2))
-    shifted = ShiftedFrames(inner, np.random.default_rng(0))
+    shifted = TrainingFrames(inner, np.random.default_rng(0))
     for envs in (plain, shifted):
         envs.seed(3)
+        envs.set_options([{"scene": 2}, {"scene": 0}])
+    right = [[inner.envs.unwrapped.scenes[i].ev100] for i in (2, 0)]
     resets = plain.reset(), shifted.reset()
     one, other = (envs.step(np.full(2, 5)) for envs in (plain, shifted))
     np.testing.assert_array_equal(one[1], other[1])
     for seen, moved in (resets, (one[0], other[0])):
+        np.testing.assert_allclose(moved["right_ev100"], right, rtol=1e-5)
         assert not np.array_equal(seen["raw"], moved["raw"])
         assert seen["raw"].mean() == pytest.approx(moved["raw"].mean(), rel=0.2)
         for name in ("settings", "sensors"):
             np.testing.assert_array_equal(seen[name], moved[name])
+
+
+def test_a_loss_joins_the_gradient() -> None:
+    tensor, weight = torch.ones(3, requires_grad=True), torch.tensor(3.0, requires_grad=True)
+    (2.0 * ppo._WithLoss.apply(tensor, weight.square())).sum().backward()
+    assert [tensor.grad.tolist(), weight.grad] == [[2.0] * 3, 6.0]
 
 
 def test_it_holds_readings_exposures_and_what_was_asked_for(context, photograph):

@@ -21,7 +21,7 @@ from simulator.camera_simulator import CameraSimulator
 from simulator.capture import sensor
 from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import Layout, PreparedScene
-from simulator.capture.sensor import exposure_table, missing_variance, noise_keys, record
+from simulator.capture.sensor import exposure_table, noise_keys, record
 from simulator.noise import noise_level_function as nlfs
 from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, philox
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
@@ -77,20 +77,6 @@ def test_bad_noise_level_functions_are_refused(name: str, value: object) -> None
     arguments = {"shot": (1e-5,) * 4, "read": (1e-8,) * 4, name: value}
     with pytest.raises(ValueError, match=f"`{name}`"):
         NoiseLevelFunction(**arguments)
-
-
-@pytest.mark.parametrize(("source", "target"), [(CLEAN, NOISY), (NOISY, CLEAN), (NOISY, NOISY)])
-def test_what_is_missing_is_the_difference_of_the_two_noises(source, target):
-    """A quarter of the source's variance is left of the second pixels: the rest is missing, too."""
-    levels, share = signal(-0.05, 0.0, 0.2, 0.9, 0.5), torch.tensor([[1.0, 0.25, 1.0, 0.25, 0.0]])
-    table = exposure_table([Exposure(1.0, source, target)])[0, 1:]
-    given, wanted = (noise_variance(levels, nlf).double() for nlf in (source, target))
-    plain, blurred = missing_variance(levels, table), missing_variance(levels, table, share)
-    np.testing.assert_allclose(plain, wanted - given, rtol=1e-5, atol=1e-12)
-    np.testing.assert_allclose(blurred, wanted - share * given, rtol=1e-5, atol=1e-12)
-    for plane in range(4):  # one plane alone, by its column of the table
-        alone = missing_variance(levels[plane], table[:, plane], share)
-        assert torch.equal(alone, blurred[plane])
 
 
 def test_the_table_has_the_differences_in_float64() -> None:
