@@ -110,7 +110,7 @@ def best_ev(seed: int) -> list[Row]:
     for _, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
         equal = OFFSETS[scores >= scores.max() - _EQUAL]
         nearest = float(equal[np.argmin(np.abs(equal))])
-        best.setdefault(name, []).extend([nearest] * (np.ptp(scores) >= _EQUAL))
+        best.setdefault(name, []).extend([nearest] * int(np.ptp(scores) >= _EQUAL))
     rows = []
     for name, known in best.items():
         row: Row = {"scorer": name, "median": float(np.median(known)) if known else None}
