@@ -43,8 +43,7 @@ def render(scene: Scene, defect: str, generator: torch.Generator) -> torch.Tenso
     proper = reference_settings(scene.ev100)
     light = scene.light * float(exposure_ratio(scene.reference, proper))
     gains = torch.tensor(scene.white_balance)
-    count = len(severities)
-    frames = light.expand(count, -1, -1, -1)
+    frames = light.expand(len(severities), -1, -1, -1)
     if defect == "exposure":
         side = 1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0
         frames = light * 2.0 ** (side * EXPOSURE_EV * severities)
@@ -152,12 +151,8 @@ def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:
 def scenes_of(split: str, resolution: int, per_kind: int, quick: bool) -> list[Scene]:
     spec = "bundled:small" if quick else "bundled"
     found = load_scenes(spec, split, camera=get_camera(CAMERA), resolution=resolution)  # type: ignore[arg-type]
-    kept: dict[str, list[Scene]] = {}
-    for scene in found:
-        own = kept.setdefault(scene.kind, [])
-        if len(own) < per_kind:
-            own.append(scene)
-    return [scene for own in kept.values() for scene in own]
+    kinds = dict.fromkeys(scene.kind for scene in found)
+    return [s for kind in kinds for s in [s for s in found if s.kind == kind][:per_kind]]
 
 
 def parts(seed: int, quick: bool) -> list[Part]:

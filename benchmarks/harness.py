@@ -65,7 +65,6 @@ class Part:
         arguments: Of `task`; ``seed`` and ``quick``, if it has them, come from the run.
         threads: Threads that torch and the kernels may use.
         fresh_cache: Whether it finds nothing on disk that earlier runs computed.
-        timeout: Seconds after which it is stopped.
     """
 
     name: str
@@ -73,7 +72,6 @@ class Part:
     arguments: Mapping[str, Any] = field(default_factory=dict)
     threads: int = CORES
     fresh_cache: bool = False
-    timeout: float = 4 * 3600.0
 
     def run(self) -> Any:
         """The result of `task`, run by a fresh Python.
@@ -88,7 +86,7 @@ class Part:
         with tempfile.TemporaryDirectory() as folder:
             if self.fresh_cache:
                 variables[CACHE_VARIABLE] = folder
-            options: Any = {"cwd": ROOT, "env": os.environ | variables, "timeout": self.timeout}
+            options: Any = {"cwd": ROOT, "env": os.environ | variables}
             done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
         if done.returncode:
             words = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

@@ -41,8 +41,6 @@ FULL, QUICK = (200, 1024), (6, 128)
 QUICK_STAGE = {"steps": 2, "batch": 1, "crop": 16}
 #: Folder of the trained networks.
 WEIGHTS = RUNS.parent / "paper"
-#: Longest training [s]: the paper's took two days on two GPUs.
-LONGEST = 14 * 86400.0
 
 
 class Case(NamedTuple):
@@ -89,7 +87,7 @@ def parts(
             raise ValueError(f"{wrong}, not {preset!r}")
         names = [str(weights.resolve())]
     own = [{"name": n, "folder": str(folder.resolve())} for n in dict.fromkeys([*names, "compact"])]
-    return [Part(given["name"], measure, given, timeout=LONGEST) for given in own]
+    return [Part(given["name"], measure, given) for given in own]
 
 
 def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -21,12 +22,14 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from scipy.stats import norm
+from torch import Tensor
 
 from ae_env.scenes.bundled import add_layout
 from ae_env.scenes.polyhaven import VIEWS, asset_views, dome_lux, polyhaven_scenes, split_assets
 from ae_env.scenes.scene import Scene, SceneRequest
 from agents.evaluation.engine import evaluate, fit_policies
 from agents.evaluation.intervals import rank, score_interval
+from agents.learning.networks import StateHead
 from agents.learning.training import load_config, train_agent
 from agents.policy_names import make_policy, training_seeds
 from benchmarks.agents import CONFIGS, best_compensations, changed_config, context_of
@@ -59,6 +62,20 @@ VARIANTS: dict[str, tuple[Row, Row]] = {
     "no loss of the right exposure": ({}, {"ev_coef": 0.0}),
     "no sensors": ({"sensors": False}, {}),
     "drawn scenes alone": ({"scenes": "bundled:large"}, {}),
+    "no absolute luminance": ({}, {}),
+    "a linear layer, no head": ({}, {}),
+}
+
+
+def _linear(head: StateHead, features: Tensor, *others: Any) -> Tensor:
+    scores = head.from_features(features)  # of as many units as there are states
+    return torch.stack([scores, torch.zeros_like(scores)], dim=2)
+
+
+#: What the network of a variant has in place of a function of `agents.learning.networks`.
+REPLACED: dict[str, tuple[str, Any]] = {
+    "no absolute luminance": ("_absolute", lambda signal, _: signal.clamp(2**-12).log2() / 8.0),
+    "a linear layer, no head": ("StateHead.forward", _linear),
 }
 #: Views of the contact sheet, and packed pixels a side of each.
 SHOWN, SIZE = 12, 256
@@ -149,6 +166,8 @@ def _right_exposure(scene: Scene) -> Row:
 def curve(variant: str, seed: int, quick: bool) -> Row:
     """The regression agent, one seed, trained as `VARIANTS` says."""
     environment, training = VARIANTS[variant]
+    for name, own in filter(None, [REPLACED.get(variant)]):
+        patch(f"agents.learning.networks.{name}", own).start()  # for this process
     training = training | {"seed": seed} | ({"frames": 2_000} if quick else {})
     config = changed_config(load_config(CONFIGS["regression"]), environment, training)
     out = ROOT / "runs" / f"bench_places{'_quick' * quick}" / re.sub(r"\W+", "_", variant)
@@ -183,8 +202,7 @@ def pictures(seed: int) -> tuple[Figure, Figure]:
         title = f"{view.scene_id}: {(raw >= 1.0).any(axis=0).mean():.0%}"
         frames.append((title, torch.from_numpy(env.render().copy()).permute(2, 0, 1)))
     sheet = side_by_side(*(dict(frames[i : i + 4]) for i in range(0, SHOWN, 4)))
-    flat = RECEPTORS["flat, C = 250"]
-    apart = [abs(np.log2(flat(*place) / dome_lux(*place))) for _, place in views]
+    apart = [abs(np.log2(receptor_reading(*p, dome=False) / dome_lux(*p))) for _, p in views]
     return sheet, receptor_figure(*views[int(np.argmax(apart))])
 
 

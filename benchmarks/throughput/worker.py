@@ -87,15 +87,8 @@ def _sweep(noise: Any) -> Case:
     shot, read = (torch.tensor(values).view(4, 1, 1) for values in (nlf.shot, nlf.read))
     normals = torch.randn(light.shape, generator=generator)
     data = (light + (light * shot + read).sqrt() * normals).clamp(-0.05, 1.0)
-    raw = RawImage(data.contiguous(), settings, camera)
-    grid = [
-        CameraSettings(iso, seconds, f_number)
-        for iso in (100, 400, 1600, 6400)
-        for seconds in (1 / 1024, 1 / 128, 1 / 16, 1 / 2)
-        for f_number in (4, 5.6, 8, 11)
-    ]
-    prepared = CameraSimulator(device="cpu").prepare(raw)
-    call = partial(prepared.expose, grid, noise=noise)
+    prepared = CameraSimulator(device="cpu").prepare(RawImage(data, settings, camera))
+    call = partial(prepared.expose, list(ae_env.ExposureGrid.default()), noise=noise)
     return call, 1, call().numpy()
 
 

@@ -19,7 +19,7 @@ from benchmarks.transfer import agents, tables
 
 
 def parts(seed: int, quick: bool, part: str | None = None) -> list[Part]:
-    found = [Part("agents", agents.measure, timeout=24 * 3600.0)] if part != "tables" else []
+    found = [Part("agents", agents.measure)] if part != "tables" else []
     for number, own in enumerate(agents.plan_of(quick).tables if part != "agents" else ()):
         for crop, iso in ((crop, iso) for crop in own.crops for iso in own.isos):
             arguments = {"number": number, "crop": crop, "iso": iso}
