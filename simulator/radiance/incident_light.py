@@ -155,8 +155,8 @@ def features(green: torch.Tensor, reflected_ev100: float) -> np.ndarray:
     return np.array([*sides.flatten().tolist(), clipped, reflected_ev100])
 
 
-#: Fitted on 48 views of each training map; its spread on these, each place left out in turn, and on
-#: those of validation places.
+#: Weights and offset by `examples/fit_posterior.py`, on 48 views of each training map; it also says
+#: what the spread covers in training places that are left out in turn and in validation places.
 POSTERIOR = IncidentPosterior(
     weights=(0.074, -0.071, 0.077, -0.144, 0.081, -0.087, 0.300, 0.242, -9.240, -0.080),
     offset=2.005,
