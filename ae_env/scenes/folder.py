@@ -232,6 +232,9 @@ def _read_files(
     `groups` has the source group of each; None for the file itself, or shots that belong to it.
     `hint` ends the error of a file that cannot be read, where there are others.
     """
+    lux, names = options.illuminance, {path.name for path in groups}
+    if isinstance(lux, Mapping) and (wrong := sorted(set(map(str, lux)) - names)):
+        raise ValueError(f"`illuminance` names {wrong[0]!r}, which is no file of {str(spec)!r}")
     endings = {path.suffix.lower() for path in groups}
     kinds = {"settings": RAW_SUFFIXES, "layer": (".exr",), "ev100": RADIANCE_SUFFIXES}
     for name, known in kinds.items():

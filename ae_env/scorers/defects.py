@@ -206,11 +206,14 @@ class _Analytic:
     domain: Domain = "srgb"
     defect: str
 
+    def __init_subclass__(cls, defect: str) -> None:
+        cls.defect = defect
+
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         return 1.0 - severity(self.defect, images).abs_()
 
 
-class AnalyticExposure(_Analytic):
+class AnalyticExposure(_Analytic, defect="exposure"):
     """1 - severity of wrong exposure, from white pixels or missing highlights.
 
     The larger of two maps: of the share of the pixels whose luma is above 0.98, and of 1 minus the
@@ -218,55 +221,43 @@ class AnalyticExposure(_Analytic):
     under-exposed to it, snow and lamps over-exposed: `brightness` knows the light, this does not.
     """
 
-    defect = "exposure"
 
-
-class AnalyticNoise(_Analytic):
+class AnalyticNoise(_Analytic, defect="noise"):
     """1 - severity of noise, from Immerkaer's estimate on the luma.
 
     1 stands for photon noise of half the signal of an 18 % card (4 photons a pixel). Fine texture
     counts as noise, blur hides it.
     """
 
-    defect = "noise"
 
-
-class AnalyticWhiteBalance(_Analytic):
+class AnalyticWhiteBalance(_Analytic, defect="white_balance"):
     """1 - severity of a wrong white balance, from the median colour ratios.
 
     1 stands for gains of red and blue that are each a stop off. A scene of one colour (grass, a
     sunset) looks off balance to it.
     """
 
-    defect = "white_balance"
 
-
-class AnalyticSaturation(_Analytic):
+class AnalyticSaturation(_Analytic, defect="saturation"):
     """1 - |severity| of weak or strong colours, from Hasler and Suesstrunk's colourfulness.
 
     -1 stands for a grey picture, 1 for twice the distance of every pixel from its luma.
     """
 
-    defect = "saturation"
 
-
-class AnalyticHaze(_Analytic):
+class AnalyticHaze(_Analytic, defect="haze"):
     """1 - severity of haze, from the light in the darkest pixels (dark channel).
 
     1 stands for a picture that is 80 % airlight. Pictures without dark pixels (snow, an even
     surface, over-exposure) look hazy to it.
     """
 
-    defect = "haze"
 
-
-class AnalyticBlur(_Analytic):
+class AnalyticBlur(_Analytic, defect="blur"):
     """1 - severity of blur, from Crete's blur effect on the luma.
 
     1 stands for a disc of 8 pixels of the frame. Noise hides blur; smooth scenes look blurred.
     """
-
-    defect = "blur"
 
 
 #: The measures of single defects, by the names that they are registered under.

@@ -72,7 +72,7 @@ def judge(
     ] = None,
     fit: Annotated[bool, Option("--fit", help="Tell what the files say; ask nothing.")] = False,
     scenes: Annotated[str, Option(help="'bundled', 'polyhaven', raws or maps.")] = "bundled",
-    split: Annotated[str, Option(help="train, test or all.")] = "test",
+    split: Annotated[str, Option(help="train, validation, test or all.")] = "test",
     resolution: Annotated[int, Option(help="Packed pixels a side of a frame.", min=36)] = 256,
     pairs: Annotated[int, Option(help="Pairs to choose from.", min=1, max=10_000)] = 60,
     name: Annotated[str, Option("--judge", help="Name or id of who chooses.")] = "anonymous",
@@ -113,7 +113,7 @@ def judge(
         found = judged_scenes(**source)
         draw = partial(draw_pairs, found, pairs, seed, task, **source)
         judging = Judging(path, name, found, draw)
-    print_line(f"{judging.done} of {len(judging.pairs)} pairs are chosen from in {path}")
+    print_line(f"{judging.done} of {len(judging.pairs)} pairs of {path} are chosen from")
     show = partial(show_pairs, judging, found, PictureStore())
     serve("ae-env judge", show, tempfile.TemporaryDirectory(), port, open_browser)
 

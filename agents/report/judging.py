@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -98,11 +99,21 @@ def draw_pairs(
 
 
 def read_choices(path: Path) -> pd.DataFrame:
-    """One judge's pairs in a file, as texts; a `ValueError` if it is none."""
-    found = read_table(path)
+    """One judge's pairs in a file, as texts; a `ValueError` that names what is wrong in it."""
+    found, start = read_table(path), f"`choices` (={str(path)!r}) must"
     used = {*FILLED, "judge", "pair", "scene_id", "group", "content", "ev100", "left", "right"}
+    used |= {re.sub("left$", "right", name) for name in found.filter(regex=":left$")}
     if not used <= set(found) or not set(found.choice) <= {*WON, ""} or found.judge.nunique() != 1:
-        raise ValueError(f"`choices` (={str(path)!r}) must be a whole file of `ae-env judge`")
+        raise ValueError(f"{start} be a whole file of `ae-env judge`")
+    numbers = found.filter(regex="^(ev100|left|right)$|:(left|right)$").apply(
+        pd.to_numeric, errors="coerce"
+    )
+    wrong, sides = ~np.isfinite(numbers), numbers[["left", "right"]]
+    wrong[["left", "right"]] = ~sides.mask(sides.left == sides.right).isin(range(len(GRID)))
+    if (rows := wrong.any(axis=1)).any():
+        row, name = rows.idxmax(), wrong.loc[rows.idxmax()].idxmax()
+        rule = f"have finite numbers and two states from 0 to {len(GRID) - 1} in each row"
+        raise ValueError(f"{start} {rule}; row {row + 2}, {name!r} has {found[name][row]!r}")
     return found
 
 
@@ -175,18 +186,15 @@ def exposure_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
     names, items = np.unique(stops, return_inverse=True)  # brighter is more
     (left, right), won = items.reshape(stops.shape).T, choices.choice.map(WON).to_numpy()
     groups, group = np.unique(choices.group, return_inverse=True)
-    wins = np.zeros((len(groups), len(names), len(names)))
+    wins, rows = np.zeros((len(groups), len(names), len(names))), list[dict[str, Any]]()
     np.add.at(wins, (group, left, right), won)
     np.add.at(wins, (group, right, left), 1.0 - won)
-    values, ends = bradley_terry(wins.sum(0)), [None] * len(names)
-    if len(groups) >= MIN_GROUPS:
-        drawn = np.tensordot(group_weights(len(groups), RESAMPLES, 0), wins, axes=1)
-        levels = (1 - LEVEL) / 2, (1 + LEVEL) / 2
-        ends = np.quantile(bradley_terry(drawn), levels, axis=0).T.tolist()
-    return [
-        _row(f"{stop:+.0f} EV", value, pair, choices.group[(stops == stop).any(axis=1)])
-        for stop, value, pair in zip(names, values, ends, strict=True)
-    ]
+    drawn = np.tensordot(group_weights(len(groups), RESAMPLES, 0), wins, axes=1)
+    ends = np.quantile(bradley_terry(drawn), ((1 - LEVEL) / 2, (1 + LEVEL) / 2), axis=0).T
+    for stop, value, pair in zip(names, bradley_terry(wins.sum(0)), ends.tolist(), strict=True):
+        own = (stops == stop).any(axis=1)
+        rows.append(_row(f"{stop:+.0f} EV", value, pair, choices.group[own]))
+    return rows
 
 
 def scorer_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
@@ -206,8 +214,8 @@ def scorer_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _row(name: str, value: float, ci95: Any, groups: pd.Series[str]) -> dict[str, Any]:
-    count = {"choices": len(groups), "num_groups": groups.nunique()}
-    return {"name": name, "value": value, "ci95": ci95, **count}
+    count = {"choices": len(groups), "num_groups": (seen := groups.nunique())}
+    return {"name": name, "value": value, "ci95": ci95 if seen >= MIN_GROUPS else None, **count}
 
 
 def write_fit(files: Sequence[Path], out: Path, command: str) -> list[Path]:
@@ -215,15 +223,18 @@ def write_fit(files: Sequence[Path], out: Path, command: str) -> list[Path]:
 
     A `ValueError` if a file is damaged or given twice, or holds no choice of one of two frames.
     """
-    choices = pd.concat([read_choices(path) for path in files], ignore_index=True).dropna(axis=1)
-    twice = choices.duplicated(choices.columns.difference(FILLED)).any()
+    together = pd.concat([read_choices(path) for path in files], ignore_index=True)
+    choices, start = together.dropna(axis=1), f"`choices` (={[str(path) for path in files]}) must"
+    if choices.duplicated(choices.columns.difference(FILLED)).any():
+        raise ValueError(f"{start} have each judge's pair once: is `judge` the same in two files?")
     choices = choices[choices.choice != ""]
     equal = int((choices.choice == "equal").sum())
-    if twice or equal == len(choices):
-        rule = "must hold choices that are not all equal, and each of them once"
-        raise ValueError(f"`choices` (={[str(path) for path in files]}) {rule}")
+    if equal == len(choices):
+        raise ValueError(f"{start} hold a choice of one of two frames")
     judges, rows = sorted(set(choices.judge)), []
     text = f"{len(choices)} choices by {', '.join(judges)}, {equal} of them equal.\n"
+    if absent := ", ".join(together.columns.difference(choices.columns)):
+        text += f"\nNot in every file, and so left out: {absent}.\n"
     for kind, value, found in (
         ("exposure", "strength", exposure_rows(choices)),
         ("scorer", "agreement", scorer_rows(choices)),

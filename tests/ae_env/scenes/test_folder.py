@@ -58,6 +58,8 @@ def test_options_reach_the_scenes(tmp_path):
     assert only.incident_light.reflected_ev100 == pytest.approx(8.0, abs=0.05)
     with pytest.raises(ValueError, match=r"`settings`.* has none"):
         load(tmp_path / "b.hdr", settings={"iso": 100})
+    with pytest.raises(ValueError, match=r"`illuminance` names 'c\.hdr'"):
+        load(tmp_path, illuminance={"a.hdr": 250.0, "c.hdr": 250.0})
 
 
 #: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same

@@ -15,7 +15,7 @@ from ae_env.observation import encode_sensors
 from agents.learning import forecaster, networks, ppo
 from agents.learning.forecaster import ForecasterTraining, LightForecaster, metered
 from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, MeterHistory, StateHead
-from agents.learning.regression import observation_tensors
+from agents.learning.regression import ScoreRegressor, observation_tensors
 from agents.learning.sb3_adapter import SB3VectorAdapter, TrainingFrames, WithHistory
 from agents.metering.meters import make_meter
 from agents.metering.reading import Reading
@@ -23,15 +23,19 @@ from agents.policy import PolicyContext
 from tests.ae_env.environments import assert_equal, make_env
 
 
-def test_shapes() -> None:
+def test_a_frame_and_its_mirror_image_count_alike() -> None:
     """Without sensors, at an odd size."""
     settings = gym.spaces.Box(-1, 1, (3,), np.float32)
     pixels, signal = (gym.spaces.Box(0, 255, (4, 37, 37), kind) for kind in (np.uint8, np.float32))
-    features = ExposureFeatures(gym.spaces.Dict({"raw": pixels, "settings": settings}), width=24)
-    values = features(torch.rand(5, 4, 37, 37), torch.zeros(5, 3), None)
-    assert values.shape == (5, 24)
-    values.sum().backward()
-    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in features.parameters())
+    space, codes = gym.spaces.Dict({"raw": pixels, "settings": settings}), torch.rand(5, 4, 37, 37)
+    network, given = (
+        ScoreRegressor(space, ExposureGrid.default(), width=24),
+        (torch.zeros(5, 3), None),
+    )
+    found, mirrored = network(codes, *given), network(codes.flip(3), *given)
+    assert found[0].shape == found[1].shape == (5, 64)
+    torch.testing.assert_close(mirrored, found)
+    assert (network.predict(codes.flip(3), *given)[0] - found[0]).abs().max() > 1e-4
     with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`"):
         ExposureFeatures(gym.spaces.Dict({"raw": signal, "settings": settings}))
 

@@ -93,9 +93,20 @@ def test_choices_are_undone_and_gone_on_with_and_wrong_files_refused(pairs, foun
     for judge, scenes in (("bob", found), ("ann", other)):
         with pytest.raises(ValueError, match=r"`out` .* must have pairs of these scenes by"):
             Judging(path, judge, scenes, lambda: pairs)
-    with pytest.raises(ValueError, match="each of them once"):
+    with pytest.raises(ValueError, match="each judge's pair once"):
         write_fit([path, path], tmp_path, "")
     text = path.read_text()
+    cells = {"left": ("64", ann.pairs.right[2]), "ev100": ("inf",), "balanced:left": ("",)}
+    for column, cell in ((name, own) for name, wrong in cells.items() for own in wrong):
+        ann.pairs.assign(**{column: ann.pairs[column].where(ann.pairs.index != 2, cell)}).to_csv(
+            path
+        )
+        with pytest.raises(ValueError, match=f"row 4, '{column}' has"):
+            write_fit([path], tmp_path, "")
+    fewer = ann.pairs.drop(columns=["shin:left", "shin:right"]).assign(judge="bob")
+    fewer.to_csv(tmp_path / "bob.csv", index=False)
+    path.write_text(text)
+    assert "shin:left" in write_fit([path, tmp_path / "bob.csv"], tmp_path, "")[1].read_text()
     for damaged in ("", text.replace("right,1", "up,1"), text.replace("seconds", "s")):
         path.write_text(damaged)
         with pytest.raises(ValueError, match=r"`choices` .*ann\.csv.* must be a whole file of"):

@@ -10,7 +10,6 @@ import subprocess
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -70,8 +69,6 @@ def test_targets_that_cannot_be_written_and_permissions(tmp_path):
         with pytest.raises(OSError, match=f"`path` .*{target}"):
             write_atomically(target, "x")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
-    with pytest.raises(ValueError, match="`path`"):
-        write_atomically(3, "x")
     written, ordinary = write_atomically(targets[0] / "a", "x"), tmp_path / "file"
     assert written.stat().st_mode == ordinary.stat().st_mode
 
@@ -92,17 +89,11 @@ def test_the_folders_of_real_files_and_of_the_cache(tmp_path, monkeypatch):
         monkeypatch.setenv("AE_ENV_CACHE", str(value))
         assert cache_dir() == expected
     assert not here.exists()
-    for cache in (LruCache, lambda size: Store(tmp_path, max_bytes=size)):
-        with pytest.raises(ValueError, match="`max_bytes`"):
-            cache(-1)
 
 
 def test_meta_says_where_a_number_comes_from():
     meta = json.loads(json.dumps(result_meta("ae-env bench throughput", seed=3)))
     assert (meta["command"], meta["seed"]) == ("ae-env bench throughput", 3)
-    assert meta["machine"]["threads"] == torch.get_num_threads()
-    assert meta["versions"]["torch"] == version("torch")
-    assert meta["date"]
     git = "git", "-C", Path(__file__).parent
     head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True)
     changed = subprocess.run([*git, "diff", "--quiet", "HEAD"], capture_output=True).returncode
@@ -485,16 +476,13 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
 
 @pytest.mark.parametrize(("count", "threads"), [(0, 3), (1, 3), (2, 8), (7, 1), (7, 3)])
 def test_every_item_is_done_once(count, threads):
-    done = np.zeros(count, int)
+    done: list[int] = []
 
-    def add_one(first: int, last: int) -> None:
-        done[first:last] += 1
-
-    def task(first: int, last: int) -> None:  # a task may ask for shares itself
-        parallel_ranges(lambda a, b: add_one(first + a, first + b), last - first, threads=2)
+    def task(a: int, b: int) -> None:  # a task may ask for shares itself
+        parallel_ranges(lambda c, d: done.extend(range(a + c, a + d)), b - a, threads=2)
 
     parallel_ranges(task, count, threads=threads)
-    assert (done == 1).all()
+    assert sorted(done) == [*range(count)]
 
 
 def test_shares_are_contiguous_and_run_at_the_same_time():
