@@ -82,14 +82,14 @@ class ScoreRegressor(nn.Module):
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Expected score and log variance, both (B, S): means over a frame and its mirror image."""
-        seen, mirrored = (self.predict(c, settings, sensors) for c in (codes, codes.flip(3)))
-        return (seen[0] + mirrored[0]) / 2.0, (seen[1] + mirrored[1]) / 2.0
+        """Expected score and log variance of the prediction, both (B, S)."""
+        scores, log_variance, _, _ = self.predict(codes, settings, sensors)
+        return scores, log_variance
 
     def predict(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
     ) -> tuple[torch.Tensor, ...]:
-        """Of the frame as it is, and the right exposure (`StateHead.right_ev100`), its spread."""
+        """As `forward`, and the right exposure (`StateHead.right_ev100`): its EV100, its spread."""
         features = self.dropout(self.features(codes, settings, sensors))
         light = self.features.light(codes, settings)
         scores, log_variance = self.states(features, light, sensors).unbind(dim=2)
