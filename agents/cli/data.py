@@ -70,7 +70,7 @@ def record(
     ] = "AutoExposure-v0",
     env: Annotated[str | None, Option(help="Preset of the environment, or a YAML file.")] = None,
     scenes: Annotated[str | None, Option(help="Scenes to draw from.")] = None,
-    split: Annotated[str | None, Option(help="train (default), test or all.")] = None,
+    split: Annotated[str | None, Option(help="train (default), validation, test or all.")] = None,
     episodes: Annotated[int, Option(help="How many.", min=1, max=1_000_000)] = 200,
     seed: console.Seed = 0,
     trust: console.Trust = False,

@@ -54,7 +54,7 @@ def evaluate(
     scenes: Scenes = None,
     on_error: console.OnError = "stop",
     source: Any = None,
-    split: Annotated[str | None, Option(help="train, test (default) or all.")] = None,
+    split: Annotated[str | None, Option(help="train, validation, test (default) or all.")] = None,
     grid: Annotated[str | None, Option(help="default, third_stop, video or bracket.")] = None,
     scorer: Annotated[str | None, Option(help="The scorer of the states: balanced...")] = None,
     lighting: Annotated[
