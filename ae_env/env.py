@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any, Unpack
 
 import gymnasium as gym
@@ -32,6 +33,7 @@ from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES, FrameSource
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.motion import Movement
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_seed, check_word
 
@@ -43,6 +45,7 @@ _MANY = 8
 #: Memory for score tables [byte]: some eight thousand of 64 states.
 TABLES_BYTES = 2**25
 _FIRST = np.array([0])
+_MOVEMENT = tuple(field.name for field in fields(Movement))
 
 
 class AutoExposure(Task):
@@ -249,7 +252,7 @@ class AutoExposure(Task):
         scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
         light = noises = movements = None
         if episodes.subject_speed[env_indices].any():  # else they do not matter
-            movements = [episodes[index].movement for index in env_indices.tolist()]
+            movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
         if not self.in_chunks:
             light = torch.empty(1).expand(len(env_indices), *scenes[0].light.shape)
         if source_noise[part].any():

@@ -5,8 +5,9 @@ Captures are described for any batch of frames, or for every state of a scene at
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -19,10 +20,14 @@ from simulator.capture.decision import MAX_DISC_PX
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED, PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DIAMETERS
-from simulator.optics.motion import ALONG_ROWS, Movement
+from simulator.optics.motion import ALONG_ROWS, Movement, path_length
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number, check_type
+from simulator.utils.compute import kernel
 
+#: In place of `Layout.shares` where all pixels have the same blur.
+_ALIKE = np.array([[-1.0], [0.0], [1.0]])
+_WIDEST = DIAMETERS[-1]
 ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
 #: Input that decides a score: ``"image"``, the recorded image with its noise; ``"light"``, the
@@ -188,7 +193,7 @@ def describe_captures(
     *,
     speed: np.ndarray,
     defocus: np.ndarray,
-    movements: Sequence[Movement] | None = None,
+    movements: np.ndarray | None = None,
     gain: np.ndarray,
     row_gain: np.ndarray | None = None,
     light: torch.Tensor | None = None,
@@ -200,7 +205,7 @@ def describe_captures(
     Args:
         scenes, settings, camera: Scene and settings of each capture, and the body.
         speed, defocus: (B,) each, see `prepare_scene`.
-        movements: Of each capture, see `prepare_scene`; None for along the rows.
+        movements: (B, 4) numbers of each `Movement`, in its order; None for along the rows.
         gain: (B,) light relative to the scenes' own.
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
         light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
@@ -211,14 +216,8 @@ def describe_captures(
     f_numbers = np.array([s.effective_f_number for s in settings])
     discs = defocus * (4.0 / f_numbers) * height / 64.0
     own = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
-    # Exactly the others' where `own` is 0.
-    blur = np.hypot(np.hypot(speed * times * height, discs), own)
-    moves = [ALONG_ROWS] * len(scenes) if movements is None else movements
-    pixel_blur = None
-    if discs.any() or any(move.subject_speed for move in moves):
-        numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
-        each = zip(scenes, moves, speed.tolist(), numbers, strict=True)
-        pixel_blur = _stacked([layout_blur(*one) for one in each], blur)
+    moves = np.zeros((len(scenes), 4)) if movements is None else movements
+    blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, np.array(own))
     nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
     pairs = zip(scenes, settings, strict=True)
     ratios = [2.0 ** (s.log2_exposure - c.reference.log2_exposure) for c, s in pairs]
@@ -250,44 +249,53 @@ def _likely_ev(scenes: Sequence[Scene], gain: np.ndarray) -> torch.Tensor | None
     return torch.from_numpy(each + np.log2(gain)[:, None])
 
 
-def layout_blur(
-    scene: Scene, movement: Movement, speed: float, numbers: np.ndarray
-) -> PixelBlur | None:
-    """Blur of S captures of a scene with a layout; None where all pixels have the same.
+def all_blur(
+    scenes: Sequence[Scene],
+    movements: np.ndarray,
+    speed: np.ndarray,
+    times: np.ndarray,
+    discs: np.ndarray,
+    own: np.ndarray,
+) -> tuple[np.ndarray, PixelBlur | None]:
+    """Extents of blur of B captures [pixel], (B,), and `Captures.pixel_blur`.
 
-    `movement` and `speed` are those of `prepare_scene`; `numbers` (3, S) exposure times [s],
-    diameters of the largest disc of defocus [pixel], and the scene's own blur [pixel].
+    `movements` (B, 4) and `speed` (B,) are those of `describe_captures`; all others are (B,):
+    exposure times [s], diameters of the largest disc of defocus, and the scenes' own blur [pixel].
     """
-    layout, height, (times, discs, own) = scene.layout, scene.light.shape[-2], numbers
-    if layout is None or not (discs.any() or movement.subject_speed):
-        return None
-    counted = layout.shares
-    own_square = own**2
-    rest = ((speed * times * height) ** 2 + own_square)[:, None]
-    if movement.subject_speed:
-        extent = movement.subject_extent(speed, times) * height
-        rest = np.where(counted.subject, (extent**2 + own_square)[:, None], rest)
-    levels = np.minimum(np.multiply.outer(discs, counted.defocus), DIAMETERS[-1])  # as in the frame
-    levels *= levels
-    levels += rest
-    np.sqrt(levels, out=levels)  # (S, K)
-    shares = torch.from_numpy(counted.share).expand(len(times), -1)
-    return PixelBlur(torch.from_numpy(levels), shares)
+    height = scenes[0].light.shape[-2]
+    # Exactly the others' where `own` is 0.
+    blur = np.hypot(np.hypot(speed * times * height, discs), own)
+    differs = (discs != 0.0) | (movements[:, 2] != 0.0)
+    parts = [_ALIKE] * len(scenes)
+    for i in np.flatnonzero(differs).tolist():
+        layout = scenes[i].layout
+        parts[i] = _ALIKE if layout is None else layout.shares
+    if all(part is _ALIKE for part in parts):
+        return blur, None
+    ends = np.cumsum([0] + [part.shape[1] for part in parts])
+    levels, shares = np.zeros((2, len(scenes), int(np.diff(ends).max())))
+    numbers = np.stack([speed, times, discs, own, blur], axis=1)
+    _fill_levels(height, np.concatenate(parts, axis=1), ends, movements, numbers, levels, shares)
+    return blur, PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
 
 
-def _stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlur | None:
-    """One of B captures from one of each; where it is None, all pixels have `blur_px` (B,)."""
-    most = max((part.levels.shape[1] for part in parts if part is not None), default=0)
-    if not most:
-        return None
-    levels, shares = torch.zeros(2, len(parts), most, dtype=torch.float64)
-    for i, part in enumerate(parts):
-        if part is None:
-            levels[i, 0], shares[i, 0] = float(blur_px[i]), 1.0
-        else:
-            count = part.levels.shape[1]
-            levels[i, :count], shares[i, :count] = part.levels[0], part.shares[0]
-    return PixelBlur(levels, shares)
+@kernel()
+def _fill_levels(height, sorts, ends, movements, numbers, levels, shares):  # type: ignore[no-untyped-def]
+    """`PixelBlur` of captures; `sorts` are the `Layout.shares` of all, one behind the other."""
+    for i in range(len(numbers)):
+        speed, time, disc, own = numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3]
+        direction, turn, angle = movements[i, 0], movements[i, 1] * time, movements[i, 3]
+        drift, extent = movements[i, 2] * time, speed * time
+        x, y = drift * math.cos(angle), drift * math.sin(angle)
+        rest = (extent * height) ** 2 + own * own
+        apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + own * own
+        for k in range(ends[i + 1] - ends[i]):
+            sort = ends[i] + k
+            level = min(disc * sorts[0, sort], _WIDEST)  # as in the frame
+            moved = apart if sorts[1, sort] > 0.0 and drift > 0.0 else rest
+            alike = sorts[0, sort] < 0.0
+            levels[i, k] = numbers[i, 4] if alike else math.sqrt(level * level + moved)
+            shares[i, k] = sorts[2, sort]
 
 
 class SceneCaptures:
@@ -356,12 +364,11 @@ class SceneCaptures:
         """
         few, alike = np.unique(self._which[part], return_inverse=True)
         times, f_numbers = self._blurs[few].T
-        speed, movement, height = prepared.image_speed, prepared.movement, scene.light.shape[-2]
+        movement, height = prepared.movement, scene.light.shape[-2]
         own = [scene.own_blur(f_number) for f_number in f_numbers.tolist()]
         # In steps of a 64-pixel frame, as episodes state it: to the bit as in `describe_captures`.
         discs = (prepared.defocus * 64.0 / height) * (4.0 / f_numbers) * height / 64.0
-        found = layout_blur(scene, movement, speed, np.stack([times, discs, own]))
-        if found is not None:
-            return found, torch.from_numpy(alike)
-        blur = np.hypot(np.hypot(speed * times * height, discs), own)
-        return torch.from_numpy(blur), torch.from_numpy(alike)
+        moves = np.tile(np.array(astuple(movement)), (len(few), 1))
+        speeds = np.full(len(few), prepared.image_speed)
+        blur, pixel_blur = all_blur([scene] * len(few), moves, speeds, times, discs, np.array(own))
+        return pixel_blur or torch.from_numpy(blur), torch.from_numpy(alike)

@@ -16,19 +16,28 @@ from typing import Any, Protocol
 import numpy as np
 
 from simulator.camera import CameraProfile
-from simulator.capture.blurred_light import Pool
-from simulator.capture.decision import LIGHT_LIMIT, Exposure, decide
+from simulator.capture.columns import (
+    BLUR,
+    SCENE,
+    BlurredFrames,
+    FramesAt,
+    blur_column,
+    plan_frames,
+    scene_column,
+    state_columns,
+)
+from simulator.capture.decision import MAX_DISC_PX, Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, exposure_table, noise_keys, record
-from simulator.capture.statistics import LightStatistics
-from simulator.optics.discs import Blur, blur_many
+from simulator.capture.statistics import BINS, LightStatistics
 from simulator.settings import CameraSettings
-from simulator.utils.compute import parallel_ranges
+from simulator.utils.compute import addresses, parallel_ranges
 
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
-_NOISE_BIT = 1 << _STEPS.index("noise")
+_BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
+_NOISE_BIT = _BIT["noise"]
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -113,23 +122,34 @@ class CaptureBatch:
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
         self.camera, self.noise, self._cache_light = camera, noise, cache_light
+        self._columns = state_columns(states)
+        apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
+        self._frames = BlurredFrames(num_scenes, len(apertures), cache_light)
+        self._targets: dict[int, np.ndarray] = {}  # by box factor, (S, 2, 4)
+        # Scenes as columns; whether their captures are planned in columns, too: where the light has
+        # no noise of its own, and no aperture is opened.
         self._scenes: dict[int, PreparedScene] = {}
-        self._pool = Pool(cache_light)
+        self._scene_columns = np.zeros(num_scenes, SCENE)
+        self._statistics = np.zeros((num_scenes, 4, 4, BINS))
+        self._in_columns = np.zeros(num_scenes, bool)
         # Row of the blurred light that each scene has at present.
         self._blurred_row = np.full(num_scenes, -1)
         # Planned captures as columns, by scene and state: all that a frame depends on, except for
-        # its noise. A row takes some 40 bytes, the rest of its memory when it is used.
+        # its noise. Memory of a row is taken when it is used.
         count = num_scenes * len(states)
         self._gain = np.full(count, np.nan)  # light that it was planned for; NaN where it was not
         self._table = np.zeros((count, 5, 4), np.float32)  # of `exposure_table`
+        self._blur = np.zeros(count, BLUR)
         # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
         self._modules = np.zeros(count, np.int64)
-        # Whether the light must be blurred, else it is the scene's own; and whether any ever was.
+        # Whether the light must be blurred, else it is the source itself; and whether any ever was.
         self._blurs, self._any_blurs = np.zeros(count, bool), False
-        # Light (4, H, W), of a blur until its scene blurs another; `Exposure.remaining_variance` of
-        # it; and the exposure, where it must be blurred.
-        self._light, self._remaining_variance, self._exposure = np.empty((3, count), object)
+        self._blurred = np.zeros(count, np.uintp)  # its address
+        # Light (4, H, W) that it starts from; of captures that are not planned in columns,
+        # `Exposure.remaining_variance` and the exposure.
+        self._source, self._remaining_variance, self._exposure = np.empty((3, count), object)
+        self._any_remaining = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         made = partial(CaptureBatch, noise=self.noise, cache_light=self._cache_light)
@@ -137,16 +157,15 @@ class CaptureBatch:
 
     def forget(self, indices: np.ndarray) -> None:
         """See `FrameSource`; the memory is used again."""
-        count, objects = len(self.states), (self._light, self._remaining_variance, self._exposure)
+        count, objects = len(self.states), (self._source, self._remaining_variance, self._exposure)
         for index in indices.tolist():
             rows = slice(index * count, (index + 1) * count)
             self._gain[rows] = np.nan
-            for column in objects:
+            for column in objects[: 3 if self._any_remaining else 1]:
                 column[rows] = None
-            scene = self._scenes.pop(index, None)
-            if scene is not None:
-                scene.blurred_light.release()
-            self._blurred_row[index] = -1
+            self._scenes.pop(index, None)
+        self._frames.release(indices)
+        self._blurred_row[indices] = -1
 
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
         """See `FrameSource`."""
@@ -157,14 +176,18 @@ class CaptureBatch:
         if self._any_blurs:
             missing = self._blurs[rows] & (self._blurred_row[indices] != rows)
             if missing.any():
-                self._blur(indices[missing], rows[missing])
+                self._blur_frames(np.unique(rows[missing]))
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
         rows, remaining = indices * len(self.states) + states, None
-        if self._any_blurs:  # else all of the source's variance remains
+        if self._any_remaining:  # else all of the source's variance remains
             remaining = self._remaining_variance[rows]
-        return Transitions(self._light[rows], self._table[rows], remaining)
+        sources = self._source[rows]
+        light = addresses(sources)
+        if self._any_blurs:
+            light = np.where(self._blurs[rows], self._blurred[rows], light)
+        return Transitions(FramesAt(light, sources[0].shape), self._table[rows], remaining)
 
     def record(
         self,
@@ -207,79 +230,109 @@ class CaptureBatch:
     def prepared_scene(self, index: int) -> PreparedScene:
         """See `FrameSource`."""
         scene = self._scenes.get(index)
-        if scene is None:
-            scene = self._prepared(index)
-            # Scenes that are shown several times share their light, but not what is blurred of it.
-            light = scene.blurred_light.copy(pool=self._pool)
-            scene = self._scenes[index] = scene.changed(blurred_light=light)
-        return scene
+        return self._added(index) if scene is None else scene
 
     # -- planning -----------------------------------------------------------------------------
 
+    def _added(self, index: int) -> PreparedScene:
+        """The scene `index`, which is new, and its columns."""
+        scene = self._prepared(index)
+        # Scenes that are shown several times share their light, but not what is blurred of it.
+        scene = scene.changed(blurred_light=scene.blurred_light.copy())
+        if scene.box_factor not in self._targets:
+            noises = [self.camera.nlf(s.iso).scaled(scene.box_factor**-2) for s in self.states]
+            self._targets[scene.box_factor] = np.array([(n.shot, n.read) for n in noises])
+        widest = scene.defocus * 4.0 / self._columns["f_number"].min()
+        largest = max(*scene.light.shape[-2:], MAX_DISC_PX)  # beyond it, `decide` raises
+        self._in_columns[index] = (
+            scene.nlf.is_zero and scene.aperture_blur is None and widest <= largest
+        )
+        if self._in_columns[index]:
+            targets = list(self._targets).index(scene.box_factor)
+            self._scene_columns[index] = scene_column(scene, targets)
+            if scene.defocus or scene.image_speed or scene.movement.subject_speed:
+                self._statistics[index] = scene.statistics.columns
+        self._scenes[index] = scene
+        return scene
+
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
         """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
-        noisy, exposures = self.noise is not None, []
-        for index, row, gain in zip(indices.tolist(), rows.tolist(), gains.tolist(), strict=True):
-            scene, settings = self.prepared_scene(index), self.states[row % len(self.states)]
-            exposure = decide(scene, settings, gain=gain)
-            blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
-            self._blurs[row], self._exposure[row] = blurs, exposure if blurs else None
-            self._remaining_variance[row] = None  # `_begin_blur` knows it
-            self._any_blurs |= bool(blurs)
-            if not blurs:
-                self._light[row] = scene.blurred_light.source(exposure).contiguous()
-            excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
-            self._excess_variance[row] = excess
-            error = exposure.left_out
-            if not scene.nlf.is_zero:
-                shown = exposure if noisy else decide(scene, settings, noise=False, gain=gain)
-                error = math.hypot(*predict_errors(scene, settings, shown).values())
-            self._predicted_error[row] = error
-            found = noisy * _NOISE_BIT
-            for step in exposure.steps:
-                found |= step.runs << _STEPS.index(step.name)
-            self._modules[row] = found
-            exposures.append(exposure)
-        self._table[rows] = exposure_table(exposures)
+        scenes = [self.prepared_scene(index) for index in indices.tolist()]
+        inside = self._in_columns[indices]
+        others = np.flatnonzero(~inside).tolist()
+        for i in others:
+            self._plan_alone(scenes[i], int(rows[i]), float(gains[i]))
+        if len(others) < len(rows):
+            some, planned = np.flatnonzero(inside), rows[inside]
+            for i, row in zip(some.tolist(), planned.tolist(), strict=True):
+                self._source[row] = scenes[i].light.contiguous()
+            columns = self._blur, self._table, self._predicted_error
+            known = self._scene_columns, self._statistics, self._columns
+            targets, height = np.stack([*self._targets.values()]), scenes[0].light.shape[-2]
+            plan_frames(*known, targets, height, indices[inside], planned, gains[inside], *columns)
+            blur = self._blur[planned]
+            defocus, motion = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0
+            found = (self.noise is not None) * _NOISE_BIT + defocus * _BIT["defocus"]
+            self._modules[planned] = found + motion * _BIT["motion_blur"]
+            self._blurs[planned] = defocus | motion
+            self._excess_variance[planned] = 0.0
+        self._any_blurs |= bool(self._blurs[rows].any())
         self._gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
 
-    def _blur(self, indices: np.ndarray, rows: np.ndarray) -> None:
-        """Makes the light of `rows`, on as many threads as torch may use."""
-        planned = list(zip(indices.tolist(), rows.tolist(), strict=True))
+    def _plan_alone(self, scene: PreparedScene, row: int, gain: float) -> None:
+        """Works out a row for a scene with noise of its own, or one whose aperture opens."""
+        noisy, settings = self.noise is not None, self.states[row % len(self.states)]
+        exposure = decide(scene, settings, gain=gain)
+        self._blurs[row] = exposure.defocus_px or exposure.motion_px or exposure.opened_to
+        self._exposure[row], self._any_remaining = exposure, True
+        self._blur[row] = blur_column(exposure)
+        remaining = exposure.remaining_variance
+        remaining = None if remaining is None else remaining.float().contiguous()
+        self._remaining_variance[row] = remaining
+        if exposure.opened_to is None:  # else the network runs when the light is made
+            self._source[row] = scene.blurred_light.source(exposure).contiguous()
+        excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
+        self._excess_variance[row] = excess
+        error = exposure.left_out
+        if not scene.nlf.is_zero:
+            shown = exposure if noisy else decide(scene, settings, noise=False, gain=gain)
+            error = math.hypot(*predict_errors(scene, settings, shown).values())
+        self._predicted_error[row] = error
+        self._modules[row] = noisy * _NOISE_BIT
+        self._modules[row] += sum(_BIT[step.name] for step in exposure.steps if step.runs)
+        self._table[row] = exposure_table([exposure])[0]
+
+    def _blur_frames(self, rows: np.ndarray) -> None:
+        """Makes the light of `rows`, all different, on as many threads as torch may use."""
+        indices, states = np.divmod(rows, len(self.states))
+        alone = rows[~self._in_columns[indices]]
         try:
-            _each(self._open, planned)
-            begun = [self._begin_blur(index, row) for index, row in planned]
-            blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
-            _each(lambda task: task(), [(task,) for task in begun if callable(task)])
-            _each(self._balance, planned)
+            _each(self._open, [(row,) for row in alone.tolist()])
+            sources = self._source[rows]
+            light, shape = addresses(sources), tuple(sources[0].shape)
+            made = self._frames.make(indices, self._slots[states], self._blur[rows], light, shape)
+            self._blurred[rows] = made
+            for row in alone.tolist():
+                self._balance(row)
         except BaseException:  # some of the light is not made
             self.forget(indices)
             raise
         self._blurred_row[indices] = rows
 
-    def _open(self, index: int, row: int) -> None:
+    def _open(self, row: int) -> None:
         """Opens the aperture where that is needed; the scene caches its result."""
-        if self._exposure[row].opened_to is not None:
-            self._scenes[index].blurred_light.source(self._exposure[row])
+        exposure, lights = self._exposure[row], self._scenes[row // len(self.states)].blurred_light
+        if exposure.opened_to is not None:
+            self._source[row] = lights.source(exposure).contiguous()
+            if not self._cache_light:
+                lights.aperture_blur.forget()
 
-    def _begin_blur(self, index: int, row: int) -> Blur | Callable[[], None] | None:
-        exposure = self._exposure[row]
-        self._light[row], blur = self._scenes[index].blurred_light.begin(exposure)
-        remaining = exposure.remaining_variance
-        if remaining is not None:
-            remaining = remaining.float().contiguous()
-        self._remaining_variance[row] = remaining
-        return blur
-
-    def _balance(self, index: int, row: int) -> None:
+    def _balance(self, row: int) -> None:
         """Computes the excess variance where it depends on the pixels."""
-        exposure = self._exposure[row]
         if np.isnan(self._excess_variance[row]):
-            self._excess_variance[row], _ = noise_balance(self._light[row], exposure)
-        aperture_blur = self._scenes[index].aperture_blur
-        if exposure.opened_to is not None and aperture_blur is not None and not self._cache_light:
-            aperture_blur.forget()
+            light = FramesAt(self._blurred[[row]], tuple(self._source[row].shape))[0]
+            self._excess_variance[row], _ = noise_balance(light, self._exposure[row])
 
 
 def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:

@@ -22,7 +22,7 @@ from simulator.capture.decision import LIGHT_LIMIT, Exposure
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
-from simulator.optics.discs import HALO, Blur, DiscBank, disc_blur, kernel_energy
+from simulator.optics.discs import HALO, DiscBank, disc_blur, kernel_energy
 from simulator.optics.motion import Path, Taps, motion_blur, path_blur, path_blur_apart, path_taps
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
@@ -188,29 +188,11 @@ class NetworkApertureBlur(ApertureBlur):
 # -- all blur ---------------------------------------------------------------------------------
 
 
-class Pool:
-    """Memory for the light of a batch's scenes: new memory costs more than what is written to it.
-
-    `keeps` is `cache_light` of `simulator.capture.batch.CaptureBatch`.
-    """
-
-    def __init__(self, keeps: bool) -> None:
-        self.keeps, self.free = keeps, list[Tensor]()
-
-    def take(self, like: Tensor) -> Tensor:
-        """Memory of the shape of `like`, which all of a batch have."""
-        return self.free.pop() if self.free else torch.empty(like.shape)
-
-
 class BlurredLight:
     """Blurs a scene's light, each blur when it is first needed, and caches the latest.
 
-    Sweeps call `blurred`. In a batch `begin` says what has to be done, so that many scenes are
-    blurred side by side, into memory that is used again.
-
     `light` is (4, H, W) as recorded, `nlf` its noise. Wider apertures add the `aperture_blur`. The
-    cache takes `cache_bytes`; the light that was used longest ago goes first. `pool` is the memory
-    of a batch.
+    cache takes `cache_bytes`; the light that was used longest ago goes first.
     """
 
     def __init__(
@@ -220,26 +202,21 @@ class BlurredLight:
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
         cache_bytes: int = CACHE_BYTES,
-        pool: Pool | None = None,
     ) -> None:
         self.light, self.aperture_blur = light, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
         self._cache_bytes = cache_bytes
         self._banks: dict[object, DiscBank] = {}
-        self._pool = Pool(keeps=True) if pool is None else pool
-        self._defocused: dict[tuple[object, ...], Tensor] = {}  # by `Exposure.lens_blur`
-        self._streak: Tensor | None = None
-        self._latest: tuple[tuple[object, ...], Tensor] | None = None  # by `Exposure.blur`
 
     @property
     def known(self) -> tuple[NoiseLevelFunction, ApertureBlur | None]:
         """Its noise and its aperture blur."""
         return self.residuals.nlf, self.aperture_blur
 
-    def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
+    def copy(self, cache_bytes: int = CACHE_BYTES) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
-        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes, pool)
+        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes)
         copied.residuals = self.residuals
         return copied
 
@@ -271,69 +248,15 @@ class BlurredLight:
                 self._cache.put(exposure.lens_blur, light, light.nbytes)
         return light
 
-    def _defocus(self, source: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
-        """`source` (4, H, W) behind the lens of `exposure`; written to `out` on the CPU."""
+    def _defocus(self, source: Tensor, exposure: Exposure) -> Tensor:
+        """`source` (4, H, W) behind the lens of `exposure`."""
         if exposure.layout is None or not exposure.defocus_px:
-            light = disc_blur(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure.defocus_px)
-            return light if out is None else out.copy_(light)
+            return disc_blur(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure.defocus_px)
         # Exposures share most of their discs; on large frames they take too much memory.
         banks = self._banks if source.shape[-2] * source.shape[-1] <= TILE**2 else {}
         diameter = exposure.layout.defocus.to(source.device) * exposure.defocus_px
         key = exposure.denoised, exposure.opened_to
-        return _bank(banks, key, source).blurred(diameter, out)
-
-    # -- batches ------------------------------------------------------------------------------
-
-    def begin(self, exposure: Exposure) -> tuple[Tensor, Blur | Callable[[], None] | None]:
-        """The light (4, H, W) with every blur of `exposure`, and what is left to do to fill it.
-
-        It is valid until the next call. The latest is cached, because an agent that has settled
-        repeats its state; nothing is left to do then.
-        """
-        if self._latest is not None and self._latest[0] == exposure.blur:
-            return self._latest[1], None
-        light = self._defocused.get(exposure.lens_blur)
-        source = lens = streak = None
-        if light is None:
-            light = source = self.source(exposure).contiguous()
-            if exposure.defocus_px:
-                if not self._pool.keeps:
-                    self._drop_defocused()
-                light = lens = self._defocused[exposure.lens_blur] = self._pool.take(light)
-        if exposure.motion_px:
-            source = light if source is None else source
-            if self._streak is None:
-                self._streak = self._pool.take(light)
-            light = streak = self._streak
-        self._latest = (exposure.blur, light)
-        if source is None or (lens is None and streak is None):
-            return light, None
-        if exposure.is_uniform:
-            return light, Blur(source, exposure.defocus_px, lens, exposure.motion_px, streak)
-        return light, functools.partial(self._fill, exposure, source, lens, streak)
-
-    def _fill(
-        self, exposure: Exposure, source: Tensor, lens: Tensor | None, streak: Tensor | None
-    ) -> None:
-        """Blurs `source` into `lens` by the lens and into `streak` by motion, where given."""
-        if lens is not None:
-            source = self._defocus(source, exposure, lens)
-            if not self._pool.keeps:
-                self._banks.clear()
-        if streak is not None:
-            _motion_blurred(source, exposure, streak)
-
-    def release(self) -> None:
-        """Puts all memory back into the pool; the light of `begin` must not be used afterwards."""
-        self._drop_defocused()
-        if self._streak is not None:
-            self._pool.free.append(self._streak)
-        self._streak = self._latest = None
-
-    def _drop_defocused(self) -> None:
-        self._pool.free.extend(self._defocused.values())
-        self._defocused.clear()
-        self._banks.clear()
+        return _bank(banks, key, source).blurred(diameter)
 
     # -- noise of the source ------------------------------------------------------------------
 
@@ -363,16 +286,16 @@ class BlurredLight:
         return replace(exposure, energy=energy, remaining_variance=left)
 
 
-def _motion_blurred(light: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
+def _motion_blurred(light: Tensor, exposure: Exposure) -> Tensor:
     """`light` (4, H, W), behind the lens already, as it moves in `exposure`."""
     if exposure.path is None:
-        return motion_blur(light, exposure.motion_px, out, limit=LIGHT_LIMIT)
+        return motion_blur(light, exposure.motion_px, limit=LIGHT_LIMIT)
     height, width = light.shape[-2:]
     taps = path_taps(exposure.path, height, width)
     if exposure.subject_path is None or exposure.layout is None:
-        return path_blur(light, taps, out, limit=LIGHT_LIMIT)
+        return path_blur(light, taps, limit=LIGHT_LIMIT)
     own, layout = path_taps(exposure.subject_path, height, width), exposure.layout
-    return path_blur_apart(light, layout.mask, layout.behind, taps, own, out, limit=LIGHT_LIMIT)
+    return path_blur_apart(light, layout.mask, layout.behind, taps, own, limit=LIGHT_LIMIT)
 
 
 def _bank(banks: dict[Any, DiscBank], key: object, light: Tensor) -> DiscBank:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
@@ -23,6 +24,7 @@ from simulator.optics.discs import kernel_energy
 from simulator.optics.motion import Path
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
+from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
     from simulator.capture.prepared_scene import Layout, PreparedScene
@@ -44,7 +46,7 @@ PEDESTAL = 1.0 / 1024.0
 #: a blur takes grows with the square of it.
 MAX_DISC_PX = 512.0
 #: Second moment of a streak over that of a disc of the same extent, per axis: (1/12) / (1/16).
-_STREAK_TO_DISC = 4.0 / 3.0
+STREAK_TO_DISC = 4.0 / 3.0
 
 
 def check_tolerance(tolerance: float) -> float:
@@ -287,26 +289,50 @@ def _decide_blurs(wanted: _Wanted, noise_reduction: Step) -> list[Step]:
         missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
     if missing_noise > scene.tolerance:  # no network can mend it: blur has it all to itself
         missing_noise = 0.0
-    disc, row = _curvature(wanted, noise_reduction.network)
-    blurs, missing_blur = [], 0.0
-    for name, extent in wanted.extents.items():
+    extents, errors, runs = np.array([*wanted.extents.values()]), np.empty(3), np.empty(3, bool)
+    curvature = _curvature(wanted, noise_reduction.network)
+    weigh_blurs(extents, *curvature, missing_noise, scene.tolerance, errors, runs)
+    blurs = []
+    for i, (name, extent) in enumerate(wanted.extents.items()):
         if not extent:
             blurs.append(_without_blur(name, estimated, wanted.opens))
             continue
-        curvature = row if name == "motion_blur" else disc
-        error = math.inf if extent == math.inf else curvature * extent * extent
-        together = missing_blur + error
-        left_out = math.hypot(missing_noise, together) <= scene.tolerance
-        added = math.sqrt(error * (together + missing_blur)) if error else 0.0
-        if left_out:
-            missing_blur = together
-        reason = "the aperture opens and adds blur"
+        reason, added = "the aperture opens and adds blur", float(errors[i])
         if extent < math.inf:
-            reason = _BLUR_REASONS[name][left_out]
-        if not left_out and added < math.inf:
+            reason = _BLUR_REASONS[name][not runs[i]]
+        if runs[i] and added < math.inf:
             reason += _WITHOUT
-        blurs.append(Step(name, not left_out, reason, added, extent))
+        blurs.append(Step(name, bool(runs[i]), reason, added, extent))
     return blurs
+
+
+@kernel()
+def weigh_blurs(  # type: ignore[no-untyped-def]
+    extents, disc, row, missing_noise, tolerance, errors, runs
+):
+    """Which of aperture, defocus and motion blur run, and the error of leaving each out.
+
+    Args:
+        extents: (3,) of each [pixel]; inf where it is not known.
+        disc, row: `LightStatistics.curvature` of the light.
+        missing_noise: Error that cannot be mended, which counts as well.
+        tolerance: See `PreparedScene`.
+        errors, runs: (3,) to fill.
+    """
+    missing_blur = 0.0
+    for i in range(3):
+        errors[i], runs[i], extent = 0.0, False, extents[i]
+        if extent == 0.0:
+            continue
+        error = math.inf
+        if extent < math.inf:
+            error = (row if i == 2 else disc) * extent * extent
+        together = missing_blur + error
+        runs[i] = not math.hypot(missing_noise, together) <= tolerance
+        if error:
+            errors[i] = math.sqrt(error * (together + missing_blur))
+        if not runs[i]:
+            missing_blur = together
 
 
 def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, float]:
@@ -319,7 +345,7 @@ def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, f
     light = scene.blurred_light.statistics if network is None else network.statistics
     disc, row = light.curvature(wanted.ratio, wanted.target)
     # No second difference exceeds the Laplacian, in the root mean square: (k u)^4 <= |k|^4.
-    return disc, row if wanted.along_rows else _STREAK_TO_DISC * disc
+    return disc, row if wanted.along_rows else STREAK_TO_DISC * disc
 
 
 @functools.cache

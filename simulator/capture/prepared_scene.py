@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, cast, get_args
+from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 import torch
@@ -33,14 +33,6 @@ _TOGETHER_BYTES = 2**26
 MAX_IMAGE_SPEED = 1000.0
 #: Levels that `Layout.shares` counts defocus in.
 _LEVELS = 255
-
-
-class Shares(NamedTuple):
-    """A layout's pixels, counted; (K,) each, for K sorts of them."""
-
-    defocus: np.ndarray  # circle of confusion relative to the largest
-    subject: np.ndarray  # bool, whether they are the subject's
-    share: np.ndarray  # of all pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +98,19 @@ class Layout:
         return Layout(self.defocus[rows, columns], subject)
 
     @cached_property
-    def shares(self) -> Shares:
-        """The pixels, counted by defocus (in steps of 1/255) and subject."""
+    def shares(self) -> np.ndarray:
+        """(3, K) the pixels, counted by defocus (in steps of 1/255) and subject, in K sorts.
+
+        Their circle of confusion relative to the largest, whether they are the subject's, and
+        their share of all pixels.
+        """
         levels = (self.defocus * _LEVELS).round().int().numpy()
         if self.subject is not None:
             levels = levels + (_LEVELS + 1) * self.subject.numpy()
         sorts, counts = np.unique(levels, return_counts=True)
         subject = sorts > _LEVELS
         defocus = (sorts - (_LEVELS + 1) * subject) / _LEVELS
-        return Shares(defocus, subject, counts / levels.size)
+        return np.stack([defocus, subject, counts / levels.size])
 
     @cached_property
     def mask(self) -> torch.Tensor:
@@ -130,6 +126,18 @@ class Layout:
             self.subject.numpy(), return_distances=False, return_indices=True
         )
         return torch.from_numpy(rows.astype(np.int64) * self.subject.shape[1] + columns)
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Arrays that kernels find by their addresses: they never move, as tensors may.
+
+        (H, W) float32 `defocus`, and (K,) that of `shares`; of a subject also its (H, W) float32
+        `mask`, and int32 `behind`.
+        """
+        found = [self.defocus.numpy().copy(), self.shares[0].astype(np.float32)]
+        if self.subject is not None:
+            found += [self.mask.numpy().copy(), self.behind.numpy().astype(np.int32)]
+        return tuple(found)
 
 
 class HasPrepared(Protocol):

@@ -139,19 +139,20 @@ def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ig
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no-untyped-def]
-    """Root mean squares over bins of second differences in units of a target's noise (2, P)."""
+def curvature(columns, ratio, target):  # type: ignore[no-untyped-def]
+    """`LightStatistics.curvature` of its `columns`; `target` is (2, P) shot and read noise."""
     discs, rows = 0.0, 0.0
-    for plane in range(share.shape[0]):
+    for plane in range(columns.shape[1]):
         shot, read = target[0, plane], target[1, plane]
-        for index in range(share.shape[1]):
-            wanted = read + shot * ratio * light[plane, index]
-            wanted = wanted if wanted > floor else floor
+        for index in range(columns.shape[2]):
+            wanted = read + shot * ratio * columns[1, plane, index]
+            wanted = wanted if wanted > _FLOOR else _FLOOR
             # What the mean moves by, and with it the deviation of shot noise.
-            weight = share[plane, index] * (1.0 + shot * shot / wanted) / wanted
-            discs += weight * disc[plane, index]
-            rows += weight * row[plane, index]
-    return np.sqrt(discs), np.sqrt(rows)
+            weight = columns[0, plane, index] * (1.0 + shot * shot / wanted) / wanted
+            discs += weight * columns[2, plane, index]
+            rows += weight * columns[3, plane, index]
+    # m = d^2 / 16 and e^2 / 12
+    return abs(ratio) / 32.0 * np.sqrt(discs), abs(ratio) / 24.0 * np.sqrt(rows)
 
 
 # -- the statistics ---------------------------------------------------------------------------
@@ -200,11 +201,15 @@ class LightStatistics:
         moves the light by at most m / 2 times its discrete Laplacian, in the root mean square:
         ``1 - cos(k t) <= k^2 (1 - cos t)``.
         """
+        disc, row = curvature(self.columns, float(ratio), noise_numbers(target))
+        return float(disc), float(row)
+
+    @functools.cached_property
+    def columns(self) -> np.ndarray:
+        """(4, P, B): share, light, and squared second differences of bins, for `curvature`."""
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
-        squares = bins.edges[0], bins.disc, bins.row
-        disc, row = _curvature(bins.share, *squares, float(ratio), noise_numbers(target), _FLOOR)
-        return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
+        return np.stack([bins.share, bins.edges[0], bins.disc, bins.row])
 
     def blur_change(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction, *, noise: bool

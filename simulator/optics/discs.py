@@ -11,13 +11,11 @@ diameters and any f-number for the cost of a gather.
 
 from __future__ import annotations
 
-import bisect
 import functools
 import math
 import operator
 import sys
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numba
 import numpy as np
@@ -33,7 +31,6 @@ from simulator.optics.motion import (
     copy_row,
     has_kernels,
     motion_kernel,
-    move_rows,
     pad_rows,
     streak_share,
 )
@@ -49,7 +46,7 @@ _LONGEST_KERNEL = 4096.0
 #: the sum of a single image.
 _FFT_TAPS, _DIRECT_TAPS = 11, 25
 #: Discs wider than this are cheaper in the Fourier domain than as a sum, in a batch [pixel].
-_WIDE_PX = 40.0
+WIDE_PX = 40.0
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
 #: discs is within 2 % of the disc between them.
 DIAMETERS = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6, 32.0)
@@ -108,12 +105,12 @@ def _disc_coverage(radius: float) -> np.ndarray:
 
 
 @functools.cache
-def _radius_table() -> tuple[list[float], list[float]]:
+def _radius_table() -> tuple[np.ndarray, np.ndarray]:
     """Second moments per axis of covered discs, and their radii: the inverse is interpolated."""
     radii = np.concatenate([[0.5], 0.5 + np.geomspace(1e-4, 7.5, 700)])
     profiles = [_disc_coverage(radius).sum(0) for radius in radii]
     moments = np.array([(p * (np.arange(len(p)) - len(p) // 2) ** 2).sum() for p in profiles])
-    return np.maximum.accumulate(moments).tolist(), radii.tolist()
+    return np.maximum.accumulate(moments), radii
 
 
 def disc_radius(diameter_px: float) -> float:
@@ -127,9 +124,7 @@ def disc_radius(diameter_px: float) -> float:
     moments, radii = _radius_table()
     if target >= moments[-1]:
         return 2.0 * math.sqrt(target - 1.0 / 12.0)
-    i = bisect.bisect_right(moments, target)
-    share = (target - moments[i - 1]) / (moments[i] - moments[i - 1])
-    return radii[i - 1] + share * (radii[i] - radii[i - 1])
+    return float(np.interp(target, moments, radii))
 
 
 @functools.lru_cache(maxsize=64)
@@ -186,67 +181,15 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     return blurred.to(light.dtype).reshape(light.shape)
 
 
-class Blur(NamedTuple):
-    """One image for `blur_many`: a disc, a streak, or one after the other."""
-
-    light: Tensor  # (..., H, W) contiguous float32 on the CPU
-    diameter_px: float = 0.0  # of the disc [pixel]
-    defocused: Tensor | None = None  # like `light`, to write the image behind the disc to, if any
-    extent_px: float = 0.0  # of the streak [pixel]
-    moved: Tensor | None = None  # like `light`, to write the image behind both to; for a streak
-
-
-def blur_many(blurs: Sequence[Blur], *, limit: float = math.inf) -> None:
-    """Blurs images of one shape: as `disc_blur` and `motion_blur`, but each image on one thread.
-
-    Where a disc is wide, images are (P, H, W); `limit` is that of `motion_blur`.
-    """
-    wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
-    if wide:
-        parallel_ranges(lambda a, b: _wide_discs(wide[a:b], limit), len(wide))
-        blurs = [b for b in blurs if b.defocused is None or b.diameter_px <= _WIDE_PX]
-        moved_on = [b for b in wide if b.moved is not None]
-        blurs += [Blur(b.defocused, extent_px=b.extent_px, moved=b.moved) for b in moved_on]  # type: ignore[arg-type]
-    if not blurs:
-        return
-    # The costliest first, and dealt out in turn: every thread gets about as much to do.
-    shares = min(torch.get_num_threads(), len(blurs))
-    ranked = sorted(blurs, key=lambda blur: -blur.diameter_px)
-    blurs = [blur for share in range(shares) for blur in ranked[share::shares]]
-    light = blurs[0].light
-    height, width = light.shape[-2:]
-    planes = light.numel() // (height * width)
-    lights = addresses([blur.light for blur in blurs])
-    defocused = addresses([blur.defocused for blur in blurs])
-    moved = addresses([blur.moved for blur in blurs])
-    images, most = (planes, height, width, lights, defocused), np.float32(limit)
-    if defocused.any():
-        radius = np.array([disc_radius(blur.diameter_px) for blur in blurs])
-    if moved.any():
-        whole, end = np.array([streak_share(blur.extent_px) for blur in blurs]).T.copy()
-        streaks = (moved, whole.astype(np.int64), end)
-
-    def run(first: int, last: int) -> None:
-        if defocused.any():
-            _defocus_some(first, last, *images, radius, most)
-        if moved.any():
-            _move_some(first, last, *images, *streaks, most)
-
-    parallel_ranges(run, len(blurs))
-
-
-def _wide_discs(blurs: Sequence[Blur], limit: float) -> None:
-    """`disc_blur` by numpy, whose transforms are safe in a forked process."""
-    for blur in blurs:
-        assert blur.defocused is not None
-        weights = disc_kernel(blur.diameter_px)
-        radius = len(weights) // 2
-        light = np.clip(blur.light.numpy(), -limit, limit).astype(np.float64)
-        padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
-        size = padded.shape[-2:]
-        spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
-        blurred = np.fft.irfft2(spectrum, s=size)
-        blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
+def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarray) -> None:
+    """`disc_blur` (P, H, W) by numpy, whose transforms are safe in a forked process."""
+    weights = disc_kernel(diameter_px)
+    radius = len(weights) // 2
+    clipped = np.clip(light, -limit, limit).astype(np.float64)
+    padded = np.pad(clipped, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
+    size = padded.shape[-2:]
+    spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
+    out[...] = np.fft.irfft2(spectrum, s=size)[:, 2 * radius :, 2 * radius :]
 
 
 @_jit()
@@ -305,33 +248,11 @@ def _quadrant(radius):  # type: ignore[no-untyped-def]
     return weights, reach
 
 
-# Two kernels for the two blurs: what compiles slowly and is not needed is not compiled.
 @_jit()
-def _defocus_some(  # type: ignore[no-untyped-def]
-    first, last, planes, height, width, light, defocused, radius, limit
-):
-    """Images `first` to `last` behind discs; an address of 0 to write to leaves one out."""
-    shape = (planes * height, width)
-    for i in range(first, last):
-        if defocused[i]:
-            rows = numba.carray(as_pointer(light[i]), shape)  # type: ignore[attr-defined, call-arg]
-            out = numba.carray(as_pointer(defocused[i]), shape)
-            weights, reach = _quadrant(radius[i])
-            _disc(0, len(rows), height, rows, weights, reach, limit, out)
-
-
-@_jit()
-def _move_some(  # type: ignore[no-untyped-def]
-    first, last, planes, height, width, light, defocused, moved, whole, end, limit
-):
-    """Images `first` to `last` behind streaks, of what is `defocused` where there is that."""
-    shape = (planes * height, width)
-    for i in range(first, last):
-        if moved[i]:
-            source = defocused[i] if defocused[i] else light[i]
-            rows = numba.carray(as_pointer(source), shape)  # type: ignore[attr-defined, call-arg]
-            out = numba.carray(as_pointer(moved[i]), shape)
-            move_rows(0, len(rows), rows, whole[i], end[i], limit, out)
+def disc_image(image, height, radius, limit, out):  # type: ignore[no-untyped-def]
+    """Planes (P * H, W) behind a disc of `radius`."""
+    weights, reach = _quadrant(radius)
+    _disc(0, len(image), height, image, weights, reach, limit, out)
 
 
 # -- a bank of discs --------------------------------------------------------------------------
@@ -381,19 +302,15 @@ class DiscBank:
         """`blurred` by kernels, by `diameter` (H, W)."""
         diameters, knots = diameter.contiguous().numpy(), _KNOTS.astype(np.float32)
         used = np.zeros(len(knots), np.bool_)
-        _mark(diameters, knots, used)
-        light, indices = self._levels[0].contiguous(), np.flatnonzero(used).tolist()
-        made = {i: torch.empty_like(light) for i in indices if i not in self._levels}
-        # Several levels side by side wake the other threads once.
-        blur_many([Blur(light, DIAMETERS[index], level) for index, level in made.items()])
-        self._levels |= made
+        mark_levels(diameters.reshape(-1), _ONE, np.float32(0), knots, used)
+        light = self._levels[0].contiguous()
         # Levels without a share are read too, times 0: any image does.
-        levels = [self._levels[i].contiguous() if used[i] else light for i in range(len(knots))]
+        levels = [self.level(i).contiguous() if used[i] else light for i in range(len(knots))]
         out = new_frame(light) if out is None else out
-        fixed = (diameters, knots, addresses(levels), out.numel())
+        fixed = (diameters, _ONE, knots, addresses(levels), 0, out.numel())
         result, (height, width) = out.numpy().reshape(-1, *out.shape[-2:]), out.shape[-2:]
         least = 1 + _WORTH_A_THREAD // width
-        parallel_ranges(lambda a, b: _blend(a, b, *fixed, result), height, least=least)
+        parallel_ranges(lambda a, b: blend_rows(a, b, *fixed, result), height, least=least)
         return out
 
 
@@ -475,9 +392,9 @@ def _correlations() -> np.ndarray:
 # Each pixel looks up the two images around its squared diameter and interpolates between them: no
 # weight is ever stored for a whole frame, and no image is read where it has none.
 @_blend_jit()
-def _square(diameter, largest, out):  # type: ignore[no-untyped-def]
+def _square(diameter, scale, largest, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
-        squared = diameter[x] * diameter[x]
+        squared = (diameter[x] * scale) * (diameter[x] * scale)
         out[x] = squared if squared < largest else largest
 
 
@@ -503,8 +420,14 @@ def _place(squared, knots, index, share):  # type: ignore[no-untyped-def]
 
 
 @_blend_jit()
-def _blend(first, last, diameter, knots, images, samples, out):  # type: ignore[no-untyped-def]
-    """Rows from `first` to `last`; `images` are the addresses of (P, H, W)."""
+def blend_rows(  # type: ignore[no-untyped-def]
+    first, last, diameter, scale, knots, images, begin, samples, out
+):
+    """Rows of `DiscBank.blurred` from `first` to `last`, by `scale` times `diameter` (H, W).
+
+    `images` are the addresses of the image behind the disc at each of `knots`, of so many
+    `samples`; `out` (P, H, W) is what begins at the sample `begin` of them.
+    """
     planes, height, width = out.shape
     squares, shares = np.empty(_BLENDED, np.float32), np.empty(_BLENDED, np.float32)
     indexes = np.empty(_BLENDED, np.int32)
@@ -513,11 +436,11 @@ def _blend(first, last, diameter, knots, images, samples, out):  # type: ignore[
             end = min(start + _BLENDED, width)
             size = end - start
             squared, index, share = squares[:size], indexes[:size], shares[:size]
-            _square(diameter[y, start:end], knots[-1], squared)
+            _square(diameter[y, start:end], scale, knots[-1], squared)
             _place(squared, knots, index, share)
             for plane in range(planes):
                 target = out[plane, y, start:end]
-                offset = (plane * height + y) * width + start
+                offset = begin + (plane * height + y) * width + start
                 for x in range(size):
                     pointer = as_pointer(images[index[x]])  # type: ignore[call-arg, var-annotated]
                     one = numba.carray(pointer, (samples,))
@@ -527,14 +450,17 @@ def _blend(first, last, diameter, knots, images, samples, out):  # type: ignore[
 
 
 @_blend_jit()
-def _mark(diameter, knots, used):  # type: ignore[no-untyped-def]
-    """Marks the images that some pixel has a share of."""
-    for y in range(len(diameter)):
-        for x in range(diameter.shape[1]):
-            squared = min(diameter[y, x] * diameter[y, x], knots[-1])
-            index = _below(knots, squared)
-            used[index] |= squared < knots[index + 1]
-            used[index + 1] |= squared > knots[index]
+def mark_levels(diameter, scale, spread, knots, used):  # type: ignore[no-untyped-def]
+    """Marks the images that `scale` times some `diameter` (N,), +- `spread`, has a share of."""
+    for x in range(len(diameter)):
+        least = max(diameter[x] - spread, np.float32(0)) * scale
+        index = _below(knots, min(least * least, knots[-1]))
+        used[index] |= least * least < knots[index + 1]
+        most = (diameter[x] + spread) * scale
+        last = _below(knots, min(most * most, knots[-1]))
+        used[last] |= most * most < knots[last + 1]
+        used[index + 1 : last + 1] = True
+        used[last + 1] |= most * most > knots[last]
 
 
 @_blend_jit()

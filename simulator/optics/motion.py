@@ -82,11 +82,6 @@ class Movement:
         shake = self.path(speed, time, height)
         return shake._replace(drift_x=own * math.cos(angle), drift_y=own * math.sin(angle))
 
-    def subject_extent(self, speed: float, times: np.ndarray) -> np.ndarray:
-        """Lengths of the subject's path [frame heights] in exposures of `times` (S,) [s]."""
-        paths = [self.subject_path(speed, time, 1) for time in times.tolist()]
-        return np.array([_length(*path) for path in paths])
-
 
 #: That of an image which moves along the rows, wherever it has a speed.
 ALONG_ROWS = Movement()
@@ -104,14 +99,14 @@ class Path(NamedTuple):
     @property
     def length(self) -> float:
         """Length of the whole path [pixel]."""
-        if not (self.drift_x or self.drift_y):
-            return self.extent
-        return float(_length(*self))
+        return float(path_length(*self))
 
 
 @_jit()
-def _length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyped-def]
+def path_length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyped-def]
     """`Path.length`, by the midpoint rule."""
+    if drift_x == 0.0 and drift_y == 0.0:
+        return extent
     total = 0.0
     for i in range(_LENGTH_POINTS):
         angle = direction + turn * (i + 0.5) / _LENGTH_POINTS
@@ -122,7 +117,8 @@ def _length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyp
 # -- streaks along the rows -------------------------------------------------------------------
 
 
-def streak_share(extent_px: float) -> tuple[int, float]:
+@_jit()
+def streak_share(extent_px):  # type: ignore[no-untyped-def]
     """Pixels n that a streak covers whole on either side, and its share e of one more.
 
     Both 0 where the extent is too small to blur anything.
@@ -303,7 +299,7 @@ def move_rows(first, last, rows, n, end, limit, out):  # type: ignore[no-untyped
 
 
 class Taps(NamedTuple):
-    """Weighted shifts, K of them, a multiple of 4: the last may have no weight."""
+    """Weighted shifts, K of them, a multiple of 8: the last may have no weight."""
 
     rows: np.ndarray  # (K,) int64, by how many rows down each looks
     columns: np.ndarray  # (K,) int64, by how many columns to the right
@@ -317,22 +313,32 @@ def path_taps(path: Path, height: int, width: int) -> Taps:
     Shifts beyond the frame show its border whatever they are, so however long a path is, its taps
     are about as many as the frame is high and wide.
     """
-    if path.turn == path.drift_y == 0.0 and path.direction == 0.0:
-        return _streak_taps(path.extent + path.drift_x, width)
-    count = math.ceil(min(max(_POINTS_PER_PIXEL * path.length, 8.0), _MOST_POINTS))
-    return Taps(*_rasterised(*path, count, height, width))
+    return Taps(*taps_of(*map(float, path), height, width))
 
 
-def _streak_taps(extent_px: float, width: int) -> Taps:
+@_jit()
+def taps_of(extent, direction, turn, drift_x, drift_y, height, width):  # type: ignore[no-untyped-def]
+    """Rows, columns and weights of `path_taps`, inside kernels."""
+    if turn == 0.0 and drift_y == 0.0 and direction == 0.0:
+        return _streak_taps(abs(extent + drift_x), width)
+    length = path_length(extent, direction, turn, drift_x, drift_y)
+    count = math.ceil(min(max(_POINTS_PER_PIXEL * length, 8.0), _MOST_POINTS))
+    return _rasterised(extent, direction, turn, drift_x, drift_y, count, height, width)
+
+
+@_jit()
+def _streak_taps(extent_px, width):  # type: ignore[no-untyped-def]
     """The taps of a streak along the rows, as `motion_kernel` has them."""
-    n, end = streak_share(abs(extent_px))
-    weights = np.ones(2 * n + 3)
-    weights[0] = weights[-1] = end
-    columns = np.clip(np.arange(-n - 1, n + 2), 1 - width, width - 1)
-    found, index = np.unique(columns, return_inverse=True)
-    total = np.bincount(index, weights / weights.sum(), len(found)).astype(np.float32)
-    fill = (0, -len(found) % 4)
-    return Taps(np.zeros(len(found) + fill[1], np.int64), np.pad(found, fill), np.pad(total, fill))
+    n, end = streak_share(extent_px)
+    reach = min(n + 1, width - 1)
+    size = (2 * reach + 8) // 8 * 8
+    rows, columns, weights = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size)
+    for k in range(2 * reach + 1):
+        columns[k], weights[k] = k - reach, 1.0
+    # The border stands for what lies beyond it, of which the last pixel has a share.
+    beyond = n + 1 - reach
+    weights[0] = weights[2 * reach] = end + beyond if reach else 1.0
+    return rows, columns, (weights / weights.sum()).astype(np.float32)
 
 
 @_jit()
@@ -395,7 +401,7 @@ def _rasterised(  # type: ignore[no-untyped-def]
                 share = x[i] - column if over else 1.0 - (x[i] - column)
                 grid[inside, min(max(column + over, left), right) - left] += part * share
     number = (grid > _LEAST_WEIGHT).sum()
-    size = (number + 3) // 4 * 4
+    size = (number + 7) // 8 * 8
     rows, columns = np.zeros(size, np.int64), np.zeros(size, np.int64)
     weights = np.zeros(size)
     k = 0
@@ -408,51 +414,66 @@ def _rasterised(  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _blur_rows(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
-    """Sums of shifted rows, four taps at a time."""
-    height, width = planes.shape[1:]
-    reach = 0
-    for column in columns:
-        reach = max(reach, abs(column))
-    padded = np.empty((height, width + 2 * reach), np.float32)
-    for plane in range(len(planes)):
-        pad_rows(planes[plane], 0, 0, height, reach, limit, padded)
-        for y in range(height):
-            total = out[plane, y]
-            total[:] = np.float32(0)
-            for k in range(0, len(weights), 4):
-                a = padded[min(max(y + rows[k], 0), height - 1), reach + columns[k] :]
-                b = padded[min(max(y + rows[k + 1], 0), height - 1), reach + columns[k + 1] :]
-                c = padded[min(max(y + rows[k + 2], 0), height - 1), reach + columns[k + 2] :]
-                d = padded[min(max(y + rows[k + 3], 0), height - 1), reach + columns[k + 3] :]
-                own = weights[k : k + 4]
-                for x in range(width):
-                    total[x] += (own[0] * a[x] + own[1] * b[x]) + (own[2] * c[x] + own[3] * d[x])
+def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
+    """Rows from `first` to `last` of a plane (H, W) as sums of its shifts, eight at a time."""
+    height, width = plane.shape
+    reach = down = 0
+    for k in range(len(weights)):
+        reach, down = max(reach, abs(columns[k])), max(down, abs(rows[k]))
+    pitch = width + 2 * reach
+    padded = np.empty((last - first + 2 * down, pitch), np.float32)
+    pad_rows(plane, first - down, 0, height, reach, limit, padded)
+    flat, offsets = padded.reshape(-1), (rows + down) * pitch + columns + reach
+    for y in range(first, last):
+        total, at = out[y], (y - first) * pitch
+        for k in range(0, len(weights), 8):
+            a, b = flat[at + offsets[k] :], flat[at + offsets[k + 1] :]
+            c, d = flat[at + offsets[k + 2] :], flat[at + offsets[k + 3] :]
+            e, f = flat[at + offsets[k + 4] :], flat[at + offsets[k + 5] :]
+            g, h = flat[at + offsets[k + 6] :], flat[at + offsets[k + 7] :]
+            w = weights[k : k + 8]
+            if k == 0:
+                total[:] = np.float32(0)
+            for x in range(width):
+                low = (w[0] * a[x] + w[1] * b[x]) + (w[2] * c[x] + w[3] * d[x])
+                high = (w[4] * e[x] + w[5] * f[x]) + (w[6] * g[x] + w[7] * h[x])
+                total[x] += low + high
 
 
 @_jit()
-def _blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
+def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
     """Background along `taps`, the subject in front of it along `own`; see `path_blur_apart`."""
     count, height, width = planes.shape
-    split = np.empty((1, height, width), np.float32)
+    split = np.empty((height, width), np.float32)
     front, cover = np.empty_like(split), np.empty_like(split)
-    _blur_rows(mask, own[0], own[1], own[2], limit, cover)
+    # The rows that the subject is smeared over.
+    down, first, last = np.abs(own[0]).max(), height, 0
+    for y in range(height):
+        if mask[y].any():
+            first, last = min(first, max(y - down, 0)), min(y + down + 1, height)
+    blur_rows(first, last, mask, own[0], own[1], own[2], limit, cover)
     for plane in range(count):
-        flat = planes[plane].reshape(-1)
+        flat, result = planes[plane].reshape(-1), out[plane]
         for y in range(height):
             for x in range(width):
-                split[0, y, x] = flat[behind[y, x]]
-        _blur_rows(split, taps[0], taps[1], taps[2], limit, out[plane : plane + 1])
+                split[y, x] = flat[np.uint64(behind[y, x])]
+        blur_rows(0, height, split, taps[0], taps[1], taps[2], limit, result)
         for y in range(height):
             for x in range(width):
                 value = planes[plane, y, x]
                 value = value if value < limit else limit
-                split[0, y, x] = mask[0, y, x] * (value if value > -limit else -limit)
-        _blur_rows(split, own[0], own[1], own[2], limit, front)
-        for y in range(height):
+                split[y, x] = mask[y, x] * (value if value > -limit else -limit)
+        blur_rows(first, last, split, own[0], own[1], own[2], limit, front)
+        for y in range(first, last):
             for x in range(width):
-                seen = max(np.float32(1) - cover[0, y, x], np.float32(0))
-                out[plane, y, x] = seen * out[plane, y, x] + front[0, y, x]
+                seen = max(np.float32(1) - cover[y, x], np.float32(0))
+                result[y, x] = seen * result[y, x] + front[y, x]
+
+
+@_jit()
+def _blur_planes(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
+    for plane in range(len(planes)):
+        blur_rows(0, planes.shape[1], planes[plane], rows, columns, weights, limit, out[plane])
 
 
 def path_blur(
@@ -463,7 +484,7 @@ def path_blur(
     It is blurred on the CPU wherever it lies; `out` and `limit` are those of `motion_blur`.
     """
     most = np.float32(limit)
-    return _by_planes(light, out, lambda planes, to: _blur_rows(planes, *taps, most, to))
+    return _by_planes(light, out, lambda planes, to: _blur_planes(planes, *taps, most, to))
 
 
 def path_blur_apart(
@@ -488,8 +509,8 @@ def path_blur_apart(
         taps, own: Of the background's path, K_b, and of the subject's, K_s.
         out, limit: See `motion_blur`.
     """
-    fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
-    return _by_planes(light, out, lambda planes, to: _blur_apart(planes, *fixed, to))
+    fixed = (mask[0].numpy(), behind.int().numpy(), tuple(taps), tuple(own), np.float32(limit))
+    return _by_planes(light, out, lambda planes, to: blur_apart(planes, *fixed, to))
 
 
 def _by_planes(

@@ -15,6 +15,7 @@ Where nothing was read there is an `IncidentPosterior`, from what a camera knows
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -103,7 +104,7 @@ class IncidentLight:
     spread: float
     reflected_ev100: float | None
 
-    @property
+    @functools.cached_property
     def right_ev100(self) -> np.ndarray:
         """(1,) EV100 of the right exposure; (16,), equally likely, where the light is not known."""
         likely = np.array([0.0] if self.spread == 0.0 else _LIKELY)

@@ -1,7 +1,7 @@
 """The terms against the published formulas, and score tables against many captures."""
 
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -204,7 +204,9 @@ def test_sharpness_of_all_states_at_once_is_that_of_each_capture(layout, movemen
     found = tables.term_scores.closed_form_terms(scene, prepared, "blur")
     for index, state in enumerate(BLUR_GRID):
         numbers = {"speed": np.array([0.2]), "defocus": np.array([6.0]), "gain": np.ones(1)}
-        capture = describe_captures([scene], [state], CAMERA, movements=[movement], **numbers)
+        capture = describe_captures(
+            [scene], [state], CAMERA, movements=np.array([astuple(movement)]), **numbers
+        )
         assert Sharpness()(None, capture).item() == found["sharpness"][index]
 
 

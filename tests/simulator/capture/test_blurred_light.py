@@ -12,6 +12,7 @@ from scipy.ndimage import correlate
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import batch as batch_module
+from simulator.capture import columns
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.decision import Exposure
@@ -321,12 +322,13 @@ def test_forgotten_scenes_are_asked_for_again() -> None:
     np.testing.assert_array_equal(after, first)
 
 
-@pytest.mark.parametrize("stage", ["blur_many", "decide"])
+@pytest.mark.parametrize("stage", ["_run", "decide"])
 def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
     """While the light is blurred, or while the plan of a later frame is made."""
     batch, calls = made(), []
     photographed(batch, 0)
-    original = getattr(batch_module, stage)
+    module = columns if stage == "_run" else batch_module
+    original = getattr(module, stage)
 
     def fail(*args, **kwargs):
         calls.append(args)
@@ -335,7 +337,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(batch_module, stage, fail)
+        patch.setattr(module, stage, fail)
         with pytest.raises(KeyboardInterrupt):
             photographed(batch, 1)
     for states in (1, 0):

@@ -1,0 +1,416 @@
+"""A batch of captures in columns: how each is exposed and blurred, and the passes that do it.
+
+`plan_frames` is `simulator.capture.decision.decide` for scenes without noise of their own, many at
+a time. `BlurredFrames` makes the light behind lens and motion, as
+`simulator.capture.blurred_light.BlurredLight` does for one, in memory that is used again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from simulator.capture.decision import (
+    LIGHT_LIMIT,
+    RATIO_LIMIT,
+    STREAK_TO_DISC,
+    Exposure,
+    weigh_blurs,
+)
+from simulator.capture.prepared_scene import Layout, PreparedScene
+from simulator.capture.statistics import curvature
+from simulator.optics.discs import (
+    DIAMETERS,
+    WIDE_PX,
+    blend_rows,
+    disc_image,
+    disc_radius,
+    mark_levels,
+    wide_disc,
+)
+from simulator.optics.motion import (
+    Path,
+    blur_apart,
+    blur_rows,
+    move_rows,
+    path_length,
+    streak_share,
+    taps_of,
+)
+from simulator.settings import CameraSettings
+from simulator.utils.compute import as_pointer, kernel, parallel_ranges
+
+_Fields = list[tuple[str, str]]
+#: Addresses of arrays of a layout, 0 for none: (H, W) float32 diameters relative to the largest;
+#: float32 diameters that pixels have, and how many these are; and of a subject that moves, (H, W)
+#: float32 mask, and int32 pixels behind it.
+_LAYOUT: _Fields = [(n, "uintp") for n in ("diameter", "sorts", "num_sorts", "mask", "behind")]
+#: All of a scene that the exposure of a capture depends on; see `PreparedScene`.
+SCENE = np.dtype(
+    [
+        *((n, "f8") for n in ("log2_reference", "gain", "tolerance", "speed", "defocus")),
+        *((n, "f8") for n in ("direction", "turn", "subject_speed", "subject_direction")),
+        ("targets", "i8"),  # which noise of the camera its captures have
+        ("streaks", "?"),  # whether the whole frame moves along the rows
+        *_LAYOUT,
+    ]
+)
+#: The blurs of a capture.
+BLUR = np.dtype(
+    [
+        ("defocus_px", "f8"),  # diameter of the largest disc [pixel]
+        ("motion_px", "f8"),  # how far the image moves at most [pixel]
+        ("streaks", "?"),
+        # The background's path, see `simulator.optics.motion.Path`; and how the subject drifts.
+        *((n, "f8") for n in ("extent", "direction", "turn", "drift_x", "drift_y")),
+        *_LAYOUT,
+    ]
+)
+#: All of a state that the exposure of a capture depends on.
+STATE = np.dtype([(name, "f8") for name in ("log2_exposure", "time", "f_number")])
+#: Frames of memory that are made at once; and samples of a frame whose planes are shared out.
+_SLAB, _LARGE = 64, 2**16
+#: Steps in which `Layout.shares` counts defocus, and a bit more than half of one.
+_HALF_STEP = np.float32(0.51 / 255)
+_KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
+_MOST = np.float32(LIGHT_LIMIT)
+_jit = functools.partial(kernel, fastmath={"contract"})
+
+
+# -- plans ------------------------------------------------------------------------------------
+
+
+def state_columns(states: Sequence[CameraSettings]) -> np.ndarray:
+    """(S,) `STATE`."""
+    numbers = [(s.log2_exposure, s.exposure_time, s.effective_f_number) for s in states]
+    return np.array(numbers, STATE)
+
+
+def scene_column(scene: PreparedScene, targets: int) -> tuple[Any, ...]:
+    """The `SCENE` of a scene."""
+    movement, layout = scene.movement, scene.layout
+    apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0
+    own = movement.subject_speed if apart else 0.0
+    return (
+        *(scene.reference.log2_exposure, scene.gain, scene.tolerance),
+        *(scene.image_speed, scene.defocus),
+        *(movement.direction, movement.turn, own, movement.subject_direction),
+        *(targets, movement.along_rows and not apart),
+        *_addresses(layout, apart),
+    )
+
+
+def blur_column(exposure: Exposure) -> tuple[Any, ...]:
+    """The `BLUR` of an exposure."""
+    path, own = exposure.path, exposure.subject_path
+    if path is None:
+        path = Path(exposure.motion_px)
+    drift = (0.0, 0.0) if own is None else own[3:]
+    numbers = exposure.defocus_px, exposure.motion_px, exposure.path is None
+    return (*numbers, *path[:3], *drift, *_addresses(exposure.layout, own is not None))
+
+
+def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
+    """The fields `_LAYOUT`."""
+    arrays = () if layout is None else layout.arrays[: 4 if subject else 2]
+    found = [array.ctypes.data for array in arrays] + [0] * (4 - len(arrays))
+    return (*found[:2], arrays[1].size if arrays else 0, *found[2:])
+
+
+@_jit()
+def plan_frames(  # type: ignore[no-untyped-def]
+    scenes, statistics, states, targets, height, indices, rows, gains, blurs, table, error
+):
+    """Plans `rows` of the columns `blurs`, `table` and `error`, which it fills.
+
+    Args:
+        scenes, statistics: `SCENE` and `LightStatistics.columns` of all scenes.
+        states, targets: `STATE`, and (T, S, 2, 4) shot and read noise of their captures.
+        height: Of the frames [pixel].
+        indices, rows, gains: (K,) scene, row, and light relative to the scene's own.
+        blurs, table, error: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, and (N,) error of the
+            blurs that are left out.
+    """
+    extents, errors, runs = np.zeros(3), np.empty(3), np.empty(3, np.bool_)
+    for k in range(len(rows)):
+        row, at = rows[k], rows[k] % len(states)
+        scene, state, blur = scenes[indices[k]], states[at], blurs[row]
+        target, time = targets[scene.targets, at], state.time
+        ratio = 2.0 ** (state.log2_exposure - scene.log2_reference)
+        ratio = min(scene.gain * gains[k] * ratio, RATIO_LIMIT)
+        drift = scene.subject_speed * time * height
+        blur.extent = moved = scene.speed * time * height
+        blur.direction, blur.turn, blur.streaks = scene.direction, scene.turn * time, scene.streaks
+        blur.drift_x = drift * math.cos(scene.subject_direction)
+        blur.drift_y = drift * math.sin(scene.subject_direction)
+        if drift > 0.0:
+            own = path_length(moved, blur.direction, blur.turn, blur.drift_x, blur.drift_y)
+            moved = max(moved, own)
+        extents[1], extents[2] = scene.defocus * 4.0 / state.f_number, moved
+        disc = line = math.inf
+        if scene.tolerance > 0.0 and extents[1] + moved > 0.0:
+            disc, line = curvature(statistics[indices[k]], ratio, target)
+            line = line if scene.streaks else STREAK_TO_DISC * disc
+        weigh_blurs(extents, disc, line, 0.0, scene.tolerance, errors, runs)
+        blur.defocus_px = extents[1] if runs[1] else 0.0
+        blur.motion_px = moved if runs[2] else 0.0
+        blur.diameter, blur.sorts = scene.diameter, scene.sorts
+        blur.num_sorts, blur.mask, blur.behind = scene.num_sorts, scene.mask, scene.behind
+        left_out = 0.0
+        for i in range(1, 3):
+            if not runs[i]:
+                left_out += errors[i] * errors[i]
+        error[row] = math.sqrt(left_out)
+        for plane in range(4):
+            table[row, 0, plane] = ratio
+            table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
+            table[row, 3, plane] = table[row, 4, plane] = 0.0
+
+
+# -- blurred light ----------------------------------------------------------------------------
+
+
+class FramesAt(Sequence[torch.Tensor]):
+    """Contiguous float32 frames of one shape, known by their `addresses` (B,)."""
+
+    def __init__(self, addresses: np.ndarray, shape: tuple[int, ...]) -> None:
+        self.addresses, self._shape = addresses, shape
+
+    def __len__(self) -> int:
+        return len(self.addresses)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return torch.from_numpy(_frame_at(int(self.addresses[index]), self._shape))
+
+
+def _frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
+    kind = ctypes.c_float * math.prod(shape)
+    return np.frombuffer(kind.from_address(address), np.float32).reshape(shape)
+
+
+class BlurredFrames:
+    """Blurred light of a batch's scenes, each frame (4, H, W), in memory that is used again.
+
+    With `keeps` the light behind the lens is cached for each of `num_apertures`, and the discs that
+    it is blended of; else only the latest.
+    """
+
+    def __init__(self, num_scenes: int, num_apertures: int, keeps: bool) -> None:
+        self.keeps = keeps
+        slots = (num_scenes, num_apertures if keeps else 1)
+        # Addresses, 0 for none; and the light and the diameter that they were made of.
+        self._lens, self._source = np.zeros((2, *slots), np.uintp)
+        self._diameter = np.zeros(slots)
+        self._levels = np.zeros((num_scenes, len(DIAMETERS)), np.uintp)
+        self._levels_source, self._moved = np.zeros((2, num_scenes), np.uintp)
+        self._slabs, self._free = list[np.ndarray](), np.empty(0, np.uintp)
+
+    def _take(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
+        """Addresses of memory for `count` frames."""
+        lacking = count - len(self._free)
+        if lacking > 0:
+            slab = np.empty((max(lacking, _SLAB), math.prod(shape)), np.float32)
+            self._slabs.append(slab)
+            places = slab.ctypes.data + np.arange(len(slab)) * slab.strides[0]
+            self._free = np.concatenate([self._free, places.astype(np.uintp)])
+        taken, self._free = np.split(self._free, [count])
+        return taken
+
+    def release(self, indices: np.ndarray) -> None:
+        """Frees the memory of the scenes `indices`."""
+        self._release_levels(indices)
+        held = np.concatenate([self._lens[indices].ravel(), self._moved[indices]])
+        self._free = np.concatenate([self._free, held[held > 0]])
+        self._lens[indices] = self._moved[indices] = 0
+
+    def _release_levels(self, indices: np.ndarray) -> None:
+        held = self._levels[indices].ravel()
+        self._free = np.concatenate([self._free, held[held > 0]])
+        self._levels[indices] = 0
+
+    def make(
+        self,
+        indices: np.ndarray,
+        slots: np.ndarray,
+        blurs: np.ndarray,
+        source: np.ndarray,
+        shape: tuple[int, ...],
+    ) -> np.ndarray:
+        """(K,) addresses of the light of scenes `indices`, all different, behind their blurs.
+
+        `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the addresses of the light
+        (4, H, W) that they start from. Each stays until its scene blurs another.
+        """
+        slots = slots if self.keeps else np.zeros_like(slots)
+        behind_lens = blurs["defocus_px"] > 0.0
+        known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
+        known &= self._diameter[indices, slots] == blurs["defocus_px"]
+        new = np.flatnonzero(behind_lens & ~known)
+        lens_to, levels = np.zeros(len(indices), np.uintp), np.zeros((len(indices), 13), np.uintp)
+        if len(new):
+            where = indices[new], slots[new]
+            lacking = self._lens[where] == 0
+            self._lens[where[0][lacking], where[1][lacking]] = self._take(lacking.sum(), shape)
+            self._source[where], self._diameter[where] = source[new], blurs["defocus_px"][new]
+            lens_to[new] = self._lens[where]
+            levels[new] = self._made_levels(where[0], blurs[new], source[new], shape)
+        light = np.where(behind_lens, self._lens[indices, slots], source)
+        moves = np.flatnonzero(blurs["motion_px"] > 0.0)
+        moved_to = np.zeros_like(light)
+        if len(moves):
+            lacking = indices[moves][self._moved[indices[moves]] == 0]
+            self._moved[lacking] = self._take(len(lacking), shape)
+            moved_to[moves] = self._moved[indices[moves]]
+        radii = np.zeros(len(indices))
+        for i in new[blurs["diameter"][new] == 0].tolist():  # one disc everywhere
+            diameter = float(blurs["defocus_px"][i])
+            if diameter > WIDE_PX:
+                frames = _frame_at(int(source[i]), shape), _frame_at(int(lens_to[i]), shape)
+                wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
+                lens_to[i] = 0
+            else:
+                radii[i] = disc_radius(diameter)
+        jobs = lens_to, light, moved_to, source, radii, blurs, levels
+        _run(blur_frames, _cost(blurs, lens_to, moved_to), shape, *jobs)
+        if not self.keeps:
+            self._release_levels(indices[new])
+        return np.where(moved_to > 0, moved_to, light)
+
+    def _made_levels(
+        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, shape: tuple[int, ...]
+    ) -> np.ndarray:
+        """(K, 13) addresses of the light of scenes behind the discs that their blend needs."""
+        stale = self._levels_source[indices] != source
+        self._release_levels(indices[stale])
+        self._levels_source[indices] = source
+        needed = np.zeros((len(indices), len(DIAMETERS)), bool)
+        mark_needed(blurs, _KNOTS, needed)
+        frame, level = np.nonzero(needed & (self._levels[indices] == 0))
+        made = self._take(len(frame), shape)
+        self._levels[indices[frame], level] = made
+        radii = np.array([disc_radius(diameter) for diameter in DIAMETERS])[level]
+        _run(blur_discs, radii, shape, source[frame], made, radii)
+        # Levels without a share are read too, times 0: any image does.
+        levels = self._levels[indices]
+        levels[:, 0] = source
+        return np.where(levels == 0, source[:, None], levels)
+
+
+def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]
+    """Calls a pass for units of each frame on all threads, the costliest first."""
+    todo = np.flatnonzero(cost)
+    if not len(todo):
+        return
+    threads = torch.get_num_threads()
+    # Frames are shared out whole, unless they are few and large.
+    parts = 1 if len(todo) >= 2 * threads or math.prod(shape) < _LARGE else shape[0]
+    ranked = todo[np.argsort(-cost[todo], kind="stable")]
+    # Dealt out in turn: every thread gets about as much to do.
+    order = np.concatenate([ranked[share::threads] for share in range(threads)])
+    fixed = order, parts, *shape
+    parallel_ranges(lambda a, b: task(a, b, *fixed, *columns), len(order) * parts)
+
+
+def _cost(blurs: np.ndarray, lens_to: np.ndarray, moved_to: np.ndarray) -> np.ndarray:
+    """(K,) about how long the blur of a frame takes; 0 for none."""
+    discs = np.where(blurs["diameter"] > 0, 20.0, 1.0 + blurs["defocus_px"] ** 2)
+    sums = np.where(blurs["mask"] > 0, 2.0, 1.0) * (8.0 + 2.0 * blurs["motion_px"])
+    return (lens_to > 0) * discs + (moved_to > 0) * np.where(blurs["streaks"], 8.0, sums)
+
+
+@_jit()
+def mark_needed(blurs, knots, needed):  # type: ignore[no-untyped-def]
+    """Marks the discs, other than none, that the blend of each frame needs."""
+    for i in range(len(blurs)):
+        blur = blurs[i]
+        if blur.diameter:
+            sorts = numba.carray(as_pointer(blur.sorts), (blur.num_sorts,))
+            mark_levels(sorts, np.float32(blur.defocus_px), _HALF_STEP, knots, needed[i])
+        needed[i, 0] = False
+
+
+@_jit()
+def blur_discs(  # type: ignore[no-untyped-def]
+    first, last, order, parts, planes, height, width, source, to, radii
+):
+    """Units `first` to `last`: parts of frames (P, H, W) behind one disc each."""
+    count = planes // parts
+    shape = (count * height, width)
+    for unit in range(first, last):
+        i, begin = order[unit // parts], unit % parts * count * height * width
+        image = numba.carray(as_pointer(source[i]), (planes * height * width,))
+        out = numba.carray(as_pointer(to[i]), (planes * height * width,))
+        end = begin + count * height * width
+        rows, result = image[begin:end].reshape(shape), out[begin:end].reshape(shape)
+        disc_image(rows, height, radii[i], _MOST, result)
+
+
+@_jit()
+def blur_frames(  # type: ignore[no-untyped-def]
+    first,
+    last,
+    order,
+    parts,
+    planes,
+    height,
+    width,
+    lens_to,
+    light,
+    moved_to,
+    source,
+    radii,
+    blurs,
+    levels,
+):
+    """Units `first` to `last`: parts of frames behind their lens, then in motion.
+
+    (K,) each are addresses to write the light behind the lens to, of what moves, to write that to,
+    and of the light without blur; radii of discs; and blurs. `levels` (K, 13) are discs to blend.
+    """
+    count, samples = planes // parts, planes * height * width
+    shape = (count, height, width)
+    for unit in range(first, last):
+        i, begin = order[unit // parts], unit % parts * count * height * width
+        end = begin + count * height * width
+        blur = blurs[i]
+        if lens_to[i]:
+            out = numba.carray(as_pointer(lens_to[i]), (samples,))[begin:end]
+            if blur.diameter:
+                scale = np.float32(blur.defocus_px)
+                diameter = numba.carray(as_pointer(blur.diameter), (height, width))
+                fixed = (diameter, scale, _KNOTS, levels[i], begin, samples)
+                blend_rows(0, height, *fixed, out.reshape(shape))
+            else:
+                rows = numba.carray(as_pointer(source[i]), (samples,))[begin:end]
+                flat = (count * height, width)
+                disc_image(rows.reshape(flat), height, radii[i], _MOST, out.reshape(flat))
+        if not moved_to[i]:
+            continue
+        image = numba.carray(as_pointer(light[i]), (samples,))[begin:end].reshape(shape)
+        out = numba.carray(as_pointer(moved_to[i]), (samples,))[begin:end]
+        moved = out.reshape(shape)
+        if blur.streaks:
+            rows = image.reshape((count * height, width))
+            n, share = streak_share(blur.motion_px)
+            move_rows(0, len(rows), rows, n, share, _MOST, out.reshape((count * height, width)))
+            continue
+        path = (blur.extent, blur.direction, blur.turn)
+        taps = taps_of(*path, 0.0, 0.0, height, width)
+        if blur.mask:
+            own = taps_of(*path, blur.drift_x, blur.drift_y, height, width)
+            mask = numba.carray(as_pointer(blur.mask), (height, width))
+            behind = numba.carray(as_pointer(blur.behind), (height, width)).view(np.int32)
+            blur_apart(image, mask, behind, taps, own, _MOST, moved)
+        else:
+            for plane in range(count):
+                rows, columns_, weights = taps
+                blur_rows(0, height, image[plane], rows, columns_, weights, _MOST, moved[plane])
