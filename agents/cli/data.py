@@ -245,12 +245,11 @@ def warm_up() -> None:
 def _use_rest() -> None:
     """Compiles what those environments do not use: raw files, the viewer, blur along rows."""
     import numpy as np
-    import torch
 
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.optics.discs import Blur, blur_many, disc_blur
+    from simulator.optics.discs import disc_blur
     from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw
 
@@ -264,5 +263,4 @@ def _use_rest() -> None:
     numbers = raw.to_mosaic().astype(np.float64)  # files hold integers
     light = RawImage.from_mosaic(numbers, raw.settings, raw.camera).data
     disc_blur(motion_blur(light, 2.5), 2.5)
-    blur_many([Blur(light, extent_px=2.5, moved=torch.empty_like(light))])
     draw("dead_leaves", np.random.default_rng(0))  # the scenes may all have been in the cache

@@ -54,7 +54,7 @@ _KNOTS = np.array(DIAMETERS) ** 2
 #: How far the largest disc reaches, and by how much tiles overlap for it [pixel].
 DISC_REACH, HALO = 16, 20
 #: Pixels from which another thread is worth waking for a blend, and pixels blended together.
-_WORTH_A_THREAD, _BLENDED = 2**12, 128
+_WORTH_A_THREAD, _BLENDED = 2**12, 256
 _ONE = np.float32(1)
 _jit = functools.partial(kernel, fastmath={"contract"})
 _blend_jit = functools.partial(kernel, fastmath={"contract", "nnan", "nsz"})
@@ -389,13 +389,18 @@ def _correlations() -> np.ndarray:
     return found
 
 
-# Each pixel looks up the two images around its squared diameter and interpolates between them: no
-# weight is ever stored for a whole frame, and no image is read where it has none.
+# Each pixel is interpolated between the two images around its squared diameter: no weight is ever
+# stored for a whole frame, and no run of pixels reads an image of which it has no share.
 @_blend_jit()
 def _square(diameter, scale, largest, out):  # type: ignore[no-untyped-def]
+    """Squared diameters of a run of pixels; the least and the most of them."""
+    least = most = min((diameter[0] * scale) * (diameter[0] * scale), largest)
     for x in range(len(out)):
         squared = (diameter[x] * scale) * (diameter[x] * scale)
-        out[x] = squared if squared < largest else largest
+        squared = squared if squared < largest else largest
+        out[x] = squared
+        least, most = min(least, squared), max(most, squared)
+    return least, most
 
 
 @_blend_jit()
@@ -408,18 +413,6 @@ def _below(knots, value):  # type: ignore[no-untyped-def]
 
 
 @_blend_jit()
-def _place(squared, knots, index, share):  # type: ignore[no-untyped-def]
-    """In which interval between `knots` each value is, and how far in it from 0 to 1."""
-    index[:] = 0
-    for knot in knots[1:-1]:
-        for x in range(len(index)):
-            index[x] += np.int32(squared[x] >= knot)
-    for x in range(len(index)):
-        low, high = knots[index[x]], knots[index[x] + 1]
-        share[x] = (squared[x] - low) / (high - low)
-
-
-@_blend_jit()
 def blend_rows(  # type: ignore[no-untyped-def]
     first, last, diameter, scale, knots, images, begin, samples, out
 ):
@@ -429,24 +422,38 @@ def blend_rows(  # type: ignore[no-untyped-def]
     `samples`; `out` (P, H, W) is what begins at the sample `begin` of them.
     """
     planes, height, width = out.shape
-    squares, shares = np.empty(_BLENDED, np.float32), np.empty(_BLENDED, np.float32)
-    indexes = np.empty(_BLENDED, np.int32)
-    for y in range(first, last):
-        for start in range(0, width, _BLENDED):
-            end = min(start + _BLENDED, width)
-            size = end - start
-            squared, index, share = squares[:size], indexes[:size], shares[:size]
-            _square(diameter[y, start:end], scale, knots[-1], squared)
-            _place(squared, knots, index, share)
+    squares, weights = np.empty(_BLENDED, np.float32), np.empty(_BLENDED, np.float32)
+    flat, results = diameter.reshape(-1), out.reshape(planes, height * width)
+    for start in range(first * width, last * width, _BLENDED):
+        end = min(start + _BLENDED, last * width)
+        squared, weight = squares[: end - start], weights[: end - start]
+        least, most = _square(flat[start:end], scale, knots[-1], squared)
+        lowest, highest = _below(knots, least), _below(knots, most) + 1
+        for level in range(lowest, highest + 1):
+            image = numba.carray(as_pointer(images[level]), (samples,))
+            _weigh(squared, knots, level, weight)
             for plane in range(planes):
-                target = out[plane, y, start:end]
-                offset = begin + (plane * height + y) * width + start
-                for x in range(size):
-                    pointer = as_pointer(images[index[x]])  # type: ignore[call-arg, var-annotated]
-                    one = numba.carray(pointer, (samples,))
-                    other = numba.carray(as_pointer(images[index[x] + 1]), (samples,))
-                    least = (_ONE - share[x]) * one[np.uint64(offset + x)]
-                    target[x] = least + share[x] * other[np.uint64(offset + x)]
+                offset = begin + plane * height * width
+                part, target = image[offset + start : offset + end], results[plane, start:end]
+                if level > lowest:
+                    for x in range(len(target)):
+                        target[x] += weight[x] * part[x]
+                else:
+                    for x in range(len(target)):
+                        target[x] = weight[x] * part[x]
+
+
+@_blend_jit()
+def _weigh(squared, knots, level, out):  # type: ignore[no-untyped-def]
+    """Weight of the image at one of `knots` for each pixel: a hat function."""
+    knot = knots[level]
+    before = knots[level - 1] if level else np.float32(-1)
+    after = knots[level + 1] if level + 1 < len(knots) else knot + _ONE
+    up, down = _ONE / (knot - before), _ONE / (after - knot)
+    for x in range(len(out)):
+        rising, falling = (squared[x] - before) * up, (after - squared[x]) * down
+        least = rising if rising < falling else falling
+        out[x] = least if least > np.float32(0) else np.float32(0)
 
 
 @_blend_jit()

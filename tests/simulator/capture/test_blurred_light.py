@@ -21,8 +21,9 @@ from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import Transitions, noise_keys, record
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
-from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur
-from simulator.optics.motion import Movement, motion_blur, path_blur, path_taps
+from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
+from simulator.optics.motion import Movement, motion_blur, motion_kernel, path_blur, path_taps
+from simulator.utils.compute import addresses
 from simulator.utils.tiles import make_tiles
 
 Z6 = get_camera("nikon_z6")
@@ -232,19 +233,45 @@ def test_whole_captures_by_hand() -> None:
     assert math.isclose(cover.sum(), mask.sum(), rel_tol=1e-5)
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("keeps", [True, False])
+def test_many_images_are_scipys_correlation(threads, keeps, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    shape, blurs = (4, 21, 40), np.zeros(7, columns.BLUR)
+    blurs["defocus_px"], blurs["streaks"] = (48.0, 0.0, 3.3, 8.0, 1e-4, 2.0, 0.7), True
+    blurs["motion_px"] = (5.0, 5.0, 0.0, 17.0, 1e-7, 90.0, 0.4)
+    lights = list(torch.rand(7, *shape, generator=torch.Generator().manual_seed(0)))
+    lights[2][0, 3, 4], lights[3][1, 5, 6] = 1e30, -1e30  # clipped first
+    frames = columns.BlurredFrames(9, 2, keeps)
+    for used in (np.arange(7), np.array([5, 2]), np.arange(4)):
+        some = addresses([lights[i] for i in used])
+        made = frames.make(used + 1, np.zeros(len(used), int), blurs[used], some, shape)
+        for i, found in zip(used, columns.FramesAt(made, shape)[:], strict=True):
+            rtol, clipped = 2e-4 if i == 0 else 1e-5, lights[i].double().clamp(-1e9, 1e9).numpy()
+            weights = disc_kernel(blurs["defocus_px"][i])[None]
+            wanted = correlate(clipped, weights, mode="nearest")
+            streak = motion_kernel(blurs["motion_px"][i])[None, None]
+            wanted = correlate(wanted, streak, mode="nearest")
+            np.testing.assert_allclose(found, wanted, rtol, atol=300.0 if i in (2, 3) else 0.0)
+
+
 # -- batches ---------------------------------------------------------------------------------------
 
 STATES = [CameraSettings(iso, time, 4) for iso in (100, 6400) for time in (1 / 500, 1 / 8)]
 STATES += [CameraSettings(400, 1 / 30, 8), CameraSettings(200, 1 / 30, 2)]
-LIGHTS = [torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(7)]
-SCENES = np.arange(7)
+LIGHTS = [
+    torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(10)
+]
+SCENES = np.arange(10)
 KEYS = noise_keys(SCENES, SCENES + 5)
 
 
 def prepared(index: int) -> PreparedScene:
     """Two at rest, one that moves, one that is also out of focus, one whose aperture opens,
-    two with a layout and a subject that moves; the first and third are free of noise."""
-    light = LIGHTS[index]
+    two with a layout and a subject that moves; then three of these without noise, as are the first
+    and third."""
+    light, noisy = LIGHTS[index], index not in (0, 2) and index < 7
+    index = {7: 3, 8: 5, 9: 6}.get(index, index)
     changes = {"image_speed": 0.3} if index in (2, 3) else {}
     if index == 3:
         changes["defocus"] = 2.0
@@ -257,17 +284,17 @@ def prepared(index: int) -> PreparedScene:
         changes["layout"] = Layout((columns >= 10).float().expand(24, 20).contiguous(), subject)
         changes["movement"] = Movement(0.6, 2.0, subject_speed=0.4, subject_direction=2.0)
         changes |= {"defocus": 3.0} | ({"image_speed": 0.2} if index == 5 else {})
-    nlf = NoiseLevelFunction.zero() if index in (0, 2) else Z6.nlf(800)
+    nlf = Z6.nlf(800) if noisy else NoiseLevelFunction.zero()
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
 
 def made(noise="bank", *, cache_light=True, scenes=prepared):
-    return CaptureBatch(scenes, 7, STATES, Z6, noise=noise, cache_light=cache_light)
+    return CaptureBatch(scenes, 10, STATES, Z6, noise=noise, cache_light=cache_light)
 
 
-def photographed(batch, states, gains=(1.0,) * 7, **options):
+def photographed(batch, states, gains=(1.0,) * 10, **options):
     """Frames of all scenes, and their statistics."""
-    chosen, frames = np.broadcast_to(states, 7), np.empty((7, 4, 24, 20), np.float32)
+    chosen, frames = np.broadcast_to(states, 10), np.empty((10, 4, 24, 20), np.float32)
     batch.prepare(SCENES, chosen, np.array(gains))
     return frames, batch.record(SCENES, chosen, SCENES, SCENES + 5, signals=frames, **options)
 
@@ -287,9 +314,9 @@ def test_frames_are_those_of_each_scene_alone(noise, cache_light):
     scenes, rng, seen = Mock(side_effect=prepared), np.random.default_rng(0), set()
     batch = made(noise, cache_light=cache_light, scenes=scenes)
     for _ in range(12):
-        states, gains = rng.integers(len(STATES), size=7), rng.choice([1e-6, 0.25, 1.0, 3.0], 7)
+        states, gains = rng.integers(len(STATES), size=10), rng.choice([1e-6, 0.25, 1.0, 3.0], 10)
         frames, found = photographed(batch, states, gains)
-        for i in range(7):
+        for i in range(10):
             key = None if noise is None else int(KEYS[i])
             wanted, counts, exposure = alone(i, states[i], gains[i], key, noise or "bank")
             np.testing.assert_array_equal(frames[i], wanted)
@@ -306,7 +333,7 @@ def test_frames_are_those_of_each_scene_alone(noise, cache_light):
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
     assert seen >= {"aperture", "defocus", "motion_blur"}
-    assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(7))
+    assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(10))
     assert noise is None or seen >= {"noise", "excess"}
 
 
@@ -314,10 +341,10 @@ def test_forgotten_scenes_are_asked_for_again() -> None:
     calls: list[int] = []
     batch = made(scenes=lambda index: calls.append(index) or prepared(index))
     first, again, _ = photographed(batch, 1)[0], photographed(batch, 1)[0], photographed(batch, 4)
-    assert sorted(calls) == list(range(7))
+    assert sorted(calls) == list(range(10))
     batch.forget(np.array([3]))
     after, _ = photographed(batch, 1)
-    assert calls[7:] == [3]
+    assert calls[10:] == [3]
     np.testing.assert_array_equal(again, first)
     np.testing.assert_array_equal(after, first)
 

@@ -20,7 +20,7 @@ from scipy.integrate import quad
 from scipy.ndimage import correlate
 
 from simulator.optics import discs, motion
-from simulator.optics.discs import DIAMETERS, Blur, DiscBank, blur_many, disc_blur, disc_kernel
+from simulator.optics.discs import DIAMETERS, DiscBank, disc_blur, disc_kernel
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 from simulator.optics.motion import Movement, Path, motion_blur, path_blur, path_taps
 from simulator.optics.thin_lens import Lens, defocus
@@ -366,31 +366,6 @@ def test_light_beyond_the_limit_is_clipped_first(extent):
     np.testing.assert_allclose(found, wanted, rtol=2e-6, atol=300)
     found = path_blur(light, path_taps(Path(extent), 16, 24), limit=1e9)
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=3000)
-    out = torch.empty(4, 16, 24)
-    blur_many([Blur(light, 3.0, out)], limit=1e9)
-    wanted = disc_blur(light.clamp(-1e9, 1e9).double(), 3.0)
-    np.testing.assert_allclose(out, wanted, rtol=2e-6, atol=300)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_many_images_are_scipys_correlation(threads, monkeypatch):
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    blurs = []
-    wide, long = (48.0, 0.0, 3.3, 8.0, 1e-4, 2.0, 0.7), (5.0, 5.0, 0.0, 17.0, 1e-7, 90.0, 0.4)
-    for extents in zip(wide, long, strict=True):
-        outputs = [torch.empty(4, 21, 40) if each else None for each in extents]
-        blurs.append(Blur(torch.rand(4, 21, 40), extents[0], outputs[0], extents[1], outputs[1]))
-    blur_many(blurs)
-    for light, diameter, defocused, extent, moved in blurs:
-        rtol = 5e-6 if diameter < 40 else 1e-4  # wide discs in the Fourier domain
-        weights = disc_kernel(diameter)[None]
-        wanted = ndimage.correlate(light.double().numpy(), weights, mode="nearest")
-        if defocused is not None:
-            np.testing.assert_allclose(defocused, wanted, rtol=rtol)
-        wanted = ndimage.correlate1d(wanted, motion.motion_kernel(extent), mode="nearest")
-        if moved is not None:
-            np.testing.assert_allclose(moved, wanted, rtol=2 * rtol)
-    blur_many([])
 
 
 @pytest.mark.slow
