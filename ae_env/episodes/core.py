@@ -38,7 +38,7 @@ from simulator.optics.discs import DIAMETERS
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
-LIGHT_CACHE_BYTES = 256 * 2**20
+LIGHT_CACHE_BYTES = 512 * 2**20
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 #: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
 _DTYPES = {"codes": np.uint8, "signals": np.float32, "numbers": np.uint16}

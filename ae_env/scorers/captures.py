@@ -64,11 +64,6 @@ class PixelBlur(NamedTuple):
     levels: torch.Tensor  # extents that pixels of a capture have [pixel of the frame]
     shares: torch.Tensor  # shares of the pixels that have them; they sum to 1
 
-    @property
-    def rms_px(self) -> torch.Tensor:
-        """(B,) root mean square extent over the pixels [pixel of the frame]."""
-        return self.levels.square().mul_(self.shares).sum(dim=1).sqrt_()
-
 
 @dataclass(frozen=True, eq=False)
 class Captures:
@@ -228,8 +223,8 @@ def describe_captures(
         ratio=torch.from_numpy(np.array(ratios) * gain),
         nlf=[nlfs[s.iso] for s in settings],
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
-        blur_px=torch.from_numpy(blur) if pixel_blur is None else pixel_blur.rms_px,
-        white_balance=torch.tensor([c.white_balance for c in scenes]),
+        blur_px=torch.from_numpy(blur),
+        white_balance=torch.from_numpy(np.array([c.white_balance for c in scenes], np.float32)),
         colour_matrices=[c.camera.colour_matrix for c in scenes],
         row_gain=None if row_gain is None else torch.from_numpy(row_gain),
         source_noise=source_noise,
@@ -257,7 +252,7 @@ def all_blur(
     discs: np.ndarray,
     own: np.ndarray,
 ) -> tuple[np.ndarray, PixelBlur | None]:
-    """Extents of blur of B captures [pixel], (B,), and `Captures.pixel_blur`.
+    """`Captures.blur_px` and `Captures.pixel_blur` of B captures.
 
     `movements` (B, 4) and `speed` (B,) are those of `describe_captures`; all others are (B,):
     exposure times [s], diameters of the largest disc of defocus, and the scenes' own blur [pixel].
@@ -275,13 +270,17 @@ def all_blur(
     ends = np.cumsum([0] + [part.shape[1] for part in parts])
     levels, shares = np.zeros((2, len(scenes), int(np.diff(ends).max())))
     numbers = np.stack([speed, times, discs, own, blur], axis=1)
-    _fill_levels(height, np.concatenate(parts, axis=1), ends, movements, numbers, levels, shares)
+    sorts = np.concatenate(parts, axis=1)
+    _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur)
     return blur, PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
 
 
 @kernel()
-def _fill_levels(height, sorts, ends, movements, numbers, levels, shares):  # type: ignore[no-untyped-def]
-    """`PixelBlur` of captures; `sorts` are the `Layout.shares` of all, one behind the other."""
+def _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur):  # type: ignore[no-untyped-def]
+    """`PixelBlur` of captures; `sorts` are the `Layout.shares` of all, one behind the other.
+
+    `blur` (B,) become the root mean squares over the pixels.
+    """
     for i in range(len(numbers)):
         speed, time, disc, own = numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3]
         direction, turn, angle = movements[i, 0], movements[i, 1] * time, movements[i, 3]
@@ -289,6 +288,7 @@ def _fill_levels(height, sorts, ends, movements, numbers, levels, shares):  # ty
         x, y = drift * math.cos(angle), drift * math.sin(angle)
         rest = (extent * height) ** 2 + own * own
         apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + own * own
+        squares = 0.0
         for k in range(ends[i + 1] - ends[i]):
             sort = ends[i] + k
             level = min(disc * sorts[0, sort], _WIDEST)  # as in the frame
@@ -296,6 +296,8 @@ def _fill_levels(height, sorts, ends, movements, numbers, levels, shares):  # ty
             alike = sorts[0, sort] < 0.0
             levels[i, k] = numbers[i, 4] if alike else math.sqrt(level * level + moved)
             shares[i, k] = sorts[2, sort]
+            squares += shares[i, k] * levels[i, k] ** 2
+        blur[i] = math.sqrt(squares)
 
 
 class SceneCaptures:
@@ -328,11 +330,9 @@ class SceneCaptures:
         For `gain` and `row_gain` see `ScoreTables.table`.
         """
         states, count = self.states[part], len(self.states[part])
-        blur, alike = self.blur(scene, prepared, part)
-        pixel_blur: PixelBlur | None = None
-        if isinstance(blur, PixelBlur):
-            pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
-            blur = blur.rms_px
+        blur, pixel_blur, alike = self.blur(scene, prepared, part)
+        if pixel_blur is not None:
+            pixel_blur = PixelBlur(*(values[alike] for values in pixel_blur))
         gains = np.broadcast_to(gain, len(self.states))[part]
         ratios = [2.0 ** (s.log2_exposure - scene.reference.log2_exposure) for s in states]
         light = scene.clean_light.clone() if self.copies else scene.clean_light
@@ -355,12 +355,12 @@ class SceneCaptures:
 
     def blur(
         self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)
-    ) -> tuple[torch.Tensor | PixelBlur, torch.Tensor]:
-        """The extents of blur that there are, of few states: the ISO blurs nothing. See `describe`.
+    ) -> tuple[torch.Tensor, PixelBlur | None, torch.Tensor]:
+        """The blur that there is, of few states: the ISO blurs nothing. See `describe`.
 
         Returns:
-            (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
-            of the K each state has.
+            `Captures.blur_px` (K,) and `Captures.pixel_blur`; and (S,) int64, which of the K each
+            state has.
         """
         few, alike = np.unique(self._which[part], return_inverse=True)
         times, f_numbers = self._blurs[few].T
@@ -371,4 +371,4 @@ class SceneCaptures:
         moves = np.tile(np.array(astuple(movement)), (len(few), 1))
         speeds = np.full(len(few), prepared.image_speed)
         blur, pixel_blur = all_blur([scene] * len(few), moves, speeds, times, discs, np.array(own))
-        return pixel_blur or torch.from_numpy(blur), torch.from_numpy(alike)
+        return torch.from_numpy(blur), pixel_blur, torch.from_numpy(alike)

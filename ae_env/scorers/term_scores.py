@@ -128,8 +128,8 @@ class TermScores:
             return {}
         terms = [self.torch_terms.parts[name] for name in names]
         if all(type(term) is Sharpness for term in terms):  # few states differ in blur
-            blur, alike = self.captures.blur(scene, prepared)
-            score = Sharpness.of(blur, scene.light.shape[-2])[alike].numpy()
+            blur, pixel_blur, alike = self.captures.blur(scene, prepared)
+            score = Sharpness.of(pixel_blur or blur, scene.light.shape[-2])[alike].numpy()
             return dict.fromkeys(names, score)
         chunks = []
         for part in slices(len(self.states), CHUNK if any(map(reads_pixels, terms)) else None):

@@ -131,7 +131,7 @@ class CaptureBatch:
         self._scenes: dict[int, PreparedScene] = {}
         self._scene_columns = np.zeros(num_scenes, SCENE)
         self._statistics = np.zeros((num_scenes, 4, 4, BINS))
-        self._in_columns = np.zeros(num_scenes, bool)
+        self._in_columns, self._light = np.zeros(num_scenes, bool), np.empty(num_scenes, object)
         # Row of the blurred light that each scene has at present.
         self._blurred_row = np.full(num_scenes, -1)
         # Planned captures as columns, by scene and state: all that a frame depends on, except for
@@ -239,6 +239,7 @@ class CaptureBatch:
         scene = self._prepared(index)
         # Scenes that are shown several times share their light, but not what is blurred of it.
         scene = scene.changed(blurred_light=scene.blurred_light.copy())
+        self._light[index] = scene.light.contiguous()
         if scene.box_factor not in self._targets:
             noises = [self.camera.nlf(s.iso).scaled(scene.box_factor**-2) for s in self.states]
             self._targets[scene.box_factor] = np.array([(n.shot, n.read) for n in noises])
@@ -257,18 +258,18 @@ class CaptureBatch:
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
         """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
-        scenes = [self.prepared_scene(index) for index in indices.tolist()]
+        for index in indices.tolist():
+            self.prepared_scene(index)
         inside = self._in_columns[indices]
         others = np.flatnonzero(~inside).tolist()
         for i in others:
-            self._plan_alone(scenes[i], int(rows[i]), float(gains[i]))
+            self._plan_alone(self._scenes[indices[i]], int(rows[i]), float(gains[i]))
         if len(others) < len(rows):
-            some, planned = np.flatnonzero(inside), rows[inside]
-            for i, row in zip(some.tolist(), planned.tolist(), strict=True):
-                self._source[row] = scenes[i].light.contiguous()
+            planned = rows[inside]
+            self._source[planned] = self._light[indices[inside]]
             columns = self._blur, self._table, self._predicted_error
             known = self._scene_columns, self._statistics, self._columns
-            targets, height = np.stack([*self._targets.values()]), scenes[0].light.shape[-2]
+            targets, height = np.stack([*self._targets.values()]), self._light[indices[0]].shape[-2]
             plan_frames(*known, targets, height, indices[inside], planned, gains[inside], *columns)
             blur = self._blur[planned]
             defocus, motion = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0

@@ -120,7 +120,7 @@ def blur_column(exposure: Exposure) -> tuple[Any, ...]:
 def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
     """The fields `_LAYOUT`."""
     arrays = () if layout is None else layout.arrays[: 4 if subject else 2]
-    found = [array.ctypes.data for array in arrays] + [0] * (4 - len(arrays))
+    found = [array.__array_interface__["data"][0] for array in arrays] + [0] * (4 - len(arrays))
     return (*found[:2], arrays[1].size if arrays else 0, *found[2:])
 
 

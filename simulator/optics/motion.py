@@ -444,30 +444,42 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
 def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
     """Background along `taps`, the subject in front of it along `own`; see `path_blur_apart`."""
     count, height, width = planes.shape
-    split = np.empty((height, width), np.float32)
-    front, cover = np.empty_like(split), np.empty_like(split)
-    # The rows that the subject is smeared over.
-    down, first, last = np.abs(own[0]).max(), height, 0
+    rows, columns, weights = own
+    # What the subject is smeared over: elsewhere there is nothing of it.
+    top, bottom, left, right = height, 0, width, 0
     for y in range(height):
-        if mask[y].any():
-            first, last = min(first, max(y - down, 0)), min(y + down + 1, height)
-    blur_rows(first, last, mask, own[0], own[1], own[2], limit, cover)
+        for x in range(width):
+            if mask[y, x] > 0:
+                top, bottom = min(top, y), max(bottom, y + 1)
+                left, right = min(left, x), max(right, x + 1)
+    down, over = np.abs(rows).max(), np.abs(columns).max()
+    top, bottom = max(top - down, 0), min(bottom + down, height)
+    left, right = max(left - over, 0), min(right + over, width)
+    back, apart = (
+        np.empty((height, width), np.float32),
+        np.zeros((height, right - left), np.float32),
+    )
+    front, cover = np.empty_like(apart), np.empty_like(apart)
+    for y in range(top, bottom):
+        for x in range(right - left):
+            apart[y, x] = mask[y, left + x]
+    blur_rows(top, bottom, apart, rows, columns, weights, limit, cover)
     for plane in range(count):
-        flat, result = planes[plane].reshape(-1), out[plane]
-        for y in range(height):
-            for x in range(width):
-                split[y, x] = flat[np.uint64(behind[y, x])]
-        blur_rows(0, height, split, taps[0], taps[1], taps[2], limit, result)
-        for y in range(height):
-            for x in range(width):
-                value = planes[plane, y, x]
+        source, result = planes[plane], out[plane]
+        flat = source.reshape(-1)
+        copy_row(flat, back.reshape(-1))
+        for y in range(top, bottom):
+            for x in range(left, right):
+                value = source[y, x]
                 value = value if value < limit else limit
-                split[y, x] = mask[y, x] * (value if value > -limit else -limit)
-        blur_rows(first, last, split, own[0], own[1], own[2], limit, front)
-        for y in range(first, last):
-            for x in range(width):
+                apart[y, x - left] = mask[y, x] * (value if value > -limit else -limit)
+                back[y, x] = flat[np.uint64(behind[y, x])]
+        blur_rows(0, height, back, taps[0], taps[1], taps[2], limit, result)
+        blur_rows(top, bottom, apart, rows, columns, weights, limit, front)
+        for y in range(top, bottom):
+            for x in range(right - left):
                 seen = max(np.float32(1) - cover[y, x], np.float32(0))
-                result[y, x] = seen * result[y, x] + front[y, x]
+                result[y, left + x] = seen * result[y, left + x] + front[y, x]
 
 
 @_jit()
