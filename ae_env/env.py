@@ -82,7 +82,7 @@ class AutoExposure(Task):
         if reads_codes or "flicker" in options.costs:  # else no code of every sample is made
             self.outputs += ("codes",)
         torch_parts = {} if terms.torch_terms is None else terms.torch_terms.parts
-        self.in_chunks = self._reads_images or any(map(reads_pixels, torch_parts.values()))
+        self.in_chunks = any(map(reads_pixels, torch_parts.values()))
         # By `Episodes.light_index` and state; and which have been scored.
         count, states = len(episodes.begun), len(episodes.grid)
         lights = len(episodes.scenes) + count
@@ -196,7 +196,9 @@ class AutoExposure(Task):
                 means = self._expected_means(frames, self._transitions, boxes)
             scores |= terms.score(means, captures)
         if self._reads_images and captures is not None:
-            shown = torch.from_numpy(frames.outputs["signals"]).clamp(0.0, 1.0)
+            shown = torch.from_numpy(frames.outputs["signals"])
+            linear = episodes.options.observation == "linear"  # the frame is observed, too
+            shown = shown.clamp(0.0, 1.0) if linear else shown.clamp_(0.0, 1.0)
             scores |= terms.torch_scores(shown, captures, "image")
         return scores
 
@@ -250,11 +252,9 @@ class AutoExposure(Task):
     ) -> Captures:
         episodes, env_indices, rows = self.episodes, frames.env_indices[part], frames.rows
         scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
-        light = noises = movements = None
+        noises = movements = None
         if episodes.subject_speed[env_indices].any():  # else they do not matter
             movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
-        if not self.in_chunks:
-            light = torch.empty(1).expand(len(env_indices), *scenes[0].light.shape)
         if source_noise[part].any():
             pairs = source_noise[part].tolist()
             noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
@@ -267,7 +267,6 @@ class AutoExposure(Task):
             movements=movements,
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],
-            light=light,
             source_noise=noises,
             noisy=self.tables.noise,
         )

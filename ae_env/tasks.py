@@ -113,7 +113,8 @@ FRAME_GAP = 1.0 / 60.0
 BRACKET_NUMBERS = ("time_left", "frames_left", "white", "noisy")
 #: A merged sample whose standard deviation is a larger share of it counts as noisy.
 NOISY = 0.1
-_STAY = Taps(np.zeros(4, np.int64), np.zeros(4, np.int64), np.array([1, 0, 0, 0], np.float32))
+_NONE = np.zeros(8, np.int64)
+_STAY = Taps(_NONE, _NONE, np.eye(1, 8, dtype=np.float32)[0])
 #: Defaults of the bracket task, and arguments that it does not have.
 BRACKET: dict[str, Any] = {"grid": "bracket", "depth": "far"}
 WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "with_oracle")
@@ -330,7 +331,7 @@ def move_subject(scene: Scene, rows: int, columns: int) -> Scene:
     layout = scene.layout
     if layout is None or layout.subject is None:
         return scene
-    there = Taps(np.full(4, -rows), np.full(4, -columns), _STAY.weights)
+    there = Taps(_NONE - rows, _NONE - columns, _STAY.weights)
     mask = torch.from_numpy(ndimage.shift(layout.mask.numpy(), (0, rows, columns), order=0))
     behind = layout.behind
 

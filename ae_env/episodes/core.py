@@ -35,8 +35,9 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, single_normals
 from simulator.optics.discs import DIAMETERS
 
-#: Samples that are scored together: a chunk this small stays in the processor's cache.
-CHUNK_SAMPLES = 2**18
+#: Samples that are scored together where pixels are read, and where rows differ: a chunk this small
+#: stays in the processor's cache.
+CHUNK_SAMPLES, SMALL_CHUNK_SAMPLES = 2**24, 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
 LIGHT_CACHE_BYTES = 512 * 2**20
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
@@ -169,6 +170,7 @@ class EpisodeCore:
         # (4, S), see `_STATE_INFO`
         self._state_info = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._at_rest: dict[int, PreparedScene] = {}
+        self._outputs: dict[str, np.ndarray] = {}  # memory that is used again
         self._captures: FrameSource
         transitions = None
         if options.recorded is not None:  # a recorded capture is its own expectation
@@ -297,8 +299,9 @@ class EpisodeCore:
         if not episodes.static:
             gains, rows = episodes.gains(env_indices, self._state_info[1, states])
         self._captures.prepare(lights, states, gains)
-        small = self.task.in_chunks or rows is not None
-        step = max(1, CHUNK_SAMPLES // (4 * size**2) if small else len(env_indices))
+        most = SMALL_CHUNK_SAMPLES if rows is not None else CHUNK_SAMPLES
+        in_chunks = self.task.in_chunks or rows is not None
+        step = max(1, most // (4 * size**2) if in_chunks else len(env_indices))
         chunks = []
         for start in range(0, len(env_indices), step):
             part = slice(start, start + step)
@@ -316,7 +319,10 @@ class EpisodeCore:
         outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
         for name in self.task.outputs:
             if name not in outputs:
-                outputs[name] = np.empty(raw.shape, _DTYPES[name])
+                kept = self._outputs.get(name)
+                if kept is None or len(kept) < len(raw):
+                    kept = self._outputs[name] = np.empty(raw.shape, _DTYPES[name])
+                outputs[name] = kept[: len(raw)]
         found = self._captures.record(
             episodes.light_index[env_indices],
             episodes.state[env_indices],

@@ -71,8 +71,7 @@ class Captures:
 
     settings: Sequence[CameraSettings]  #: of each capture, B long
     scene_ids: Sequence[str]  #: scene of each capture, B long
-    #: (B, 4, H, W) linear light of the scenes at their reference settings.
-    scene_light: torch.Tensor
+    _lights: Sequence[torch.Tensor]  # (4, H, W) of the scenes themselves, B long
     ratio: torch.Tensor  #: (B,) float64, exposure ratio from that reference to the capture
     nlf: Sequence[NoiseLevelFunction]  #: of a native sensor pixel at the settings, B long
     #: (B,) float64, EV100 of the right exposure: that of the incident light, or the mean of what is
@@ -100,6 +99,14 @@ class Captures:
 
     def __len__(self) -> int:
         return len(self.settings)
+
+    @cached_property
+    def scene_light(self) -> torch.Tensor:
+        """(B, 4, H, W) linear light of the scenes at their reference settings, a copy."""
+        first, count = self._lights[0], len(self._lights)
+        if all(light is first for light in self._lights):
+            return first.clone().expand(count, -1, -1, -1)
+        return torch.stack(list(self._lights))
 
     @cached_property
     def light(self) -> torch.Tensor:
@@ -134,7 +141,7 @@ class Captures:
     @property
     def frame_height(self) -> int:
         """Height of the packed frame [pixel]."""
-        return self.scene_light.shape[-2]
+        return self._lights[0].shape[-2]
 
 
 def prepare_scene(
@@ -191,7 +198,6 @@ def describe_captures(
     movements: np.ndarray | None = None,
     gain: np.ndarray,
     row_gain: np.ndarray | None = None,
-    light: torch.Tensor | None = None,
     source_noise: Sequence[NoiseLevelFunction] | None = None,
     noisy: bool = True,
 ) -> Captures:
@@ -203,7 +209,6 @@ def describe_captures(
         movements: (B, 4) numbers of each `Movement`, in its order; None for along the rows.
         gain: (B,) light relative to the scenes' own.
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
-        light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
         source_noise, noisy: See `Captures`.
     """
     height = scenes[0].light.shape[-2]
@@ -219,7 +224,7 @@ def describe_captures(
     return Captures(
         settings=settings,
         scene_ids=[c.scene_id for c in scenes],
-        scene_light=torch.stack([c.clean_light for c in scenes]) if light is None else light,
+        _lights=[c.clean_light for c in scenes],
         ratio=torch.from_numpy(np.array(ratios) * gain),
         nlf=[nlfs[s.iso] for s in settings],
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
@@ -303,13 +308,13 @@ def _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur):
 class SceneCaptures:
     """Describes captures of a scene at the states of a grid, of which it knows all that it can.
 
-    Scorers get a copy of the light with `copies`; for `noisy` see `Captures`.
+    For `noisy` see `Captures`.
     """
 
     def __init__(
-        self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool, copies: bool
+        self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool
     ) -> None:
-        self.camera, self.states, self.noisy, self.copies = camera, states, noisy, copies
+        self.camera, self.states, self.noisy = camera, states, noisy
         nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in states}}
         self._nlf = [nlfs[s.iso] for s in states]
         # (K, 2) times and f-numbers of states that differ in them, and (S,) which each state has.
@@ -335,11 +340,10 @@ class SceneCaptures:
             pixel_blur = PixelBlur(*(values[alike] for values in pixel_blur))
         gains = np.broadcast_to(gain, len(self.states))[part]
         ratios = [2.0 ** (s.log2_exposure - scene.reference.log2_exposure) for s in states]
-        light = scene.clean_light.clone() if self.copies else scene.clean_light
         return Captures(
             settings=states,
             scene_ids=[scene.scene_id] * count,
-            scene_light=light.expand(count, -1, -1, -1),
+            _lights=[scene.clean_light] * count,
             ratio=torch.from_numpy(ratios * gains),
             nlf=self._nlf[part],
             proper_ev=torch.from_numpy(scene.ev100 + np.log2(gains)),

@@ -30,7 +30,6 @@ from ae_env.scorers.terms import (
     Shadows,
     Sharpness,
     code_signals,
-    is_own,
 )
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import PreparedScene
@@ -85,8 +84,7 @@ class TermScores:
         self.reads_captures = any(type(part) not in _COLUMNS for part in self.parts.values())
         #: Whether every part's expectation has one, so that no noise is drawn for it.
         self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
-        # Scorers of one's own get a copy of the light, lest they write to the scene.
-        self.captures = SceneCaptures(camera, states, noisy=noise, copies=is_own(scorer))
+        self.captures = SceneCaptures(camera, states, noisy=noise)
         isos = sorted({state.iso for state in states})
         noises = [camera.nlf(iso) for iso in isos]
         self._which = np.array([isos.index(state.iso) for state in states])
