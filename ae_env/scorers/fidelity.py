@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from skimage.color import deltaE_ciede2000, rgb2lab
-from skimage.metrics import structural_similarity
 
 from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.scorers.measures import luma_of
@@ -61,6 +59,9 @@ class Fidelity:
 
 def likeness(picture: np.ndarray, ideal: np.ndarray) -> float:
     """The score of a picture (H, W, 3) in CIELAB beside the ideal one."""
+    from skimage.color import deltaE_ciede2000  # not above: they take long
+    from skimage.metrics import structural_similarity
+
     difference = deltaE_ciede2000(picture, ideal)  # type: ignore[no-untyped-call]
     colour = math.exp(-float(difference.mean()) / COLOUR_SCALE)
     structure = structural_similarity(  # type: ignore[no-untyped-call]
@@ -74,6 +75,8 @@ def likeness(picture: np.ndarray, ideal: np.ndarray) -> float:
 
 
 def _lab(picture: torch.Tensor) -> np.ndarray:
+    from skimage.color import rgb2lab
+
     return np.asarray(rgb2lab(picture.permute(1, 2, 0).double().numpy()))
 
 

@@ -13,7 +13,6 @@ from typing import Any, Protocol, cast, get_args
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import distance_transform_edt
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
@@ -121,6 +120,8 @@ class Layout:
     @cached_property
     def behind(self) -> torch.Tensor:
         """(H, W) int64, the pixel of the background nearest to each, counted row by row."""
+        from scipy.ndimage import distance_transform_edt  # not above: it takes long
+
         assert self.subject is not None
         rows, columns = distance_transform_edt(
             self.subject.numpy(), return_distances=False, return_indices=True

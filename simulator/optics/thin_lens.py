@@ -17,7 +17,6 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 
 from simulator.optics.discs import disc_blur, disc_kernel
 from simulator.utils.checks import check_number
@@ -153,6 +152,8 @@ def _continue_behind(canvas: _Canvas, light: torch.Tensor, layers: _Layers) -> N
         farther = layers.diameters[layers.number[box]] > blur + _STEP + _STEP_SHARE * abs(blur)
         if not (farther.any() and bool((canvas.covered[box] < 1.0 - _GAP).any())):
             continue
+        from scipy.ndimage import distance_transform_edt  # not above: it takes long
+
         distance, (row, column) = distance_transform_edt(~farther, return_indices=True)
         hiding = (layers.number[box] == layer) & (distance <= reach)
         row, column = row[hiding] + box[0].start, column[hiding] + box[1].start

@@ -35,19 +35,18 @@ def mean_anchor(green: torch.Tensor) -> float:
 
     Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
     """
-    values = green.double().clamp(min=0.0).flatten()
-    lit = float((values > 0).double().mean())
-    if lit <= MEAN_SIGNAL:
+    values = green.detach().double().clamp(min=0.0).cpu().numpy().ravel()
+    rest = values[values > 0.0]
+    if len(rest) <= MEAN_SIGNAL * len(values):
         reason = f"no exposure brings its mean to {MEAN_SIGNAL}; give `illuminance`"
+        lit = len(rest) / max(len(values), 1)
         raise ValueError(f"`light` is 0 in all but {lit:.1%} of its pixels: {reason}")
-    low, high = -40.0, 40.0  # log2 of the factor, found by bisection
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if float((values * 2.0**middle).clamp_(max=1.0).mean()) < MEAN_SIGNAL:
-            low = middle
-        else:
-            high = middle
-    return float(2.0 ** (0.5 * (low + high)))
+    while True:  # what a factor that is too low clips stays clipped
+        clipped = np.count_nonzero(values) - len(rest)
+        factor = float((MEAN_SIGNAL * len(values) - clipped) / rest.sum())
+        if factor * rest.max() <= 1.0:
+            return factor
+        rest = rest[rest * factor < 1.0]
 
 
 def camera_from_srgb(

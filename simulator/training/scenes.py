@@ -23,7 +23,6 @@ import numpy as np
 import tifffile
 import torch
 from PIL import Image, ImageDraw, ImageFont
-from scipy.ndimage import distance_transform_edt
 
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -618,5 +617,7 @@ def fill_from_nearest(values: np.ndarray) -> np.ndarray:
     [[1.0, 1.0, 4.0, 4.0]]
     """
     missing = ~np.isfinite(values)
+    from scipy.ndimage import distance_transform_edt  # not above: it takes long
+
     indices = distance_transform_edt(missing, return_distances=False, return_indices=True)
     return np.asarray(values[tuple(indices)])
