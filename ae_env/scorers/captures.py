@@ -70,8 +70,7 @@ class Captures:
     """The facts about a batch of B captures besides their pixels."""
 
     settings: Sequence[CameraSettings]  #: of each capture, B long
-    scene_ids: Sequence[str]  #: scene of each capture, B long
-    _lights: Sequence[torch.Tensor]  # (4, H, W) of the scenes themselves, B long
+    _scenes: Sequence[Scene]  # of each capture, B long
     ratio: torch.Tensor  #: (B,) float64, exposure ratio from that reference to the capture
     nlf: Sequence[NoiseLevelFunction]  #: of a native sensor pixel at the settings, B long
     #: (B,) float64, EV100 of the right exposure: that of the incident light, or the mean of what is
@@ -80,9 +79,6 @@ class Captures:
     #: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the root mean
     #: square over the pixels, where they differ.
     blur_px: torch.Tensor
-    white_balance: torch.Tensor  #: (B, 3) gains of R, G, B
-    #: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where unknown.
-    colour_matrices: Sequence[ColourMatrix | None]
     #: (B, H) float64, light of each row relative to the frame's mean, which is in `ratio` and
     #: `proper_ev`: the bands of flickering light. None where every row of every capture has the
     #: same.
@@ -103,10 +99,25 @@ class Captures:
     @cached_property
     def scene_light(self) -> torch.Tensor:
         """(B, 4, H, W) linear light of the scenes at their reference settings, a copy."""
-        first, count = self._lights[0], len(self._lights)
-        if all(light is first for light in self._lights):
-            return first.clone().expand(count, -1, -1, -1)
-        return torch.stack(list(self._lights))
+        first, count = self._scenes[0], len(self._scenes)
+        if all(scene is first for scene in self._scenes):
+            return first.clean_light.clone().expand(count, -1, -1, -1)
+        return torch.stack([scene.clean_light for scene in self._scenes])
+
+    @property
+    def scene_ids(self) -> Sequence[str]:
+        """The scene of each capture, B long."""
+        return [scene.scene_id for scene in self._scenes]
+
+    @cached_property
+    def white_balance(self) -> torch.Tensor:
+        """(B, 3) gains of R, G, B."""
+        return torch.tensor([scene.white_balance for scene in self._scenes])
+
+    @property
+    def colour_matrices(self) -> Sequence[ColourMatrix | None]:
+        """XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where unknown."""
+        return [scene.camera.colour_matrix for scene in self._scenes]
 
     @cached_property
     def light(self) -> torch.Tensor:
@@ -141,7 +152,7 @@ class Captures:
     @property
     def frame_height(self) -> int:
         """Height of the packed frame [pixel]."""
-        return self._lights[0].shape[-2]
+        return self._scenes[0].light.shape[-2]
 
 
 def prepare_scene(
@@ -219,18 +230,29 @@ def describe_captures(
     moves = np.zeros((len(scenes), 4)) if movements is None else movements
     blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, np.array(own))
     nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
-    pairs = zip(scenes, settings, strict=True)
+    noise = [nlfs[s.iso] for s in settings], source_noise, noisy
+    return _captures(scenes, settings, noise, gain, row_gain, torch.from_numpy(blur), pixel_blur)
+
+
+def _captures(
+    scenes: Sequence[Scene],
+    settings: Sequence[CameraSettings],
+    noise: tuple[Sequence[NoiseLevelFunction], Sequence[NoiseLevelFunction] | None, bool],
+    gain: np.ndarray,
+    row_gain: np.ndarray | None,
+    blur_px: torch.Tensor,
+    pixel_blur: PixelBlur | None,
+) -> Captures:
+    """`noise` are `nlf`, `source_noise` and `noisy`; the others are those of `Captures`."""
+    pairs, (nlf, source_noise, noisy) = zip(scenes, settings, strict=True), noise
     ratios = [2.0 ** (s.log2_exposure - c.reference.log2_exposure) for c, s in pairs]
     return Captures(
         settings=settings,
-        scene_ids=[c.scene_id for c in scenes],
-        _lights=[c.clean_light for c in scenes],
+        _scenes=scenes,
         ratio=torch.from_numpy(np.array(ratios) * gain),
-        nlf=[nlfs[s.iso] for s in settings],
+        nlf=nlf,
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
-        blur_px=torch.from_numpy(blur),
-        white_balance=torch.from_numpy(np.array([c.white_balance for c in scenes], np.float32)),
-        colour_matrices=[c.camera.colour_matrix for c in scenes],
+        blur_px=blur_px,
         row_gain=None if row_gain is None else torch.from_numpy(row_gain),
         source_noise=source_noise,
         noisy=noisy,
@@ -339,23 +361,9 @@ class SceneCaptures:
         if pixel_blur is not None:
             pixel_blur = PixelBlur(*(values[alike] for values in pixel_blur))
         gains = np.broadcast_to(gain, len(self.states))[part]
-        ratios = [2.0 ** (s.log2_exposure - scene.reference.log2_exposure) for s in states]
-        return Captures(
-            settings=states,
-            scene_ids=[scene.scene_id] * count,
-            _lights=[scene.clean_light] * count,
-            ratio=torch.from_numpy(ratios * gains),
-            nlf=self._nlf[part],
-            proper_ev=torch.from_numpy(scene.ev100 + np.log2(gains)),
-            blur_px=blur[alike],
-            white_balance=torch.tensor([scene.white_balance] * count),
-            colour_matrices=[scene.camera.colour_matrix] * count,
-            row_gain=None if row_gain is None else torch.from_numpy(row_gain[part]),
-            source_noise=source_noises(prepared, states, gains),
-            noisy=self.noisy,
-            pixel_blur=pixel_blur,
-            likely_ev=_likely_ev([scene] * count, gains),
-        )
+        noise = self._nlf[part], source_noises(prepared, states, gains), self.noisy
+        rows = None if row_gain is None else row_gain[part]
+        return _captures([scene] * count, states, noise, gains, rows, blur[alike], pixel_blur)
 
     def blur(
         self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)
