@@ -24,7 +24,7 @@ from benchmarks.throughput.paired import COLUMNS, checkout, measure_paired
 from benchmarks.throughput.steps import measure_cold_start, measure_resets, measure_steps
 
 #: Threads and frame sizes of the steps; the first is drawn.
-STEPS = ((CORES, 128), (CORES, 64), (1, 128))
+STEPS = ((CORES, 64), (CORES, 128), (1, 64), (1, 128))
 
 
 def parts(seed: int, quick: bool, against: Path | None = None) -> list[Part]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import statistics
 import subprocess
@@ -22,6 +21,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 import ae_env  # noqa: F401  registers the environment
 from ae_env.scorers import Captures
+from agents.learning.ppo import PPOTraining, train_ppo
 from benchmarks.harness import Row, quartiles
 from benchmarks.isolated import CORES, timed
 from benchmarks.throughput.kernel_limit import KernelLimit
@@ -69,7 +69,11 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
     for noise, name in KERNEL.items():
         kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
         cases.append(Case(name, 64, kernel.step, noise))
+    images, scorer = torch.rand(64, *lights.shape[1:]), LiveScore()
+    cases.append(Case("a torch scorer alone", 64, partial(scorer, images, None)))
     cases += _cases(size, seed, threads > 1)
+    if threads > 1 and size == 64 and not quick:
+        cases.append(_ppo(seed))
     try:
         _measure(cases, *(QUICK if quick else FULL))
     finally:
@@ -88,15 +92,12 @@ def _cases(size: int, seed: int, full: bool) -> Iterator[Case]:
     cases: list[tuple[str, int, dict[str, Any]]] = [
         (f"one environment, {rest}", 1, CACHED),
         (f"{many}, {rest}", 64, CACHED),
-        # An episode of 8 steps takes 9 frames; the kernel takes one per step.
-        (f"{many}, {rest}, endless episodes", 64, CACHED | {"max_episode_steps": None}),
-        (f"{many}, {rest}, live scoring", 64, CACHED | live),
+        (f"{many}, {rest}, torch scorer", 64, CACHED | live),
         (f"{many}, {rest}, exact noise", 64, CACHED | exact),
         (f"{many}, {moved}", 64, {}),
     ]
     if full:
-        shown = ("linear", "dn")
-        cases += [(f"{many}, {rest}, {kind}", 64, CACHED | {"observation": kind}) for kind in shown]
+        cases.append((f"{many}, {rest}, linear", 64, CACHED | {"observation": "linear"}))
         lights = ("sine", "flicker")
         cases += [(f"{many}, {moved}, {kind} light", 64, {"lighting": kind}) for kind in lights]
         cases.append((f"one environment, {moved}", 1, {}))
@@ -109,24 +110,21 @@ def _cases(size: int, seed: int, full: bool) -> Iterator[Case]:
         yield Case(name, count, _stepper(envs, seed), make.get("noise", "bank"))
 
 
-def _copies(count: int, size: int, seed: int) -> Case:
-    """The single environment many times: what users have who do not batch.
+def _ppo(seed: int) -> Case:
+    """PPO's whole loop in the environment that it has by default."""
+    envs = warm_environments(64, {"scenes": SCENES, "autoreset_mode": "SAME_STEP"}, seed)
+    training = PPOTraining(total_timesteps=1024)
+    return Case("PPO, motion and defocus", 1024, partial(train_ppo, envs, training))
 
-    They are forked, so that they share the scenes and the libraries that are loaded once; nothing
-    may have run on several threads before.
-    """
+
+def _copies(count: int, size: int, seed: int) -> Case:
+    """Forks of the single environment: no thread may have been started before."""
     options: dict[str, Any] = {"scenes": SCENES, "resolution": size, **CACHED}
     warm_environments(1, options).close()
-    context = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-    copies, mode = [partial(_copy, options)] * count, AutoresetMode.SAME_STEP
-    envs = AsyncVectorEnv(copies, context=context, autoreset_mode=mode)
+    copies, mode = [partial(warm_environments, 1, options)] * count, AutoresetMode.SAME_STEP
+    envs = AsyncVectorEnv(copies, context="fork", autoreset_mode=mode)  # on one thread each
     name = "copies in subprocesses, cached scene"
     return Case(name, count, _stepper(envs, seed), close=envs.close)
-
-
-def _copy(options: dict[str, Any]) -> Any:
-    torch.set_num_threads(1)
-    return warm_environments(1, options)
 
 
 def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
