@@ -38,7 +38,7 @@ from simulator.optics.discs import (
 from simulator.optics.motion import (
     Path,
     blur_apart,
-    blur_rows,
+    blur_planes,
     move_rows,
     path_length,
     streak_share,
@@ -80,7 +80,7 @@ _SLAB, _LARGE = 64, 2**16
 #: Steps in which `Layout.shares` counts defocus, and a bit more than half of one.
 _HALF_STEP = np.float32(0.51 / 255)
 _KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
-_MOST = np.float32(LIGHT_LIMIT)
+_MOST, _TOP = np.float32(LIGHT_LIMIT), np.int64(0)  # of their types, lest they compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
 
 
@@ -276,11 +276,19 @@ class BlurredFrames:
             if diameter > WIDE_PX:
                 frames = _frame_at(int(source[i]), shape), _frame_at(int(lens_to[i]), shape)
                 wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
-                lens_to[i] = 0
             else:
                 radii[i] = disc_radius(diameter)
-        jobs = lens_to, light, moved_to, source, radii, blurs, levels
-        _run(blur_frames, _cost(blurs, lens_to, moved_to), shape, *jobs)
+        _run(blur_discs, radii, shape, source, lens_to, radii)
+        blends = (lens_to > 0) & (blurs["diameter"] > 0)
+        _run(blend_discs, blends, shape, lens_to, blurs, levels)
+        # Sums of taps take as long as these are many, twice as long with a subject.
+        taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
+        taps *= moved_to > 0
+        for task, mine in (
+            (move_along_rows, blurs["streaks"]),
+            (move_along_paths, ~blurs["streaks"]),
+        ):
+            _run(task, taps * mine, shape, light, moved_to, blurs)
         if not self.keeps:
             self._release_levels(indices[new])
         return np.where(moved_to > 0, moved_to, light)
@@ -313,18 +321,11 @@ def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -
     threads = torch.get_num_threads()
     # Frames are shared out whole, unless they are few and large.
     parts = 1 if len(todo) >= 2 * threads or math.prod(shape) < _LARGE else shape[0]
-    ranked = todo[np.argsort(-cost[todo], kind="stable")]
+    ranked = todo[np.argsort(cost[todo], kind="stable")[::-1]]
     # Dealt out in turn: every thread gets about as much to do.
     order = np.concatenate([ranked[share::threads] for share in range(threads)])
     fixed = order, parts, *shape
     parallel_ranges(lambda a, b: task(a, b, *fixed, *columns), len(order) * parts)
-
-
-def _cost(blurs: np.ndarray, lens_to: np.ndarray, moved_to: np.ndarray) -> np.ndarray:
-    """(K,) about how long the blur of a frame takes; 0 for none."""
-    discs = np.where(blurs["diameter"] > 0, 20.0, 1.0 + blurs["defocus_px"] ** 2)
-    sums = np.where(blurs["mask"] > 0, 2.0, 1.0) * (8.0 + 2.0 * blurs["motion_px"])
-    return (lens_to > 0) * discs + (moved_to > 0) * np.where(blurs["streaks"], 8.0, sums)
 
 
 @_jit()
@@ -338,79 +339,76 @@ def mark_needed(blurs, knots, needed):  # type: ignore[no-untyped-def]
         needed[i, 0] = False
 
 
+# Passes do units `first` to `last`: a unit is one of `parts` equal parts of the planes (P, H, W) of
+# a frame. Those of the frame ``order[unit // parts]`` are read and written at addresses (K,). There
+# is one for each kind of blur: what compiles slowly and is not needed is not compiled.
+@_jit()
+def _part(address, unit, parts, planes, height, width):  # type: ignore[no-untyped-def]
+    """The part of a frame at an address that a unit works on, (P / parts, H, W)."""
+    count = planes // parts
+    samples = count * height * width
+    frame = numba.carray(as_pointer(address), (planes * height * width,))
+    begin = unit % parts * samples
+    return frame[begin : begin + samples].reshape((count, height, width))
+
+
 @_jit()
 def blur_discs(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, source, to, radii
 ):
-    """Units `first` to `last`: parts of frames (P, H, W) behind one disc each."""
-    count = planes // parts
-    shape = (count * height, width)
+    """Light behind one disc each."""
     for unit in range(first, last):
-        i, begin = order[unit // parts], unit % parts * count * height * width
-        image = numba.carray(as_pointer(source[i]), (planes * height * width,))
-        out = numba.carray(as_pointer(to[i]), (planes * height * width,))
-        end = begin + count * height * width
-        rows, result = image[begin:end].reshape(shape), out[begin:end].reshape(shape)
-        disc_image(rows, height, radii[i], _MOST, result)
+        i, shape = order[unit // parts], (planes // parts * height, width)
+        image = _part(source[i], unit, parts, planes, height, width).reshape(shape)
+        out = _part(to[i], unit, parts, planes, height, width).reshape(shape)
+        disc_image(image, height, radii[i], _MOST, out)
 
 
 @_jit()
-def blur_frames(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    order,
-    parts,
-    planes,
-    height,
-    width,
-    lens_to,
-    light,
-    moved_to,
-    source,
-    radii,
-    blurs,
-    levels,
+def blend_discs(  # type: ignore[no-untyped-def]
+    first, last, order, parts, planes, height, width, to, blurs, levels
 ):
-    """Units `first` to `last`: parts of frames behind their lens, then in motion.
-
-    (K,) each are addresses to write the light behind the lens to, of what moves, to write that to,
-    and of the light without blur; radii of discs; and blurs. `levels` (K, 13) are discs to blend.
-    """
-    count, samples = planes // parts, planes * height * width
-    shape = (count, height, width)
+    """Light behind a disc of its own for each pixel, from `levels` (K, 13)."""
+    samples = planes * height * width
     for unit in range(first, last):
-        i, begin = order[unit // parts], unit % parts * count * height * width
-        end = begin + count * height * width
+        i = order[unit // parts]
+        diameter = numba.carray(as_pointer(blurs[i].diameter), (height, width))
+        scale, begin = np.float32(blurs[i].defocus_px), unit % parts * (samples // parts)
+        out = _part(to[i], unit, parts, planes, height, width)
+        blend_rows(_TOP, height, diameter, scale, _KNOTS, levels[i], begin, samples, out)
+
+
+@_jit()
+def move_along_rows(  # type: ignore[no-untyped-def]
+    first, last, order, parts, planes, height, width, light, to, blurs
+):
+    """Light that moves along the rows."""
+    for unit in range(first, last):
+        i, shape = order[unit // parts], (planes // parts * height, width)
+        image = _part(light[i], unit, parts, planes, height, width).reshape(shape)
+        out = _part(to[i], unit, parts, planes, height, width).reshape(shape)
+        n, share = streak_share(blurs[i].motion_px)
+        move_rows(_TOP, len(image), image, n, share, _MOST, out)
+
+
+@_jit()
+def move_along_paths(  # type: ignore[no-untyped-def]
+    first, last, order, parts, planes, height, width, light, to, blurs
+):
+    """Light that moves along a path, and a subject that moves along its own."""
+    still = 0.0
+    for unit in range(first, last):
+        i = order[unit // parts]
         blur = blurs[i]
-        if lens_to[i]:
-            out = numba.carray(as_pointer(lens_to[i]), (samples,))[begin:end]
-            if blur.diameter:
-                scale = np.float32(blur.defocus_px)
-                diameter = numba.carray(as_pointer(blur.diameter), (height, width))
-                fixed = (diameter, scale, _KNOTS, levels[i], begin, samples)
-                blend_rows(0, height, *fixed, out.reshape(shape))
-            else:
-                rows = numba.carray(as_pointer(source[i]), (samples,))[begin:end]
-                flat = (count * height, width)
-                disc_image(rows.reshape(flat), height, radii[i], _MOST, out.reshape(flat))
-        if not moved_to[i]:
-            continue
-        image = numba.carray(as_pointer(light[i]), (samples,))[begin:end].reshape(shape)
-        out = numba.carray(as_pointer(moved_to[i]), (samples,))[begin:end]
-        moved = out.reshape(shape)
-        if blur.streaks:
-            rows = image.reshape((count * height, width))
-            n, share = streak_share(blur.motion_px)
-            move_rows(0, len(rows), rows, n, share, _MOST, out.reshape((count * height, width)))
-            continue
-        path = (blur.extent, blur.direction, blur.turn)
-        taps = taps_of(*path, 0.0, 0.0, height, width)
+        image = _part(light[i], unit, parts, planes, height, width)
+        out = _part(to[i], unit, parts, planes, height, width)
+        path = blur.extent, blur.direction, blur.turn
+        taps = taps_of(path[0], path[1], path[2], still, still, height, width)
         if blur.mask:
-            own = taps_of(*path, blur.drift_x, blur.drift_y, height, width)
+            drift = blur.drift_x, blur.drift_y
+            own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
             mask = numba.carray(as_pointer(blur.mask), (height, width))
             behind = numba.carray(as_pointer(blur.behind), (height, width)).view(np.int32)
-            blur_apart(image, mask, behind, taps, own, _MOST, moved)
+            blur_apart(image, mask, behind, taps, own, _MOST, out)
         else:
-            for plane in range(count):
-                rows, columns_, weights = taps
-                blur_rows(0, height, image[plane], rows, columns_, weights, _MOST, moved[plane])
+            blur_planes(image, taps[0], taps[1], taps[2], _MOST, out)

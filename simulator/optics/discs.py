@@ -252,7 +252,7 @@ def _quadrant(radius):  # type: ignore[no-untyped-def]
 def disc_image(image, height, radius, limit, out):  # type: ignore[no-untyped-def]
     """Planes (P * H, W) behind a disc of `radius`."""
     weights, reach = _quadrant(radius)
-    _disc(0, len(image), height, image, weights, reach, limit, out)
+    _disc(np.int64(0), len(image), height, image, weights, reach, limit, out)
 
 
 # -- a bank of discs --------------------------------------------------------------------------

@@ -42,6 +42,8 @@ GROUP = 2048
 _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 #: Points that the length of a path is summed over.
 _LENGTH_POINTS = 32
+#: The first row: a literal 0 would compile what takes it twice.
+_TOP = np.int64(0)
 #: Shares below this are left out.
 _LEAST_WEIGHT = 1e-9
 _jit = functools.partial(kernel, fastmath={"contract"})
@@ -433,7 +435,7 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
         reach, down = max(reach, abs(columns[k])), max(down, abs(rows[k]))
     pitch = width + 2 * reach
     padded = np.empty((last - first + 2 * down, pitch), np.float32)
-    pad_rows(plane, first - down, 0, height, reach, limit, padded)
+    pad_rows(plane, first - down, _TOP, height, reach, limit, padded)
     flat, offsets = padded.reshape(-1), (rows + down) * pitch + columns + reach
     for y in range(first, last):
         total, at = out[y], (y - first) * pitch
@@ -485,7 +487,7 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
                 value = value if value < limit else limit
                 apart[y, x - left] = mask[y, x] * (value if value > -limit else -limit)
                 back[y, x] = flat[np.uint64(behind[y, x])]
-        blur_rows(0, height, back, taps[0], taps[1], taps[2], limit, result)
+        blur_rows(_TOP, height, back, taps[0], taps[1], taps[2], limit, result)
         blur_rows(top, bottom, apart, rows, columns, weights, limit, front)
         for y in range(top, bottom):
             for x in range(right - left):
@@ -494,9 +496,10 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
 
 
 @_jit()
-def _blur_planes(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
+def blur_planes(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
+    """Planes (P, H, W) as sums of their shifts."""
     for plane in range(len(planes)):
-        blur_rows(0, planes.shape[1], planes[plane], rows, columns, weights, limit, out[plane])
+        blur_rows(_TOP, planes.shape[1], planes[plane], rows, columns, weights, limit, out[plane])
 
 
 def path_blur(
@@ -507,7 +510,7 @@ def path_blur(
     It is blurred on the CPU wherever it lies; `out` and `limit` are those of `motion_blur`.
     """
     most = np.float32(limit)
-    return _by_planes(light, out, lambda planes, to: _blur_planes(planes, *taps, most, to))
+    return _by_planes(light, out, lambda planes, to: blur_planes(planes, *taps, most, to))
 
 
 def path_blur_apart(
