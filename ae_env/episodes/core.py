@@ -33,13 +33,10 @@ from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, single_normals
-from simulator.optics.discs import DIAMETERS
 
 #: Samples that are scored together where pixels are read, and where rows differ: a chunk this small
 #: stays in the processor's cache.
 CHUNK_SAMPLES, SMALL_CHUNK_SAMPLES = 2**24, 2**18
-#: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
-LIGHT_CACHE_BYTES = 512 * 2**20
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 #: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
 _DTYPES = {"codes": np.uint8, "signals": np.float32, "numbers": np.uint16}
@@ -177,14 +174,12 @@ class EpisodeCore:
             self._captures = LookupBatch(self.scenes, self._prepared, self.camera)
         else:
             noise: Noise | None = "bank" if options.noise is True else options.noise or None
-            light_bytes = num_envs * self._cached_frames() * 16 * options.resolution**2
             batch = self._captures = CaptureBatch(
                 self._prepared,
                 len(self.scenes) + num_envs,
                 states,
                 self.camera,
                 noise=noise,
-                cache_light=light_bytes <= LIGHT_CACHE_BYTES,
             )
             transitions = batch.transitions if options.reward == "expected" else None
         self.task = make_task(episodes, self._captures, scorer, transitions)
@@ -199,17 +194,6 @@ class EpisodeCore:
     def _restorable(self, scenes: Sequence[Scene] | None) -> tuple[Any, ...]:
         arguments = self.options, len(self.episodes.begun), self._make_task, scenes
         return arguments, self.episodes.columns(), self.task.columns()
-
-    def _cached_frames(self) -> int:
-        """Blurred frames that are cached for an episode at most."""
-        apertures = len(self.grid.f_numbers)
-        scenes = [self.scenes[index] for index in self.scenes.loaded]
-        if any(scene.layout is not None for scene in scenes):  # what their discs make of it
-            apertures += len(DIAMETERS)
-        if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results
-            apertures += len(DIAMETERS) + apertures
-        as_recorded_and_denoised = 1 + any(s.denoised is not None for s in scenes)
-        return as_recorded_and_denoised * apertures + 1
 
     def observation_space(self) -> gym.spaces.Dict:
         """Space of one episode's observation."""

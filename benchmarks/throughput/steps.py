@@ -40,7 +40,7 @@ class LiveScore:
 
     domain = "raw"
 
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+    def __call__(self, images: torch.Tensor, captures: Captures | None) -> torch.Tensor:
         """Scores (B,) of `images` (B, 4, H, W)."""
         return ((images.sqrt() - 0.5) ** 2 / (-2 * 0.2**2)).exp().mean(dim=(1, 2, 3))
 

@@ -34,6 +34,8 @@ from simulator.capture.statistics import BINS, LightStatistics
 from simulator.settings import CameraSettings
 from simulator.utils.compute import addresses, parallel_ranges
 
+#: Memory that the blurred light of a batch may take before less of it is cached [byte].
+LIGHT_BYTES = 512 * 2**20
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
@@ -105,9 +107,9 @@ class FrameSource(Protocol):
 class CaptureBatch:
     """`FrameSource` that simulates the frames, on the CPU.
 
-    `prepared` returns the scene of an index, in its own light, when it is first photographed. With
-    `cache_light` the defocused light of every f-number is cached until a scene is forgotten; else
-    only that of the latest f-number. A pickled copy works everything out again.
+    `prepared` returns the scene of an index, in its own light, when it is first photographed. The
+    light behind the lens at every f-number is cached until a scene is forgotten, as long as all
+    takes no more than `light_bytes`. A pickled copy works everything out again.
     """
 
     def __init__(
@@ -118,13 +120,13 @@ class CaptureBatch:
         camera: CameraProfile,
         *,
         noise: Noise | None,
-        cache_light: bool,
+        light_bytes: int = LIGHT_BYTES,
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
-        self.camera, self.noise, self._cache_light = camera, noise, cache_light
+        self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
         self._columns = state_columns(states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
-        self._frames = BlurredFrames(num_scenes, len(apertures), cache_light)
+        self._frames = BlurredFrames(num_scenes, len(apertures), light_bytes)
         self._targets: dict[int, np.ndarray] = {}  # by box factor, (S, 2, 4)
         # Scenes as columns; whether their captures are planned in columns, too: where the light has
         # no noise of its own, and no aperture is opened.
@@ -152,7 +154,7 @@ class CaptureBatch:
         self._any_remaining = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        made = partial(CaptureBatch, noise=self.noise, cache_light=self._cache_light)
+        made = partial(CaptureBatch, noise=self.noise, light_bytes=self._light_bytes)
         return made, (self._prepared, self.num_scenes, self.states, self.camera)
 
     def forget(self, indices: np.ndarray) -> None:
@@ -326,7 +328,7 @@ class CaptureBatch:
         exposure, lights = self._exposure[row], self._scenes[row // len(self.states)].blurred_light
         if exposure.opened_to is not None:
             self._source[row] = lights.source(exposure).contiguous()
-            if not self._cache_light:
+            if self._frames.is_full and lights.aperture_blur is not None:
                 lights.aperture_blur.forget()
 
     def _balance(self, row: int) -> None:

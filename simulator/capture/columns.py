@@ -75,8 +75,8 @@ BLUR = np.dtype(
 )
 #: All of a state that the exposure of a capture depends on.
 STATE = np.dtype([(name, "f8") for name in ("log2_exposure", "time", "f_number")])
-#: Frames of memory that are made at once; and samples of a frame whose planes are shared out.
-_SLAB, _LARGE = 64, 2**16
+#: Samples of memory that are made at once, and of a frame whose planes are shared out.
+_SLAB, _LARGE = 2**20, 2**16
 #: Steps in which `Layout.shares` counts defocus, and a bit more than half of one.
 _HALF_STEP = np.float32(0.51 / 255)
 _KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
@@ -194,19 +194,18 @@ class FramesAt(Sequence[torch.Tensor]):
 
 def _frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
     kind = ctypes.c_float * math.prod(shape)
-    return np.frombuffer(kind.from_address(address), np.float32).reshape(shape)
+    return np.ctypeslib.as_array(kind.from_address(address)).reshape(shape)
 
 
 class BlurredFrames:
     """Blurred light of a batch's scenes, each frame (4, H, W), in memory that is used again.
 
-    With `keeps` the light behind the lens is cached for each of `num_apertures`, and the discs that
-    it is blended of; else only the latest.
+    The light behind the lens is cached for each of `num_apertures`, and the discs that it is
+    blended of; where all memory together exceeds `most_bytes`, only the latest light.
     """
 
-    def __init__(self, num_scenes: int, num_apertures: int, keeps: bool) -> None:
-        self.keeps = keeps
-        slots = (num_scenes, num_apertures if keeps else 1)
+    def __init__(self, num_scenes: int, num_apertures: int, most_bytes: int) -> None:
+        self._most_bytes, slots = most_bytes, (num_scenes, num_apertures)
         # Addresses, 0 for none; and the light and the diameter that they were made of.
         self._lens, self._source = np.zeros((2, *slots), np.uintp)
         self._diameter = np.zeros(slots)
@@ -214,11 +213,17 @@ class BlurredFrames:
         self._levels_source, self._moved = np.zeros((2, num_scenes), np.uintp)
         self._slabs, self._free = list[np.ndarray](), np.empty(0, np.uintp)
 
+    @property
+    def is_full(self) -> bool:
+        """Whether the memory exceeds its limit."""
+        return sum(slab.nbytes for slab in self._slabs) > self._most_bytes
+
     def _take(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
         """Addresses of memory for `count` frames."""
         lacking = count - len(self._free)
         if lacking > 0:
-            slab = np.empty((max(lacking, _SLAB), math.prod(shape)), np.float32)
+            samples = math.prod(shape)
+            slab = np.empty((max(lacking, _SLAB // samples), samples), np.float32)
             self._slabs.append(slab)
             places = slab.ctypes.data + np.arange(len(slab)) * slab.strides[0]
             self._free = np.concatenate([self._free, places.astype(np.uintp)])
@@ -237,6 +242,14 @@ class BlurredFrames:
         self._free = np.concatenate([self._free, held[held > 0]])
         self._levels[indices] = 0
 
+    def _free_others(self, indices: np.ndarray, slots: np.ndarray) -> None:
+        """Frees all of the scenes `indices` but the light at the apertures `slots`."""
+        self._release_levels(indices)
+        others = self._lens[indices]
+        others[np.arange(len(indices)), slots] = 0
+        self._lens[indices] -= others
+        self._free = np.concatenate([self._free, others[others > 0]])
+
     def make(
         self,
         indices: np.ndarray,
@@ -250,7 +263,8 @@ class BlurredFrames:
         `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the addresses of the light
         (4, H, W) that they start from. Each stays until its scene blurs another.
         """
-        slots = slots if self.keeps else np.zeros_like(slots)
+        if self.is_full:
+            self._free_others(indices, slots)
         behind_lens = blurs["defocus_px"] > 0.0
         known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
         known &= self._diameter[indices, slots] == blurs["defocus_px"]
@@ -289,8 +303,6 @@ class BlurredFrames:
             (move_along_paths, ~blurs["streaks"]),
         ):
             _run(task, taps * mine, shape, light, moved_to, blurs)
-        if not self.keeps:
-            self._release_levels(indices[new])
         return np.where(moved_to > 0, moved_to, light)
 
     def _made_levels(
@@ -329,12 +341,17 @@ def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -
 
 
 @_jit()
+def _array_at(address, shape):  # type: ignore[no-untyped-def]
+    return numba.carray(as_pointer(address), shape)  # type: ignore[attr-defined, call-arg]
+
+
+@_jit()
 def mark_needed(blurs, knots, needed):  # type: ignore[no-untyped-def]
     """Marks the discs, other than none, that the blend of each frame needs."""
     for i in range(len(blurs)):
         blur = blurs[i]
         if blur.diameter:
-            sorts = numba.carray(as_pointer(blur.sorts), (blur.num_sorts,))
+            sorts = _array_at(blur.sorts, (blur.num_sorts,))
             mark_levels(sorts, np.float32(blur.defocus_px), _HALF_STEP, knots, needed[i])
         needed[i, 0] = False
 
@@ -347,7 +364,7 @@ def _part(address, unit, parts, planes, height, width):  # type: ignore[no-untyp
     """The part of a frame at an address that a unit works on, (P / parts, H, W)."""
     count = planes // parts
     samples = count * height * width
-    frame = numba.carray(as_pointer(address), (planes * height * width,))
+    frame = _array_at(address, (planes * height * width,))
     begin = unit % parts * samples
     return frame[begin : begin + samples].reshape((count, height, width))
 
@@ -372,7 +389,7 @@ def blend_discs(  # type: ignore[no-untyped-def]
     samples = planes * height * width
     for unit in range(first, last):
         i = order[unit // parts]
-        diameter = numba.carray(as_pointer(blurs[i].diameter), (height, width))
+        diameter = _array_at(blurs[i].diameter, (height, width))
         scale, begin = np.float32(blurs[i].defocus_px), unit % parts * (samples // parts)
         out = _part(to[i], unit, parts, planes, height, width)
         blend_rows(_TOP, height, diameter, scale, _KNOTS, levels[i], begin, samples, out)
@@ -407,8 +424,8 @@ def move_along_paths(  # type: ignore[no-untyped-def]
         if blur.mask:
             drift = blur.drift_x, blur.drift_y
             own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
-            mask = numba.carray(as_pointer(blur.mask), (height, width))
-            behind = numba.carray(as_pointer(blur.behind), (height, width)).view(np.int32)
+            mask = _array_at(blur.mask, (height, width))
+            behind = _array_at(blur.behind, (height, width)).view(np.int32)
             blur_apart(image, mask, behind, taps, own, _MOST, out)
         else:
             blur_planes(image, taps[0], taps[1], taps[2], _MOST, out)

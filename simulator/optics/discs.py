@@ -430,7 +430,7 @@ def blend_rows(  # type: ignore[no-untyped-def]
         least, most = _square(flat[start:end], scale, knots[-1], squared)
         lowest, highest = _below(knots, least), _below(knots, most) + 1
         for level in range(lowest, highest + 1):
-            image = numba.carray(as_pointer(images[level]), (samples,))
+            image = numba.carray(as_pointer(images[level]), (samples,))  # type: ignore[attr-defined, call-arg]
             _weigh(squared, knots, level, weight)
             for plane in range(planes):
                 offset = begin + plane * height * width
