@@ -27,7 +27,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
-from ae_env.scorers.captures import Captures, describe_captures, reads_pixels
+from ae_env.scorers.captures import Captures, describe_captures
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
@@ -82,7 +82,6 @@ class AutoExposure(Task):
         if reads_codes or "flicker" in options.costs:  # else no code of every sample is made
             self.outputs += ("codes",)
         torch_parts = {} if terms.torch_terms is None else terms.torch_terms.parts
-        self.in_chunks = any(map(reads_pixels, torch_parts.values()))
         # By `Episodes.light_index` and state; and which have been scored.
         count, states = len(episodes.begun), len(episodes.grid)
         lights = len(episodes.scenes) + count

@@ -34,9 +34,8 @@ from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, single_normals
 
-#: Samples that are scored together where pixels are read, and where rows differ: a chunk this small
-#: stays in the processor's cache.
-CHUNK_SAMPLES, SMALL_CHUNK_SAMPLES = 2**24, 2**18
+#: Samples that are recorded and scored together, at most.
+CHUNK_SAMPLES = 2**24
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 #: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
 _DTYPES = {"codes": np.uint8, "signals": np.float32, "numbers": np.uint16}
@@ -74,7 +73,6 @@ class Task:
     """
 
     outputs: tuple[str, ...] = ()  # of `FrameSource.record`, that `measure` reads
-    in_chunks = False  # whether `measure` reads so much that it takes small batches
 
     def __init__(self, episodes: Episodes) -> None:
         self.episodes = episodes
@@ -283,9 +281,7 @@ class EpisodeCore:
         if not episodes.static:
             gains, rows = episodes.gains(env_indices, self._state_info[1, states])
         self._captures.prepare(lights, states, gains)
-        most = SMALL_CHUNK_SAMPLES if rows is not None else CHUNK_SAMPLES
-        in_chunks = self.task.in_chunks or rows is not None
-        step = max(1, most // (4 * size**2) if in_chunks else len(env_indices))
+        step = max(1, CHUNK_SAMPLES // (4 * size**2))
         chunks = []
         for start in range(0, len(env_indices), step):
             part = slice(start, start + step)

@@ -87,7 +87,7 @@ def test_frames_are_those_of_the_simulator(noise, tolerance, lighting):
     assert different < 1e-3 * total  # float32 against float64, where rounding is close
 
 
-def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
+def test_scorers_that_look_at_images_see_the_frames_that_are_observed(monkeypatch) -> None:
     seen: list[torch.Tensor] = []
 
     def watch(images, captures):
@@ -95,6 +95,7 @@ def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
         return torch.full((len(images),), 0.5)
 
     watched = _frames(make_envs(scorer=Own(watch)))
+    monkeypatch.setattr("ae_env.episodes.core.CHUNK_SAMPLES", 1)  # frame by frame
     assert_equal(watched, _frames(make_envs()))
     codes = torch.from_numpy(watched[0][0])
     assert float(seen[0].min()) >= 0.0

@@ -212,9 +212,7 @@ def test_scores_are_shares_and_the_oracle_has_the_highest(light, reference, grid
 
 
 #: The fields and the properties worked out from them that a scorer could write to.
-TENSORS = [
-    f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type) and f.name[0] != "_"
-]
+TENSORS = [f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type)]
 TENSORS += [name for name, value in vars(Captures).items() if isinstance(value, cached_property)]
 
 
