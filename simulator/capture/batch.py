@@ -311,7 +311,10 @@ class CaptureBatch:
         indices, states = np.divmod(rows, len(self.states))
         alone = rows[~self._in_columns[indices]]
         try:
-            _each(self._open, [(row,) for row in alone.tolist()])
+            opens = [row for row in alone.tolist() if self._exposure[row].opened_to is not None]
+            _each(self._open, [(row,) for row in opens])
+            # Light that was opened before may have had the same address.
+            self._frames.release(np.array(opens, np.int64) // len(self.states))
             sources = self._source[rows]
             light, shape = addresses(sources), tuple(sources[0].shape)
             made = self._frames.make(indices, self._slots[states], self._blur[rows], light, shape)
@@ -324,12 +327,11 @@ class CaptureBatch:
         self._blurred_row[indices] = rows
 
     def _open(self, row: int) -> None:
-        """Opens the aperture where that is needed; the scene caches its result."""
+        """Opens the aperture; the scene caches its result."""
         exposure, lights = self._exposure[row], self._scenes[row // len(self.states)].blurred_light
-        if exposure.opened_to is not None:
-            self._source[row] = lights.source(exposure).contiguous()
-            if self._frames.is_full and lights.aperture_blur is not None:
-                lights.aperture_blur.forget()
+        self._source[row] = lights.source(exposure).contiguous()
+        if self._frames.is_full and lights.aperture_blur is not None:
+            lights.aperture_blur.forget()
 
     def _balance(self, row: int) -> None:
         """Computes the excess variance where it depends on the pixels."""

@@ -232,6 +232,7 @@ class BlurredFrames:
 
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
+        indices = np.unique(indices)
         self._release_levels(indices)
         held = np.concatenate([self._lens[indices].ravel(), self._moved[indices]])
         self._free = np.concatenate([self._free, held[held > 0]])
