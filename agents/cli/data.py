@@ -249,9 +249,11 @@ def _use_rest() -> None:
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
+    from simulator.capture.columns import BLUR, BlurredFrames
     from simulator.optics.discs import disc_blur
     from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw
+    from simulator.utils.compute import addresses
 
     library = find_scenes(DEFAULT_SCENES)
     viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))
@@ -263,4 +265,7 @@ def _use_rest() -> None:
     numbers = raw.to_mosaic().astype(np.float64)  # files hold integers
     light = RawImage.from_mosaic(numbers, raw.settings, raw.camera).data
     disc_blur(motion_blur(light, 2.5), 2.5)
+    blurs = np.array([(0.0, 2.5, True, *[0] * 10)], BLUR)
+    first = np.zeros(1, np.int64)
+    BlurredFrames(1, 1, 0).make(first, first, blurs, addresses([light]), tuple(light.shape))
     draw("dead_leaves", np.random.default_rng(0))  # the scenes may all have been in the cache
