@@ -218,7 +218,7 @@ class CaptureBatch:
             count=True,
             **outputs,
         )
-        samples = transitions.light[0].numel()
+        samples = self._source[rows[0]].numel()
         return FrameStatistics(
             clipped_low=counts[:, 0] / samples,
             clipped_high=counts[:, 1] / samples,

@@ -193,8 +193,8 @@ class FramesAt(Sequence[torch.Tensor]):
 
 
 def _frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
-    kind = ctypes.c_float * math.prod(shape)
-    return np.ctypeslib.as_array(kind.from_address(address)).reshape(shape)
+    memory = ctypes.c_float * math.prod(shape)
+    return np.ndarray(shape, np.float32, memoryview(memory.from_address(address)))
 
 
 class BlurredFrames:
