@@ -312,9 +312,10 @@ class CaptureBatch:
         alone = rows[~self._in_columns[indices]]
         try:
             opens = [row for row in alone.tolist() if self._exposure[row].opened_to is not None]
-            _each(self._open, [(row,) for row in opens])
-            # Light that was opened before may have had the same address.
-            self._frames.release(np.array(opens, np.int64) // len(self.states))
+            if opens:
+                _each(self._open, [(row,) for row in opens])
+                # Light that was opened before may have had the same address.
+                self._frames.release(np.array(opens) // len(self.states))
             sources = self._source[rows]
             light, shape = addresses(sources), tuple(sources[0].shape)
             made = self._frames.make(indices, self._slots[states], self._blur[rows], light, shape)

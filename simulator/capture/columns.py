@@ -270,41 +270,51 @@ class BlurredFrames:
         known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
         known &= self._diameter[indices, slots] == blurs["defocus_px"]
         new = np.flatnonzero(behind_lens & ~known)
-        lens_to, levels = np.zeros(len(indices), np.uintp), np.zeros((len(indices), 13), np.uintp)
         if len(new):
-            where = indices[new], slots[new]
-            lacking = self._lens[where] == 0
-            self._lens[where[0][lacking], where[1][lacking]] = self._take(lacking.sum(), shape)
-            self._source[where], self._diameter[where] = source[new], blurs["defocus_px"][new]
-            lens_to[new] = self._lens[where]
-            levels[new] = self._made_levels(where[0], blurs[new], source[new], shape)
+            self._focus(indices[new], slots[new], blurs[new], source[new], shape)
         light = np.where(behind_lens, self._lens[indices, slots], source)
         moves = np.flatnonzero(blurs["motion_px"] > 0.0)
-        moved_to = np.zeros_like(light)
         if len(moves):
-            lacking = indices[moves][self._moved[indices[moves]] == 0]
+            some, blurs, source = indices[moves], blurs[moves], light[moves]
+            lacking = some[self._moved[some] == 0]
             self._moved[lacking] = self._take(len(lacking), shape)
-            moved_to[moves] = self._moved[indices[moves]]
+            light[moves] = moved_to = self._moved[some]
+            # Sums of taps take as long as these are many, twice as long with a subject.
+            taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
+            streaks = blurs["streaks"]
+            _run(move_along_rows, taps * streaks, shape, source, moved_to, blurs)
+            _run(move_along_paths, taps * ~streaks, shape, source, moved_to, blurs)
+        return light
+
+    def _focus(
+        self,
+        indices: np.ndarray,
+        slots: np.ndarray,
+        blurs: np.ndarray,
+        source: np.ndarray,
+        shape: tuple[int, ...],
+    ) -> None:
+        """Makes the light behind the lens, of scenes that are out of focus; see `make`."""
+        lacking = self._lens[indices, slots] == 0
+        memory = self._take(int(lacking.sum()), shape)
+        self._lens[indices[lacking], slots[lacking]] = memory
+        self._source[indices, slots] = source
+        self._diameter[indices, slots] = blurs["defocus_px"]
+        to, blends = self._lens[indices, slots], blurs["diameter"] > 0
+        if blends.any():
+            levels = np.zeros((len(indices), len(DIAMETERS)), np.uintp)
+            made = indices[blends], blurs[blends], source[blends]
+            levels[blends] = self._made_levels(*made, shape)
+            _run(blend_discs, blends, shape, to, blurs, levels)
         radii = np.zeros(len(indices))
-        for i in new[blurs["diameter"][new] == 0].tolist():  # one disc everywhere
+        for i in np.flatnonzero(~blends).tolist():  # one disc everywhere
             diameter = float(blurs["defocus_px"][i])
             if diameter > WIDE_PX:
-                frames = _frame_at(int(source[i]), shape), _frame_at(int(lens_to[i]), shape)
+                frames = _frame_at(int(source[i]), shape), _frame_at(int(to[i]), shape)
                 wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
             else:
                 radii[i] = disc_radius(diameter)
-        _run(blur_discs, radii, shape, source, lens_to, radii)
-        blends = (lens_to > 0) & (blurs["diameter"] > 0)
-        _run(blend_discs, blends, shape, lens_to, blurs, levels)
-        # Sums of taps take as long as these are many, twice as long with a subject.
-        taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
-        taps *= moved_to > 0
-        for task, mine in (
-            (move_along_rows, blurs["streaks"]),
-            (move_along_paths, ~blurs["streaks"]),
-        ):
-            _run(task, taps * mine, shape, light, moved_to, blurs)
-        return np.where(moved_to > 0, moved_to, light)
+        _run(blur_discs, radii, shape, source, to, radii)
 
     def _made_levels(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, shape: tuple[int, ...]
@@ -318,12 +328,17 @@ class BlurredFrames:
         frame, level = np.nonzero(needed & (self._levels[indices] == 0))
         made = self._take(len(frame), shape)
         self._levels[indices[frame], level] = made
-        radii = np.array([disc_radius(diameter) for diameter in DIAMETERS])[level]
+        radii = _disc_radii()[level]
         _run(blur_discs, radii, shape, source[frame], made, radii)
         # Levels without a share are read too, times 0: any image does.
         levels = self._levels[indices]
         levels[:, 0] = source
         return np.where(levels == 0, source[:, None], levels)
+
+
+@functools.cache
+def _disc_radii() -> np.ndarray:
+    return np.array([disc_radius(diameter) for diameter in DIAMETERS])
 
 
 def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]
