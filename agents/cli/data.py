@@ -249,7 +249,7 @@ def _use_rest() -> None:
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.capture.columns import BLUR, BlurredFrames
+    from simulator.capture.blurred_frames import BLUR, BlurredFrames
     from simulator.optics.discs import disc_blur
     from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw

@@ -16,11 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from simulator.camera import CameraProfile
+from simulator.capture.blurred_frames import BLUR, BlurredFrames, FramesAt
 from simulator.capture.columns import (
-    BLUR,
     SCENE,
-    BlurredFrames,
-    FramesAt,
     blur_column,
     plan_frames,
     scene_column,

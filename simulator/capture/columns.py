@@ -1,57 +1,26 @@
-"""A batch of captures in columns: how each is exposed and blurred, and the passes that do it.
+"""A batch of captures in columns: how each is exposed.
 
 `plan_frames` is `simulator.capture.decision.decide` for scenes without noise of their own, many at
-a time. `BlurredFrames` makes the light behind lens and motion, as
-`simulator.capture.blurred_light.BlurredLight` does for one, in memory that is used again.
+a time.
 """
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
-import torch
 
-from simulator.capture.decision import (
-    LIGHT_LIMIT,
-    RATIO_LIMIT,
-    STREAK_TO_DISC,
-    Exposure,
-    weigh_blurs,
-)
+from simulator.capture.blurred_frames import LAYOUT
+from simulator.capture.decision import RATIO_LIMIT, STREAK_TO_DISC, Exposure, weigh_blurs
 from simulator.capture.prepared_scene import Layout, PreparedScene
 from simulator.capture.statistics import curvature
-from simulator.optics.discs import (
-    DIAMETERS,
-    WIDE_PX,
-    blend_rows,
-    disc_image,
-    disc_radius,
-    mark_levels,
-    wide_disc,
-)
-from simulator.optics.motion import (
-    Path,
-    blur_apart,
-    blur_planes,
-    move_rows,
-    path_length,
-    streak_share,
-    taps_of,
-)
+from simulator.optics.motion import Path, path_length
 from simulator.settings import CameraSettings
-from simulator.utils.compute import as_pointer, kernel, parallel_ranges
+from simulator.utils.compute import kernel
 
-_Fields = list[tuple[str, str]]
-#: Addresses of arrays of a layout, 0 for none: (H, W) float32 diameters relative to the largest;
-#: float32 diameters that pixels have, and how many these are; and of a subject that moves, (H, W)
-#: float32 mask, and int32 pixels behind it.
-_LAYOUT: _Fields = [(n, "uintp") for n in ("diameter", "sorts", "num_sorts", "mask", "behind")]
 #: All of a scene that the exposure of a capture depends on; see `PreparedScene`.
 SCENE = np.dtype(
     [
@@ -59,32 +28,12 @@ SCENE = np.dtype(
         *((n, "f8") for n in ("direction", "turn", "subject_speed", "subject_direction")),
         ("targets", "i8"),  # which noise of the camera its captures have
         ("streaks", "?"),  # whether the whole frame moves along the rows
-        *_LAYOUT,
-    ]
-)
-#: The blurs of a capture.
-BLUR = np.dtype(
-    [
-        ("defocus_px", "f8"),  # diameter of the largest disc [pixel]
-        ("motion_px", "f8"),  # how far the image moves at most [pixel]
-        ("streaks", "?"),
-        # The background's path, see `simulator.optics.motion.Path`; and how the subject drifts.
-        *((n, "f8") for n in ("extent", "direction", "turn", "drift_x", "drift_y")),
-        *_LAYOUT,
+        *LAYOUT,
     ]
 )
 #: All of a state that the exposure of a capture depends on.
 STATE = np.dtype([(name, "f8") for name in ("log2_exposure", "time", "f_number")])
-#: Samples of memory that are made at once, and of a frame whose planes are shared out.
-_SLAB, _LARGE = 2**20, 2**16
-#: Steps in which `Layout.shares` counts defocus, and a bit more than half of one.
-_HALF_STEP = np.float32(0.51 / 255)
-_KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
-_MOST, _TOP = np.float32(LIGHT_LIMIT), np.int64(0)  # of their types, lest they compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
-
-
-# -- plans ------------------------------------------------------------------------------------
 
 
 def state_columns(states: Sequence[CameraSettings]) -> np.ndarray:
@@ -118,7 +67,7 @@ def blur_column(exposure: Exposure) -> tuple[Any, ...]:
 
 
 def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
-    """The fields `_LAYOUT`."""
+    """The fields `LAYOUT`."""
     arrays = () if layout is None else layout.arrays[: 4 if subject else 2]
     found = [array.__array_interface__["data"][0] for array in arrays] + [0] * (4 - len(arrays))
     return (*found[:2], arrays[1].size if arrays else 0, *found[2:])
@@ -172,276 +121,3 @@ def plan_frames(  # type: ignore[no-untyped-def]
             table[row, 0, plane] = ratio
             table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
             table[row, 3, plane] = table[row, 4, plane] = 0.0
-
-
-# -- blurred light ----------------------------------------------------------------------------
-
-
-class FramesAt(Sequence[torch.Tensor]):
-    """Contiguous float32 frames of one shape, known by their `addresses` (B,)."""
-
-    def __init__(self, addresses: np.ndarray, shape: tuple[int, ...]) -> None:
-        self.addresses, self._shape = addresses, shape
-
-    def __len__(self) -> int:
-        return len(self.addresses)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return torch.from_numpy(_frame_at(int(self.addresses[index]), self._shape))
-
-
-def _frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
-    memory = ctypes.c_float * math.prod(shape)
-    return np.ndarray(shape, np.float32, memoryview(memory.from_address(address)))
-
-
-class BlurredFrames:
-    """Blurred light of a batch's scenes, each frame (4, H, W), in memory that is used again.
-
-    The light behind the lens is cached for each of `num_apertures`, and the discs that it is
-    blended of; where all memory together exceeds `most_bytes`, only the latest light.
-    """
-
-    def __init__(self, num_scenes: int, num_apertures: int, most_bytes: int) -> None:
-        self._most_bytes, slots = most_bytes, (num_scenes, num_apertures)
-        # Addresses, 0 for none; and the light and the diameter that they were made of.
-        self._lens, self._source = np.zeros((2, *slots), np.uintp)
-        self._diameter = np.zeros(slots)
-        self._levels = np.zeros((num_scenes, len(DIAMETERS)), np.uintp)
-        self._levels_source, self._moved = np.zeros((2, num_scenes), np.uintp)
-        self._slabs, self._free = list[np.ndarray](), np.empty(0, np.uintp)
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the memory exceeds its limit."""
-        return sum(slab.nbytes for slab in self._slabs) > self._most_bytes
-
-    def _take(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
-        """Addresses of memory for `count` frames."""
-        lacking = count - len(self._free)
-        if lacking > 0:
-            samples = math.prod(shape)
-            slab = np.empty((max(lacking, _SLAB // samples), samples), np.float32)
-            self._slabs.append(slab)
-            places = slab.ctypes.data + np.arange(len(slab)) * slab.strides[0]
-            self._free = np.concatenate([self._free, places.astype(np.uintp)])
-        taken, self._free = np.split(self._free, [count])
-        return taken
-
-    def release(self, indices: np.ndarray) -> None:
-        """Frees the memory of the scenes `indices`."""
-        indices = np.unique(indices)
-        self._release_levels(indices)
-        held = np.concatenate([self._lens[indices].ravel(), self._moved[indices]])
-        self._free = np.concatenate([self._free, held[held > 0]])
-        self._lens[indices] = self._moved[indices] = 0
-
-    def _release_levels(self, indices: np.ndarray) -> None:
-        held = self._levels[indices].ravel()
-        self._free = np.concatenate([self._free, held[held > 0]])
-        self._levels[indices] = 0
-
-    def _free_others(self, indices: np.ndarray, slots: np.ndarray) -> None:
-        """Frees all of the scenes `indices` but the light at the apertures `slots`."""
-        self._release_levels(indices)
-        others = self._lens[indices]
-        others[np.arange(len(indices)), slots] = 0
-        self._lens[indices] -= others
-        self._free = np.concatenate([self._free, others[others > 0]])
-
-    def make(
-        self,
-        indices: np.ndarray,
-        slots: np.ndarray,
-        blurs: np.ndarray,
-        source: np.ndarray,
-        shape: tuple[int, ...],
-    ) -> np.ndarray:
-        """(K,) addresses of the light of scenes `indices`, all different, behind their blurs.
-
-        `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the addresses of the light
-        (4, H, W) that they start from. Each stays until its scene blurs another.
-        """
-        if self.is_full:
-            self._free_others(indices, slots)
-        behind_lens = blurs["defocus_px"] > 0.0
-        known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
-        known &= self._diameter[indices, slots] == blurs["defocus_px"]
-        new = np.flatnonzero(behind_lens & ~known)
-        if len(new):
-            self._focus(indices[new], slots[new], blurs[new], source[new], shape)
-        light = np.where(behind_lens, self._lens[indices, slots], source)
-        moves = np.flatnonzero(blurs["motion_px"] > 0.0)
-        if len(moves):
-            some, blurs, source = indices[moves], blurs[moves], light[moves]
-            lacking = some[self._moved[some] == 0]
-            self._moved[lacking] = self._take(len(lacking), shape)
-            light[moves] = moved_to = self._moved[some]
-            # Sums of taps take as long as these are many, twice as long with a subject.
-            taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
-            streaks = blurs["streaks"]
-            _run(move_along_rows, taps * streaks, shape, source, moved_to, blurs)
-            _run(move_along_paths, taps * ~streaks, shape, source, moved_to, blurs)
-        return light
-
-    def _focus(
-        self,
-        indices: np.ndarray,
-        slots: np.ndarray,
-        blurs: np.ndarray,
-        source: np.ndarray,
-        shape: tuple[int, ...],
-    ) -> None:
-        """Makes the light behind the lens, of scenes that are out of focus; see `make`."""
-        lacking = self._lens[indices, slots] == 0
-        memory = self._take(int(lacking.sum()), shape)
-        self._lens[indices[lacking], slots[lacking]] = memory
-        self._source[indices, slots] = source
-        self._diameter[indices, slots] = blurs["defocus_px"]
-        to, blends = self._lens[indices, slots], blurs["diameter"] > 0
-        if blends.any():
-            levels = np.zeros((len(indices), len(DIAMETERS)), np.uintp)
-            made = indices[blends], blurs[blends], source[blends]
-            levels[blends] = self._made_levels(*made, shape)
-            _run(blend_discs, blends, shape, to, blurs, levels)
-        radii = np.zeros(len(indices))
-        for i in np.flatnonzero(~blends).tolist():  # one disc everywhere
-            diameter = float(blurs["defocus_px"][i])
-            if diameter > WIDE_PX:
-                frames = _frame_at(int(source[i]), shape), _frame_at(int(to[i]), shape)
-                wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
-            else:
-                radii[i] = disc_radius(diameter)
-        _run(blur_discs, radii, shape, source, to, radii)
-
-    def _made_levels(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, shape: tuple[int, ...]
-    ) -> np.ndarray:
-        """(K, 13) addresses of the light of scenes behind the discs that their blend needs."""
-        stale = self._levels_source[indices] != source
-        self._release_levels(indices[stale])
-        self._levels_source[indices] = source
-        needed = np.zeros((len(indices), len(DIAMETERS)), bool)
-        mark_needed(blurs, _KNOTS, needed)
-        frame, level = np.nonzero(needed & (self._levels[indices] == 0))
-        made = self._take(len(frame), shape)
-        self._levels[indices[frame], level] = made
-        radii = _disc_radii()[level]
-        _run(blur_discs, radii, shape, source[frame], made, radii)
-        # Levels without a share are read too, times 0: any image does.
-        levels = self._levels[indices]
-        levels[:, 0] = source
-        return np.where(levels == 0, source[:, None], levels)
-
-
-@functools.cache
-def _disc_radii() -> np.ndarray:
-    return np.array([disc_radius(diameter) for diameter in DIAMETERS])
-
-
-def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]
-    """Calls a pass for units of each frame on all threads, the costliest first."""
-    todo = np.flatnonzero(cost)
-    if not len(todo):
-        return
-    threads = torch.get_num_threads()
-    # Frames are shared out whole, unless they are few and large.
-    parts = 1 if len(todo) >= 2 * threads or math.prod(shape) < _LARGE else shape[0]
-    ranked = todo[np.argsort(cost[todo], kind="stable")[::-1]]
-    # Dealt out in turn: every thread gets about as much to do.
-    order = np.concatenate([ranked[share::threads] for share in range(threads)])
-    fixed = order, parts, *shape
-    parallel_ranges(lambda a, b: task(a, b, *fixed, *columns), len(order) * parts)
-
-
-@_jit()
-def _array_at(address, shape):  # type: ignore[no-untyped-def]
-    return numba.carray(as_pointer(address), shape)  # type: ignore[attr-defined, call-arg]
-
-
-@_jit()
-def mark_needed(blurs, knots, needed):  # type: ignore[no-untyped-def]
-    """Marks the discs, other than none, that the blend of each frame needs."""
-    for i in range(len(blurs)):
-        blur = blurs[i]
-        if blur.diameter:
-            sorts = _array_at(blur.sorts, (blur.num_sorts,))
-            mark_levels(sorts, np.float32(blur.defocus_px), _HALF_STEP, knots, needed[i])
-        needed[i, 0] = False
-
-
-# Passes do units `first` to `last`: a unit is one of `parts` equal parts of the planes (P, H, W) of
-# a frame. Those of the frame ``order[unit // parts]`` are read and written at addresses (K,). There
-# is one for each kind of blur: what compiles slowly and is not needed is not compiled.
-@_jit()
-def _part(address, unit, parts, planes, height, width):  # type: ignore[no-untyped-def]
-    """The part of a frame at an address that a unit works on, (P / parts, H, W)."""
-    count = planes // parts
-    samples = count * height * width
-    frame = _array_at(address, (planes * height * width,))
-    begin = unit % parts * samples
-    return frame[begin : begin + samples].reshape((count, height, width))
-
-
-@_jit()
-def blur_discs(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, source, to, radii
-):
-    """Light behind one disc each."""
-    for unit in range(first, last):
-        i, shape = order[unit // parts], (planes // parts * height, width)
-        image = _part(source[i], unit, parts, planes, height, width).reshape(shape)
-        out = _part(to[i], unit, parts, planes, height, width).reshape(shape)
-        disc_image(image, height, radii[i], _MOST, out)
-
-
-@_jit()
-def blend_discs(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, to, blurs, levels
-):
-    """Light behind a disc of its own for each pixel, from `levels` (K, 13)."""
-    samples = planes * height * width
-    for unit in range(first, last):
-        i = order[unit // parts]
-        diameter = _array_at(blurs[i].diameter, (height, width))
-        scale, begin = np.float32(blurs[i].defocus_px), unit % parts * (samples // parts)
-        out = _part(to[i], unit, parts, planes, height, width)
-        blend_rows(_TOP, height, diameter, scale, _KNOTS, levels[i], begin, samples, out)
-
-
-@_jit()
-def move_along_rows(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, light, to, blurs
-):
-    """Light that moves along the rows."""
-    for unit in range(first, last):
-        i, shape = order[unit // parts], (planes // parts * height, width)
-        image = _part(light[i], unit, parts, planes, height, width).reshape(shape)
-        out = _part(to[i], unit, parts, planes, height, width).reshape(shape)
-        n, share = streak_share(blurs[i].motion_px)
-        move_rows(_TOP, len(image), image, n, share, _MOST, out)
-
-
-@_jit()
-def move_along_paths(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, light, to, blurs
-):
-    """Light that moves along a path, and a subject that moves along its own."""
-    still = 0.0
-    for unit in range(first, last):
-        i = order[unit // parts]
-        blur = blurs[i]
-        image = _part(light[i], unit, parts, planes, height, width)
-        out = _part(to[i], unit, parts, planes, height, width)
-        path = blur.extent, blur.direction, blur.turn
-        taps = taps_of(path[0], path[1], path[2], still, still, height, width)
-        if blur.mask:
-            drift = blur.drift_x, blur.drift_y
-            own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
-            mask = _array_at(blur.mask, (height, width))
-            behind = _array_at(blur.behind, (height, width)).view(np.int32)
-            blur_apart(image, mask, behind, taps, own, _MOST, out)
-        else:
-            blur_planes(image, taps[0], taps[1], taps[2], _MOST, out)

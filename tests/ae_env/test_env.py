@@ -168,7 +168,7 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
 
 def test_cached_light_changes_nothing_and_random_states_are_left_alone(monkeypatch) -> None:
     cached = rollout(5, depth=3.0, motion=0.5)
-    monkeypatch.setattr("simulator.capture.columns.BlurredFrames.is_full", True)
+    monkeypatch.setattr("simulator.capture.blurred_frames.BlurredFrames.is_full", True)
     assert_equal(rollout(5, depth=3.0, motion=0.5), cached)
     unseen = make_env(sensors=False, depth=3.0, motion=0.5)
     assert set(unseen.observation_space) == {"raw", "settings"}

@@ -12,7 +12,7 @@ from scipy.ndimage import correlate
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import batch as batch_module
-from simulator.capture import columns
+from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.decision import Exposure
@@ -237,16 +237,16 @@ def test_whole_captures_by_hand() -> None:
 @pytest.mark.parametrize("most_bytes", [2**30, 0])
 def test_many_images_are_scipys_correlation(threads, most_bytes, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    shape, blurs = (4, 21, 40), np.zeros(7, columns.BLUR)
+    shape, blurs = (4, 21, 40), np.zeros(7, blurred_frames.BLUR)
     blurs["defocus_px"], blurs["streaks"] = (48.0, 0.0, 3.3, 8.0, 1e-4, 2.0, 0.7), True
     blurs["motion_px"] = (5.0, 5.0, 0.0, 17.0, 1e-7, 90.0, 0.4)
     lights = list(torch.rand(7, *shape, generator=torch.Generator().manual_seed(0)))
     lights[2][0, 3, 4], lights[3][1, 5, 6] = 1e30, -1e30  # clipped first
-    frames = columns.BlurredFrames(9, 2, most_bytes)
+    frames = blurred_frames.BlurredFrames(9, 2, most_bytes)
     for used in (np.arange(7), np.array([5, 2]), np.arange(4)):
         some = addresses([lights[i] for i in used])
         made = frames.make(used + 1, np.zeros(len(used), int), blurs[used], some, shape)
-        for i, found in zip(used, columns.FramesAt(made, shape)[:], strict=True):
+        for i, found in zip(used, blurred_frames.FramesAt(made, shape)[:], strict=True):
             rtol, clipped = 2e-4 if i == 0 else 1e-5, lights[i].double().clamp(-1e9, 1e9).numpy()
             weights = disc_kernel(blurs["defocus_px"][i])[None]
             wanted = correlate(clipped, weights, mode="nearest")
@@ -354,7 +354,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     """While the light is blurred, or while the plan of a later frame is made."""
     batch, calls = made(), []
     photographed(batch, 0)
-    module = columns if stage == "_run" else batch_module
+    module = blurred_frames if stage == "_run" else batch_module
     original = getattr(module, stage)
 
     def fail(*args, **kwargs):
