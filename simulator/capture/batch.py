@@ -37,7 +37,6 @@ LIGHT_BYTES = 512 * 2**20
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
-_NOISE_BIT = _BIT["noise"]
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -273,7 +272,7 @@ class CaptureBatch:
             plan_frames(*known, targets, height, indices[inside], planned, gains[inside], *columns)
             blur = self._blur[planned]
             defocus, motion = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0
-            found = (self.noise is not None) * _NOISE_BIT + defocus * _BIT["defocus"]
+            found = (self.noise is not None) * _BIT["noise"] + defocus * _BIT["defocus"]
             self._modules[planned] = found + motion * _BIT["motion_blur"]
             self._blurs[planned] = defocus | motion
             self._excess_variance[planned] = 0.0
@@ -300,7 +299,7 @@ class CaptureBatch:
             shown = exposure if noisy else decide(scene, settings, noise=False, gain=gain)
             error = math.hypot(*predict_errors(scene, settings, shown).values())
         self._predicted_error[row] = error
-        self._modules[row] = noisy * _NOISE_BIT
+        self._modules[row] = noisy * _BIT["noise"]
         self._modules[row] += sum(_BIT[step.name] for step in exposure.steps if step.runs)
         self._table[row] = exposure_table([exposure])[0]
 

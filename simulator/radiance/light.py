@@ -36,13 +36,13 @@ def mean_anchor(green: torch.Tensor) -> float:
     Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
     """
     values = green.detach().double().clamp(min=0.0).cpu().numpy().ravel()
-    rest = values[values > 0.0]
+    rest = lit = values[values > 0.0]
     if len(rest) <= MEAN_SIGNAL * len(values):
         reason = f"no exposure brings its mean to {MEAN_SIGNAL}; give `illuminance`"
-        lit = len(rest) / max(len(values), 1)
-        raise ValueError(f"`light` is 0 in all but {lit:.1%} of its pixels: {reason}")
+        share = len(lit) / max(len(values), 1)
+        raise ValueError(f"`light` is 0 in all but {share:.1%} of its pixels: {reason}")
     while True:  # what a factor that is too low clips stays clipped
-        clipped = np.count_nonzero(values) - len(rest)
+        clipped = len(lit) - len(rest)
         factor = float((MEAN_SIGNAL * len(values) - clipped) / rest.sum())
         if factor * rest.max() <= 1.0:
             return factor
