@@ -105,7 +105,11 @@ class AutoExposure(Task):
             columns = {f"score:{name}": values for name, values in scores.items()}
         if "flicker" in self.episodes.options.costs:
             flat = frames.outputs["codes"].reshape(len(frames.gains), -1)
-            columns["image_mean"] = flat.sum(axis=1, dtype=np.int64) / (255.0 * flat.shape[1])
+            if torch.is_tensor(flat):
+                total = flat.sum(dim=1, dtype=torch.int64).cpu().numpy()
+            else:
+                total = flat.sum(axis=1, dtype=np.int64)
+            columns["image_mean"] = total / (255.0 * flat.shape[1])
         return columns
 
     def reward(
@@ -195,7 +199,7 @@ class AutoExposure(Task):
                 means = self._expected_means(frames, self._transitions, boxes)
             scores |= terms.score(means, captures)
         if self._reads_images and captures is not None:
-            shown = torch.from_numpy(frames.outputs["signals"])
+            shown = torch.as_tensor(frames.outputs["signals"])
             linear = episodes.options.observation == "linear"  # the frame is observed, too
             shown = shown.clamp(0.0, 1.0) if linear else shown.clamp_(0.0, 1.0)
             scores |= terms.torch_scores(shown, captures, "image")
@@ -356,7 +360,7 @@ class AutoExposureBase(SpecProperty):
         info, scores = self._last.info, self._last.info["rewards.score"]
         return tuple(
             render_frame(
-                self._last.raw[i],
+                torch.as_tensor(self._last.raw[i]).cpu().numpy(),
                 self.scene(i),
                 self.camera,
                 self.grid[info["state"].item(i)],
@@ -473,6 +477,8 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
+    | `device` | `None` | of environments side by side: torch device on which frames are made and stay, `"cpu"`, `"cuda"` or `"auto"`; `None`: compiled loops on the CPU |
+    | `blur_memory` | 512 | memory that blurred light may take before less of it is cached [MiB] |
     | `render_mode` | `None` | `"rgb_array"`: `render()` returns the developed capture, (H, W, 3) uint8, with its settings and score written on it; `None`: it returns None |
 
     ## Version History
@@ -487,6 +493,11 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     def __init__(
         self, *, render_mode: str | None = None, **arguments: Unpack[EnvArguments]
     ) -> None:
+        if arguments.get("device") is not None:
+            raise ValueError(
+                f"`device` (={arguments['device']!r}) must be None: only environments side by side "
+                "have one (gymnasium.make_vec)"
+            )
         self._set_up(arguments, 1, render_mode)
         self.action_space = gym.spaces.Discrete(self.core.num_actions)
         self.observation_space: Any = self.core.observation_space()

@@ -9,6 +9,8 @@ from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal, ParamSpec, TypedDict, get_args
 
+import torch
+
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, MovingLighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
@@ -25,6 +27,7 @@ from simulator.capture.decision import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.decision import MAX_DISC_PX, check_tolerance
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED
 from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
+from simulator.utils.compute import check_device
 
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36
@@ -68,6 +71,8 @@ class EnvArguments(TypedDict, total=False):
     tolerance: float
     reward: Reward
     with_oracle: bool
+    device: str | None
+    blur_memory: float
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,8 @@ class EnvOptions:
     tolerance: float = DEFAULT_TOLERANCE
     reward: Reward = "capture"
     with_oracle: bool = False
+    device: str | None = None
+    blur_memory: float = 512.0
 
     def __post_init__(self) -> None:
         if self.costs is None:
@@ -134,6 +141,9 @@ class EnvOptions:
         for name, weight in self.costs.items():
             check_word("costs", name, COSTS)
             check_number(f"costs[{name!r}]", weight, 0.0, MAX_COST)
+        check_number("blur_memory", self.blur_memory, 0.0, 2.0**24, more=" MiB")
+        if self.device is not None:
+            check_device(self.device)
         if self.recorded is not None:
             self._check_recorded()
 
@@ -141,6 +151,7 @@ class EnvOptions:
         """Real captures have the light, the motion and the noise that they have."""
         defaults: dict[str, tuple[Any, ...]] = {"lighting": ("static",), "source": ("light",)}
         defaults |= {"motion": ("random", "none"), "depth": ("random", "far"), "noise": (True,)}
+        defaults["device"] = (None,)
         for name, allowed in defaults.items():
             value = getattr(self, name)
             if not any(value is word or value == word for word in allowed):
@@ -156,6 +167,11 @@ class EnvOptions:
     def recorded(self) -> RecordedOptions | None:
         """The folder of recorded grids, where the scenes are some."""
         return RecordedOptions.of(self.scenes)
+
+    @cached_property
+    def torch_device(self) -> torch.device | None:
+        """Where torch makes the frames; None where compiled loops make them."""
+        return None if self.device is None else check_device(self.device)
 
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:

@@ -117,7 +117,7 @@ _NONE = np.zeros(8, np.int64)
 _STAY = Taps(_NONE, _NONE, np.eye(1, 8, dtype=np.float32)[0])
 #: Defaults of the bracket task, and arguments that it does not have.
 BRACKET: dict[str, Any] = {"grid": "bracket", "depth": "far"}
-WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "with_oracle")
+WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "with_oracle", "device")
 #: Time of all frames together [s], and how many there may be.
 BUDGET, MAX_FRAMES = 0.3, 3
 _MOST_SECONDS, _MOST_FRAMES = 3600.0, 16

@@ -9,6 +9,7 @@ from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -40,7 +41,8 @@ class AutoExposureVectorEnv(
             values (``"SameStep"``), too.
         max_episode_steps: Steps after which an episode is truncated; None for never.
 
-    All other arguments are those of `AutoExposureEnv`.
+    All other arguments are those of `AutoExposureEnv`. With a `device`, observations, rewards
+    (float32) and flags are torch tensors on it, and actions may be; the info stays NumPy's.
     """
 
     @takes_env_arguments()
@@ -130,10 +132,10 @@ class AutoExposureVectorEnv(
         _assign_rows(vars(shown), vars(fresh), env_indices)
         return self._shown(shown), info
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Observation, Any, Any, Any, dict[str, Any]]:
         """Takes the next frame of every episode with the states `actions` (N,)."""
+        if torch.is_tensor(actions):
+            actions = actions.cpu().numpy()
         actions = check_actions("actions", actions, (self.num_envs,))
         resetting = np.flatnonzero(self._done)
         if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
@@ -156,7 +158,16 @@ class AutoExposureVectorEnv(
             self._done = done
             infos = self._vector_info(frames.info, self._all)
             observation = self._shown(frames)
-        return observation, frames.reward, terminated, truncated, infos
+        flags = frames.reward, terminated, truncated
+        return observation, *(self._on_device(values) for values in flags), infos
+
+    def _on_device(self, values: np.ndarray) -> Any:
+        """Rewards or flags, as tensors where the environment has a device."""
+        device = self.core.options.torch_device
+        if device is None:
+            return values
+        single = values.astype(np.float32) if values.dtype.kind == "f" else values
+        return torch.from_numpy(single).to(device)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture (H, W, 3) uint8 per environment, as `AutoExposureEnv.render` draws it.

@@ -39,7 +39,7 @@ from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
-from simulator.utils.compute import check_bfloat16
+from simulator.utils.compute import check_bfloat16, check_device
 from simulator.utils.tiles import in_tiles, varying
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -147,14 +147,7 @@ class CameraSimulator:
         precision: Literal["float32", "bfloat16"] = "float32",
         cache: Where | None = "memory",
     ) -> None:
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        try:
-            self.device = torch.device(device)
-        except RuntimeError as error:
-            raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
+        self.device = check_device(device)
         check_word("precision", precision, ("float32", "bfloat16"))
         if precision == "bfloat16":
             check_bfloat16(self.device)

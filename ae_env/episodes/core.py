@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from ae_env.episodes.lookup import LookupBatch
 from ae_env.episodes.state import Episode, Episodes
@@ -46,12 +47,13 @@ _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": 
 class Frames:
     """Observations, info and rewards of n episodes after a reset or a step."""
 
-    observation: dict[str, np.ndarray]  # arrays by name, n long; new ones every time
+    #: Arrays by name, n long; new ones every time. Tensors where the environment has a device.
+    observation: dict[str, Any]
     #: Columns of numbers by name, n long. ``scene_id`` and ``modules`` are indices into
     #: `EpisodeCore.scene_ids` and `AutoExposureBase.module_names`.
     info: dict[str, Any]
     reward: np.ndarray  # (n,) float64
-    raw: np.ndarray  # (n, 4, R, R) the whole frames, also where less of them is observed
+    raw: Any  # (n, 4, R, R) the whole frames, also where less of them is observed
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class FrameBatch:
 
     env_indices: np.ndarray
     statistics: FrameStatistics
-    outputs: Mapping[str, np.ndarray]  # the frames (B, 4, R, R), by the names of `Task.outputs`
+    #: The frames (B, 4, R, R), by the names of `Task.outputs`; tensors where there is a device.
+    outputs: Mapping[str, Any]
     gains: np.ndarray  # (B,) light relative to the scenes' own
     rows: np.ndarray | None  # (B, R) light of each row relative to that, or None; see `Captures`
 
@@ -165,7 +168,7 @@ class EpisodeCore:
         # (4, S), see `_STATE_INFO`
         self._state_info = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._at_rest: dict[int, PreparedScene] = {}
-        self._outputs: dict[str, np.ndarray] = {}  # memory that is used again
+        self._outputs: dict[str, Any] = {}  # memory that is used again
         self._captures: FrameSource
         transitions = None
         if options.recorded is not None:  # a recorded capture is its own expectation
@@ -178,6 +181,8 @@ class EpisodeCore:
                 states,
                 self.camera,
                 noise=noise,
+                light_bytes=int(options.blur_memory * 2**20),
+                device=options.torch_device,
             )
             transitions = batch.transitions if options.reward == "expected" else None
         self.task = make_task(episodes, self._captures, scorer, transitions)
@@ -257,7 +262,9 @@ class EpisodeCore:
         episodes, options = self.episodes, self.options
         states = episodes.state[env_indices]
         raw, columns = self._capture(env_indices)
-        shown = frame_statistics(raw) if options.observation == "statistics" else {"raw": raw}
+        shown = {"raw": raw}
+        if options.observation == "statistics":
+            shown = frame_statistics(torch.as_tensor(raw).cpu().numpy())
         observation = shown | {"settings": self._settings[states]}
         if options.sensors:
             speed, focus_drive = episodes.speed[env_indices], episodes.focus_drive[env_indices]
@@ -265,17 +272,25 @@ class EpisodeCore:
             observation["sensors"] = encode_sensors(speed, focus_drive, normals)
         terms, reward = self.task.reward(env_indices, columns)
         observation |= self.task.observation(env_indices)
+        if (device := options.torch_device) is not None:
+            observation = {n: torch.as_tensor(v, device=device) for n, v in observation.items()}
         info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
         info |= zip(_STATE_INFO, self._state_info[:, states], strict=True)
         info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
         return Frames(observation, info, reward, raw)
 
-    def _capture(self, env_indices: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def _memory(self, count: int, name: str) -> Any:
+        """Memory for `count` frames of an output of `FrameSource.record`."""
+        shape, device = (count, 4, *[self.options.resolution] * 2), self.options.torch_device
+        if device is None:
+            return np.empty(shape, _DTYPES[name])
+        return torch.empty(shape, dtype=getattr(torch, np.dtype(_DTYPES[name]).name), device=device)
+
+    def _capture(self, env_indices: np.ndarray) -> tuple[Any, dict[str, np.ndarray]]:
         """Frames (B, 4, R, R) as they are observed, and columns of the info and of the task."""
         options, episodes = self.options, self.episodes
         size = options.resolution
-        dtype = _DTYPES[_OUTPUTS[options.observation]]
-        raw = np.empty((len(env_indices), 4, size, size), dtype)
+        raw = self._memory(len(env_indices), _OUTPUTS[options.observation])
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
         gains, rows = np.ones(len(env_indices)), None
         if not episodes.static:
@@ -292,16 +307,16 @@ class EpisodeCore:
         return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
 
     def _capture_chunk(
-        self, env_indices: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
+        self, env_indices: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: Any
     ) -> dict[str, np.ndarray]:
         """Columns of the episodes of `env_indices`; their observations are written to `raw`."""
         episodes = self.episodes
-        outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
+        outputs: dict[str, Any] = {_OUTPUTS[self.options.observation]: raw}
         for name in self.task.outputs:
             if name not in outputs:
                 kept = self._outputs.get(name)
                 if kept is None or len(kept) < len(raw):
-                    kept = self._outputs[name] = np.empty(raw.shape, _DTYPES[name])
+                    kept = self._outputs[name] = self._memory(len(raw), name)
                 outputs[name] = kept[: len(raw)]
         found = self._captures.record(
             episodes.light_index[env_indices],
@@ -323,7 +338,7 @@ class EpisodeCore:
             columns["sensor_normals"] = single_normals(found.keys, 2)
         columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows))
         if self.options.observation == "linear":
-            np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
+            torch.as_tensor(raw).clamp_(-PEDESTAL, 1.0)
         return columns
 
     def _prepared(self, light_index: int) -> PreparedScene:

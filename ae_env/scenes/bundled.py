@@ -270,3 +270,44 @@ def _stored(key: str, camera: CameraProfile, resolution: int | None) -> list[Sce
     except (ValueError, KeyError, TypeError) as error:
         logger.warning("the cached scenes are damaged (%s) and are made again", error)
         return None
+
+
+# -- photographs whose depth was measured ---------------------------------------------------------
+
+#: Largest circle of confusion of a subject, relative to the largest of the scene.
+IN_FOCUS = 0.1
+
+
+def depth_scenes(camera: CameraProfile) -> list[Scene]:
+    """Those of ``scenes="ae_env.scenes.bundled:depth_scenes"``, in the colours of `camera`.
+
+    Their layout is that of a lens focused at one distance: each is focused on its front and on its
+    median depth, and the subject is what is in focus. How large the circle of confusion is, is
+    drawn with each episode, as for every scene. Cones is among them where ``AE_ENV_DATA`` has it.
+    """
+    # Not above: no other scene needs them.
+    from simulator.reference.reference_camera import lens_blur, sample_mosaic
+    from simulator.training.scenes import depth_photographs
+    from simulator.utils.files import data_folder
+
+    scenes = []
+    for found in depth_photographs(camera, data=data_folder()):
+        light, k, depth, layout = found.light, found.pitch, found.depth, None
+        if depth is not None:
+            distance = found.lens.focus_distance
+            layout = Layout.from_depth(depth, distance, in_focus=IN_FOCUS).averaged(k)
+        scene = Scene.from_array(
+            sample_mosaic(lens_blur(light), camera.cfa) if k == 2 else light,
+            found.reference,
+            camera,
+            scene_id=found.scene_id,
+            group=found.group,
+            kind=found.kind,
+            illuminance=found.illuminance,
+            white_balance=found.white_balance,
+            source=found.source,
+            sampled=found.sampled,
+            layout=layout,
+        )
+        scenes.append(scene)
+    return scenes

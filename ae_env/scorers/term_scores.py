@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -171,17 +172,19 @@ class TermScores:
         return np.concatenate([self._shares, own]), which
 
     def measured(
-        self, codes: np.ndarray, states: np.ndarray, source_noise: np.ndarray
+        self, codes: np.ndarray | torch.Tensor, states: np.ndarray, source_noise: np.ndarray
     ) -> np.ndarray:
         """Means (B, 3) of recorded frames: shares of blown and of blocked samples, and `noise`.
 
         Args:
-            codes: (B, 4, H, W) uint8 of the frames.
+            codes: (B, 4, H, W) uint8 of the frames; where they are a tensor, its device counts.
             states: (B,) at which they were taken.
             source_noise: (B, 2, 4) shot and read noise of the sources, of a native pixel.
         """
         shares, which = self._shares_of_frames(states, source_noise)
         flat = codes.reshape(len(codes), 4, -1)
+        if isinstance(flat, torch.Tensor):
+            return _means_by_torch(flat, shares, which, self._dark)
         means = np.empty((len(codes), 3))
         least = max(1, _WORTH_A_THREAD // flat[0].size)
         fixed = (flat, shares, which, self._dark, means)
@@ -200,6 +203,8 @@ class TermScores:
         `box_factors` (B,) sensor pixels per side are averaged into one of the frame; `row_gain`
         (B, H) is the light of each row relative to the frame's.
         """
+        if isinstance(transitions.light, torch.Tensor):  # looked at on the CPU
+            transitions = replace(transitions, light=list(transitions.light.cpu()))
         table = transitions.before_rounding(self.camera).averaged_table()
         source_noise = table[:, 3:] * np.square(box_factors)[:, None, None]
         if not self.noise:
@@ -287,6 +292,18 @@ def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarra
         return np.asarray(part(None, captures).numpy())
     values = means[:, column]
     return np.asarray(np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0))
+
+
+def _means_by_torch(
+    codes: torch.Tensor, shares: np.ndarray, which: np.ndarray, dark: np.ndarray
+) -> np.ndarray:
+    """`measure_codes` by torch operations on any device."""
+    to, index = codes.device, codes.long()
+    own = torch.from_numpy(shares).to(to)[torch.from_numpy(which).to(to)]  # (B, 4, 256)
+    blocked = torch.from_numpy(dark).to(to)[index].mean(dim=(1, 2))
+    clean, blown = own.gather(2, index).mean(dim=(1, 2)), (codes == 255).any(dim=1)
+    means = torch.stack([blown.float().mean(dim=1), blocked, clean], dim=1)
+    return np.asarray(means.cpu().double().numpy())
 
 
 @_jit

@@ -14,9 +14,10 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.blurred_frames import BLUR, BlurredFrames, FramesAt
+from simulator.capture.blurred_frames import BLUR, BlurredFrames
 from simulator.capture.columns import (
     SCENE,
     blur_column,
@@ -30,10 +31,8 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, exposure_table, noise_keys, record
 from simulator.capture.statistics import BINS, LightStatistics
 from simulator.settings import CameraSettings
-from simulator.utils.compute import addresses, parallel_ranges
+from simulator.utils.compute import parallel_ranges
 
-#: Memory that the blurred light of a batch may take before less of it is cached [byte].
-LIGHT_BYTES = 512 * 2**20
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
@@ -83,7 +82,7 @@ class FrameSource(Protocol):
         seeds: np.ndarray,
         frames: np.ndarray,
         row_gain: np.ndarray | None = None,
-        **outputs: np.ndarray,
+        **outputs: Any,
     ) -> FrameStatistics:
         """Records scenes that are prepared, and fills the outputs.
 
@@ -94,7 +93,7 @@ class FrameSource(Protocol):
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None
                 where all rows have the same.
             outputs: Any of ``codes``, ``numbers`` and ``signals`` of `simulator.capture.sensor`,
-                each (B, 4, H, W).
+                each (B, 4, H, W), arrays or, where there is a device, tensors on it.
         """
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -102,11 +101,13 @@ class FrameSource(Protocol):
 
 
 class CaptureBatch:
-    """`FrameSource` that simulates the frames, on the CPU.
+    """`FrameSource` that simulates the frames.
 
     `prepared` returns the scene of an index, in its own light, when it is first photographed. The
     light behind the lens at every f-number is cached until a scene is forgotten, as long as all
-    takes no more than `light_bytes`. A pickled copy works everything out again.
+    takes no more than `light_bytes`. Everything is planned on the CPU; light is blurred and frames
+    are recorded there by compiled loops or, with a `device`, by torch operations on it. A pickled
+    copy works everything out again.
     """
 
     def __init__(
@@ -117,13 +118,21 @@ class CaptureBatch:
         camera: CameraProfile,
         *,
         noise: Noise | None,
-        light_bytes: int = LIGHT_BYTES,
+        light_bytes: int,
+        device: torch.device | None = None,
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
         self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
+        self._device = device
         self._columns = state_columns(states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
-        self._frames = BlurredFrames(num_scenes, len(apertures), light_bytes)
+        fixed = num_scenes, len(apertures), light_bytes
+        if device is None:
+            self._frames = BlurredFrames(*fixed)
+        else:
+            from simulator.capture.device_frames import DeviceFrames  # few need it
+
+            self._frames = DeviceFrames(*fixed, device)
         self._targets: dict[int, np.ndarray] = {}  # by box factor, (S, 2, 4)
         # Scenes as columns; whether their captures are planned in columns, too: where the light has
         # no noise of its own, and no aperture is opened.
@@ -144,14 +153,15 @@ class CaptureBatch:
         self._modules = np.zeros(count, np.int64)
         # Whether the light must be blurred, else it is the source itself; and whether any ever was.
         self._blurs, self._any_blurs = np.zeros(count, bool), False
-        self._blurred = np.zeros(count, np.uintp)  # its address
+        self._blurred = np.zeros(count, np.uintp)  # its place
         # Light (4, H, W) that it starts from; of captures that are not planned in columns,
         # `Exposure.remaining_variance` and the exposure.
         self._source, self._remaining_variance, self._exposure = np.empty((3, count), object)
         self._any_remaining = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        made = partial(CaptureBatch, noise=self.noise, light_bytes=self._light_bytes)
+        options: dict[str, Any] = {"noise": self.noise, "light_bytes": self._light_bytes}
+        made = partial(CaptureBatch, device=self._device, **options)
         return made, (self._prepared, self.num_scenes, self.states, self.camera)
 
     def forget(self, indices: np.ndarray) -> None:
@@ -183,10 +193,11 @@ class CaptureBatch:
         if self._any_remaining:  # else all of the source's variance remains
             remaining = self._remaining_variance[rows]
         sources = self._source[rows]
-        light = addresses(sources)
+        places = self._frames.places(sources)
         if self._any_blurs:
-            light = np.where(self._blurs[rows], self._blurred[rows], light)
-        return Transitions(FramesAt(light, sources[0].shape), self._table[rows], remaining)
+            places = np.where(self._blurs[rows], self._blurred[rows], places)
+        light = self._frames.at(places, tuple(sources[0].shape))
+        return Transitions(light, self._table[rows], remaining)
 
     def record(
         self,
@@ -195,7 +206,7 @@ class CaptureBatch:
         seeds: np.ndarray,
         frames: np.ndarray,
         row_gain: np.ndarray | None = None,
-        **outputs: np.ndarray,
+        **outputs: Any,
     ) -> FrameStatistics:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
@@ -314,7 +325,7 @@ class CaptureBatch:
                 # Light that was opened before may have had the same address.
                 self._frames.release(np.array(opens) // len(self.states))
             sources = self._source[rows]
-            light, shape = addresses(sources), tuple(sources[0].shape)
+            light, shape = self._frames.places(sources), tuple(sources[0].shape)
             made = self._frames.make(indices, self._slots[states], self._blur[rows], light, shape)
             self._blurred[rows] = made
             for row in alone.tolist():
@@ -334,8 +345,8 @@ class CaptureBatch:
     def _balance(self, row: int) -> None:
         """Computes the excess variance where it depends on the pixels."""
         if np.isnan(self._excess_variance[row]):
-            light = FramesAt(self._blurred[[row]], tuple(self._source[row].shape))[0]
-            self._excess_variance[row], _ = noise_balance(light, self._exposure[row])
+            light = self._frames.at(self._blurred[[row]], tuple(self._source[row].shape))[0]
+            self._excess_variance[row], _ = noise_balance(light.cpu(), self._exposure[row])
 
 
 def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:

@@ -26,7 +26,7 @@ from simulator.optics.discs import (
     wide_disc,
 )
 from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak_share, taps_of
-from simulator.utils.compute import as_pointer, kernel, parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Addresses of arrays of a layout, 0 for none: (H, W) float32 diameters relative to the largest;
 #: float32 diameters that pixels have, and how many these are; and of a subject that moves, (H, W)
@@ -64,10 +64,11 @@ class FramesAt(Sequence[torch.Tensor]):
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        return torch.from_numpy(_frame_at(int(self.addresses[index]), self._shape))
+        return torch.from_numpy(frame_at(int(self.addresses[index]), self._shape))
 
 
-def _frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
+def frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
+    """The contiguous float32 frame at an address."""
     memory = ctypes.c_float * math.prod(shape)
     return np.ndarray(shape, np.float32, memoryview(memory.from_address(address)))
 
@@ -76,12 +77,13 @@ class BlurredFrames:
     """Blurred light of a batch's scenes, each frame (4, H, W), in memory that is used again.
 
     The light behind the lens is cached for each of `num_apertures`, and the discs that it is
-    blended of; where all memory together exceeds `most_bytes`, only the latest light.
+    blended of; where all memory together exceeds `most_bytes`, only the latest light. A frame is
+    known by its place, here the address of its memory; 0 is none.
     """
 
     def __init__(self, num_scenes: int, num_apertures: int, most_bytes: int) -> None:
         self._most_bytes, slots = most_bytes, (num_scenes, num_apertures)
-        # Addresses, 0 for none; and the light and the diameter that they were made of.
+        # Places, and the light and the diameter that they were made of.
         self._lens, self._source = np.zeros((2, *slots), np.uintp)
         self._diameter = np.zeros(slots)
         self._levels = np.zeros((num_scenes, len(DIAMETERS)), np.uintp)
@@ -93,17 +95,28 @@ class BlurredFrames:
         """Whether the memory exceeds its limit."""
         return sum(slab.nbytes for slab in self._slabs) > self._most_bytes
 
+    def places(self, lights: Sequence[torch.Tensor]) -> np.ndarray:
+        """(B,) places of lights (4, H, W) of scenes, contiguous float32."""
+        return addresses(lights)
+
+    def at(self, places: np.ndarray, shape: tuple[int, ...]) -> Sequence[torch.Tensor]:
+        """The frames at `places` (B,), each (4, H, W)."""
+        return FramesAt(places, shape)
+
     def _take(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
-        """Addresses of memory for `count` frames."""
+        """Places of memory for `count` frames."""
         lacking = count - len(self._free)
         if lacking > 0:
-            samples = math.prod(shape)
-            slab = np.empty((max(lacking, _SLAB // samples), samples), np.float32)
-            self._slabs.append(slab)
-            places = slab.ctypes.data + np.arange(len(slab)) * slab.strides[0]
-            self._free = np.concatenate([self._free, places.astype(np.uintp)])
+            self._free = np.concatenate([self._free, self._more(lacking, shape)])
         taken, self._free = np.split(self._free, [count])
         return taken
+
+    def _more(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
+        """Places of new memory for `count` frames or more."""
+        samples = math.prod(shape)
+        slab = np.empty((max(count, _SLAB // samples), samples), np.float32)
+        self._slabs.append(slab)
+        return (slab.ctypes.data + np.arange(len(slab)) * slab.strides[0]).astype(np.uintp)
 
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
@@ -134,9 +147,9 @@ class BlurredFrames:
         source: np.ndarray,
         shape: tuple[int, ...],
     ) -> np.ndarray:
-        """(K,) addresses of the light of scenes `indices`, all different, behind their blurs.
+        """(K,) places of the light of scenes `indices`, all different, behind their blurs.
 
-        `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the addresses of the light
+        `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the places of the light
         (4, H, W) that they start from. Each stays until its scene blurs another.
         """
         if self.is_full:
@@ -153,12 +166,8 @@ class BlurredFrames:
             some, blurs, source = indices[moves], blurs[moves], light[moves]
             lacking = some[self._moved[some] == 0]
             self._moved[lacking] = self._take(len(lacking), shape)
-            light[moves] = moved_to = self._moved[some]
-            # Sums of taps take as long as these are many, twice as long with a subject.
-            taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
-            streaks = blurs["streaks"]
-            _run(move_along_rows, taps * streaks, shape, source, moved_to, blurs)
-            _run(move_along_paths, taps * ~streaks, shape, source, moved_to, blurs)
+            light[moves] = self._moved[some]
+            self._move(some, blurs, source, self._moved[some], shape)
         return light
 
     def _focus(
@@ -180,21 +189,14 @@ class BlurredFrames:
             levels = np.zeros((len(indices), len(DIAMETERS)), np.uintp)
             made = indices[blends], blurs[blends], source[blends]
             levels[blends] = self._made_levels(*made, shape)
-            _run(blend_discs, blends, shape, to, blurs, levels)
-        radii = np.zeros(len(indices))
-        for i in np.flatnonzero(~blends).tolist():  # one disc everywhere
-            diameter = float(blurs["defocus_px"][i])
-            if diameter > WIDE_PX:
-                frames = _frame_at(int(source[i]), shape), _frame_at(int(to[i]), shape)
-                wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
-            else:
-                radii[i] = disc_radius(diameter)
-        _run(blur_discs, radii, shape, source, to, radii)
+            self._blend(indices, blends, blurs, levels, to, shape)
+        one = ~blends  # disc everywhere
+        self._blur(blurs["defocus_px"][one], source[one], to[one], shape)
 
     def _made_levels(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, shape: tuple[int, ...]
     ) -> np.ndarray:
-        """(K, 13) addresses of the light of scenes behind the discs that their blend needs."""
+        """(K, 13) places of the light of scenes behind the discs that their blend needs."""
         stale = self._levels_source[indices] != source
         self._release_levels(indices[stale])
         self._levels_source[indices] = source
@@ -203,17 +205,53 @@ class BlurredFrames:
         frame, level = np.nonzero(needed & (self._levels[indices] == 0))
         made = self._take(len(frame), shape)
         self._levels[indices[frame], level] = made
-        radii = _disc_radii()[level]
-        _run(blur_discs, radii, shape, source[frame], made, radii)
+        self._blur(np.array(DIAMETERS)[level], source[frame], made, shape)
         # Levels without a share are read too, times 0: any image does.
         levels = self._levels[indices]
         levels[:, 0] = source
         return np.where(levels == 0, source[:, None], levels)
 
+    # Each writes frames to the places `to` (K,): behind one disc, behind discs of the pixels' own
+    # (of the frames that `blends` (K,) marks), and moved.
+    def _blur(
+        self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray, shape: tuple[int, ...]
+    ) -> None:
+        radii = np.zeros(len(diameters))
+        for i, diameter in enumerate(diameters.tolist()):
+            if diameter > WIDE_PX:
+                frames = frame_at(int(source[i]), shape), frame_at(int(to[i]), shape)
+                wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
+            else:
+                radii[i] = _radius(diameter)
+        _run(blur_discs, radii, shape, source, to, radii)
 
-@functools.cache
-def _disc_radii() -> np.ndarray:
-    return np.array([disc_radius(diameter) for diameter in DIAMETERS])
+    def _blend(
+        self,
+        indices: np.ndarray,
+        blends: np.ndarray,
+        blurs: np.ndarray,
+        levels: np.ndarray,
+        to: np.ndarray,
+        shape: tuple[int, ...],
+    ) -> None:
+        _run(blend_discs, blends, shape, to, blurs, levels)
+
+    def _move(
+        self,
+        indices: np.ndarray,
+        blurs: np.ndarray,
+        source: np.ndarray,
+        to: np.ndarray,
+        shape: tuple[int, ...],
+    ) -> None:
+        # Sums of taps take as long as these are many, twice as long with a subject.
+        taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
+        streaks = blurs["streaks"]
+        _run(move_along_rows, taps * streaks, shape, source, to, blurs)
+        _run(move_along_paths, taps * ~streaks, shape, source, to, blurs)
+
+
+_radius = functools.lru_cache(maxsize=4096)(disc_radius)
 
 
 def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]

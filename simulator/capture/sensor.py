@@ -27,7 +27,7 @@ where the read noise has rows and tails, the steps run one by one.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -182,13 +182,16 @@ def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> n
 # -- a batch of frames ------------------------------------------------------------------------
 
 
+Lights = Sequence[torch.Tensor] | torch.Tensor
+
+
 @dataclass
 class Transitions:
     """All that B frames depend on, except for their noise."""
 
     #: (4, H, W) each, contiguous float32: blurred already, at the exposure of its prepared scene.
-    #: Several may be the same.
-    light: Sequence[torch.Tensor]
+    #: Several may be the same. One tensor (B, 4, H, W) where torch is to record the frames.
+    light: Lights
     table: np.ndarray  # (B, 5, 4) of `exposure_table`
     #: `Exposure.remaining_variance` of each, contiguous float32; None for all of the variance. None
     #: in place of the sequence where no frame has any.
@@ -213,15 +216,19 @@ class Transitions:
         by the square of the row's gain, r^2. What the top-up takes away for it has the variance
         times r: exact for shot noise, and off by r (1 - r) of the source's read noise.
         """
-        lights, width = list(self.light), self.light[0].shape[-1]
-        shares = self.shares()
+        shares, (height, width) = self.shares(), self.light[0].shape[-2:]
+        gains = torch.from_numpy(row_gain).to(self.light[0]).view(-1, height, 1)
+        bands = row_gain.max(axis=1) > row_gain.min(axis=1)
+        lights: Lights
+        if isinstance(self.light, torch.Tensor):
+            lights = self.light * gains[:, None]
+        else:
+            each = zip(self.light, gains, bands.tolist(), strict=True)
+            lights = [(light * gain).contiguous() if own else light for light, gain, own in each]
         noisy = self.table[:, 3:].max(axis=(1, 2)) > 0.0  # the source is
-        for i in np.flatnonzero(row_gain.max(axis=1) > row_gain.min(axis=1)).tolist():
-            gain = torch.from_numpy(row_gain[i]).float()[:, None].to(lights[i].device)
-            lights[i] = (lights[i] * gain).contiguous()
-            if noisy[i]:
-                share, known = gain.expand(-1, width), shares[i]
-                shares[i] = (share if known is None else share * known).contiguous()
+        for i in np.flatnonzero(bands & noisy).tolist():
+            share, known = gains[i].expand(-1, width), shares[i]
+            shares[i] = (share if known is None else share * known).contiguous()
         return Transitions(lights, self.table, shares)
 
     def before_rounding(self, camera: CameraProfile) -> Transitions:
@@ -273,17 +280,25 @@ def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
 
 
 def missing_variance(
-    signal: torch.Tensor, table: np.ndarray, remaining_variance: torch.Tensor | None = None
+    signal: torch.Tensor,
+    table: np.ndarray | Sequence[torch.Tensor],
+    remaining_variance: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """D(x) of each pixel; negative where the source is noisier.
 
     Args:
         signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
-        table: (4, 4), rows 1 to 4 of `exposure_table`, or (4,), its column for that plane.
+        table: (4, 4), rows 1 to 4 of `exposure_table`, or (4,), its column for that plane; or four
+            tensors for rows.
         remaining_variance: (H, W) share of the source's variance that a blur left; None for all.
     """
     shot, read, source_shot, source_read = (
-        plane_tensor(row, signal.device) if row.ndim else row.item() for row in table
+        row
+        if torch.is_tensor(row)
+        else plane_tensor(row, signal.device)
+        if row.ndim
+        else row.item()
+        for row in table
     )
     bright = signal.float().clamp(min=0.0)
     missing = (bright * shot).add_(read)
@@ -307,7 +322,7 @@ def record(
 ) -> np.ndarray:
     """Records a batch of frames: exposes, adds noise, clips and quantises.
 
-    Every output that is given is filled; `codes`, `numbers` and `count` on the CPU only.
+    Every output that is given is filled.
 
     Args:
         transitions: Light and exposures.
@@ -329,24 +344,14 @@ def record(
     if row_gain is not None:
         transitions = transitions.in_bands(row_gain)
     transitions = transitions.before_rounding(camera)
-    signals = None if signals is None else torch.as_tensor(signals)
-    frames, on_cpu = len(transitions.light), transitions.light[0].is_cpu
-    if read_noise is not None and keys is not None:
-        if signals is None:
-            signals = torch.empty(frames, *transitions.light[0].shape)
-        record_stepwise(transitions, camera, keys, "exact", signals, read_noise)
-        if not on_cpu or (codes is None and numbers is None and not count):
-            return np.zeros((frames, 2), np.int64)
-        # What is recorded already passes the fused kernel unchanged, which fills the rest.
-        table, keys = np.zeros_like(transitions.table), None
-        table[:, 0] = 1.0
-        transitions, signals = Transitions(list(signals), table), None
-    if on_cpu:
-        shown = None if signals is None else signals.numpy()
-        return _record_fused(transitions, camera, keys, noise, codes, numbers, shown, count)
-    assert signals is not None
-    record_stepwise(transitions, camera, keys, noise, signals)
-    return np.zeros((frames, 2), np.int64)
+    given = {"signals": signals, "codes": codes, "numbers": numbers}
+    outputs = {name: torch.as_tensor(out) for name, out in given.items() if out is not None}
+    stepwise = isinstance(transitions.light, torch.Tensor) or not transitions.light[0].is_cpu
+    if stepwise or (read_noise is not None and keys is not None):
+        kind: Noise = "exact" if noise == "sensor" else noise
+        return record_stepwise(transitions, camera, keys, kind, outputs, read_noise, count=count)
+    arrays = {name: out.numpy() for name, out in outputs.items()}
+    return _record_fused(transitions, camera, keys, noise, arrays, count)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -362,22 +367,88 @@ def record_stepwise(
     camera: CameraProfile,
     keys: np.ndarray | None,
     noise: Noise,
-    signals: torch.Tensor,
+    outputs: Mapping[str, torch.Tensor],
     read_noise: Sequence[ReadNoise] | None = None,
-) -> None:
-    """`record` on any device: the reference of the fused kernel. Fills `signals`."""
-    frames = zip(transitions.light, transitions.table, transitions.shares(), strict=True)
-    for i, (light, table, share) in enumerate(frames):
-        signal = (light * table[0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
+    *,
+    count: bool = False,
+) -> np.ndarray:
+    """`record` on any device by torch operations: the reference of the fused kernel.
+
+    The `transitions` are `before_rounding`. Frames in one tensor are recorded together, others one
+    by one.
+    """
+    lights, device = transitions.light, transitions.light[0].device
+    span, black, low, high = (plane_tensor(row, device) for row in camera.digits[:4])
+    counts = torch.zeros(len(lights), 2, dtype=torch.int64, device=device)
+    batched = isinstance(lights, torch.Tensor)
+    together = len(lights) if batched and read_noise is None else 1
+    shares = transitions.shares()
+    for first in range(0, len(lights), together):
+        part = slice(first, first + together)
+        light = lights[part] if isinstance(lights, torch.Tensor) else lights[first][None]
+        table = torch.from_numpy(transitions.table[part]).to(device)[..., None, None]
+        signal = (light * table[:, 0]).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
         if keys is not None:
-            missing = missing_variance(signal, table[1:], share)
-            normals = frame_normals(int(keys[i]), tuple(light.shape), noise)
-            drawn = torch.from_numpy(normals).to(signal.device)
-            missing.clamp_(min=0.0)
+            share = _stacked(shares[part], signal)
+            missing = missing_variance(signal, table[:, 1:].unbind(1), share).clamp_(min=0.0)
             if read_noise is not None:
-                signal = signal + _read_part(missing, table, share, int(keys[i]), read_noise[i])
-            signal = missing.sqrt_().mul_(drawn).add_(signal)
-        signals[i] = clip_and_quantise(signal, camera)
+                own = None if share is None else share[0, 0], int(keys[first]), read_noise[first]
+                signal = signal + _read_part(missing[0], transitions.table[first], *own)
+            normals = _normals(keys[part], tuple(light.shape[1:]), noise, device)
+            signal = missing.sqrt_().mul_(normals).add_(signal)
+        numbers = signal.mul_(span).add_(black).round_().clamp_(0.0, camera.white_level)
+        if "numbers" in outputs:
+            outputs["numbers"][part] = numbers.to(torch.int32).to(torch.uint16)
+        if count:
+            for column, clipped in enumerate((numbers <= low, numbers >= high)):
+                counts[part, column] = clipped.flatten(1).sum(dim=1)
+        if "codes" in outputs:
+            bright = (numbers - (black - PEDESTAL * span)).clamp_(min=0.0)
+            codes = bright.sqrt_().mul_(255.0 / (span * (1.0 + PEDESTAL)).sqrt()).add_(0.5)
+            outputs["codes"][part] = codes.to(torch.uint8)
+        if "signals" in outputs:
+            outputs["signals"][part] = numbers.sub_(black).div_(span)
+    return counts.cpu().numpy()
+
+
+def _stacked(shares: Sequence[torch.Tensor | None], like: torch.Tensor) -> torch.Tensor | None:
+    """Remaining shares of a batch's variances as (B, 1, H, W), like the signals; None for all."""
+    if all(share is None for share in shares):
+        return None
+    everything = like.new_ones(like.shape[-2:])
+    each = [everything if share is None else share.to(like.device) for share in shares]
+    return torch.stack(each)[:, None]
+
+
+def _normals(
+    keys: np.ndarray, shape: tuple[int, ...], noise: Noise, device: torch.device
+) -> torch.Tensor:
+    """`frame_normals` (B, P, H, W) of frames, on any device; drawn ones are drawn on the CPU."""
+    if noise != "bank" or len(keys) == 1:
+        each = [frame_normals(key, shape, noise) for key in keys.tolist()]
+        return torch.from_numpy(np.stack(each)).to(device)
+    planes, samples = shape[0], shape[1] * shape[2]
+    blocks = -(-samples // BLOCK)
+    counters = np.arange(1, planes * blocks + 1, dtype=np.uint64) * KEY_STEP
+    own, turns = (torch.from_numpy(v.view(np.int64)).to(device) for v in (keys, counters))
+    words = _mixed_words(own[:, None] + turns)
+    pieces = _bank_on(device).unfold(0, BLOCK, STRIDE)
+    values = pieces[words & int(_START_BITS)]  # (B, blocks of all planes, 256)
+    values *= torch.where(words < 0, -1.0, 1.0)[..., None]
+    return values.view(len(keys), planes, -1)[..., :samples].reshape(len(keys), *shape)
+
+
+@functools.lru_cache(maxsize=8)
+def _bank_on(device: torch.device) -> torch.Tensor:
+    return torch.tensor(noise_bank(), device=device)
+
+
+def _mixed_words(words: torch.Tensor) -> torch.Tensor:
+    """`mixed` of int64 words: their products wrap, too, and shifts fill in zeros."""
+    for shift, multiplier in zip(_SHIFTS, (*_MULTIPLIERS, np.uint64(1)), strict=True):
+        shifted = (words >> int(shift)) & ((1 << (64 - int(shift))) - 1)
+        words = (words ^ shifted) * int(multiplier.view(np.int64))
+    return words
 
 
 def _read_part(
@@ -405,9 +476,7 @@ def _read_part(
 
 def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tensor:
     """The camera's digital numbers of `signal` (..., 4, H, W), on the scale where white is 1."""
-    device = signal.device
-    span = torch.tensor(camera.span, dtype=torch.float32, device=device)[:, None, None]
-    black = torch.tensor(camera.black_level, dtype=torch.float32, device=device)[:, None, None]
+    span, black = (plane_tensor(row, signal.device) for row in camera.digits[:2])
     numbers = (signal * span).add_(black).round_().clamp_(0.0, camera.white_level)
     return numbers.sub_(black).div_(span)
 
@@ -579,9 +648,7 @@ def _record_fused(
     camera: CameraProfile,
     keys: np.ndarray | None,
     noise: Noise,
-    codes: np.ndarray | None,
-    numbers: np.ndarray | None,
-    signals: np.ndarray | None,
+    given: Mapping[str, np.ndarray],
     count: bool,
 ) -> np.ndarray:
     """`record` on the CPU, of transitions `before_rounding`."""
@@ -593,10 +660,10 @@ def _record_fused(
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
     keys = np.zeros(frames, np.uint64) if keys is None else keys
-    given = ((codes, np.uint8), (numbers, np.uint16), (signals, np.float32))
+    kinds = {"codes": np.uint8, "numbers": np.uint16, "signals": np.float32}
     outputs = [
-        np.empty((0, 4, 0), dtype) if out is None else out.reshape(frames, 4, samples)
-        for out, dtype in given
+        given[name].reshape(frames, 4, samples) if name in given else np.empty((0, 4, 0), dtype)
+        for name, dtype in kinds.items()
     ]
     fixed = (
         samples,

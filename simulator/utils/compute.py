@@ -19,7 +19,7 @@ import re
 import sys
 import threading
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
@@ -138,7 +138,7 @@ event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 # Images are given to kernels by their addresses: a batch need not lie in one piece of memory.
-def addresses(images: Sequence[torch.Tensor | None]) -> np.ndarray:
+def addresses(images: Iterable[torch.Tensor | None]) -> np.ndarray:
     """(B,) uintp addresses of contiguous float32 images, 0 for None.
 
     Take them again for each call: sharing a tensor with another process moves its memory.
@@ -203,6 +203,19 @@ def _pool(process: int, size: int) -> ThreadPoolExecutor:
 
 
 # -- what else a computation needs ----------------------------------------------------------------
+
+
+def check_device(device: str | torch.device) -> torch.device:
+    """`device` of torch; a `ValueError` unless it is there. ``"auto"``: CUDA where there is one."""
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
+    if found.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
+    return found
 
 
 def computes_bfloat16(device: torch.device) -> bool:

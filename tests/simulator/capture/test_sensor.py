@@ -266,7 +266,8 @@ def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
     exact = reference(light, exposure, normals)
     transitions, frames = Transitions.of([light], [exposure]), torch.empty(2, 4, *size)
     counts = record(transitions, Z6, keys=keys, noise=kind, signals=frames[:1], count=True)
-    sensor.record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, frames[1:])
+    outputs = {"signals": frames[1:]}
+    sensor.record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, outputs)
     for frame in frames:
         numbers = in_numbers(frame)
         assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 of 14 bits: 0.001

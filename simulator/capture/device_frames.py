@@ -1,0 +1,249 @@
+"""`BlurredFrames` by torch operations, on any device: light and what is blurred of it stay there.
+
+What is blurred, and how, is planned in the same columns. All frames (N, 4, H, W) are one tensor;
+the place of a frame is its number in it, from 1 on.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from simulator.capture.blurred_frames import BlurredFrames, frame_at
+from simulator.capture.decision import LIGHT_LIMIT
+from simulator.optics.discs import DIAMETERS, disc_blur
+from simulator.optics.motion import taps_of
+from simulator.utils.compute import kernel
+
+#: Taps that are summed together, samples of them that are read at once, and frames that are added
+#: to the memory at once, at least.
+_TOGETHER, _SAMPLES, _FRAMES = 8, 2**25, 64
+_KNOTS = torch.tensor(DIAMETERS).square()
+
+
+class DeviceFrames(BlurredFrames):
+    """See the module."""
+
+    def __init__(
+        self, num_scenes: int, num_apertures: int, most_bytes: int, device: torch.device
+    ) -> None:
+        super().__init__(num_scenes, num_apertures, most_bytes)
+        self._frames = torch.empty(0, device=device)
+        # The lights of scenes by `id`, as long as they exist, and their places.
+        self._known: dict[int, tuple[weakref.ref[Tensor], int]] = {}
+        # Places of each scene's layout as a frame: diameters, mask, pixels behind it; and the
+        # addresses of diameters and mask that they were copied from.
+        self._layouts, self._diameters, self._masks = np.zeros((3, num_scenes), np.uintp)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the memory exceeds its limit."""
+        return self._frames.nbytes > self._most_bytes
+
+    def places(self, lights: Sequence[Tensor]) -> np.ndarray:
+        """(B,) places of lights (4, H, W) of scenes, which are copied when they are new."""
+        new = {id(light): light for light in lights if self._place_of(light) == 0}
+        if new:
+            shape = next(iter(new.values())).shape
+            made = self._take(len(new), tuple(shape))
+            self._put(made, list(new.values()))
+            for (key, light), place in zip(new.items(), made.tolist(), strict=True):
+                self._known[key] = weakref.ref(light), place
+        return np.array([self._known[id(light)][1] for light in lights], np.uintp)
+
+    def _place_of(self, light: Tensor) -> int:
+        found = self._known.get(id(light))
+        return found[1] if found is not None and found[0]() is light else 0
+
+    def at(self, places: np.ndarray, shape: tuple[int, ...]) -> Any:
+        """The frames at `places` (B,), a copy (B, 4, H, W)."""
+        return self._frames[self._numbers(places)]
+
+    def release(self, indices: np.ndarray) -> None:
+        """Frees the memory of the scenes `indices`."""
+        super().release(indices)
+        held = self._layouts[np.unique(indices)]
+        self._free = np.concatenate([self._free, held[held > 0]])
+        self._layouts[indices] = 0
+
+    def _numbers(self, places: np.ndarray) -> Tensor:
+        return torch.from_numpy(places.astype(np.int64) - 1).to(self._frames.device)
+
+    def _put(self, places: np.ndarray, frames: Sequence[Tensor]) -> None:
+        self._frames[self._numbers(places)] = torch.stack(list(frames)).to(self._frames.device)
+
+    def _more(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
+        # Lights of scenes that are gone come first.
+        gone = {key: place for key, (light, place) in self._known.items() if light() is None}
+        for key in gone:
+            del self._known[key]
+        freed, old = np.array([*gone.values()], np.uintp), self._frames
+        lacking = count - len(freed)
+        if lacking <= 0:
+            return freed
+        begin = len(old)
+        self._frames = old.new_empty(begin + max(lacking, begin // 2, _FRAMES), *shape)
+        if begin:
+            self._frames[:begin] = old
+        added = np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
+        return np.concatenate([freed, added])
+
+    # -- passes -------------------------------------------------------------------------------
+
+    def _blur(
+        self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray, shape: tuple[int, ...]
+    ) -> None:
+        for diameter in np.unique(diameters).tolist():
+            alike = diameters == diameter
+            light = self._clamped(source[alike])
+            self._frames[self._numbers(to[alike])] = disc_blur(light, diameter)
+
+    def _clamped(self, places: np.ndarray) -> Tensor:
+        return self._frames[self._numbers(places)].clamp_(-LIGHT_LIMIT, LIGHT_LIMIT)
+
+    def _blend(
+        self,
+        indices: np.ndarray,
+        blends: np.ndarray,
+        blurs: np.ndarray,
+        levels: np.ndarray,
+        to: np.ndarray,
+        shape: tuple[int, ...],
+    ) -> None:
+        for part in _parts(np.flatnonzero(blends), 2 * shape[0] * shape[1] * shape[2]):
+            maps = self._layout_frames(indices[part], blurs[part], shape)
+            scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
+            knots = _KNOTS.to(maps.device)
+            squared = (
+                (maps[:, 0].flatten(1) * scale[:, None]).square_().clamp_(max=float(knots[-1]))
+            )
+            below = torch.searchsorted(knots, squared, right=True).sub_(1).clamp_(0, len(knots) - 2)
+            share = (squared - knots[below]) / (knots[below + 1] - knots[below])  # (K, H W)
+            numbers = self._numbers(levels[part])
+            low, high = (self._pixels(numbers.gather(1, below + i), shape) for i in range(2))
+            blended = torch.lerp(low, high, share[:, None])
+            self._frames[self._numbers(to[part])] = blended.reshape(-1, *shape)
+
+    def _pixels(self, numbers: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """(K, 4, H W) pixels, each of the frame at `numbers` (K, H W)."""
+        planes, size = shape[0], shape[1] * shape[2]
+        first = (numbers * planes * size + torch.arange(size, device=numbers.device))[:, None]
+        offsets = size * torch.arange(planes, device=numbers.device)[:, None]
+        return self._frames.view(-1)[first + offsets]
+
+    def _layout_frames(
+        self, indices: np.ndarray, blurs: np.ndarray, shape: tuple[int, ...]
+    ) -> Tensor:
+        """(K, 4, H, W) diameters, masks, and pixels behind the subjects."""
+        stale = (self._layouts[indices] == 0) | (self._diameters[indices] != blurs["diameter"])
+        stale |= (blurs["mask"] > 0) & (self._masks[indices] != blurs["mask"])
+        if stale.any():
+            lacking = indices[stale & (self._layouts[indices] == 0)]
+            self._layouts[lacking] = self._take(len(lacking), shape)
+            frames = []
+            for blur in blurs[stale]:
+                frame = np.zeros(shape, np.float32)
+                frame[0] = frame_at(blur["diameter"].item(), shape[1:])
+                if blur["mask"]:
+                    frame[1] = frame_at(blur["mask"].item(), shape[1:])
+                    frame[2] = frame_at(blur["behind"].item(), shape[1:]).view(np.int32)
+                frames.append(torch.from_numpy(frame))
+            self._put(self._layouts[indices[stale]], frames)
+            self._diameters[indices[stale]] = blurs["diameter"][stale]
+            self._masks[indices[stale]] = blurs["mask"][stale]
+        return self._frames[self._numbers(self._layouts[indices])]
+
+    def _move(
+        self,
+        indices: np.ndarray,
+        blurs: np.ndarray,
+        source: np.ndarray,
+        to: np.ndarray,
+        shape: tuple[int, ...],
+    ) -> None:
+        apart = blurs["mask"] > 0
+        for part in _parts(np.flatnonzero(~apart), _TOGETHER * shape[0] * shape[1] * shape[2]):
+            light = self._clamped(source[part])
+            moved = moved_sums(light, *tap_columns(blurs[part], False, *shape[1:]))
+            self._frames[self._numbers(to[part])] = moved
+        for part in _parts(np.flatnonzero(apart), 2 * _TOGETHER * shape[0] * shape[1] * shape[2]):
+            # See `simulator.optics.motion.path_blur_apart`.
+            light, maps = (
+                self._clamped(source[part]),
+                self._layout_frames(indices[part], blurs[part], shape),
+            )
+            mask, behind = maps[:, 1:2], maps[:, 2:3].long().flatten(2)
+            back = light.flatten(2).gather(2, behind.expand(-1, shape[0], -1)).view_as(light)
+            back = moved_sums(back, *tap_columns(blurs[part], False, *shape[1:]))
+            own = tap_columns(blurs[part], True, *shape[1:])
+            front = moved_sums(torch.cat([light * mask, mask], dim=1), *own)
+            seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
+            self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
+
+
+def _parts(chosen: np.ndarray, samples: int) -> list[np.ndarray]:
+    """`chosen` in parts of frames that need so many `samples` each at once."""
+    size = max(1, _SAMPLES // samples)
+    return [chosen[i : i + size] for i in range(0, len(chosen), size)]
+
+
+@kernel()
+def tap_columns(blurs, own, height, width):  # type: ignore[no-untyped-def]
+    """Taps of the paths of `BLUR` (K,), those of the subjects' `own` or of the backgrounds.
+
+    Returns:
+        (K,) int64 where the taps of each begin, and behind them the end of all; and the taps one
+        behind the other: (T,) int64 rows and columns, (T,) float32 weights.
+    """
+    ends = np.zeros(len(blurs) + 1, np.int64)
+    rows, columns, weights = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
+    for i in range(len(blurs)):
+        blur = blurs[i]
+        x, y = (blur.drift_x, blur.drift_y) if own else (0.0, 0.0)
+        found = taps_of(blur.extent, blur.direction, blur.turn, x, y, height, width)
+        ends[i + 1] = end = ends[i] + len(found[0])
+        if end > len(rows):
+            more = end + len(rows)
+            rows, columns = _longer(rows, more), _longer(columns, more)
+            weights = _longer(weights, more)
+        rows[ends[i] : end], columns[ends[i] : end] = found[0], found[1]
+        weights[ends[i] : end] = found[2]
+    return ends, rows[: ends[-1]], columns[: ends[-1]], weights[: ends[-1]]
+
+
+@kernel()
+def _longer(values, size):  # type: ignore[no-untyped-def]
+    out = np.empty(size, values.dtype)
+    out[: len(values)] = values
+    return out
+
+
+def moved_sums(
+    images: Tensor, ends: np.ndarray, rows: np.ndarray, columns: np.ndarray, weights: np.ndarray
+) -> Tensor:
+    """Sums of shifts of `images` (K, C, H, W) by the taps of each; the borders are replicated."""
+    height, width = images.shape[-2:]
+    counts = np.diff(ends)
+    order = np.argsort(-counts, kind="stable")  # those with the most taps first
+    to = images.device
+    taps = [torch.from_numpy(values).to(to) for values in (rows, columns, weights)]
+    first, own = torch.from_numpy(ends[order]).to(to), torch.from_numpy(order).to(to)
+    light, total = images.flatten(2)[own], torch.zeros_like(images).flatten(2)
+    y, x = torch.arange(height, device=to)[:, None], torch.arange(width, device=to)
+    eight = torch.arange(_TOGETHER, device=to)
+    for done in range(0, int(counts.max(initial=0)), _TOGETHER):
+        active = int((counts > done).sum())
+        down, right, weight = (values[first[:active, None] + done + eight] for values in taps)
+        looks_at = (y + down[..., None, None]).clamp_(0, height - 1) * width
+        looks_at = looks_at + (x + right[..., None, None]).clamp_(0, width - 1)  # (K, 8, H, W)
+        places = looks_at.flatten(1)[:, None].expand(-1, images.shape[1], -1)
+        read = light[:active].gather(2, places).view(*places.shape[:2], _TOGETHER, -1)
+        total[:active] += (read * weight[:, None, :, None]).sum(dim=2)
+    out = torch.empty_like(total)
+    out[own] = total
+    return out.view_as(images)

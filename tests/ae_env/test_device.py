@@ -1,0 +1,99 @@
+"""Environments whose frames torch makes on a device: here the CPU's, against the compiled loops.
+
+With the same seed both have the same noise; only the order of float32 arithmetic differs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.wrappers.vector import ArrayConversion
+
+from tests.ae_env.environments import SMALL, make_env, make_envs
+
+SAME = {"autoreset_mode": "SAME_STEP"}
+
+
+def pair(num_envs=3, **arguments):
+    return [make_envs(num_envs, device=device, **arguments) for device in (None, "cpu")]
+
+
+def assert_close(loops, torchs, reward=1e-4) -> None:
+    """At most one code, and that where rounding is close; rewards as near as one blown pixel."""
+    (first, *rest), (second, *others) = loops, torchs
+    for name, values in second.items():
+        assert isinstance(values, torch.Tensor)
+        apart = np.abs(values.double().numpy() - first[name])
+        assert values.numpy().dtype == first[name].dtype
+        assert apart.max() <= (name == "raw")
+        assert (apart > 0).mean() < 1e-3
+    if len(rest) == 4:
+        assert [v.dtype for v in others[:3]] == [torch.float32, torch.bool, torch.bool]
+        np.testing.assert_allclose(others[0].numpy(), rest[0], rtol=0, atol=reward)
+        for flags, wanted in zip(others[1:3], rest[1:3], strict=True):
+            np.testing.assert_array_equal(flags.numpy(), wanted)
+    own, wanted = others[-1], rest[-1]
+    assert own.keys() == wanted.keys()
+    for name in ("state", "modules", "clipped_low", "excess_noise", "predicted_error"):
+        np.testing.assert_allclose(own[name], wanted[name], rtol=1e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize("lighting", ["static", "flicker"])
+def test_frames_are_those_of_the_loops_at_every_state(lighting: str) -> None:
+    """20 scenes in 64 states each, in motion, with subjects that move, and out of focus."""
+    both = pair(64, lighting=lighting, scenes="bundled", split="test")
+    scenes = both[0].unwrapped.scene_ids[:: len(both[0].unwrapped.scene_ids) // 20][:20]
+    for seed, scene in enumerate(scenes):
+        options = {"scene": scene, "state": list(range(64))}
+        assert_close(*(envs.reset(seed=100 * seed, options=options) for envs in both))
+        assert_close(*(envs.step(np.arange(64)) for envs in both))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"source": "raw", "costs": {"flicker": 1.0}},  # denoised; a blur averages its noise
+        {"source": "raw", "noise": "sensor", "camera": "sony_a7s2", "reward": "expected"},
+        {"observation": "dn", "noise": "exact", "lighting": "sine", "scorer": "shin"},
+        {"observation": "statistics", "motion": 0.5, "depth": 3.0, "scenes": "bundled:snow"},
+    ],
+)
+def test_every_option_has_the_same_episodes(arguments, monkeypatch) -> None:
+    both = pair(**SAME, max_episode_steps=3, **arguments)
+    rng = np.random.default_rng(0)
+    assert_close(*(envs.reset(seed=3) for envs in both), reward=1e-3)
+    full = "simulator.capture.device_frames.DeviceFrames.is_full"
+    for step in range(7):
+        monkeypatch.setattr(full, step > 3)  # then less is cached
+        actions = rng.integers(64, size=3)
+        results = [envs.step(actions) for envs in both]
+        assert_close(*results, reward=1e-3)
+    last = [result[-1] for result in results]
+    assert ("final_obs" in last[0]) == ("final_obs" in last[1]) == (step % 3 == 2)
+
+
+def test_actions_may_be_tensors_and_a_wrapper_gives_arrays() -> None:
+    envs = make_envs(device="cpu", render_mode="rgb_array", **SAME)
+    first = envs.reset(seed=0)[0]
+    shown = envs.step(torch.tensor([3, 9, 63]))
+    assert envs.render()[0].dtype == np.uint8
+    assert shown[0]["raw"].data_ptr() != first["raw"].data_ptr()
+    converted = ArrayConversion(make_envs(device="cpu", **SAME), env_xp=torch, target_xp=np)
+    converted.reset(seed=0)
+    observation, reward, *_ = converted.step(np.array([3, 9, 63]))
+    assert isinstance(reward, np.ndarray)
+    np.testing.assert_array_equal(observation["raw"], shown[0]["raw"].numpy())
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "named"),
+    [
+        (make_envs, {"device": "gpu9"}, "device"),
+        (make_env, {"device": "cpu"}, "make_vec"),
+        (make_envs, {"task": "ae_env/ExposureBracket-v0", "device": "cpu"}, "device"),
+    ],
+)
+def test_what_has_no_device_says_so(make, arguments, named) -> None:
+    with pytest.raises((ValueError, TypeError), match=named):
+        make(**{**SMALL, **arguments})
