@@ -81,13 +81,27 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "growth": f"{table(more['growth'], _CURVES)}\n\n{by_x}",
         "frames": table(more["full_frame"], _FRAMES),
     }
-    figure = Figure(figsize=(10.0, 5.0), dpi=80, layout="constrained")
+    return Report([*steps, *paired], tables, meta=more, figures={"throughput.png": _drawn(steps)})
+
+
+def _drawn(steps: list[Row]) -> Figure:
+    """Steps per second against the number of environments, beside the fused kernel."""
     frame = pd.DataFrame(steps)
-    frame = frame[frame["title"] == frame["title"][0]]
-    frame.index = frame["case"] + frame["num_envs"].map(" ({})".format)
-    axis, speeds = figure.subplots(), frame["steps_per_second"].sort_values()
-    speeds.plot.barh(ax=axis, logx=True, xlabel="steps per second, " + frame["title"].iloc[0])
-    return Report([*steps, *paired], tables, meta=more, figures={"throughput.png": figure})
+    frame = frame[frame["size"] == frame["size"].iloc[0]]
+    kinds = frame["case"].str.removeprefix("vector env, ").str.removeprefix("one environment, ")
+    shown = kinds.isin(["fused kernel, noise bank", "cached scene", "motion and defocus"])
+    figure = Figure(figsize=(8.0, 4.5), dpi=100, layout="constrained")
+    axis = figure.subplots()
+    for (threads, kind), own in frame[shown].groupby(["threads", kinds], sort=False):
+        own = own.sort_values("num_envs").set_index("num_envs")["steps_per_second"]
+        label, style = f"{kind}, threads: {threads}", "o-" if threads > 1 else "o--"
+        if len(own) > 1:
+            own.plot(ax=axis, loglog=True, style=style, label=label)
+        else:
+            axis.axhline(own.iloc[0], color="grey", linestyle=style[1:], label=label)
+    axis.set(xlabel="environments side by side", ylabel="frames per second")
+    axis.legend()
+    return figure
 
 
 run = benchmark("throughput", parts, report)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from typing import Any
 
 import gymnasium as gym
@@ -31,6 +32,8 @@ from simulator.utils.cache import CACHE_VARIABLE
 SCENES = "bundled:small"
 #: Rounds, and seconds that a case takes in each.
 QUICK, FULL = (3, 0.08), (9, 0.3)
+#: Numbers of environments, and kinds of light.
+COUNTS, LIGHTS = (1, 8, 64, 512), ("sine", "flicker")
 #: Names of the limits that others are compared with.
 KERNEL = {"bank": "fused kernel, noise bank", "exact": "fused kernel, exact noise"}
 
@@ -71,7 +74,7 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
         cases.append(Case(name, 64, kernel.step, noise))
     images, scorer = torch.rand(64, *lights.shape[1:]), LiveScore()
     cases.append(Case("a torch scorer alone", 64, partial(scorer, images, None)))
-    cases += _cases(size, seed, threads > 1)
+    cases += _cases(size, seed)
     if threads > 1 and size == 64 and not quick:
         cases.append(_ppo(seed))
     try:
@@ -85,24 +88,23 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
 # -- the cases ------------------------------------------------------------------------------------
 
 
-def _cases(size: int, seed: int, full: bool) -> Iterator[Case]:
-    """Cases of the environment itself; without `full` only the chief ones."""
-    live, exact = {"scorer": f"{__name__}:LiveScore"}, {"noise": "exact"}
-    many, rest, moved = "vector env", "cached scene", "motion and defocus"
+def _cases(size: int, seed: int) -> Iterator[Case]:
+    """Cases of the environment itself, by compiled loops and by torch on each device."""
+    live, many, rest = {"scorer": f"{__name__}:LiveScore"}, "vector env", "cached scene"
+    moved = "motion and defocus"
     cases: list[tuple[str, int, dict[str, Any]]] = [
-        (f"one environment, {rest}", 1, CACHED),
-        (f"{many}, {rest}", 64, CACHED),
         (f"{many}, {rest}, torch scorer", 64, CACHED | live),
-        (f"{many}, {rest}, exact noise", 64, CACHED | exact),
-        (f"{many}, {moved}", 64, {}),
+        (f"{many}, {rest}, exact noise", 64, CACHED | {"noise": "exact"}),
+        (f"{many}, {rest}, linear", 64, CACHED | {"observation": "linear"}),
+        *((f"{many}, {moved}, {kind} light", 64, {"lighting": kind}) for kind in LIGHTS),
     ]
-    if full:
-        cases.append((f"{many}, {rest}, linear", 64, CACHED | {"observation": "linear"}))
-        lights = ("sine", "flicker")
-        cases += [(f"{many}, {moved}, {kind} light", 64, {"lighting": kind}) for kind in lights]
-        cases.append((f"one environment, {moved}", 1, {}))
-        for count in (8, 512):
-            cases += [(f"{many}, {rest}", count, CACHED), (f"{many}, {moved}", count, {})]
+    for count in COUNTS:
+        name = many if count > 1 else "one environment"
+        cases += [(f"{name}, {rest}", count, CACHED), (f"{name}, {moved}", count, {})]
+    for device in ("cpu", *["cuda"] * torch.cuda.is_available()):
+        for count, own in product((64, 4096) if device == "cuda" else (64,), (CACHED, {})):
+            kind = rest if own else moved
+            cases.append((f"{many}, {kind}, torch on {device}", count, own | {"device": device}))
     for name, count, options in cases:
         make: dict[str, Any] = {"scenes": SCENES, "resolution": size} | options
         make |= {"autoreset_mode": "SAME_STEP"} if count > 1 else {}
