@@ -224,8 +224,8 @@ def check_bfloat16(device: torch.device) -> None:
 def _bfloat16_time() -> float:
     """Time of a convolution in bfloat16, over that in float32.
 
-    Measured: processors without bfloat16 emulate it, ten times as slow, and of those that compute
-    it some still multiply faster in float32 (Intel's without AMX).
+    Measured, as it cannot be told from what the processor supports: those without bfloat16 emulate
+    it, ten times as slow, and one with AVX-512 BF16 but without AMX is faster in float32, too.
     """
     seconds = []
     for dtype in (torch.float32, torch.bfloat16):
