@@ -21,11 +21,12 @@ from simulator.capture.blurred_light import (
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
 from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
-from simulator.capture.statistics import DenoisedLight
+from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.network_cache import NetworkCache, Where
 from simulator.networks.noise_module import (
+    BFLOAT16_ERROR,
     SIZES,
     Denoiser,
     NoiseModule,
@@ -49,6 +50,8 @@ Depth = Literal["far", "unknown"]
 Source = RawImage | PreparedScene | HasPrepared
 #: Reach of the family's networks around a pixel [pixel], a multiple of 8; tiles overlap by it.
 _NOISE_HALO, _MAP_HALO = 80, 56
+#: What bfloat16 changes of the family's results.
+_ROUNDING = {name: Residual.alike(error) for name, error in BFLOAT16_ERROR.items()}
 #: Size of the raw that a network's time is measured on [packed pixel].
 _TIMED = 128
 
@@ -125,7 +128,8 @@ class CameraSimulator:
             ``"large"``, ``"paper"`` or ``"ncs"``; see `from_pretrained` for trained ones. None has
             none: noise is only added, and every scene is taken as far.
         device: ``"auto"`` (CUDA where there is one), or any torch device.
-        precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32.
+        precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32, as
+            are networks whose rounding would be more than the tolerance (`BFLOAT16_ERROR`).
         cache: Where `prepare` stores the networks' results about a source, for the next time that
             it comes: ``"memory"`` (the last 256 MiB), ``"disk"`` (also in the cache folder,
             for later runs), or None: nowhere.
@@ -282,13 +286,14 @@ class CameraSimulator:
         """
         noise = _required("noise", self.noise if noise is None else noise)
         image, (shot, read) = prepared.light[None], self._noise_of(prepared)
+        precision = self._precision_of(noise, prepared)
         if not noise.commutes:
-            with self._autocast():
+            with self._autocast(precision):
                 return noise(image, shot, read)[0]
         network = cast(Denoiser, noise.network)
 
         def uncorrected(part: torch.Tensor, far: torch.Tensor) -> torch.Tensor:
-            with self._autocast():
+            with self._autocast(precision):
                 return network.uncorrected(part, far, shot, read)
 
         needed = varying(prepared.light) if prepared.tolerance > 0 else None
@@ -313,7 +318,7 @@ class CameraSimulator:
 
         def network(part: torch.Tensor, noisy: torch.Tensor) -> torch.Tensor:
             deviation = variance_map(smoothed(noisy), shot, read).sqrt()
-            with self._autocast():
+            with self._autocast(self._precision_of(aperture, prepared)):
                 return aperture.estimate_defocus(part, deviation)
 
         # No disc changes a pixel that sees a constant neighbourhood.
@@ -337,10 +342,12 @@ class CameraSimulator:
     def _denoised(self, noise: NoiseModule, prepared: PreparedScene) -> DenoisedLight:
         """`denoise` when it is first needed, cached."""
         pixels, make = prepared.light[0].numel(), partial(self.denoise, prepared, noise)
+        rounds = self._precision_of(noise, prepared) == "bfloat16"
         return DenoisedLight(
             lambda: self._cached("denoised", noise, prepared, make, prepared.light.shape),
             name=noise.preset,
             residual=noise.residual,
+            rounding=_ROUNDING.get(noise.preset) if rounds else None,
             operations=noise.operations * pixels,
             seconds=lambda: self._seconds_of(noise) * pixels,
             everywhere=prepared.tolerance == 0.0 or not noise.commutes,
@@ -355,7 +362,7 @@ class CameraSimulator:
             times = []
             for _ in range(2):
                 start = time.perf_counter()
-                with self._autocast():
+                with self._autocast(self.precision):
                     noise(image, variance, variance).sum().item()
                 times.append(time.perf_counter() - start)
             self._seconds[noise.preset] = min(times) / _TIMED**2
@@ -364,7 +371,7 @@ class CameraSimulator:
     def _cached(
         self,
         kind: str,
-        module: nn.Module,
+        module: NoiseModule | ApertureModule,
         prepared: PreparedScene,
         make: Callable[[], torch.Tensor],
         shape: Sequence[int],
@@ -379,7 +386,7 @@ class CameraSimulator:
             make,
             shape=shape,
             nlf=[prepared.nlf.shot, prepared.nlf.read],
-            precision=self.precision,
+            precision=self._precision_of(module, prepared),
             everywhere=prepared.tolerance == 0,
         )
 
@@ -387,8 +394,13 @@ class CameraSimulator:
         shot, read = (torch.tensor([v]) for v in (prepared.nlf.shot, prepared.nlf.read))
         return shot.to(self.device), read.to(self.device)
 
-    def _autocast(self) -> torch.autocast:
-        enabled = self.precision == "bfloat16"
+    def _precision_of(self, module: NoiseModule | ApertureModule, prepared: PreparedScene) -> str:
+        """Float32 where bfloat16 would be an error beyond the tolerance."""
+        within = BFLOAT16_ERROR.get(module.preset, 0.0) <= prepared.tolerance
+        return self.precision if within else "float32"
+
+    def _autocast(self, precision: str) -> torch.autocast:
+        enabled = precision == "bfloat16"
         return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
 
     def plan(
@@ -443,7 +455,7 @@ class CameraSimulator:
             exposed = exposed.clamp(0.0, 1.0)
         nlf = prepared.nlf.exposed(float(module.w) * exposure.ratio)
         shot, read = (torch.tensor([v]).to(exposed) for v in (nlf.shot, nlf.read))
-        with self._autocast():
+        with self._autocast(self.precision):
             denoised = opened = noise(exposed, shot, read)
             if depth == "unknown" or prepared.aperture_blur is not None:
                 deviation = variance_map(smoothed(exposed), shot, read).sqrt()

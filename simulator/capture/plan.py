@@ -248,13 +248,17 @@ def predict_errors(
     """`SimulationPlan.errors` of the exposure that was decided for `settings`."""
     ratio, target = exposure.ratio, exposure.target
     extrapolated = abs(target.extrapolation) if exposure.noise else 0.0
+    rounding = ROUNDING * scene.statistics.relative_level(ratio, target)
+    if exposure.denoised is not None and exposure.denoised.rounding is not None:
+        error_of, bfloat16 = scene.blurred_light.residuals.error, exposure.denoised.rounding
+        rounding = math.hypot(rounding, error_of(bfloat16, ratio, target, noise=exposure.noise))
     return {
         "left out": exposure.left_out,
         "network": exposure.steps[0].residual,
         "clipped highlights": _hidden_highlights(ratio, target, *scene.clipped_light),
         "unknown depth": _depth_error(scene, settings, exposure),
         "ISO": EXTRAPOLATION_ERROR * extrapolated,
-        "rounding": ROUNDING * scene.statistics.relative_level(ratio, target),
+        "rounding": rounding,
     }
 
 

@@ -365,6 +365,11 @@ class Residual:
     spread: float  # factor on a predicted error below which 90 % of the measured ones are
 
     @classmethod
+    def alike(cls, error: float) -> Residual:
+        """The same systematic `error` whatever the light."""
+        return cls(np.array([0.0, 1.0]), np.full(2, error**2), np.zeros(2), 1.0)
+
+    @classmethod
     def from_card(cls, values: Mapping[str, Any]) -> Residual:
         """Of the numbers in a model card; a `ValueError` if they are none."""
         try:
@@ -493,6 +498,7 @@ class DenoisedLight:
         light: (4, H, W) float32, or a function that works it out.
         name: Of the network.
         residual: Its error; None where that was not measured.
+        rounding: What bfloat16 changes of it; None where it was worked out in float32.
         operations: Arithmetic operations that it takes, all pixels together.
         seconds: Estimates how long that takes on this machine.
         everywhere: Whether the noise is also removed where a positive tolerance needs no network.
@@ -504,6 +510,7 @@ class DenoisedLight:
         *,
         name: str = "network",
         residual: Residual | None = None,
+        rounding: Residual | None = None,
         operations: int = 0,
         seconds: Callable[[], float] = float,
         everywhere: bool = True,
@@ -512,14 +519,14 @@ class DenoisedLight:
             light = check_packed("denoised", light)
         self._light, self.everywhere = light, everywhere
         self.name, self.residual, self.operations = name, residual, operations
-        self.seconds = seconds
+        self.seconds, self.rounding = seconds, rounding
         self._lock = threading.RLock()
 
     def __reduce__(self) -> tuple[Callable[..., DenoisedLight], tuple[torch.Tensor]]:
         return functools.partial(DenoisedLight, **self._known()), (self.light,)
 
     def _known(self) -> dict[str, Any]:
-        names = ("name", "residual", "operations", "everywhere")
+        names = ("name", "residual", "rounding", "operations", "everywhere")
         return {name: getattr(self, name) for name in names}
 
     @property
