@@ -81,14 +81,16 @@ def prepared_of(source: Source, device: torch.device) -> PreparedScene:
         marks, camera = source.saturated, source.camera
         if source.nlf is not None and not camera.nlf_by_iso:
             camera = camera.with_nlf(source.settings.iso, source.nlf)
+        light, noise = neutral_highlights(source, marks).to(device), source.noise
         return PreparedScene(
-            light=neutral_highlights(source, marks).to(device),
+            light=light,
             reference=source.settings,
             camera=camera,
-            nlf=source.noise,
+            nlf=noise,
             saturated=marks.to(device) if marks.count_nonzero() else None,
             white_balance=source.white_balance,
             box_factor=source.box_factor,
+            blurred_light=BlurredLight(light, noise, None),  # the raw was checked
         )
     if isinstance(source, PreparedScene):
         if source.light.device == device:
@@ -297,9 +299,12 @@ class CameraSimulator:
                 return network.uncorrected(part, far, shot, read)
 
         needed = varying(prepared.light) if prepared.tolerance > 0 else None
-        around = network.surroundings(image, shot, read)
         clean = in_tiles(
-            uncorrected, image, around, halo=_NOISE_HALO, needed=needed, fallback=image
+            uncorrected,
+            *(image, network.surroundings(image, shot, read)),
+            halo=_NOISE_HALO,
+            needed=needed,
+            fallback=image,
         )
         clean = network.corrected(clean, image, shot, read)[0]
         return clean if needed is None else torch.where(needed, clean, prepared.light)
@@ -520,8 +525,8 @@ class CameraSimulator:
             "excess_noise": excess_noise,
             "clipped_source": prepared.saturated_share,
         }
-        return RawImage(
-            data=data,
+        return RawImage.from_finite(
+            data,
             settings=settings,
             camera=prepared.camera,
             nlf=output_noise,

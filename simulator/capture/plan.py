@@ -294,12 +294,13 @@ def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Expos
     added = 0.0
     if exposure.opened_to is not None:
         light = scene.light if exposure.denoised is None else exposure.denoised.light
-        lights = light, scene.blurred_light.source(exposure)
-        sharp, opened = (part * ratio for part in lights)
-        if noise:
-            sharp, opened = sharp.clamp_(max=1.0), opened.clamp_(max=1.0)
-        wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
-        added = float(((opened - sharp).square_() / wanted).double().mean().sqrt())
+        lights, white = (light, scene.blurred_light.source(exposure)), 1.0 if noise else math.inf
+        rows = max(1, _BALANCED // light.shape[-1])
+        for top in range(0, light.shape[-2], rows):
+            sharp, opened = ((x[:, top : top + rows] * ratio).clamp_(max=white) for x in lights)
+            wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
+            added += float(((opened - sharp).square_() / wanted).sum(dtype=torch.float64))
+        added = math.sqrt(added / light.numel())
     return math.hypot(disc * MISSED_BLUR**2 * (wider - 1.0), DEPTH_ERROR * added)
 
 
@@ -312,9 +313,8 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> tuple[float, bool]
     if exposure.source_noise.is_zero:
         return 0.0, not target.is_zero
     table = exposure_table([exposure])[0, 1:]
-    height, width = light.shape[-2:]
-    rows = max(1, _BALANCED // width)
-    parts = [slice(top, top + rows) for top in range(0, height, rows)]
+    rows = max(1, _BALANCED // light.shape[-1])
+    parts = [slice(top, top + rows) for top in range(0, light.shape[-2], rows)]
     relative, lacks = np.zeros(4), np.zeros(4, bool)
 
     def balance(first: int, last: int) -> None:

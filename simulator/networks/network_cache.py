@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from simulator.utils.cache import LruCache, cache_key, content_digest, disk_cache
 from simulator.utils.checks import check_word
+from simulator.utils.compute import release_memory
 
 #: ``"memory"``, or ``"disk"``: both in memory and in files that later runs find.
 Where = Literal["memory", "disk"]
@@ -47,7 +48,7 @@ class NetworkCache:
         finite, or not of `shape`, where that is known beforehand, is made again.
         """
         if self.where is None:
-            return make()
+            return _made(make)
         given = {name: tensor for name, tensor in inputs.items() if tensor is not None}
         device = next(modules[0].parameters()).device
         description = {
@@ -64,7 +65,7 @@ class NetworkCache:
         if tensor is not None:
             tensor = tensor.to(device)
         else:
-            tensor = make().contiguous()  # as it comes from disk: later sums round alike
+            tensor = _made(make).contiguous()  # as it comes from disk: later sums round alike
             if self._disk is not None:
                 self._disk.put(key, {"result": tensor})
         self.memory.put(key, (tensor, _changes(tensor)), tensor.nbytes)
@@ -95,6 +96,13 @@ class NetworkCache:
             known = marks, content_digest(state)
             self._fingerprints[id(module)] = known
         return known[1]
+
+
+def _made(make: Callable[[], Tensor]) -> Tensor:
+    """The result of networks, whose memory goes back to the system."""
+    tensor = make()
+    release_memory()
+    return tensor
 
 
 def _changes(tensor: Tensor) -> int:

@@ -145,13 +145,15 @@ class Denoiser(nn.Module):
         stabiliser = Stabiliser.of(shot, read)
         z, far = stabiliser.forward(padded(image.float(), _CELL)), padded(far.float(), _CELL)
         near = box_mean(z, _NEAR)
-        features = (
+        features = [
             _LEVEL * _asinh((z - near) / _LEVEL),
             _asinh(4.0 * (near - far)),
             _asinh(near / _LEVEL),
             stabiliser.linearity.expand_as(z),
-        )
-        residual = self._residual(torch.cat(features, dim=1)).float()
+        ]
+        del near, far
+        features[:] = [torch.cat(features, dim=1)]
+        residual = self._residual(features.pop()).float()  # the tile's memory is the network's now
         # Bounded by a function whose slope never vanishes: a saturated network must still learn.
         clean = stabiliser.inverse(z + residual * (1.0 + (residual / _LARGEST).square()).rsqrt())
         return clean[..., :height, :width]
@@ -175,10 +177,9 @@ class Denoiser(nn.Module):
             skips.append(x)
             x = down(x)
         x = self.coarsest(x)
-        for block, up, skip in zip(
-            reversed(self.decode), reversed(self.up), reversed(skips), strict=True
-        ):
-            x = block(up(x).add_(skip))
+        for block, up in zip(reversed(self.decode), reversed(self.up), strict=True):
+            x = up(x).add_(skips.pop())  # on large frames these are most of the memory
+            x = block(x)
         residual: Tensor = self.tail(x)
         return residual
 

@@ -412,7 +412,9 @@ def read_black_level(
     rows, columns = map(int, tile)
     values = values[: rows * columns]
     down, right = (a - int(b) for a, b in zip(origin, corner, strict=True))
-    height, width = shape
+    # Alike in every 2 x 2 pixels, as in most files, it is looked at in those.
+    varies = max(rows, columns) > 2 or "BlackLevelDeltaV" in tags or "BlackLevelDeltaH" in tags
+    height, width = shape if varies else (2, 2)
     level = np.reshape(values, (rows, columns))
     level = level[(np.arange(height) + down) % rows][:, (np.arange(width) + right) % columns]
     for name, begin, count, axis in (

@@ -204,7 +204,8 @@ def _read(
         known = _settings(path, stated, settings)
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
-    if float(packed.max()) > _WHITE_TOLERANCE:
+        most = (float(decoded.mosaic.max()) - min(profile.black_level)) / min(profile.span)
+    if most > _WHITE_TOLERANCE and float(packed.max()) > _WHITE_TOLERANCE:
         logger.warning(
             "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: give "
             "`camera` with the right one",
@@ -214,7 +215,7 @@ def _read(
     noise, source = _noise(path, packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
         profile = profile.with_nlf(known.iso, noise)
-    return RawImage(
+    return RawImage.from_finite(
         packed,
         known,
         profile,

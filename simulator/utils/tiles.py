@@ -15,6 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from simulator.utils.compute import release_memory
+
 #: Side of a tile without its halo [pixel]: larger tiles waste less on halos and take more memory.
 TILE = 768
 #: Side of the cells in which pixels count as needed or varying, a multiple of 4 [pixel].
@@ -171,5 +173,6 @@ def in_tiles(
         if needed is not None:
             part = torch.where(needed[each.inner], part, output[each.inner])
         output[each.inner] = part
+    release_memory()
     assert output is not None
     return output
