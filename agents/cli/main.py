@@ -130,19 +130,24 @@ class _Commands(TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     epilog="A folder that an output names is made where it is missing. Exit status: 2 for a "
     "mistake in an option or a file, 1 for a failure while running.",
 )
-for command in (
-    *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
-    *(view, judge, refocus, hdr, film, record, export, score_tables, cache, warm_up),
-):
-    app.command()(command)
-app.command(no_args_is_help=True)(bench)
-app.add_typer(scenes, name="scenes")
+#: Commands by the heading of the help that they stand under.
+_HEADINGS: dict[str, tuple[Callable[..., None], ...]] = {
+    "Start": (quickstart, view),
+    "Policies": (evaluate, train, scorers, film, judge, record, export),
+    "Raw files": (simulate, sweep, refocus, hdr),
+    "Scenes": (score_tables,),
+    "Maintenance": (cache, warm_up, train_simulator),
+}
+for heading, commands in _HEADINGS.items():
+    for command in commands:
+        app.command(rich_help_panel=heading)(command)
+app.add_typer(scenes, name="scenes", rich_help_panel="Scenes")
+app.command(no_args_is_help=True, rich_help_panel="Maintenance")(bench)
 
 #: Commands that go on where they were stopped.
 _RESUMING = {"quickstart", "evaluate", "bench", "scenes", "score-tables"}

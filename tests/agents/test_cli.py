@@ -105,10 +105,12 @@ def test_help_and_usage_errors_load_nothing_heavy() -> None:
     wrong += [["evaluate", "--frames", "0"], ["bench", "throughput", "--seed", str(2**63)]]
     wrong += [["hdr", "a.dng", "--step", "half"]]
     code = f"""
-import importlib.metadata, sys
+import importlib.metadata, os, sys
 importlib.metadata.version = None  # a source tree need not be installed
 from agents.cli.main import main
-for arguments in {asked + wrong}:
+for arguments in {[*asked, *wrong, []]}:
+    if not arguments:
+        os.environ.update(_AE_ENV_COMPLETE="complete_bash", COMP_WORDS="ae-env ev", COMP_CWORD="1")
     sys.argv = ["ae-env", *arguments]
     try:
         main()
@@ -120,12 +122,14 @@ print("loaded", *sys.modules)
     command = [sys.executable, "-c", code]
     run = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     statuses = re.findall(r"^status (\d)$", run.stdout, re.MULTILINE)
-    assert statuses == ["0"] * len(asked) + ["2"] * len(wrong)
+    assert statuses == ["0"] * len(asked) + ["2"] * len(wrong) + ["0"]
+    assert "\nevaluate\nstatus 0\nloaded " in run.stdout  # completed
     assert run.stderr.count("Usage: ae-env") == len(wrong)
     for said in ("--frames.* '?0", f"--seed.*{2**63}", "--step.*'half'"):
         assert re.search(said, run.stderr)
     listed, _, *helps = run.stdout.split("status 0\n")
     assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", listed, re.MULTILINE)) == list(COMMANDS)
+    assert re.search("Start.* view .*Raw files.* hdr .*Scenes.*Maintenance", listed, re.DOTALL)
     assert f"ae-env {simulator.__version__}\n" in run.stdout
     for name, text in zip(COMMANDS, helps, strict=False):
         assert re.search(rf"Example: \W?ae-env {name} ", text)

@@ -24,7 +24,7 @@ from starlette.websockets import WebSocketDisconnect
 from ae_env.scenes import Scene
 from agents.report.judging import read_choices
 from agents.viewer import tab
-from agents.viewer.one_raw_page import opened, wider_f_numbers
+from agents.viewer.one_raw_page import opened
 from agents.viewer.server import TokenGuard
 from agents.viewer.viewed_scene import WINDOW_SIZE, OpenedScene, View, ViewedScene, find_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
@@ -183,13 +183,6 @@ def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown(tm
     assert (back.settings.f_number, back.data.shape) == (1.6, (4, 96, 144))
     assert back.data[:, 8:-8, :60].equal(before.data[:, 8:-8, :60])  # as it was recorded
     assert back.data[soft].std() < 0.8 * before.data[soft].std()
-
-
-def test_only_wider_f_numbers_than_the_raw_s_are_offered():
-    for own, offered in ((2.8, 6), (8**0.5, 6), (1.4, 0), (2**0.5, 0), (4, 9)):
-        raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 1, own), CAMERA)
-        wider = (3.5, 3.2, 2.8, 2.5, 2.2, 2.0, 1.8, 1.6, 1.4)
-        assert wider_f_numbers(raw) == wider[len(wider) - offered :]
 
 
 def _run(log, *arguments):
