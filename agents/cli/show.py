@@ -164,7 +164,7 @@ def film(
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in policy or POLICIES}
         with progress("fitting") as task:
-            fit_policies(policies, {"scenes": "bundled", "grid": "video"}, progress=task)
+            fit_policies(policies, {"scenes": "bundled", "grid": "video"}, progress=task, keep=True)
         with progress("film") as task:
             episodes = [record(n, p, envs, frames, seed, scene) for n, p in policies.items()]
             write_film(out, episodes, task)

@@ -395,21 +395,16 @@ def test_networks_run_once_for_a_raw(ae_env, raw, tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "kept"))
     options = ("--weights", networks, "--depth", "unknown", "--device", "cpu")
     simulate = ("simulate", dng, "--iso", 100, "--shutter", "1", "--aperture", 8, *options)
-    sweep = ("sweep", dng, *options)
     assert ae_env(*simulate, "--no-cache")[0] == 0
     assert not {path.name for path in tmp_path.glob("kept/*")} & {"denoised", "defocus_maps"}
     _, text, _ = ae_env(*simulate, "-o", "first.dng")
     assert "exposure -> noise_reduction (compact) -> noise" in text
-    assert ae_env(*sweep, "--out", "first")[0] == 0
     for network in ("denoise", "estimate_defocus"):
         monkeypatch.setattr(CameraSimulator, network, lambda *_: pytest.fail("it ran again"))
     assert ae_env(*simulate, "-o", "second.dng")[0] == 0
-    assert ae_env(*sweep, "--out", "second")[0] == 0
+    assert Path("first.dng").read_bytes() == Path("second.dng").read_bytes()
     with pytest.raises(pytest.fail.Exception):
-        ae_env(*sweep, "--no-cache")
-    for written in ("{}.dng", "{}/contact_sheet.png"):
-        first, second = (Path(written.format(run)) for run in ("first", "second"))
-        assert first.read_bytes() == second.read_bytes()
+        ae_env(*simulate, "--no-cache")
 
 
 def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path) -> None:

@@ -24,7 +24,9 @@ from starlette.websockets import WebSocketDisconnect
 from ae_env.scenes import Scene
 from agents.report.judging import read_choices
 from agents.viewer import tab
+from agents.viewer.episode_page import Stopped, play
 from agents.viewer.one_raw_page import opened
+from agents.viewer.page import PictureStore
 from agents.viewer.server import TokenGuard
 from agents.viewer.viewed_scene import WINDOW_SIZE, OpenedScene, View, ViewedScene, find_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
@@ -60,11 +62,6 @@ def test_the_window_lies_where_the_upright_picture_was_clicked(flip):
     np.testing.assert_allclose(found, np.array(window.shape) / 2, atol=8)
 
 
-def test_a_large_frame_is_averaged_to_the_size_of_the_page():
-    capture = viewed(torch.zeros(4, 1025, 1100)).picture(View(SETTINGS)).capture
-    assert capture.shape == (4, 341, 366)  # thirds
-
-
 def test_clipped_pixels_are_marked():
     light = torch.full((4, 64, 64), 0.1)
     light[:, :32, :32] = 3.0
@@ -84,6 +81,8 @@ def test_numbers_of_a_flat_scene():
     assert (readout.white, readout.black) == (pytest.approx(1.0, abs=0.6), 0.0)
     assert readout.motion == pytest.approx(0.5 * 64 / 16)  # speed, height, time
     assert readout.defocus == pytest.approx(4.0)
+    huge = viewed(torch.zeros(4, 1025, 1100)).picture(View(SETTINGS)).capture
+    assert huge.shape == (4, 341, 366)  # thirds fit the page
     large = viewed(torch.full((4, 512, 384), 0.1))
     for centre in (None, (0.5, 0.5)):  # a window moves as the frame does
         shown = replace(view, centre=centre)
@@ -125,14 +124,29 @@ def test_a_folder_opens_at_its_first_readable_raw_and_few_are_kept(tmp_path):
         library.open("2.dng")
 
 
+def test_thumbnails_are_made_once_and_last_and_an_episode_can_be_stopped():
+    store, made = PictureStore(), []
+    address = store.thumbnail_address("all/a b.dng", lambda: made.append(1) or b"jpeg")
+    store.thumbnail_address("all/bad", lambda: float("no raw"))
+    for _ in range(300):
+        store.address(b"another")
+    bodies = [store.fetch_thumbnail("all/a b.dng").body for _ in range(2)]
+    assert store.fetch_thumbnail("all/bad").status_code == 204
+    assert (address, bodies, made) == ("/thumbnail/all/a%20b.dng", [b"jpeg"] * 2, [1])
+
+    def stop(doing):
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        play(["average"], viewed(torch.full((4, 64, 64), 0.1)).scored, watch=stop)
+
+
 def test_files_of_all_tabs_together_have_a_bound(tmp_path, monkeypatch):
     for name in ("", "..", "a\0b.dng", "x" * 256):
         with pytest.raises(ValueError, match="cannot be called"):
             tab.new_file(tmp_path, name)
-    for own in ("mine", "other"):
-        (tmp_path / own).mkdir()
-    tab.new_file(tmp_path / "other", "a.dng").write_bytes(bytes(10**6))
-    assert tab.new_file(tmp_path / "mine", "a.dng").parent.is_dir()
+    (tmp_path / "mine").mkdir()
+    tab.new_file(tmp_path / "mine", "a.dng").write_bytes(bytes(10**6))
     monkeypatch.setattr(tab, "_MOST_STORED", 10**6)
     with pytest.raises(ValueError, match="close other tabs"):
         tab.new_file(tmp_path / "mine", "a.dng")
@@ -257,9 +271,7 @@ def page(browser, address):
 
 @pytest.fixture
 def expect(browser):
-    from playwright.sync_api import expect
-
-    return expect
+    return pytest.importorskip("playwright.sync_api").expect
 
 
 def saved(page, button, folder):
@@ -360,7 +372,10 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
             page.get_by_role("tab", name=name).click()
             page.locator(there).wait_for()
             page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
-    # Another tab of the browser shows another scene.
+        page.evaluate("scrollTo(0, 400)")
+        top = "document.querySelector('.stage').getBoundingClientRect().top"
+        page.wait_for_function(f"w => scrollY > 200 && ({top} === 0) === (w < 900)", arg=width)
+    # Another tab of the browser shows another scene, and goes back, forward, and loads it again.
     other = page.context.new_page()
     other.goto(address.partition("?")[0])  # the cookie has the token
     other.wait_for_selector(".state.shown")
@@ -371,6 +386,14 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     thumb.click()
     expect(other.locator(".title", has_text=name).first).to_be_visible()
     expect(page.locator(".title").first).not_to_have_text(name)
+    other.wait_for_url(f"**scene={name}&**")
+    other.go_back()
+    expect(other.locator(".title", has_text=name)).to_have_count(0)
+    other.go_forward()
+    other.wait_for_url(f"**scene={name}&**")
+    other.goto(re.sub("iso=.*", "iso=1600&t=1/15&n=4&tab=exposure", other.url))
+    other.locator("button.shown[aria-label^='ISO 1600, 1/15 s, f/4']").wait_for()
+    expect(other.locator(".title").first).to_have_text(name)
 
 
 @pytest.mark.slow
