@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -17,11 +16,11 @@ from agents.foresight import Foresight, TrendTracker
 from agents.metering.meters import make_meter
 from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
 from agents.metering.reading import EVTracker, ReferenceFrames
-from agents.metering.tuned import ScoreRegression, kept_fit
+from agents.metering.tuned import ScoreRegression
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import PROGRAMS
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
-from simulator.utils.cache import cache_key
+from simulator.utils.cache import cache_key, disk_cache
 from simulator.utils.checks import check_word
 
 #: Meters whose reading is the most exposure that may be given: no state above it is chosen.
@@ -39,6 +38,8 @@ FIT_EPISODES, FIT_PER_SCENE, FIT_FRAMES = 1600, 4, 4
 SECOND_PASS = 1_000_000
 #: What a meter may foresee.
 FORESIGHTS = ("none", "trend", "model")
+#: Fits of this process by key, see `MeteringPolicy.fit_once`: no folder need be writable.
+_FITS: dict[str, ScoreRegression] = {}
 
 
 class MeteringPolicy(Policy):
@@ -213,7 +214,12 @@ class MeteringPolicy(Policy):
         own = (self._meter_name, self.program, self.options, self.uses_sensors)
         seen = (context.grid, context.camera, context.observation_space)
         key = cache_key("fits", [repr((own, seen, sizes)), dict(env_options), seed])
-        self.regression = kept_fit(key, partial(self._fit, envs, seed))
+        if key not in _FITS:
+            stored = disk_cache().get(key)
+            _FITS[key] = self._fit(envs, seed) if stored is None else ScoreRegression(**stored)
+            if stored is None:
+                disk_cache().put(key, vars(_FITS[key]))
+        self.regression = _FITS[key]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a tuned program, a `ValueError` if there is none yet; ``weights=path`` loads it."""

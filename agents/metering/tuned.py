@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from agents.policy import Floats
 from simulator.networks.weights import read_weights
-from simulator.utils.cache import disk_cache
 from simulator.utils.files import read_bounded, write_atomically
 
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
@@ -137,20 +136,6 @@ class ScoreRegression:
             return cls(features, scores, bandwidths)
         except (OSError, ValueError) as error:
             raise ValueError(f"`{name}` (={str(path)!r}) holds no tuned program: {error}") from None
-
-
-#: Fits of this process by key: they need no folder that can be written.
-_FITS: dict[str, ScoreRegression] = {}
-
-
-def kept_fit(key: str, fit: Callable[[], ScoreRegression]) -> ScoreRegression:
-    """What `fit` returns, or returned under that `cache_key` in this run or an earlier one."""
-    if key not in _FITS:
-        stored = disk_cache().get(key)
-        _FITS[key] = fit() if stored is None else ScoreRegression(**stored)
-        if stored is None:
-            disk_cache().put(key, vars(_FITS[key]))
-    return _FITS[key]
 
 
 def _widest_good(bandwidths: Sequence[float], criteria: Sequence[float]) -> float:

@@ -17,7 +17,6 @@ from nicegui import ui
 import ae_env  # noqa: F401  (registers the environments)
 from ae_env.grid import ExposureGrid
 from ae_env.lighting.moving import KIND_SETS, MOVES
-from ae_env.rendering import PATH_COLOURS
 from ae_env.scenes import Scene
 from agents.evaluation.engine import fit_policies
 from agents.policy import PolicyContext
@@ -39,7 +38,7 @@ NAMES = (
 )
 _FRAMES = 64
 #: Colour of the best state, and of each policy.
-_BEST, _POLICIES = "#a0a0a0", PATH_COLOURS[:2]
+_BEST, _POLICIES = "#a0a0a0", ("#D55E00", "#56B4E9")
 
 
 class Stopped(BaseException):
@@ -111,7 +110,8 @@ class EpisodePage(Tab):
                 self._cancel = ui.button("Cancel", icon="close", on_click=self._stop)
                 self._status = ui.label().classes("note").props("role=status")
             self._clock = ui.timer(0.5, self._tick, active=False)
-            self._show_progress(False)
+            for element in (self._cancel, self._status):
+                element.bind_visibility_from(self._clock, "active")
             with ui.element("div").classes("column w-full") as self._shown:
                 self._build_player()
         self._shown.set_visibility(False)
@@ -158,10 +158,10 @@ class EpisodePage(Tab):
         found: list[Recording] | None = None
         self._stopped, self._doing, self._begun = Event(), "starting", perf_counter()
         watch = partial(self._step, self._stopped)
-        self._show_progress(True)
+        self._clock.active = True
         with suppress(Stopped), loading(self._run, Exception):  # of a policy of the user's
             found = await self.work(play, names, self.viewed.scored, watch=watch, **options)
-        self._show_progress(False)
+        self._clock.active = False
         if found is not None:
             self._grid = ExposureGrid.default() if light == STILL else ExposureGrid.video()
             self._show_recordings(found)
@@ -174,11 +174,6 @@ class EpisodePage(Tab):
     def _stop(self) -> None:
         self._stopped.set()
         self._doing = "stopping"
-
-    def _show_progress(self, busy: bool) -> None:
-        self._cancel.set_visibility(busy)
-        self._clock.active = busy
-        self._status.text = ""
 
     def _tick(self) -> None:
         self._status.text = f"{self._doing} ... {perf_counter() - self._begun:.0f} s"

@@ -325,14 +325,14 @@ class ExposurePage(Tab):
 
 def asked_settings(asked: Mapping[str, str]) -> CameraSettings | None:
     """Settings of the sliders nearest to those of an address; None if it lacks one or is wrong."""
-    found = []
-    for name, values in (("iso", ISOS), ("t", TIMES), ("n", F_NUMBERS)):
-        try:
-            number = parse_number(asked.get(name, ""), name)
-        except ValueError:
-            return None
-        found.append(min(values, key=lambda value: abs(value - number)))
-    return CameraSettings(*found)
+    try:
+        wanted = [parse_number(asked.get(name, "")) for name in ("iso", "t", "n")]
+    except ValueError:
+        return None
+    sliders = zip((ISOS, TIMES, F_NUMBERS), wanted, strict=True)
+    return CameraSettings(
+        *(values[np.abs(np.subtract(values, v)).argmin()] for values, v in sliders)
+    )
 
 
 def score_colour(score: float) -> tuple[str, str]:

@@ -8,6 +8,7 @@ import tempfile
 import threading
 import uuid
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -45,8 +46,7 @@ class PictureStore:
         self._kept: dict[str, bytes] = {}
         self._thumbnails: dict[str, Callable[[], bytes]] = {}
         self._one = threading.Lock()  # more would keep several raws in memory
-        app.get("/frame/{key}")(self.fetch)
-        app.get("/thumbnail/{key:path}")(self.fetch_thumbnail)
+        app.get("/frame/{key:path}")(self.fetch)
 
     def address(self, jpeg: bytes) -> str:
         """Address that `jpeg` can be fetched from."""
@@ -56,31 +56,20 @@ class PictureStore:
             del self._kept[next(iter(self._kept))]  # the oldest
         return f"/frame/{key}"
 
-    def fetch(self, key: str) -> Response:
-        """The answer to a browser that asks for a picture."""
-        if key not in self._kept:
-            return Response(status_code=404)
-        return _jpeg(self._kept[key])
-
     def thumbnail_address(self, key: str, make: Callable[[], bytes]) -> str:
         """Lasting address of the thumbnail that `make` returns, once a browser asks for it."""
         self._thumbnails.setdefault(key, cache(make))
-        return f"/thumbnail/{quote(key)}"
+        return f"/frame/{quote(key)}"
 
-    def fetch_thumbnail(self, key: str) -> Response:
-        """The answer to a browser that asks for a thumbnail."""
-        if key not in self._thumbnails:
-            return Response(status_code=404)
-        try:
-            with self._one:
-                return _jpeg(self._thumbnails[key]())
-        except (ValueError, OSError):  # such a file says so when it is opened
-            return Response(status_code=204)
-
-
-def _jpeg(content: bytes) -> Response:
-    headers = {"Cache-Control": "no-store"}
-    return Response(content, media_type="image/jpeg", headers=headers)
+    def fetch(self, key: str) -> Response:
+        """The answer to a browser that asks for a picture."""
+        found, status = self._kept.get(key), 404
+        if key in self._thumbnails:
+            status = 204  # a file that cannot be read says so when it is opened
+            with suppress(ValueError, OSError), self._one:
+                found = self._thumbnails[key]()
+        headers = {"Cache-Control": "no-store"}
+        return Response(found, 200 if found else status, headers, media_type="image/jpeg")
 
 
 @dataclass
@@ -167,7 +156,7 @@ class Page:
                 self._episode = EpisodePage(*shared)
             with ui.tab_panel(_RAW).classes("p-0"):
                 self._one_raw = OneRawPage(*shared, options.simulator)
-        self._scene, self._place, self._following = "", ("", ""), False
+        self._scene, self._address, self._following = "", "", False
         ui.on("went_back", lambda event: self.follow(dict(parse_qsl(event.args))))
         ui.run_javascript(
             "addEventListener('popstate', () => emitEvent('went_back', location.search.slice(1)))"
@@ -185,23 +174,25 @@ class Page:
             complain(f"There is no scene {name!r} here{did_you_mean(name, readers)}")
             name = self._library.first
         settings, self._following = asked_settings(asked), True
+        self._address = urlencode(asked, safe="/:")
         self._panels.value = _TABS.get(asked.get("tab", ""), self._panels.value)
         if name != self._scene:
             await self.open(name, settings)
         elif settings is not None:
             await self._exposure.set(settings)
         self._following = False
+        self._show_address("replaceState")
 
-    def _show_address(self) -> None:
+    def _show_address(self, how: str = "") -> None:
         """Puts what is shown into the address: another scene or tab is a place to go back to."""
         tab = next(key for key, title in _TABS.items() if title == self._panels.value)
-        if not self._scene:
+        place, settings = {"scene": self._scene, "tab": tab}, self._exposure.asked
+        address, before = urlencode(place | settings, safe="/:"), self._address
+        if self._following or address == before:
             return
-        entries = {"scene": self._scene, **self._exposure.asked, "tab": tab}
-        stays = self._following or self._place == (self._scene, tab)
-        how, self._place = "replaceState" if stays else "pushState", (self._scene, tab)
-        address = json.dumps(f"?{urlencode(entries, safe='/:')}")
-        ui.run_javascript(f"history.{how}(null, '', {address})")
+        stays = before.startswith(urlencode(place, safe="/:"))
+        how, self._address = how or ("replaceState" if stays else "pushState"), address
+        ui.run_javascript(f"history.{how}(null, '', {json.dumps('?' + address)})")
 
     async def _show_tab(self) -> None:
         self._show_address()

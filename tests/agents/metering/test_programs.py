@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from ae_env.grid import ExposureGrid
-from agents.metering import programs, tuned
+from agents.metering import metering_policy, programs
 from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.programs import ProgramOptions, StateChooser, program_cost
 from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
@@ -155,14 +155,6 @@ def test_ranges_of_the_options(option, low, high):
             ProgramOptions(**{option: value})
 
 
-def test_options_belong_to_programs():
-    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
-    programs.check_used("M", f_number=4.0, exposure_time=0.1, iso=100, weights=None)
-    for program, option in (("A", "iso"), ("P", "f_number")):
-        with pytest.raises(ValueError, match=f"`{option}`"):
-            programs.check_used(program, **{option: 4})
-
-
 def _samples(count=600, seed=0):
     rng = np.random.default_rng(seed)
     features = rng.uniform(-4, 4, (count, 2))
@@ -277,7 +269,7 @@ def test_a_fit_is_found_again_by_another_run_and_by_nothing_else(context, tmp_pa
     monkeypatch.setattr(MeteringPolicy, "_fit", lambda *_: next(fits))
     told = None, 0, {"scenes": "bundled"}
     for name in ("average:tuned", "average:tuned?foresight=model"):
-        monkeypatch.setattr(tuned, "_FITS", {})  # as in another process
+        monkeypatch.setattr(metering_policy, "_FITS", {})  # as in another process
         policy = make_policy(name, context)
         policy.fit_once(*told)
         np.testing.assert_array_equal(policy.regression.scores, _fitted().scores)

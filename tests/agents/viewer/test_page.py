@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -23,11 +24,11 @@ from starlette.websockets import WebSocketDisconnect
 
 from ae_env.scenes import Scene
 from agents.report.judging import read_choices
-from agents.viewer import tab
 from agents.viewer.episode_page import Stopped, play
 from agents.viewer.one_raw_page import opened
 from agents.viewer.page import PictureStore
 from agents.viewer.server import TokenGuard
+from agents.viewer.tab import new_file
 from agents.viewer.viewed_scene import WINDOW_SIZE, OpenedScene, View, ViewedScene, find_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.discs import disc_blur
@@ -124,32 +125,21 @@ def test_a_folder_opens_at_its_first_readable_raw_and_few_are_kept(tmp_path):
         library.open("2.dng")
 
 
-def test_thumbnails_are_made_once_and_last_and_an_episode_can_be_stopped():
+def test_thumbnails_are_made_once_and_last_and_an_episode_can_be_stopped(tmp_path):
+    for name in ("", "..", "a\0b.dng", "x" * 256):
+        with pytest.raises(ValueError, match="cannot be called"):
+            new_file(tmp_path, name)
     store, made = PictureStore(), []
     address = store.thumbnail_address("all/a b.dng", lambda: made.append(1) or b"jpeg")
     store.thumbnail_address("all/bad", lambda: float("no raw"))
     for _ in range(300):
         store.address(b"another")
-    bodies = [store.fetch_thumbnail("all/a b.dng").body for _ in range(2)]
-    assert store.fetch_thumbnail("all/bad").status_code == 204
-    assert (address, bodies, made) == ("/thumbnail/all/a%20b.dng", [b"jpeg"] * 2, [1])
-
-    def stop(doing):
-        raise Stopped
-
+    bodies = [store.fetch("all/a b.dng").body for _ in range(2)]
+    assert store.fetch("all/bad").status_code == 204
+    assert (address, bodies, made) == ("/frame/all/a%20b.dng", [b"jpeg"] * 2, [1])
+    scene = viewed(torch.full((4, 64, 64), 0.1)).scored
     with pytest.raises(Stopped):
-        play(["average"], viewed(torch.full((4, 64, 64), 0.1)).scored, watch=stop)
-
-
-def test_files_of_all_tabs_together_have_a_bound(tmp_path, monkeypatch):
-    for name in ("", "..", "a\0b.dng", "x" * 256):
-        with pytest.raises(ValueError, match="cannot be called"):
-            tab.new_file(tmp_path, name)
-    (tmp_path / "mine").mkdir()
-    tab.new_file(tmp_path / "mine", "a.dng").write_bytes(bytes(10**6))
-    monkeypatch.setattr(tab, "_MOST_STORED", 10**6)
-    with pytest.raises(ValueError, match="close other tabs"):
-        tab.new_file(tmp_path / "mine", "a.dng")
+        play(["average"], scene, watch=Mock(side_effect=Stopped))
 
 
 def test_a_scene_is_found_by_its_id_and_what_is_none_is_refused():
@@ -389,9 +379,7 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     other.wait_for_url(f"**scene={name}&**")
     other.go_back()
     expect(other.locator(".title", has_text=name)).to_have_count(0)
-    other.go_forward()
-    other.wait_for_url(f"**scene={name}&**")
-    other.goto(re.sub("iso=.*", "iso=1600&t=1/15&n=4&tab=exposure", other.url))
+    other.goto(f"{address.partition('?')[0]}?scene={name}&iso=1600&t=1/15&n=4&tab=exposure")
     other.locator("button.shown[aria-label^='ISO 1600, 1/15 s, f/4']").wait_for()
     expect(other.locator(".title").first).to_have_text(name)
 
