@@ -49,12 +49,12 @@ def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str
     for part in shown:
         marker, offset = _PARTS[part]
         own = parts[part][parts[part].policy.isin(names)]
-        for row in own.itertuples():
-            height = names.index(row.policy) + offset * (len(shown) > 1)
-            colour = line_style(order.index(row.policy))["color"]
-            if row.ci95 is not None:
-                axes.plot(row.ci95, [height] * 2, color=colour, lw=1.6, alpha=0.6)
-            axes.plot(row.normalised_score, height, marker, color=colour, markersize=6)
+        for name, interval, score in zip(own.policy, own.ci95, own.normalised_score, strict=True):
+            height = names.index(name) + offset * (len(shown) > 1)
+            colour = line_style(order.index(name))["color"]
+            if interval is not None:
+                axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
+            axes.plot(score, height, marker, color=colour, markersize=6)
         label = f"{part} ({parts[part].num_groups.iloc[0]} groups)"
         axes.plot([], [], marker, color="0.35", label=label)
     axes.axvline(1.0, color="0.35", lw=1.0)
@@ -163,7 +163,7 @@ def plot_cost(
     axes.step(*steps, where="post", color="0.6", lw=1.0, label=label)
     points = {name: (costs[name], scores[name]) for name in scores}
     colours = [line_style(order.index(name))["color"] for name in scores]
-    axes.scatter(*zip(*points.values(), strict=True), 36, colours, zorder=2)
+    axes.scatter([costs[name] for name in scores], [*scores.values()], c=colours, zorder=2)
     axes.set_xscale("log")
     axes.margins(x=0.18, y=0.12)
     axes.set_xlabel("time of a decision for one camera alone [ms]")

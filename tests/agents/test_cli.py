@@ -37,12 +37,12 @@ from simulator.training.crops import ReferencePairs
 from simulator.utils.files import sibling
 
 COMMANDS = (
-    *("bench", "cache", "evaluate", "export", "film", "hdr", "judge"),
-    *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate", "sweep"),
-    *("train", "train-simulator", "view", "warm-up"),
+    *("bench", "cache", "cameras", "evaluate", "export", "film", "hdr", "judge", "lightings"),
+    *("policies", "quickstart", "record", "refocus", "scenes", "score-tables", "scorers"),
+    *("simulate", "sweep", "train", "train-simulator", "view", "warm-up"),
 )
 #: Those that write no folder of results, and those that draw nothing at random.
-NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
+NO_OUT = ("cache", "cameras", "lightings", "policies", "scenes", "scorers", "view", "warm-up")
 NO_SEED = (*NO_OUT, "export", "hdr")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
@@ -101,7 +101,7 @@ def dng(raw: RawImage, tmp_path: Path) -> Path:
 def test_help_and_usage_errors_load_nothing_heavy() -> None:
     """One fresh interpreter answers them all and says what it has loaded."""
     asked = [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)]
-    wrong = [["nonsense"], ["simulate", "a.dng"], ["sweep", "a.dng", "--nonsense"]]
+    wrong = [["nonsense"], ["simulate"], ["sweep", "a.dng", "--nonsense"]]
     wrong += [["evaluate", "--frames", "0"], ["bench", "throughput", "--seed", str(2**63)]]
     wrong += [["hdr", "a.dng", "--step", "half"]]
     code = f"""
@@ -144,21 +144,21 @@ print("loaded", *sys.modules)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`source-aperture` (=-2"),
-        ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs networks"),
-        (("evaluate", *UNKNOWN), "`policy` (='matrx:P') must"),  # before scenes are read
+        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`--shutter` (='1/0')"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`--source-aperture`"),
+        ((*PLAIN, "--depth", "unknown"), "`--depth` (='unknown') needs networks"),
+        (("evaluate", *UNKNOWN), "Unknown policy 'matrx:P'. Did you mean 'matrix:P'? It must"),
         (("export", "ppo:video"), "`policy` (='ppo:video') must be without a history"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
-        (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
-        (("score-tables", "IMG_1.dng", "--on", "cluster"), "`on` (='cluster')"),
-        (("bench", "thruput"), "did you mean 'throughput'?"),
+        (("train", "agent.yaml", "--out", "/proc/a"), "`--out` (='/proc/a.json') cannot be"),
+        (("score-tables", "IMG_1.dng", "--on", "cluster"), "`--on` (='cluster')"),
+        (("bench", "thruput"), "Did you mean 'throughput'?"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
-        (("refocus", "IMG_1.dng", "--aperture", "8"), "`aperture` (=8)"),
-        ((*OPEN, "--depth", "small.png", "--png", "small.png"), "`png`"),
+        (("refocus", "IMG_1.dng", "--aperture", "8"), "`--aperture` (=8)"),
+        ((*OPEN, "--depth", "small.png", "--png", "small.png"), "`--png`"),
         (("refocus", "nameless.dng", *OPEN[2:], *FITS), "`--pixel-pitch`"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else "",
@@ -230,7 +230,9 @@ main.main()
     assert (code, "pip install -e ." in error) == (2, True)
 
 
-def test_all_scorers_are_listed(ae_env) -> None:
+def test_all_scorers_and_other_names_are_listed(ae_env) -> None:
+    for command, known in (("policies", "ppo"), ("cameras", "nikon_z6"), ("lightings", "ramp")):
+        assert known in ae_env(command)[1].split()
     code, out, _ = ae_env("scorers")
     assert {*list_scorers()} <= {line.split()[0] for line in out.splitlines() if line.strip()}
     assert (code, "Needs extra cv" in out) == (0, True)
@@ -325,7 +327,7 @@ def test_a_raw_at_other_settings(ae_env, raw: RawImage, dng: Path, tmp_path: Pat
     assert not read_raw(out).data.equal(back.data)
     before = dng.read_bytes()
     code, _, error = ae_env("simulate", dng, *arguments, "-o", dng)
-    assert (code, "`out`" in error, dng.read_bytes()) == (2, True, before)
+    assert (code, "`-o`" in error, dng.read_bytes()) == (2, True, before)
 
 
 @pytest.mark.parametrize(
@@ -356,8 +358,9 @@ def test_settings_of_a_source_that_has_none(ae_env, tmp_path: Path) -> None:
     assert read_raw("out.dng").data.mean() == pytest.approx(0.25 / 4, rel=0.02)  # at ISO 400 it was
     with Image.open("a.png") as picture:
         assert picture.size == (40, 120)
-    code, text, _ = ae_env(*command, 8, "--source-aperture", "f/4")  # one alone
+    code, text, _ = ae_env(*command[:4], "--source-aperture", "f/4", "--ev", "+1")
     assert (code, "source ISO 100, 1/64 s, f/4" in text) == (0, True)
+    assert read_raw("out.dng").settings == CameraSettings(100, 1 / 32, 4)
 
 
 def test_what_a_raw_hides_is_printed(ae_env, tmp_path: Path) -> None:
@@ -482,7 +485,7 @@ def test_broken_files_of_a_folder_are_skipped_when_asked(ae_env, dng, tmp_path, 
     command = ("evaluate", "--env", tmp_path / "env.yaml", "--scenes", dng.parent)
     command += ("--policy", "random", "--frames", 2, "--workers", 1)
     code, _, error = ae_env(*command)
-    assert (code, "damaged; --on-error skip" in error) == (2, True)
+    assert (code, "is a JPEG, not a raw; --on-error skip" in error) == (2, True)
     code, _, error = ae_env(*command, "--on-error", "skip", "--source-iso", 100)
     assert code == 0, error
     assert "1 of 2 scene files skipped (IMG_2.dng: " in caplog.text
