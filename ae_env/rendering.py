@@ -29,8 +29,11 @@ FRAME_PIXELS = 256
 #: A contact sheet of more states would be unreadable. Height of one picture on it [pixel], and that
 #: which scenes are averaged to for it [packed pixel].
 MAX_SHEET_STATES, THUMB_PIXELS, CAPTURE_PIXELS = 256, 104, 192
-#: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
-PATH_COLOURS = ("#D55E00", "#56B4E9", "#FFFFFF", "#CC79A7", "#009E73", "#0072B2", "#E69F00")
+#: Colours for up to ten policies, most of them those of Okabe and Ito (2008).
+PATH_COLOURS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C8C8C", "#B8A800"),
+    *("#8C4B1F", "#8A6FE8"),
+)
 _font: Any = ImageFont.load_default
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
 _BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
@@ -81,6 +84,7 @@ def contact_sheet(
     defocus: float = 0.0,
     movement: Movement = ALONG_ROWS,
     path: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
+    colours: Sequence[str] = PATH_COLOURS,
     seed: int = 0,
 ) -> Image.Image:
     """All exposure states of a scene as one picture.
@@ -96,6 +100,7 @@ def contact_sheet(
         scorer: Scorer of the captures, as `make_scorer` takes it.
         speed, defocus, movement: See `ae_env.scorers.captures.prepare_scene`.
         path: States that a policy went through, the start state first; or several by name.
+        colours: Of the paths, in turn.
         seed: Seed of the noise.
     """
     check_type("scene", scene, Scene)
@@ -116,7 +121,7 @@ def contact_sheet(
         frames = (f * float(a) for f, a in zip(frames, np.asarray(scene.allowed), strict=True))
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, moves, grid, table)
-    return _Sheet(grid, table, pictures, paths).draw(title)
+    return _Sheet(grid, table, pictures, paths, colours).draw(title)
 
 
 def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
@@ -174,6 +179,7 @@ class _Sheet:
     table: ScoreTable
     pictures: list[Image.Image]
     paths: dict[str, list[int]]
+    colours: Sequence[str] = PATH_COLOURS
 
     @property
     def thumb(self) -> tuple[int, int]:
@@ -279,7 +285,7 @@ class _Sheet:
             dy = int((height - 16) * (row + 1) / (rows + 1)) + 2
             corners = {state: self.corner(state) for state in states}
             spots = {s: (2 * (x + dx), 2 * (y + dy)) for s, (x, y) in corners.items()}
-            colour = PATH_COLOURS[i % len(PATH_COLOURS)]
+            colour = self.colours[i % len(self.colours)]
             route = [spots[s] for s, _ in itertools.groupby(states)]
             for ink, thickness in (("black", 11), (colour, 6)):
                 if len(route) > 1:
@@ -305,7 +311,7 @@ class _Sheet:
         draw.polygon(_star(x, y + 7, 10), "white")
         draw.text((x + 15, y + 7), "oracle", _INK, _font(14), anchor="lm")
         x += 84
-        for name, colour in zip(self.paths, itertools.cycle(PATH_COLOURS), strict=False):
+        for name, colour in zip(self.paths, itertools.cycle(self.colours), strict=False):
             length = 40 + int(draw.textlength(name, _font(14)))
             if x + length > sheet.width:
                 x, y = _MARGIN + 264, y + 20

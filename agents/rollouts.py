@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -74,6 +74,21 @@ def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Bools:
     """States that the scene of each episode allows, ``(N, S)``."""
     base: Any = envs.unwrapped
     return np.array(base.action_masks(), dtype=np.bool_)
+
+
+class WatchedEnvs(gym.vector.VectorWrapper):
+    """Environments that call `watch` before each step; an error that it raises ends the work."""
+
+    def __init__(
+        self, envs: gym.vector.VectorEnv[Any, Any, Any], watch: Callable[[], None]
+    ) -> None:
+        super().__init__(envs)
+        self._watch = watch
+
+    def step(self, actions: Any) -> Any:
+        """Call `watch`, then take the step."""
+        self._watch()
+        return super().step(actions)
 
 
 class EpisodeBatch(NamedTuple):

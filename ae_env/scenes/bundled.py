@@ -32,6 +32,7 @@ from simulator.radiance.procedural import (
 )
 from simulator.settings import CameraSettings
 from simulator.utils.cache import cache_key, disk_cache
+from simulator.utils.checks import NOTE
 from simulator.utils.compute import parallel_ranges, progress_bar
 
 logger = logging.getLogger(__name__)
@@ -138,7 +139,7 @@ class DrawnScenes(SceneSet):
             return
         many = len(missing) >= _MANY
         if many:
-            logger.warning("drawing %s, once for this camera and resolution", self._name)
+            logger.log(NOTE, "drawing %s, once for this camera and resolution", self._name)
         with progress_bar("drawing scenes", len(missing) if many else 0) as advance:
 
             def draw_some(first: int, last: int) -> None:

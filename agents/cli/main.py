@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -27,11 +28,11 @@ from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
-from agents.cli.show import film, judge, scorers, view
+from agents.cli.show import cameras, film, judge, lightings, policies, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 from simulator import __version__
-from simulator.utils.checks import check_word
+from simulator.utils.checks import NOTE, check_word
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
@@ -130,19 +131,24 @@ class _Commands(TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     epilog="A folder that an output names is made where it is missing. Exit status: 2 for a "
     "mistake in an option or a file, 1 for a failure while running.",
 )
-for command in (
-    *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
-    *(view, judge, refocus, hdr, film, record, export, score_tables, cache, warm_up),
-):
-    app.command()(command)
-app.command(no_args_is_help=True)(bench)
-app.add_typer(scenes, name="scenes")
+#: Commands by the heading of the help that they stand under.
+_HEADINGS: dict[str, tuple[Callable[..., None], ...]] = {
+    "Start": (quickstart, view),
+    "Policies": (evaluate, train, policies, scorers, film, judge, record, export),
+    "Raw files": (simulate, sweep, refocus, hdr),
+    "Scenes": (cameras, lightings, score_tables),
+    "Maintenance": (cache, warm_up, train_simulator),
+}
+for heading, commands in _HEADINGS.items():
+    for command in commands:
+        app.command(rich_help_panel=heading)(command)
+app.add_typer(scenes, name="scenes", rich_help_panel="Scenes")
+app.command(no_args_is_help=True, rich_help_panel="Maintenance")(bench)
 
 #: Commands that go on where they were stopped.
 _RESUMING = {"quickstart", "evaluate", "bench", "scenes", "score-tables"}
@@ -161,7 +167,8 @@ def main() -> None:
     """
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
     handler.addFilter(_first_time())
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    logging.addLevelName(NOTE, "NOTE")
+    logging.basicConfig(level=NOTE, format="%(message)s", handlers=[handler])
     signal.signal(signal.SIGTERM, _terminate)
     try:
         app(prog_name="ae-env")
@@ -170,7 +177,8 @@ def main() -> None:
             raise
         from ae_env.utils.user_files import UserCodeError
 
-        Console(stderr=True).print(f"[bold red]error[/] {escape(_one_line(error))}", soft_wrap=True)
+        text = escape(_as_typed(_one_line(error)))
+        Console(stderr=True).print(f"[bold red]error[/] {text}", soft_wrap=True)
         usage = isinstance(error, _USAGE) and not isinstance(error, UserCodeError)
         raise SystemExit(2 if usage else 1) from None
     except SystemExit as stop:
@@ -210,6 +218,21 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, ValueError | OSError | ImportError):
         return text
     return f"{type(error).__name__}: {text}; `ae-env --debug` shows where"
+
+
+def _as_typed(text: str) -> str:
+    """An error with its option or file as it was typed, and what may have been meant first."""
+    form = r"`([\w-]+)` \(=(.*?)\) (.*?)(?:; did you mean ('[^']*'\?)(.*))?"
+    found = re.fullmatch(form, text)
+    if found is None:
+        return text
+    name, value, rule, meant, more = found.groups()
+    if meant is not None and rule.startswith("must be "):
+        return f"Unknown {name} {value}. Did you mean {meant} It {rule}{more}"
+    if name == "path":
+        return value.strip("'") + f" {rule}"
+    typed = {f"--{name}", f"-{name[0]}"} & {word.partition("=")[0] for word in sys.argv}
+    return text.replace(f"`{name}`", f"`{min(typed, default=name)}`", 1)
 
 
 def _version(asked: bool) -> None:

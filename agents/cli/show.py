@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -164,7 +165,7 @@ def film(
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in policy or POLICIES}
         with progress("fitting") as task:
-            fit_policies(policies, {"scenes": "bundled", "grid": "video"}, progress=task)
+            fit_policies(policies, {"scenes": "bundled", "grid": "video"}, progress=task, keep=True)
         with progress("film") as task:
             episodes = [record(n, p, envs, frames, seed, scene) for n, p in policies.items()]
             write_film(out, episodes, task)
@@ -176,22 +177,73 @@ def scorers() -> None:
 
     Example: `ae-env scorers` lists them; docs/plug-in-a-scorer.md says how to add one.
     """
+    from ae_env.scorers.registry import describe_scorers
+
+    rows = []
+    for row in describe_scorers():
+        what = f"broken: {row.error}" if row.error else row.summary
+        what += f" Needs {row.needs}." if row.needs else ""
+        what += f" From {row.package}." if row.package != "ae-env" else ""
+        rows.append((row.name, row.domain, row.depends_on, what))
+    title = "scorers: all in [0, 1], higher is better"
+    _print_table(title, rows, "name", "sees", "depends on", "what it is")
+    print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")
+
+
+def policies() -> None:
+    """List the built-in policies of single frames.
+
+    Example: `ae-env policies` lists them; docs/policies.md says what they are.
+    """
+    from agents import policy_names as names
+
+    rows = [(name,) for name in names.list_policies() if not names.is_metering(name)]
+    rows += [(f"{meter}:PROGRAM",) for meter in (*names.METERS, "rpi_agc")]
+    _print_table("policies", rows, "name")
+    print_line(f"programs: {', '.join(names.PROGRAMS)} (of rpi_agc the first four); P by default")
+
+
+def cameras() -> None:
+    """List the built-in cameras.
+
+    Example: `ae-env cameras` lists them.
+    """
+    from simulator import get_camera, list_cameras
+
+    rows = []
+    for camera in map(get_camera, list_cameras()):
+        isos = sorted(camera.nlf_by_iso)
+        calibrated = f"ISO {isos[0]:g} to {isos[-1]:g}" if isos else "-"
+        by = camera.source.partition(";")[0]
+        rows.append((camera.name, f"{camera.make} {camera.model}", calibrated, by))
+    _print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
+
+
+def lightings() -> None:
+    """List the kinds of light that changes, with their options.
+
+    Example: `ae-env lightings` lists them; `ae-env evaluate --lighting` takes each.
+    """
+    from dataclasses import fields
+
+    import ae_env.lighting  # noqa: F401  (defines them)
+    from ae_env.lighting.base import KINDS
+
+    rows = []
+    for name, kind in KINDS.items():
+        options = ", ".join(f"{option.name}={option.default}" for option in fields(kind))
+        rows.append((name, options, str(kind.__doc__).partition("\n")[0]))
+    _print_table("lightings", rows, "name", "options", "what it is")
+
+
+def _print_table(title: str, rows: Iterable[Sequence[str]], *columns: str) -> None:
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    from ae_env.scorers.registry import describe_scorers
-
-    table = Table(title="scorers: all in [0, 1], higher is better", box=box.SIMPLE_HEAD)
-    for title in ("name", "sees", "depends on"):
-        table.add_column(title, no_wrap=True)
-    table.add_column("what it is", overflow="fold")
-    for row in describe_scorers():
-        what = Text(f"broken: {row.error}", "red") if row.error else Text(row.summary)
-        if row.needs:
-            what.append(f" Needs {row.needs}.", "dim")
-        if row.package != "ae-env":
-            what.append(f" From {row.package}.", "dim")
-        table.add_row(Text(row.name), row.domain, row.depends_on, what)
+    table = Table(title=title, box=box.SIMPLE_HEAD)
+    for column in columns:
+        table.add_column(column, no_wrap=column == "name", overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
     console.terminal.print(table)
-    print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")

@@ -28,9 +28,12 @@ _SHEET_SIZE = 128
 @console.takes_source
 def simulate(
     raw: console.Raw,
-    iso: Annotated[float, Option(help="Target ISO speed.")],
-    shutter: Annotated[str, Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
-    aperture: Annotated[str, Option(help="Target f-number, such as 4 or f/4.")],
+    iso: Annotated[float | None, Option(help="Target ISO speed; by default the raw's.")] = None,
+    shutter: Annotated[str | None, Option(help="Exposure time, such as 1/60 or 0.5 [s].")] = None,
+    aperture: Annotated[str | None, Option(help="F-number, such as 4 or f/4.")] = None,
+    ev: Annotated[
+        float | None, Option(help="+1: twice the raw's exposure time.", min=-32, max=32)
+    ] = None,
     out: console.OutDng = Path("out.dng"),
     png: console.Png = None,
     source: Any = None,
@@ -47,22 +50,30 @@ def simulate(
 ) -> None:
     """Simulate one raw at other settings and write it as a DNG; prints the plan.
 
+    Settings that are not given are the raw's.
+
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
-    from simulator import CameraSettings, read_raw
+    from simulator import read_raw
     from simulator.capture.decision import check_tolerance
     from simulator.capture.sensor import Noise
+    from simulator.raw.read import check_settings
 
     check_word("noise", noise, get_args(Noise))
     check_tolerance(tolerance)
-    seconds, f_number = parse_number(shutter, "shutter"), parse_number(aperture, "aperture")
+    if ev is not None and shutter is not None:
+        raise ValueError(f"`ev` (={ev:g}) changes the exposure time: leave out --shutter")
+    texts = {"iso": iso, "exposure_time": shutter, "f_number": aperture}
     with console.option_names(exposure_time="shutter", f_number="aperture"):
-        settings = CameraSettings(iso, seconds, f_number)
+        given = {k: parse_number(str(v), k) for k, v in texts.items() if v is not None}
+        check_settings(given)
     check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
     simulator = make_simulator(weights, device, cache, depth)
     source = read_raw(raw, settings=source)
+    given = {"exposure_time": source.settings.exposure_time * 2.0 ** (ev or 0.0), **given}
+    settings = replace(source.settings, **given)
     if noise == "sensor":
-        source.camera.read_noise(iso)  # refuses a camera without its calibration
+        source.camera.read_noise(settings.iso)  # refuses a camera without its calibration
     prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     print_line(f"source {source.settings} ({source.camera.name})")
     plan = prepared.plan(settings)

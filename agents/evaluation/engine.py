@@ -36,12 +36,14 @@ from agents.evaluation.evaluation_plan import (
     plan_scenes,
 )
 from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
+from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.reading import signal_codes
 from agents.policy import Ints, Policy, PolicyContext
 from agents.policy_names import make_policy, training_seeds
 from agents.rollouts import (
     EpisodeBatch,
     RolloutPlan,
+    WatchedEnvs,
     action_masks,
     checked_states,
     choose,
@@ -388,11 +390,15 @@ def fit_policies(
     seed: int = 0,
     batch: int = BATCH,
     progress: Progress | None = None,
+    watch: Callable[[str], None] | None = None,
+    keep: bool = False,
 ) -> None:
     """Call `fit` of every policy that has one, on the training split of an environment.
 
     `env_options` are its arguments, `seed` decides the episodes, of which `batch` run at a time;
-    `progress` is called before and after each fit.
+    `progress` is called before and after each fit, `watch` with the policy's name before each step
+    of one. With `keep`, fits of light meters are kept in the user's cache: the scenes must be named
+    ones, which are always the same.
     """
     learners = [(name, policy) for name, policy in policies.items() if _learns(policy)]
     if not learners:
@@ -401,14 +407,19 @@ def fit_policies(
     with closing(_training_envs(env_options, batch)) as envs:
         for i, (name, policy) in enumerate(learners):
             report(i, len(learners), name)
+            watched = envs if watch is None else WatchedEnvs(envs, partial(watch, name))
             with errors_of(name, "fit"):
-                policy.fit(envs, seed)
+                if keep and isinstance(policy, MeteringPolicy):
+                    policy.fit_once(watched, seed, env_options)
+                    continue
+                policy.fit(watched, seed)
     report(len(learners), len(learners), "")
 
 
 def _learns(policy: Policy) -> bool:
-    """Whether a policy has a `fit` of its own."""
-    return getattr(type(policy), "fit", Policy.fit) is not Policy.fit
+    """Whether a policy has a `fit` of its own, and that something to learn."""
+    own = getattr(type(policy), "fit", Policy.fit) is not Policy.fit
+    return own and getattr(policy, "learns", True)
 
 
 def _training_envs(env_options: Mapping[str, Any], batch: int = BATCH) -> VectorEnv:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ from agents.metering.tuned import ScoreRegression
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import PROGRAMS
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
+from simulator.utils.cache import cache_key, disk_cache
 from simulator.utils.checks import check_word
 
 #: Meters whose reading is the most exposure that may be given: no state above it is chosen.
@@ -36,6 +38,8 @@ FIT_EPISODES, FIT_PER_SCENE, FIT_FRAMES = 1600, 4, 4
 SECOND_PASS = 1_000_000
 #: What a meter may foresee.
 FORESIGHTS = ("none", "trend", "model")
+#: Fits of this process by key, see `MeteringPolicy.fit_once`: no folder need be writable.
+_FITS: dict[str, ScoreRegression] = {}
 
 
 class MeteringPolicy(Policy):
@@ -91,6 +95,8 @@ class MeteringPolicy(Policy):
         self.name = f"{meter}:{program}"
         self.uses_sensors = context.has_sensors and program != "tuned_blind"
         self.regression = None if weights is None else ScoreRegression.load(weights, "weights")
+        #: Whether `fit` has something to learn.
+        self.learns = program.startswith("tuned") and weights is None
         self._chooser = StateChooser(context.grid, program, self.options, meter in CEILING_METERS)
         self.reset(0)
 
@@ -177,14 +183,16 @@ class MeteringPolicy(Policy):
         return scores
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
-        """Tune on the scenes of `envs` (tuned programs only; the others have nothing to learn).
+        """Tune on the scenes of `envs`; only a tuned program without `weights` learns.
 
         Episodes, which must not end within 4 frames, run twice: led by program P, then by what was
         learnt from those, so that the readings are those of the frames that the tuned program
         itself takes.
         """
-        if not self.program.startswith("tuned"):
-            return
+        if self.learns:
+            self.regression = self._fit(envs, seed)
+
+    def _fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int) -> ScoreRegression:
         leader = copy.copy(self)
         leader.program, leader.foresight = "P", "none"  # the light of these episodes stays
         per_scene = FIT_EPISODES // (2 * len(scenes_of(envs)))
@@ -193,7 +201,25 @@ class MeteringPolicy(Policy):
         leader.program, leader.regression = self.program, ScoreRegression.fit(*first)
         second = leader._gather(envs, seed + SECOND_PASS, per_scene)
         both = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
-        self.regression = ScoreRegression.fit(*both)
+        return ScoreRegression.fit(*both)
+
+    def fit_once(
+        self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int, env_options: Mapping[str, Any]
+    ) -> None:
+        """`fit`, or what it found before, in this run or an earlier one.
+
+        `env_options` are the arguments that `envs` were made with, JSON values.
+        """
+        context, sizes = self.context, (FIT_EPISODES, FIT_PER_SCENE, FIT_FRAMES)
+        own = (self._meter_name, self.program, self.options, self.uses_sensors)
+        seen = (context.grid, context.camera, context.observation_space)
+        key = cache_key("fits", [repr((own, seen, sizes)), dict(env_options), seed])
+        if key not in _FITS:
+            stored = disk_cache().get(key)
+            _FITS[key] = self._fit(envs, seed) if stored is None else ScoreRegression(**stored)
+            if stored is None:
+                disk_cache().put(key, vars(_FITS[key]))
+        self.regression = _FITS[key]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a tuned program, a `ValueError` if there is none yet; ``weights=path`` loads it."""

@@ -274,14 +274,14 @@ def _write_pictures(
         named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
         rows = pd.concat([rows, together.assign(**named)])
     pictures = {
-        "scores.png": plot_scores(folder / "scores.png", rows, title),
+        "scores.png": plot_scores(folder / "scores.png", rows, order, title),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
     }
     alone = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
     ranked = ranking[ranking.policy.isin(list(alone))]
     scores = dict(zip(ranked.policy, ranked.normalised_score, strict=True))
     if scores:
-        pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores)
+        pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores, order)
     return pictures | path_sheets(folder, result, order)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from ae_env.rendering import PATH_COLOURS
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
 from simulator.utils.files import write_picture
@@ -19,16 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
+#: Dash patterns of the rounds through the colours.
 _DASHES = ("-", "--", ":", "-.")
-#: Colour, shape (for print without colour) and vertical offset of each part's marks.
-_PARTS = {
-    "all": ("#000000", "o", 0.0),
-    "hard": ("#D55E00", "v", 0.2),
-    "rest": ("#0072B2", "^", -0.2),
-    "all conditions": ("#009E73", "s", 0.38),
-}
+#: Shape and vertical offset of each part's marks.
+_PARTS = {"all": ("o", 0.0), "hard": ("v", 0.2), "rest": ("^", -0.2), "all conditions": ("s", 0.38)}
 #: Panels in a row of the plot of EV errors.
 _COLUMNS = 4
 #: Paths on one contact sheet, and frames of a path.
@@ -39,11 +34,11 @@ _SHEETS, _QUALITY = 2, 75
 _KINDS = ("photograph", "backlit")
 
 
-def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
+def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str = "") -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     `rows` are those of `result_rows`, and of ``"all conditions"``, where there are several; those
-    of a single other condition are left out.
+    of a single other condition are left out. `order` are the policies in the order of the colours.
     """
     parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
     ordered = parts["all"].sort_values("normalised_score", kind="stable").policy
@@ -52,15 +47,16 @@ def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
     axes = figure.add_subplot()
     shown = [part for part in _PARTS if part in parts]
     for part in shown:
-        colour, marker, offset = _PARTS[part]
+        marker, offset = _PARTS[part]
         own = parts[part][parts[part].policy.isin(names)]
-        heights = [names.index(name) + offset * (len(shown) > 1) for name in own.policy]
-        for interval, height in zip(own.ci95, heights, strict=True):
+        for name, interval, score in zip(own.policy, own.ci95, own.normalised_score, strict=True):
+            height = names.index(name) + offset * (len(shown) > 1)
+            colour = line_style(order.index(name))["color"]
             if interval is not None:
                 axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
+            axes.plot(score, height, marker, color=colour, markersize=6)
         label = f"{part} ({parts[part].num_groups.iloc[0]} groups)"
-        marks: dict[str, Any] = {"color": colour, "marker": marker, "linestyle": "none"}
-        axes.plot(own.normalised_score, heights, label=label, markersize=6, **marks)
+        axes.plot([], [], marker, color="0.35", label=label)
     axes.axvline(1.0, color="0.35", lw=1.0)
     axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
     axes.axvline(0.0, color="0.75", lw=1.0, ls=":")
@@ -81,7 +77,10 @@ def plot_convergence(
     """Draw the mean EV error of every frame, a panel per condition, and write it as PNG."""
     columns = min(_COLUMNS, len(results))
     rows = -(-len(results) // columns)
-    figure = _figure(3.1 * columns + 1.0, 2.1 * rows + 1.2)
+    width = max(3.1 * columns + 1.0, 6.0)
+    longest = 0.5 + 0.065 * max(map(len, order))  # of a line of the legend [inch]
+    wide = max(1, min(len(order), int(width / longest)))
+    figure = _figure(width, 2.1 * rows + 0.8 + 0.2 * -(-len(order) // wide))
     panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)
     lines: list[Any] = []
     for panel, (name, result) in zip(panels.flat, results.items(), strict=False):
@@ -103,7 +102,7 @@ def plot_convergence(
         panel.tick_params(labelbottom=True)
         panel.set_xlabel("frame", fontsize=9)
     figure.supylabel("mean EV error [EV]", fontsize=9)
-    labels, wide = [_text(policy) for policy in order], min(5, len(order))
+    labels = [_text(policy) for policy in order]
     figure.legend(lines, labels, loc="outside lower center", ncols=wide, fontsize=8)
     return _write(path, figure)
 
@@ -132,8 +131,8 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
 
 def line_style(index: int) -> dict[str, str]:
     """Colour and dashes of a policy by its position in the ranking."""
-    round_, colour = divmod(index, len(PALETTE))
-    return {"color": PALETTE[colour], "linestyle": _DASHES[round_ % len(_DASHES)]}
+    round_, colour = divmod(index, len(PATH_COLOURS))
+    return {"color": PATH_COLOURS[colour], "linestyle": _DASHES[round_ % len(_DASHES)]}
 
 
 def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> list[str]:
@@ -149,26 +148,63 @@ def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> lis
     return front
 
 
-def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float]) -> Path:
-    """Draw normalised score against the time of one decision [ms] and write it as PNG."""
-    figure = _figure(7.5, 4.6)
+def plot_cost(
+    path: Path, costs: Mapping[str, float], scores: Mapping[str, float], order: Sequence[str]
+) -> Path:
+    """Draw normalised score against the time of one decision [ms] and write it as PNG.
+
+    `order` are the policies in the order of the colours.
+    """
+    figure = _figure(7.5, 4.0 + 0.1 * len(scores))
     axes = figure.add_subplot()
     front = pareto_front(costs, scores)
     steps = [costs[n] for n in front], [scores[n] for n in front]
     label = "nothing else is both faster and better"
     axes.step(*steps, where="post", color="0.6", lw=1.0, label=label)
-    for i, name in enumerate(scores):
-        position = costs[name], scores[name]
-        axes.plot(*position, "o", color=line_style(i)["color"], markersize=6)
-        offset = (5, 3 if i % 2 else -9)
-        axes.annotate(_text(name), position, xytext=offset, textcoords="offset points", fontsize=7)
+    points = {name: (costs[name], scores[name]) for name in scores}
+    colours = [line_style(order.index(name))["color"] for name in scores]
+    axes.scatter([costs[name] for name in scores], [*scores.values()], c=colours, zorder=2)
     axes.set_xscale("log")
-    axes.margins(x=0.18)
+    axes.margins(x=0.18, y=0.12)
     axes.set_xlabel("time of a decision for one camera alone [ms]")
     axes.set_ylabel("normalised score (random 0, oracle 1)")
     _tidy(axes)
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center")
+    _label(axes, points, colours)
     return _write(path, figure)
+
+
+def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Sequence[str]) -> None:
+    """Write names at points, apart from each other, each nearest to its own point if possible."""
+    from matplotlib.text import Text
+
+    figure: Any = axes.figure
+    figure.draw_without_rendering()  # settles where the points lie
+    spots = axes.transData.transform(list(points.values()))
+    boxes = [*np.hstack([spots - 5, spots + 5])]  # of the marks: left, bottom, right, top
+    frame = axes.get_window_extent().extents
+    angles = np.arange(16) * np.pi / 8
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    for name, spot, colour in zip(points, spots, colours, strict=True):
+        line = {"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 0, "shrinkB": 3}
+        how: Any = {"textcoords": "offset pixels", "arrowprops": line, "in_layout": False}
+        how |= {"fontsize": 7, "color": colour, "va": "bottom"}
+        text = axes.annotate(_text(name), points[name], (0, 0), **how)
+        size = np.array(Text.get_window_extent(text).size)  # without the line
+        steps = [d * (r + size / 2) - size / 2 for r in (7, 12, 20, 30, 45, 65) for d in around]
+        tried = [np.concatenate([spot + step, spot + step + size]) for step in steps]
+        best = min(tried, key=lambda box: _label_cost(box, spot, spots, boxes, frame))
+        boxes.append(best)
+        text.xyann = tuple(best[:2] - spot)
+
+
+def _label_cost(box: Any, spot: Any, spots: Any, boxes: Sequence[Any], frame: Any) -> Any:
+    """What is wrong with a label's place: what it covers, leaves, is nearer to; its distance."""
+    covered = sum(((box[:2] < other[2:]) & (other[:2] < box[2:])).all() for other in boxes)
+    outside = (box[:2] < frame[:2]).any() or (box[2:] > frame[2:]).any()
+    far = np.hypot(*np.maximum(np.maximum(box[:2] - spots, spots - box[2:]), 0).T)
+    own = far[(spots == spot).all(axis=1)][0]
+    return covered, outside, own > far.min(), own
 
 
 def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
@@ -194,6 +230,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
             grid=result.grid,
             scorer=options.make_scorer(),
             path={name: [start, *own.tolist()] for name, own in states.items()},
+            colours=[line_style(first + i)["color"] for i in range(len(shown))],
             **result.moves(episode),
         )
         name = "contact_sheet.webp" if k == 0 else f"contact_sheet_{k + 1}.webp"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
+from threading import Event
+from time import perf_counter
 from typing import Any
 
 import gymnasium as gym
@@ -14,12 +17,12 @@ from nicegui import ui
 import ae_env  # noqa: F401  (registers the environments)
 from ae_env.grid import ExposureGrid
 from ae_env.lighting.moving import KIND_SETS, MOVES
-from ae_env.rendering import PATH_COLOURS
 from ae_env.scenes import Scene
 from agents.evaluation.engine import fit_policies
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from agents.report.film import FRAME_RATE, Recording, record
+from agents.rollouts import WatchedEnvs
 from agents.viewer.tab import Tab, curves, loading
 from agents.viewer.viewed_scene import ViewedScene, encoded
 
@@ -28,22 +31,33 @@ STILL = "still"
 LIGHTS = (STILL, *MOVES, *KIND_SETS)
 #: Frames after which a policy has settled in still light.
 SETTLED = 8
-#: Policies that are offered; others are typed.
+#: Policies that are offered, the first two by default, which learn nothing; others are typed.
 NAMES = (
-    *("average:tuned", "average:tuned?foresight=model", "regression:video?foresight=learnt"),
-    *("regression:video", "ppo:video", "rpi_agc", "average", "matrix", "regression", "ppo"),
+    *("average", "regression:video?foresight=learnt", "regression:video", "ppo:video", "rpi_agc"),
+    *("average:tuned", "average:tuned?foresight=model", "matrix", "regression", "ppo"),
 )
 _FRAMES = 64
 #: Colour of the best state, and of each policy.
-_BEST, _POLICIES = "#a0a0a0", PATH_COLOURS[:2]
+_BEST, _POLICIES = "#a0a0a0", ("#D55E00", "#56B4E9")
+
+
+class Stopped(BaseException):
+    """The user wants no result; no `Exception`, which would be a policy's mistake."""
 
 
 def play(
-    names: Sequence[str], scene: Scene, *, light: str = STILL, frames: int = 64, seed: int = 0
+    names: Sequence[str],
+    scene: Scene,
+    *,
+    light: str = STILL,
+    frames: int = 64,
+    seed: int = 0,
+    watch: Callable[[str], None] = lambda _: None,
 ) -> list[Recording]:
     """One episode of each policy in `scene` (at most 64 pixels a side), all in the same light.
 
     `light` is one of `LIGHTS`: `AutoExposure-v0` where it stays, else `AutoExposureVideo-v0`.
+    Before each step `watch` gets what it is for, and may raise `Stopped`.
     """
     fitted_on: dict[str, Any] = {"scenes": "bundled"}
     options: dict[str, Any] = {"scenes": [scene], "camera": scene.camera}
@@ -56,8 +70,13 @@ def play(
     with closing(gym.make_vec(task, num_envs=1, **options)) as envs:
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in names}
-        fit_policies(policies, fitted_on)
-        return [record(name, policy, envs, frames, seed) for name, policy in policies.items()]
+        learns = "{} learns on the training scenes, once for this camera (about a minute)"
+        fit_policies(policies, fitted_on, watch=lambda n: watch(learns.format(n)), keep=True)
+        found = []
+        for name, policy in policies.items():
+            watched = WatchedEnvs(envs, partial(watch, f"episode of {name}"))
+            found.append(record(name, policy, watched, frames, seed))
+        return found
 
 
 def settled(names: Sequence[str], scene: Scene) -> dict[str, int]:
@@ -72,12 +91,14 @@ class EpisodePage(Tab):
         super().__init__(address, folder)
         self._recordings: list[Recording] = []
         self._grid = ExposureGrid.video()
+        self._stopped, self._doing, self._begun = Event(), "", 0.0
+        ui.context.client.on_delete(self._stop)
         with ui.element("div").classes("column w-full"):
             with ui.element("div").classes("bar"):
                 choices = "".join(f'<option value="{name}">' for name in NAMES)
                 ui.html(choices, sanitize=False, tag="datalist").props("id=policies")
                 self._policies = [ui.input("policy A", value=NAMES[0])]
-                self._policies += [ui.input("policy B", value=NAMES[2])]
+                self._policies += [ui.input("policy B", value=NAMES[1])]
                 for policy in self._policies:
                     policy.props("dense list=policies").classes("w-72")
                 self._light = ui.select(list(LIGHTS), label="light", value="shadows").props("dense")
@@ -86,6 +107,11 @@ class EpisodePage(Tab):
                 for number in (self._frames, self._seed):
                     number.props("dense").classes("w-20")
                 self._run = ui.button("Run", icon="play_circle", on_click=self._record)
+                self._cancel = ui.button("Cancel", icon="close", on_click=self._stop)
+                self._status = ui.label().classes("note").props("role=status")
+            self._clock = ui.timer(0.5, self._tick, active=False)
+            for element in (self._cancel, self._status):
+                element.bind_visibility_from(self._clock, "active")
             with ui.element("div").classes("column w-full") as self._shown:
                 self._build_player()
         self._shown.set_visibility(False)
@@ -117,6 +143,7 @@ class EpisodePage(Tab):
 
     def show_scene(self, viewed: ViewedScene) -> None:
         """Takes another scene for the next episode."""
+        self._stop()
         self.viewed, self._recordings = viewed, []
         self._timer.active = False
         self._shown.set_visibility(False)
@@ -129,11 +156,27 @@ class EpisodePage(Tab):
         light, frames = str(self._light.value), int(self._frames.value or _FRAMES)
         options = {"light": light, "frames": frames, "seed": int(self._seed.value or 0)}
         found: list[Recording] | None = None
-        with loading(self._run, Exception):  # whatever a policy of the user's raises
-            found = await self.work(play, names, self.viewed.scored, **options)
+        self._stopped, self._doing, self._begun = Event(), "starting", perf_counter()
+        watch = partial(self._step, self._stopped)
+        self._clock.active = True
+        with suppress(Stopped), loading(self._run, Exception):  # of a policy of the user's
+            found = await self.work(play, names, self.viewed.scored, watch=watch, **options)
+        self._clock.active = False
         if found is not None:
             self._grid = ExposureGrid.default() if light == STILL else ExposureGrid.video()
             self._show_recordings(found)
+
+    def _step(self, stopped: Event, doing: str) -> None:
+        if stopped.is_set():
+            raise Stopped
+        self._doing = doing
+
+    def _stop(self) -> None:
+        self._stopped.set()
+        self._doing = "stopping"
+
+    def _tick(self) -> None:
+        self._status.text = f"{self._doing} ... {perf_counter() - self._begun:.0f} s"
 
     def _show_recordings(self, recordings: list[Recording]) -> None:
         self._recordings = recordings

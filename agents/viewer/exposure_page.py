@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from agents.viewer.tab import Stage, Tab, curves, loading
 from agents.viewer.viewed_scene import Picture, Readout, View, ViewedScene
 from simulator import CameraSettings
 from simulator.settings import format_exposure_time
+from simulator.utils.checks import parse_number
 
 _GRID = ExposureGrid.default()
 #: Values of the sliders, in third stops as cameras mark them; the default grid's are among them.
@@ -41,10 +42,13 @@ _PLANES = ("#ff5c5c", "#4fd36b", "#b6f0a0", "#6aa5ff")
 
 
 class ExposurePage(Tab):
-    """The tab, see `Tab`."""
+    """The tab, see `Tab`; `on_view` is called when it shows another view."""
 
-    def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
+    def __init__(
+        self, address: Callable[[bytes], str], folder: Path, on_view: Callable[[], None]
+    ) -> None:
         super().__init__(address, folder)
+        self._on_view = on_view
         self._refreshing = asyncio.Lock()
         self._shown: tuple[ViewedScene, View] | None = None
         self._centre: tuple[float, float] | None = None
@@ -52,7 +56,7 @@ class ExposurePage(Tab):
         self._rows: dict[str, ui.element] = {}
         self._states: dict[int, tuple[ui.element, ui.label]] = {}
         self._facts: dict[str, ui.label] = {}
-        with ui.element("div").classes("columns"):
+        with ui.element("div").classes("columns waiting") as self._columns:
             with ui.element("div").classes("column looked-at"):
                 self._build_picture()
             with ui.element("div").classes("column controls"):
@@ -127,7 +131,7 @@ class ExposurePage(Tab):
                     for i, t in np.ndindex(len(_GRID.isos), len(_GRID.exposure_times)):
                         state = _GRID.index(i, t, n)
                         button = ui.element("button").classes("state")
-                        button.on("click", partial(self._set, _GRID[state]))
+                        button.on("click", partial(self.set, _GRID[state]))
                         with button:
                             self._states[state] = (button, ui.label())
         with ui.element("div").classes("bar"):
@@ -156,8 +160,17 @@ class ExposurePage(Tab):
             centre=self._centre,
         )
 
-    async def show_scene(self, viewed: ViewedScene, before: CameraSettings) -> None:
-        """Shows another scene, at its best state or at what was chosen since it was asked for.
+    @property
+    def asked(self) -> dict[str, str]:
+        """Entries of an address that `asked_settings` reads as the settings of `view`."""
+        settings = self.view.settings
+        time = format_exposure_time(settings.exposure_time).removesuffix(" s")
+        return {"iso": f"{settings.iso:g}", "t": time, "n": f"{settings.f_number:g}"}
+
+    async def show_scene(
+        self, viewed: ViewedScene, before: CameraSettings, settings: CameraSettings | None
+    ) -> None:
+        """Shows another scene at `settings`, its best state, or what was chosen meanwhile.
 
         `before` are the settings on the page when it was asked for.
         """
@@ -168,11 +181,12 @@ class ExposurePage(Tab):
         self._legend.text = ""
         self._show_compared(None)
         self._show_window()
-        best = await self.work(viewed.best)
+        best = settings or await self.work(viewed.best)
         if best is not None:
-            await (self._set(best) if self.view.settings == before else self._refresh())
+            await (self.set(best) if self.view.settings == before else self._refresh())
 
-    async def _set(self, settings: CameraSettings) -> None:
+    async def set(self, settings: CameraSettings) -> None:
+        """Shows the scene at `settings`, which the sliders have."""
         self._iso.value = ISOS.index(round(settings.iso))
         self._time.value = TIMES.index(settings.exposure_time)
         self._f_number.value = F_NUMBERS.index(settings.f_number)
@@ -192,6 +206,8 @@ class ExposurePage(Tab):
         self._shown = viewed, view
         if picture is None:  # the program ends
             return
+        self._columns.classes(remove="waiting")
+        self._on_view()
         self._stage.show(picture.jpeg, picture.aspect, "pixels" if view.centre else "whole")
         if self.view != view:
             return
@@ -305,6 +321,18 @@ class ExposurePage(Tab):
     @property
     def _marked(self) -> list[str]:
         return [str(name) for name in self._names.value or []]
+
+
+def asked_settings(asked: Mapping[str, str]) -> CameraSettings | None:
+    """Settings of the sliders nearest to those of an address; None if it lacks one or is wrong."""
+    try:
+        wanted = [parse_number(asked.get(name, "")) for name in ("iso", "t", "n")]
+    except ValueError:
+        return None
+    sliders = zip((ISOS, TIMES, F_NUMBERS), wanted, strict=True)
+    return CameraSettings(
+        *(values[np.abs(np.subtract(values, v)).argmin()] for values, v in sliders)
+    )
 
 
 def score_colour(score: float) -> tuple[str, str]:

@@ -2,44 +2,51 @@
 
 from __future__ import annotations
 
-import asyncio
+import json
 import shutil
 import tempfile
+import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl, quote, urlencode
 from weakref import WeakMethod
 
 from fastapi import Response
 from nicegui import app, run, ui
 
 from agents.viewer.episode_page import EpisodePage
-from agents.viewer.exposure_page import ExposurePage
+from agents.viewer.exposure_page import ExposurePage, asked_settings
 from agents.viewer.one_raw_page import OneRawPage
 from agents.viewer.tab import complain, loading, new_file
 from agents.viewer.viewed_scene import Library, ViewedScene
-from simulator import CameraSimulator
+from simulator import CameraSettings, CameraSimulator
 from simulator.camera_simulator import Depth
+from simulator.utils.checks import did_you_mean
 
 #: Largest file that is taken [byte].
 LARGEST_UPLOAD = 300_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
-_TABS = ("Exposure", "Episode", "Refocus, HDR")
+#: Tabs by their names in the page's address.
+_TABS = {"exposure": "Exposure", "episode": "Episode", "raw": "Refocus, HDR"}
+_RAW = _TABS["raw"]
 #: The looks of all pages.
 STYLE = Path(__file__).with_name("page.css")
 
 
 class PictureStore:
-    """Pictures under addresses of their own, the latest `_WAITING` of them."""
+    """Pictures under addresses of their own: the latest `_WAITING`, and thumbnails, made later."""
 
     def __init__(self) -> None:
         self._kept: dict[str, bytes] = {}
-        app.get("/frame/{key}")(self.fetch)
+        self._thumbnails: dict[str, Callable[[], bytes]] = {}
+        self._one = threading.Lock()  # more would keep several raws in memory
+        app.get("/frame/{key:path}")(self.fetch)
 
     def address(self, jpeg: bytes) -> str:
         """Address that `jpeg` can be fetched from."""
@@ -49,19 +56,27 @@ class PictureStore:
             del self._kept[next(iter(self._kept))]  # the oldest
         return f"/frame/{key}"
 
+    def thumbnail_address(self, key: str, make: Callable[[], bytes]) -> str:
+        """Lasting address of the thumbnail that `make` returns, once a browser asks for it."""
+        self._thumbnails.setdefault(key, cache(make))
+        return f"/frame/{quote(key)}"
+
     def fetch(self, key: str) -> Response:
         """The answer to a browser that asks for a picture."""
-        if key not in self._kept:
-            return Response(status_code=404)
+        found, status = self._kept.get(key), 404
+        if key in self._thumbnails:
+            status = 204  # a file that cannot be read says so when it is opened
+            with suppress(ValueError, OSError), self._one:
+                found = self._thumbnails[key]()
         headers = {"Cache-Control": "no-store"}
-        return Response(self._kept[key], media_type="image/jpeg", headers=headers)
+        return Response(found, 200 if found else status, headers, media_type="image/jpeg")
 
 
 @dataclass
 class Options:
     """The options of `ae-env view`, which all tabs of the browser share.
 
-    `thumbnails` are JPEGs of scenes that were asked for; `folder` has one for each tab's files.
+    `folder` has one for each tab's files.
     """
 
     library: Library
@@ -69,7 +84,6 @@ class Options:
     depth: Depth
     tolerance: float
     scorer: str
-    thumbnails: dict[str, bytes] = field(default_factory=dict)
     folder: tempfile.TemporaryDirectory[str] = field(
         default_factory=lambda: tempfile.TemporaryDirectory(prefix="ae-env-view-")
     )
@@ -97,9 +111,10 @@ async def show_page(options: Options) -> None:
     """Puts the page together, for one tab of the browser, and opens the first scene."""
     ui.add_css(STYLE.read_text())
     client = ui.context.client
+    asked = dict(client.request.query_params)
     await client.connected()
     if not client.is_deleted:  # a page that nobody looks at costs nothing
-        await Page(options).open(options.library.first)
+        await Page(options).follow(asked)
 
 
 class Page:
@@ -129,17 +144,61 @@ class Page:
             self._open = ui.button("Open raw", icon="upload", on_click=pick).props("dense")
             self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")
         with ui.tabs().props("dense align=left") as tabs:
-            for name in _TABS:
+            for name in _TABS.values():
                 ui.tab(name)
-        self._panels = ui.tab_panels(tabs, value=_TABS[0], animated=False, on_change=self._show_raw)
+        first, *_ = _TABS.values()
+        self._panels = ui.tab_panels(tabs, value=first, animated=False, on_change=self._show_tab)
         shared = options.pictures.address, folder
         with self._panels.classes("w-full bg-transparent"):
-            with ui.tab_panel(_TABS[0]).classes("p-0"):
-                self._exposure = ExposurePage(*shared)
-            with ui.tab_panel(_TABS[1]).classes("p-0"):
+            with ui.tab_panel(first).classes("p-0"):
+                self._exposure = ExposurePage(*shared, self._show_address)
+            with ui.tab_panel(_TABS["episode"]).classes("p-0"):
                 self._episode = EpisodePage(*shared)
-            with ui.tab_panel(_TABS[2]).classes("p-0"):
+            with ui.tab_panel(_RAW).classes("p-0"):
                 self._one_raw = OneRawPage(*shared, options.simulator)
+        self._scene, self._address, self._following = "", "", False
+        ui.on("went_back", lambda event: self.follow(dict(parse_qsl(event.args))))
+        ui.run_javascript(
+            "addEventListener('popstate', () => emitEvent('went_back', location.search.slice(1)))"
+        )
+
+    # -- the page's address -----------------------------------------------------------------------
+
+    async def follow(self, asked: Mapping[str, str]) -> None:
+        """Shows what the entries of an address ask for: ``scene``, ``iso``, ``t``, ``n``, ``tab``.
+
+        What they leave out stays, or is the first scene at its best state.
+        """
+        readers, name = self._library.readers, asked.get("scene", self._library.first)
+        if name not in readers:
+            complain(f"There is no scene {name!r} here{did_you_mean(name, readers)}")
+            name = self._library.first
+        settings, self._following = asked_settings(asked), True
+        self._address = urlencode(asked, safe="/:")
+        self._panels.value = _TABS.get(asked.get("tab", ""), self._panels.value)
+        if name != self._scene:
+            await self.open(name, settings)
+        elif settings is not None:
+            await self._exposure.set(settings)
+        self._following = False
+        self._show_address("replaceState")
+
+    def _show_address(self, how: str = "") -> None:
+        """Puts what is shown into the address: another scene or tab is a place to go back to."""
+        tab = next(key for key, title in _TABS.items() if title == self._panels.value)
+        place, settings = {"scene": self._scene, "tab": tab}, self._exposure.asked
+        address, before = urlencode(place | settings, safe="/:"), self._address
+        if self._following or address == before:
+            return
+        stays = before.startswith(urlencode(place, safe="/:"))
+        how, self._address = how or ("replaceState" if stays else "pushState"), address
+        ui.run_javascript(f"history.{how}(null, '', {json.dumps('?' + address)})")
+
+    async def _show_tab(self) -> None:
+        self._show_address()
+        await self._show_raw()
+
+    # -- scenes and files -------------------------------------------------------------------------
 
     async def _open_picker(self) -> None:
         self._picker.open()
@@ -150,29 +209,26 @@ class Page:
                 self._listed.add(name)
                 button = ui.element("button").classes("thumb")
                 with button:
-                    image = ui.element("img").props('alt=""')
+                    ui.element("img").props(f'alt="" loading=lazy src={self._thumbnail(name)}')
                     ui.label(name)
                 button.on("click", lambda name=name: self._pick(name))
-                asyncio.get_running_loop().create_task(self._fill(image, name))
 
-    async def _fill(self, image: ui.element, name: str) -> None:
-        """Puts the thumbnail of the scene called `name` into `image`."""
-        shared = name in self._options.library.readers
-        known = self._options.thumbnails if shared else {}
-        jpeg, viewed = known.get(name), self._options.viewed
-        if jpeg is None:
-            with suppress(ValueError, OSError):  # such a file says so when it is opened
-                jpeg = await run.io_bound(lambda: viewed(self._library, name).thumbnail())
-        if jpeg is not None:  # else the program ends
-            known[name] = jpeg
-            self._exposure.show(image, jpeg)
+    def _thumbnail(self, name: str) -> str:
+        """Address of the thumbnail of the scene called `name`."""
+        options, library = self._options, self._options.library
+        key = f"all/{name}"
+        if name not in library.readers:  # an upload
+            library, key = self._library, f"{self._folder.name}/{name}"
+        return options.pictures.thumbnail_address(
+            key, lambda: options.viewed(library, name).thumbnail()
+        )
 
     async def _pick(self, name: str) -> None:
         self._picker.close()
         await self.open(name)
 
-    async def open(self, name: str) -> None:
-        """Shows the scene called `name` on all tabs."""
+    async def open(self, name: str, settings: CameraSettings | None = None) -> None:
+        """Shows the scene called `name` on all tabs, at `settings` or at its best state."""
         title, self._title.text = self._title.text, f"{name} ..."
         before = self._exposure.view.settings
         try:
@@ -183,15 +239,16 @@ class Page:
             return
         if viewed is None:  # the program ends
             return
+        self._scene = name
         self._episode.show_scene(viewed)
         self._one_raw.take_scene(viewed)
-        await self._exposure.show_scene(viewed, before)
+        await self._exposure.show_scene(viewed, before, settings)
         if viewed is self._exposure.viewed:  # no other was opened meanwhile
             self._title.text = name
         await self._show_raw()
 
     async def _show_raw(self) -> None:
-        if self._panels.value == _TABS[2]:
+        if self._panels.value == _RAW:
             await self._one_raw.show_raw()
 
     async def _take_upload(self, event: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,6 @@ from nicegui import run, ui
 
 from agents.viewer.viewed_scene import ViewedScene
 
-#: Uploads and downloads of all tabs together, from which on no other is taken or made [byte].
-_MOST_STORED = 4_000_000_000
 _CHART_WIDTH = 640
 _DIVIDE = (
     "(e) => e.target.closest('.columns').querySelector('.stage')"
@@ -23,18 +21,9 @@ _DIVIDE = (
 
 
 def new_file(folder: Path, name: str) -> Path:
-    """Where the file called `name` may be written, in a folder of its own below `folder`.
-
-    A `ValueError` if there is no such name, or the program's files have `_MOST_STORED` bytes.
-    """
+    """Where the file called `name` may be written, in a folder of its own below `folder`."""
     if name in ("", "..") or "\0" in name or len(name.encode(errors="replace")) > 255:
         raise ValueError(f"A file cannot be called {name[:40]!r}.")
-    stored = 0
-    with suppress(OSError):  # another tab may go meanwhile, with its files
-        stored = sum(file.lstat().st_size for file in folder.parent.rglob("*"))
-    if stored > _MOST_STORED:
-        most = f"Uploads and downloads have more than {_MOST_STORED // 10**9} GB"
-        raise ValueError(f"{most}: close other tabs, or load this one again.")
     return Path(tempfile.mkdtemp(dir=folder), name)
 
 

@@ -77,6 +77,8 @@ _BLACK_LEVEL_RULE = (
     "without one), and a BlackLevelDelta for each column and row, but has {found} of them; "
     "exiftool -BlackLevel=64 writes one for all"
 )
+#: First bytes of files that are taken for raws by mistake.
+_PICTURES = {b"\xff\xd8\xff": "JPEG", b"\x89PN": "PNG"}
 #: What LibRaw raises; NotImplementedError is a RuntimeError.
 _LIBRAW_ERRORS = (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError)
 
@@ -91,7 +93,12 @@ def _errors_name(path: Path) -> Iterator[None]:
     try:
         yield
     except RawFileError as error:
-        raise RawFileError(f"`path` (={path.name!r}) {error}") from None
+        text = str(error)
+        if not file_fault(path):
+            with suppress(OSError), path.open("rb") as stream:
+                kind = _PICTURES.get(stream.read(3))
+                text = text if kind is None else f"is a {kind}, not a raw"
+        raise RawFileError(f"`path` (={path.name!r}) {text}") from None
     except OSError as error:
         raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
 

@@ -15,6 +15,10 @@ from typing import Any
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 
+#: Level of log lines about work under way, which only the command line shows.
+NOTE = 25
+
+
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
     """End of a message that proposes the nearest of `known` to a misspelt `name`; empty if none is.
 

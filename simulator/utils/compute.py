@@ -34,6 +34,8 @@ import torch
 from numba import types
 from numba.core import event
 
+from simulator.utils.checks import NOTE
+
 logger = logging.getLogger(__name__)
 _PACKAGES = ("simulator", "ae_env")
 #: Kernels that a default environment needs for its first frame, about.
@@ -109,7 +111,7 @@ def _checksum(module: Path) -> int:
 
 
 class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
-    """Warns once that kernels are compiled, which takes seconds, logs each one, and shows a bar."""
+    """Says once that kernels are compiled, which takes seconds, logs each one, and shows a bar."""
 
     warned = False
     depth = 0  # kernels compile the kernels that they call
@@ -124,7 +126,7 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
             if not self.warned and multiprocessing.parent_process() is None:  # children are many
                 self.warned = True
                 cache = getattr(event.data["dispatcher"], "_cache", None)
-                logger.warning(_KEPT if hasattr(cache, "_cache_file") else _NOT_KEPT)
+                logger.log(NOTE, _KEPT if hasattr(cache, "_cache_file") else _NOT_KEPT)
             logger.info("compiling %s.%s", function.__module__, function.__name__)
             if self.depth == 1:
                 bar = progress_bar("compiling the simulator", _FIRST_KERNELS, done=self.compiled)

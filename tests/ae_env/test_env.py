@@ -218,7 +218,7 @@ def test_paths_are_drawn_in_their_own_colours() -> None:
         np.asarray(contact_sheet(_scene(), grid=FEW, path=path)) @ [2**16, 2**8, 1]
         for path in (None, paths)
     )
-    colours = [0xD55E00, 0x56B4E9]
+    colours = [0x0072B2, 0xD55E00]
     assert np.isin(colours, drawn).all()
     assert not np.isin(colours, plain).any()
     for path in ([0, 64], [], {"mine": [1.5]}):

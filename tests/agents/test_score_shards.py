@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 
 import numpy as np
 import pytest
@@ -87,15 +86,6 @@ def test_a_run_continues_with_the_shards_that_are_missing(folder, done):
     assert run(plan, "local", lambda *_: None) == []
     with pytest.raises(ValueError, match="`out`"):
         run(make(folder, done, scorer="mertens"), "local", lambda *_: None)
-
-
-def test_what_cannot_run_leaves_no_folder(ae_env, folder, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    out = tmp_path / "tables"
-    for on, status, message in (("ray://head:10001", 1, "ae-env[ray]"), ("cluster", 2, "`on`")):
-        code, _, error = ae_env("score-tables", folder, "--on", on, "-o", out)
-        assert (code, error.count("\n"), message in error) == (status, 1, True)
-    assert not out.exists()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Ray, of its own settings

@@ -177,14 +177,6 @@ def test_pictures_weigh_as_the_formula_says() -> None:
     np.testing.assert_allclose(float(weight[0, 0] / weight[5, 5]), 19.0, rtol=1e-4)
 
 
-def test_a_mirrored_bracket_gives_the_mirrored_picture() -> None:
-    # Pixel 0 of a coarser level lies on pixel 0 of the finer one: 2^n + 1 pixels are symmetric.
-    light = torch.rand(3, 129, 257, generator=torch.Generator().manual_seed(2)).square()
-    pictures = [(light * gain).clamp(max=1.0).sqrt() for gain in (0.2, 1.0, 5.0)]
-    mirrored = fuse([picture.flip(1, 2) for picture in pictures])
-    torch.testing.assert_close(mirrored.flip(1, 2), fuse(pictures), atol=2e-5, rtol=0)
-
-
 def test_a_large_flat_patch_stays_flat() -> None:
     light = torch.full((3, 1024, 1024), 0.02)
     light[:, 312:712, 312:712] = 0.45  # a bright patch of a chart, on black

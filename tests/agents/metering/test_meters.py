@@ -5,7 +5,6 @@ import pytest
 
 from ae_env.observation import decode_observation
 from agents.metering import reading as readings
-from agents.metering import search_meters
 from agents.metering.meters import make_meter, weight_map
 from agents.metering.reading import EVTracker, frame_ev100
 from agents.policy_names import METERS, make_policy
@@ -129,13 +128,6 @@ def test_entropy_finds_the_exposure_of_the_highest_entropy(context, photograph):
     reading = make_meter("entropy", context.camera)(photograph(light, 9.0, state))
     # The frame has its top at 0.35 at EV 9, so at 1 at 9 - log2(1 / 0.35).
     assert reading.ev100[0] == pytest.approx(9.0 + math.log2(top), abs=0.15)
-
-
-def test_peak_is_the_top_of_a_parabola():
-    x = np.arange(-3.0, 3.01, 0.5)
-    tops = (0.7, -1.2, -3.2, 3.2)  # the last two lie beyond the ends
-    values = np.stack([*(-((x - top) ** 2) for top in tops), x, np.zeros_like(x)])
-    np.testing.assert_allclose(search_meters.peak(values, x), [0.7, -1.2, -3, 3, 3, 0])
 
 
 @pytest.mark.parametrize("name", ["shim", "zhang"])

@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from ae_env.grid import ExposureGrid
-from agents.metering import programs
+from agents.metering import metering_policy, programs
 from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.programs import ProgramOptions, StateChooser, program_cost
 from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
@@ -21,6 +21,7 @@ from agents.metering.tuned import ScoreRegression
 from agents.policy import PolicyContext
 from agents.policy_names import METERS, make_policy
 from agents.rollouts import make_envs
+from simulator import get_camera
 
 #: ISO 100 and 400, 1/64 and 1/4 s, f/4 and f/8: every value a power of two.
 GRID = ExposureGrid((100, 400), (1 / 64, 1 / 4), (4, 8))
@@ -131,18 +132,12 @@ def test_costs_of_the_programs():
         np.testing.assert_allclose(program_cost(program, found, readings)[0], gain / 10)
 
 
-@pytest.mark.parametrize(
-    ("grid", "step"),
-    [
-        (ExposureGrid.default(), 1.0),
-        (GRID, 2.0),
-        (ExposureGrid((100,), (1 / 64,), (4,)), 1.0),  # nothing to step to
-        (ExposureGrid((100,), (1 / 64, 1 / 60, 1 / 8), (4,)), 3.0),  # 1/60 is 1/64
-        (ExposureGrid((100,), (1 / 64, 1 / 32, 1 / 16, 1 / 2), (4,)), 1.0),  # the median
-    ],
-)
-def test_step_of_a_grid(grid, step):
-    assert programs.ev_step(grid) == pytest.approx(step, abs=0.1)
+def test_step_of_a_grid():
+    assert (programs.ev_step(ExposureGrid.default()), programs.ev_step(GRID)) == (1.0, 2.0)
+    # Nothing to step to; 1/60 is 1/64; the median.
+    for places, step in (((6,), 1.0), ((6, 5.9, 3), 3.0), ((6, 5, 4, 1), 1.0)):
+        grid = ExposureGrid((100,), tuple(2.0**-place for place in places), (4,))
+        assert programs.ev_step(grid) == pytest.approx(step, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -158,14 +153,6 @@ def test_ranges_of_the_options(option, low, high):
     for value in (low - 0.1, high * 1.01, float("nan"), "half", True):
         with pytest.raises(ValueError, match=f"`{option}`"):
             ProgramOptions(**{option: value})
-
-
-def test_options_belong_to_programs():
-    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
-    programs.check_used("M", f_number=4.0, exposure_time=0.1, iso=100, weights=None)
-    for program, option in (("A", "iso"), ("P", "f_number")):
-        with pytest.raises(ValueError, match=f"`{option}`"):
-            programs.check_used(program, **{option: 4})
 
 
 def _samples(count=600, seed=0):
@@ -274,6 +261,22 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
         make_policy("average:tuned", context).save(tmp_path / "x.safetensors")
     with pytest.raises(ValueError, match="`sensors`"):
         _run(make_policy("average:tuned_blind", context, weights=weights), photograph, 8.0)
+
+
+def test_a_fit_is_found_again_by_another_run_and_by_nothing_else(context, tmp_path, monkeypatch):
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    fits = iter([_fitted()])
+    monkeypatch.setattr(MeteringPolicy, "_fit", lambda *_: next(fits))
+    told = None, 0, {"scenes": "bundled"}
+    for name in ("average:tuned", "average:tuned?foresight=model"):
+        monkeypatch.setattr(metering_policy, "_FITS", {})  # as in another process
+        policy = make_policy(name, context)
+        policy.fit_once(*told)
+        np.testing.assert_array_equal(policy.regression.scores, _fitted().scores)
+    other = dataclasses.replace(context, camera=get_camera("canon_5d4"))
+    for name, own in (("spot:tuned", context), ("average:tuned", other)):
+        with pytest.raises(StopIteration):
+            make_policy(name, own).fit_once(*told)
 
 
 def test_sensors_are_averaged_over_the_frames(context, photograph):

@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -23,9 +24,11 @@ from starlette.websockets import WebSocketDisconnect
 
 from ae_env.scenes import Scene
 from agents.report.judging import read_choices
-from agents.viewer import tab
-from agents.viewer.one_raw_page import opened, wider_f_numbers
+from agents.viewer.episode_page import Stopped, play
+from agents.viewer.one_raw_page import opened
+from agents.viewer.page import PictureStore
 from agents.viewer.server import TokenGuard
+from agents.viewer.tab import new_file
 from agents.viewer.viewed_scene import WINDOW_SIZE, OpenedScene, View, ViewedScene, find_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.discs import disc_blur
@@ -60,11 +63,6 @@ def test_the_window_lies_where_the_upright_picture_was_clicked(flip):
     np.testing.assert_allclose(found, np.array(window.shape) / 2, atol=8)
 
 
-def test_a_large_frame_is_averaged_to_the_size_of_the_page():
-    capture = viewed(torch.zeros(4, 1025, 1100)).picture(View(SETTINGS)).capture
-    assert capture.shape == (4, 341, 366)  # thirds
-
-
 def test_clipped_pixels_are_marked():
     light = torch.full((4, 64, 64), 0.1)
     light[:, :32, :32] = 3.0
@@ -84,6 +82,8 @@ def test_numbers_of_a_flat_scene():
     assert (readout.white, readout.black) == (pytest.approx(1.0, abs=0.6), 0.0)
     assert readout.motion == pytest.approx(0.5 * 64 / 16)  # speed, height, time
     assert readout.defocus == pytest.approx(4.0)
+    huge = viewed(torch.zeros(4, 1025, 1100)).picture(View(SETTINGS)).capture
+    assert huge.shape == (4, 341, 366)  # thirds fit the page
     large = viewed(torch.full((4, 512, 384), 0.1))
     for centre in (None, (0.5, 0.5)):  # a window moves as the frame does
         shown = replace(view, centre=centre)
@@ -125,17 +125,21 @@ def test_a_folder_opens_at_its_first_readable_raw_and_few_are_kept(tmp_path):
         library.open("2.dng")
 
 
-def test_files_of_all_tabs_together_have_a_bound(tmp_path, monkeypatch):
+def test_thumbnails_are_made_once_and_last_and_an_episode_can_be_stopped(tmp_path):
     for name in ("", "..", "a\0b.dng", "x" * 256):
         with pytest.raises(ValueError, match="cannot be called"):
-            tab.new_file(tmp_path, name)
-    for own in ("mine", "other"):
-        (tmp_path / own).mkdir()
-    tab.new_file(tmp_path / "other", "a.dng").write_bytes(bytes(10**6))
-    assert tab.new_file(tmp_path / "mine", "a.dng").parent.is_dir()
-    monkeypatch.setattr(tab, "_MOST_STORED", 10**6)
-    with pytest.raises(ValueError, match="close other tabs"):
-        tab.new_file(tmp_path / "mine", "a.dng")
+            new_file(tmp_path, name)
+    store, made = PictureStore(), []
+    address = store.thumbnail_address("all/a b.dng", lambda: made.append(1) or b"jpeg")
+    store.thumbnail_address("all/bad", lambda: float("no raw"))
+    for _ in range(300):
+        store.address(b"another")
+    bodies = [store.fetch("all/a b.dng").body for _ in range(2)]
+    assert store.fetch("all/bad").status_code == 204
+    assert (address, bodies, made) == ("/frame/all/a%20b.dng", [b"jpeg"] * 2, [1])
+    scene = viewed(torch.full((4, 64, 64), 0.1)).scored
+    with pytest.raises(Stopped):
+        play(["average"], scene, watch=Mock(side_effect=Stopped))
 
 
 def test_a_scene_is_found_by_its_id_and_what_is_none_is_refused():
@@ -183,13 +187,6 @@ def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown(tm
     assert (back.settings.f_number, back.data.shape) == (1.6, (4, 96, 144))
     assert back.data[:, 8:-8, :60].equal(before.data[:, 8:-8, :60])  # as it was recorded
     assert back.data[soft].std() < 0.8 * before.data[soft].std()
-
-
-def test_only_wider_f_numbers_than_the_raw_s_are_offered():
-    for own, offered in ((2.8, 6), (8**0.5, 6), (1.4, 0), (2**0.5, 0), (4, 9)):
-        raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 1, own), CAMERA)
-        wider = (3.5, 3.2, 2.8, 2.5, 2.2, 2.0, 1.8, 1.6, 1.4)
-        assert wider_f_numbers(raw) == wider[len(wider) - offered :]
 
 
 def _run(log, *arguments):
@@ -264,9 +261,7 @@ def page(browser, address):
 
 @pytest.fixture
 def expect(browser):
-    from playwright.sync_api import expect
-
-    return expect
+    return pytest.importorskip("playwright.sync_api").expect
 
 
 def saved(page, button, folder):
@@ -367,7 +362,10 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
             page.get_by_role("tab", name=name).click()
             page.locator(there).wait_for()
             page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
-    # Another tab of the browser shows another scene.
+        page.evaluate("scrollTo(0, 400)")
+        top = "document.querySelector('.stage').getBoundingClientRect().top"
+        page.wait_for_function(f"w => scrollY > 200 && ({top} === 0) === (w < 900)", arg=width)
+    # Another tab of the browser shows another scene, and goes back, forward, and loads it again.
     other = page.context.new_page()
     other.goto(address.partition("?")[0])  # the cookie has the token
     other.wait_for_selector(".state.shown")
@@ -378,6 +376,12 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     thumb.click()
     expect(other.locator(".title", has_text=name).first).to_be_visible()
     expect(page.locator(".title").first).not_to_have_text(name)
+    other.wait_for_url(f"**scene={name}&**")
+    other.go_back()
+    expect(other.locator(".title", has_text=name)).to_have_count(0)
+    other.goto(f"{address.partition('?')[0]}?scene={name}&iso=1600&t=1/15&n=4&tab=exposure")
+    other.locator("button.shown[aria-label^='ISO 1600, 1/15 s, f/4']").wait_for()
+    expect(other.locator(".title").first).to_have_text(name)
 
 
 @pytest.mark.slow
