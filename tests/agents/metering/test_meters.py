@@ -5,10 +5,9 @@ import pytest
 
 from ae_env.observation import decode_observation
 from agents.metering import reading as readings
-from agents.metering import search_meters
 from agents.metering.meters import make_meter, weight_map
 from agents.metering.reading import EVTracker, frame_ev100
-from agents.policy_names import METERS, make_policy
+from agents.policy_names import METERS
 
 GREY = np.ones((64, 64))
 
@@ -131,13 +130,6 @@ def test_entropy_finds_the_exposure_of_the_highest_entropy(context, photograph):
     assert reading.ev100[0] == pytest.approx(9.0 + math.log2(top), abs=0.15)
 
 
-def test_peak_is_the_top_of_a_parabola():
-    x = np.arange(-3.0, 3.01, 0.5)
-    tops = (0.7, -1.2, -3.2, 3.2)  # the last two lie beyond the ends
-    values = np.stack([*(-((x - top) ** 2) for top in tops), x, np.zeros_like(x)])
-    np.testing.assert_allclose(search_meters.peak(values, x), [0.7, -1.2, -3, 3, 3, 0])
-
-
 @pytest.mark.parametrize("name", ["shim", "zhang"])
 def test_steps_go_on_from_the_estimate_and_not_from_the_state(context, photograph, name):
     """The same frame, a controller that is further on: the step is taken from there."""
@@ -153,21 +145,6 @@ def test_steps_go_on_from_the_estimate_and_not_from_the_state(context, photograp
     assert abs(path[-1] - path[-2]) < 0.02  # comes to rest though the frame stays
     assert path[-1] < 10.5
     assert steps[0] > 0.3
-
-
-@pytest.mark.parametrize("name", ["shim", "zhang", "entropy"])
-def test_the_dark_is_left(context, photograph, name):
-    """8 EV under at the start, and again after a flash of EV 35: within 2 EV of the light."""
-    rng = np.random.default_rng(0)
-    light = 1.0 + 0.1 * np.kron(rng.uniform(-1, 1, (16, 16)), np.ones((4, 4)))
-    policy = make_policy(f"{name}:P", context)
-    policy.reset(1)
-    state = np.array([context.grid.nearest(17.0)])
-    for frame in range(26):
-        if frame == 12:
-            assert context.grid.ev100[state[0]] < 9.0 + 1.6
-        state = policy.act(photograph(light, 35.0 if frame in (13, 14) else 9.0, state))
-    assert context.grid.ev100[state[0]] < 9.0 + 1.6
 
 
 def test_highlights_are_exposed_to_nine_tenths_of_white(context, photograph):
@@ -262,14 +239,3 @@ def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
         np.testing.assert_array_equal(reading.ev100, plain.ev100)
         np.testing.assert_array_equal(reading.saturated, plain.saturated)
     assert reading.saturated[0] == 1.0
-
-
-def test_only_zones_that_both_show_are_compared():
-    before = np.array([0.02, 0.1, 0.3, np.nan, 0.5])
-    now = np.array([0.08, 0.4, np.nan, 0.9, np.nan])
-    stops, enough = readings.light_change(before, now)
-    assert stops == pytest.approx(2.0)
-    assert enough
-    for dark in (np.full(5, 1e-4), np.full(5, np.nan)):
-        stops, enough = readings.light_change(dark, now)
-        assert (stops, enough) == (0.0, False)
