@@ -91,15 +91,6 @@ def test_hysteresis_is_a_fifth_of_a_step():
         assert ceiling.with_hysteresis(np.array([target]), previous) == pytest.approx(expected)
 
 
-def test_states_nearby():
-    found = chooser("S", exposure_time=1 / 64)
-    assert np.flatnonzero(found.nearby(np.array([9.0]), 0.5)[0]).tolist() == [0, 4, 5]
-    assert np.flatnonzero(found.nearby(np.array([9.9]), 0.5)[0]).tolist() == [0, 5]
-    assert np.flatnonzero(found.nearby(np.array([10.0]), 2.0)[0]).tolist() == [0, 1, 4, 5]
-    capped = chooser("S", exposure_time=1 / 4, shutter_cap=1 / 8)  # the cap excludes what is set
-    assert np.flatnonzero(capped.nearby(np.array([6.0]), 9.0)[0]).tolist() == [0, 1, 4, 5]
-
-
 def test_limits_of_shutter_and_aperture():
     blind, seen = np.array([[8.0]]), np.array([[8.0, 1.0, 2.0]])  # 2 frame heights/s, 4 pixels
     np.testing.assert_allclose(programs.shutter_limit(blind), [[np.log2(60)]])
