@@ -1,9 +1,8 @@
 """The long training: both agents over several seeds, and every light meter, on unseen scenes.
 
 Trained agents lie under ``runs/bench_agents``, so that a second run continues where the first was
-stopped. It writes the report of an evaluation on each set of scenes to ``agents/`` under the output
-folder. Real places and raws are looked for in the folder of real files and in the cache. Trainings
-run side by side and show their own progress, so this one is no `benchmarks.harness.benchmark`.
+stopped. Trainings run side by side and show their own progress, so this one is no
+`benchmarks.harness.benchmark`.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ from agents.policy import PolicyContext
 from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
 from agents.report.evaluation import write_report
 from agents.rollouts import make_envs
+from benchmarks.harness import real_files
 from benchmarks.isolated import ROOT
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.files import data_folder
 
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}
 SEEDS = (0, 1, 2)
@@ -62,12 +61,9 @@ def views_of_unknown_light(split: Split, camera: CameraProfile, resolution: int)
 
 def raws(split: Split, camera: CameraProfile, resolution: int) -> list[Scene]:
     """Raws of a Canon and two GoPro cameras, each a source group of its own."""
-    data = data_folder()
-    if data is None:
-        raise FileNotFoundError("set AE_ENV_DATA to the folder of real files")
     size: Any = {"camera": camera, "resolution": resolution}
-    scenes = load_scenes(data / "canon_crw_cc0", split, **size)
-    folder = data / "gopro_raw"
+    scenes = load_scenes(real_files("canon_crw_cc0"), split, **size)
+    folder = real_files("gopro_raw")
     for name, meta in json.loads((folder / "meta.json").read_text()).items():
         tags: dict[str, str] = meta["dng_tags"]
         iso, seconds, stop = (
@@ -164,8 +160,4 @@ def _train(jobs: dict[str, list[TrainingJob]]) -> None:
     everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
     with progress_bars() as progress, ExitStack() as bars:
         tasks = {job.name: bars.enter_context(progress(job.name)) for job in everything}
-
-        def report(name: str, done: int, total: int, values: dict[str, float]) -> None:
-            tasks[name](done, total)
-
-        train_in_parallel(everything, progress=report)
+        train_in_parallel(everything, progress=lambda name, *done: tasks[name](*done[:2]))

@@ -36,15 +36,18 @@ class Chart:
     rows: tuple[int, int] = (0, 3)
     columns: tuple[int, int] = (0, 5)
 
-    def patches(self) -> dict[int, tuple[float, float, float]]:
-        """Index of each patch to (x, y, half side of the square that is averaged)."""
+    def means(self, raw: RawImage) -> dict[int, np.ndarray]:
+        """Means (4,) over a square of each patch, by its index."""
         down, across = self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
         corners, found = np.array(self.corners, float), {}
         half = float(0.22 * np.linalg.norm(corners[1] - corners[0]) / across)
         for i, j in product(range(down + 1), range(across + 1)):
             v, u = i / down, j / across
             x, y = np.array([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v]) @ corners
-            found[6 * (self.rows[0] + i) + self.columns[0] + j] = (x, y, half)
+            rows, columns = (slice(round(n - half), round(n + half) + 1) for n in (y, x))
+            square = raw.data[:, rows, columns].double()
+            index = 6 * (self.rows[0] + i) + self.columns[0] + j
+            found[index] = square.mean(dim=(1, 2)).numpy()
         return found
 
 
@@ -61,18 +64,8 @@ def linear_srgb_to_lab(linear: np.ndarray) -> np.ndarray:
     return colour.XYZ_to_Lab(colour.RGB_to_XYZ(linear, "sRGB", D50, "Bradford"), D50)
 
 
-def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
-    means = {}
-    for index, (x, y, half) in chart.patches().items():
-        rows = slice(round(y - half), round(y + half) + 1)
-        columns = slice(round(x - half), round(x + half) + 1)
-        square = raw.data[:, rows, columns].double()
-        means[index] = square.mean(dim=(1, 2)).numpy()
-    return means
-
-
 def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
-    means = patch_means(raw, chart)
+    means = chart.means(raw)
     order = sorted(means)
     planes, lab = np.stack([means[i] for i in order]), PUBLISHED[order]  # (N, 4), (N, 3)
     gains = np.array(raw.white_balance)

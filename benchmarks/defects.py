@@ -1,8 +1,7 @@
 """Do the analytic measures of photographic defects read the severity that was rendered?
 
-Bundled scenes are rendered well exposed, noise-free and sharp, then with one defect at known
-severities. The maps from what a defect leaves in the picture to its severity are fitted on training
-scenes and tested on test scenes; the constants that `ae_env/scorers/defects.py` holds are printed.
+The maps from what a defect leaves in the picture to its severity are fitted on training scenes and
+tested on test scenes; the constants that `ae_env/scorers/defects.py` holds are printed.
 """
 
 from __future__ import annotations

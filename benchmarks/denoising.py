@@ -1,9 +1,8 @@
 """Denoising of real detail that no training saw, sampled as a sensor samples it.
 
-One crop of every source of the test split of `simulator.training.scenes`: views into radiance maps,
-photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
-every method; the gain is that of the PSNR over the noisy input. One thread. Clipped views of maps
-go the whole way of a user's raw, the estimate of what is clipped included.
+One crop of every source of the test split of `simulator.training.scenes`, photographed by the
+reference camera. The gain is that of the PSNR over the noisy input. One thread. Clipped views of
+maps go the whole way of a user's raw, the estimate of what is clipped included.
 """
 
 from __future__ import annotations
@@ -22,10 +21,11 @@ import torch
 from skimage.restoration import denoise_nl_means
 from torch import Tensor
 
-from benchmarks.fidelity.models import trained_noise_modules
+from benchmarks.fidelity.models import weights
 from benchmarks.harness import Part, Report, Row, benchmark, interval, pivot, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.noise_module import SIZES
+from simulator.networks.weights import load_modules
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.reading import read_radiance
@@ -93,7 +93,9 @@ def _by_network(module: Any, raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
 
 
 def networks() -> dict[str, Denoiser]:
-    return {name: partial(_by_network, module) for name, module in trained_noise_modules().items()}
+    """The noise modules that come with the package, and the paper's where it was trained."""
+    found = {name: load_modules(w)[0] for name in (*SIZES, "paper") if (w := weights(name))}
+    return {name: partial(_by_network, modules["noise"]) for name, modules in found.items()}
 
 
 def classical() -> dict[str, Denoiser]:

@@ -1,10 +1,8 @@
 """One way to run a benchmark: parts in processes of their own, rows, a page with tables, plots.
 
 A benchmark is a module or a folder whose function `run`, which `benchmark` makes, is what
-`ae-env bench` calls. Its ``parts(seed, quick)`` names what is measured: each `Part` is a function
-that returns JSON values and runs in a fresh Python (`benchmarks.isolated`). A part that is done is
-kept on disk until the whole run is, so that a run that was stopped continues. Its
-``report(results, meta)`` makes the `Report` of all results.
+`ae-env bench` calls. Each `Part` runs in a fresh Python (`benchmarks.isolated`), and is kept on
+disk until the whole run is done, so that a run that was stopped continues.
 """
 
 from __future__ import annotations
@@ -127,10 +125,6 @@ def benchmark(
         name: Of its command and its files.
         parts: ``parts(seed, quick, **options)``: what is measured, in order.
         report: ``report(results, meta)``: what is written, of the results by name of the part.
-
-    Returns:
-        ``run(out, seed, quick, **options)``: folder of results, seed of everything random, whether
-        a short version does, and further arguments of `parts`.
     """
 
     def run(out: Path, *, seed: int = 0, quick: bool = False, **options: Any) -> None:

@@ -55,7 +55,8 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
         times = [settings.exposure_time * 2.0**ev for ev in exposures]
         states = [replace(settings, exposure_time=seconds) for seconds in times]
         captures = [reference.capture(scene, s, seed, light=light).sample for s in states]
-        raw = _raw(scene, captures[exposures.index(0.0)], settings)
+        look: Any = {"white_balance": scene.white_balance}
+        raw = RawImage(captures[exposures.index(0.0)], settings, reference.camera, **look)
         begun = time.perf_counter()
         ours = hdr_picture(raw, simulator=simulator)
         seconds = time.perf_counter() - begun
@@ -82,10 +83,6 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
     return rows
 
 
-def _raw(scene: ReferenceScene, data: Tensor, settings: CameraSettings) -> RawImage:
-    return RawImage(data, settings, get_camera(CAMERA), white_balance=scene.white_balance)
-
-
 def _simulated(raw: RawImage) -> list[Tensor]:
     """The bracket of one raw, developed."""
     return [expose_and_develop(raw, ev) for ev in bracket_exposures()]
@@ -99,7 +96,8 @@ def picture(seed: int, quick: bool) -> Figure:
         dark, bright = (float(s.double().mean()) for s in (unclipped < 2.0**-6, unclipped > 1.0))
         found.append((min(dark, 10.0 * bright), scene, settings, unclipped))
     _, scene, settings, unclipped = max(found, key=lambda entry: entry[0])
-    raw = _raw(scene, reference.capture(scene, settings, seed).sample, settings)
+    sample = reference.capture(scene, settings, seed).sample
+    raw = RawImage(sample, settings, reference.camera, white_balance=scene.white_balance)
     simulator = CameraSimulator.from_pretrained("large", cache=None)
     pictures = {
         f"the raw, developed (ISO {iso})": expose_and_develop(raw),

@@ -31,7 +31,6 @@ SIDES = (64, 32, 16, 8, 4, 2)
 
 def _prepared(policy: str, quick: bool) -> tuple[int, Any, Any]:
     """Episodes on unseen scenes, in light that jumps in the middle: how many; and the agent."""
-    torch.set_num_threads(1)
     count = 8 if quick else EPISODES
     given: Any = {"kind": "step", "stops": STOPS, "at": FRAMES // 2}
     given = {"split": "test", "max_episode_steps": None, "lighting": given}

@@ -2,9 +2,9 @@
 
     ae-env bench paper FOLDER
 
-Sequences are split, the paper's networks and its two baselines are trained on the captures of one
-part (or weights are given), and every method is measured on pairs of real captures of the other. A
-training that was stopped continues. Published numbers are of another split of the authors' data.
+The paper's networks and its two baselines are trained on a part of the sequences (or weights are
+given), and every method is measured on pairs of real captures of the others. Published numbers are
+of another split of the authors' data.
 """
 
 from __future__ import annotations
@@ -91,11 +91,7 @@ def parts(
 
 
 def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
-    """One row for each held-out pair and stage of a network.
-
-    `name` is one of `TRAINED`, which is trained where it is not yet; ``"compact"``; or weights.
-    `seed` is that of the split, the training and the choice of pairs.
-    """
+    """A row for each held-out pair and stage of one of `TRAINED`, ``"compact"`` or weights."""
     train, held_out = split_dataset(Path(folder), seed=seed)
     weights = trained(name, Path(folder), train, seed, quick) if name in TRAINED else name
     modules, card = load_modules(weights)

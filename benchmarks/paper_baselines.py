@@ -1,7 +1,6 @@
 """The paper's two baselines (section 4.3): networks that know the settings, but no physics.
 
-They are presets of `simulator.networks.weights.build_modules` once this module is imported. In a
-clone of the repository they are trained by
+They are presets of `build_modules` once this module is imported. In a clone they are trained by
 
     python -m benchmarks.paper_baselines train-simulator configs/simulator/pc.yaml
 
@@ -59,9 +58,7 @@ class AdaptiveNorm(nn.Module):
 class ParameterConcatenation(nn.Module):
     """Baseline PC: a context aggregation network, the parameters as six constant planes.
 
-    3 x 3 convolutions of growing dilation, each with `AdaptiveNorm` and LeakyReLU(0.2), then a
-    1 x 1 convolution; convolutions start as the identity. 77,046 parameters at the published
-    width. In training the normalisation uses statistics of the batch, in ``eval()`` running ones.
+    Convolutions of growing dilation that start as the identity. 77,046 parameters.
 
     Source: Chen, Xu and Koltun 2017, Fast Image Processing with Fully-Convolutional Networks,
     table 1 and equations 2 and 3.
@@ -92,9 +89,8 @@ class ParameterConcatenation(nn.Module):
 class GeneratedConvolution(nn.Module):
     """A convolution without bias whose kernel is a fully connected layer of the parameters.
 
-    Every sample of a batch is convolved with its own kernel. Starts as a He-initialised kernel
-    that the parameters vary by some tens of percent. `upsample`: a 4 x 4 transposed convolution of
-    stride 2 in place of 3 x 3, for as many outputs as inputs.
+    Starts as a He-initialised kernel that the parameters vary by some tens of percent. `upsample`:
+    a 4 x 4 transposed convolution of stride 2 in place of 3 x 3, for as many outputs as inputs.
     """
 
     def __init__(
@@ -162,10 +158,8 @@ def edge_map(image: Tensor) -> Tensor:
 class DecoupledNet(nn.Module):
     """Baseline DL: a network whose convolution weights are generated from the parameters.
 
-    Twenty convolutions: three (the third halves the size), seven dilated residual blocks of two,
-    one transposed that doubles it, two. Instance normalisation and ReLU after all but the last.
-    The image comes with its edge map. 4.88 M parameters at the published width. Instance
-    normalisation takes the absolute brightness out of the features, as published.
+    Instance normalisation, which takes the absolute brightness out of the features, and ReLU after
+    all convolutions but the last. The image comes with its edge map. 4.88 M parameters.
 
     Source: Fan et al. 2018, Decouple Learning for Parameterized Image Operators. One thing
     differs: no ReLU on the output, because a packed raw may be negative.

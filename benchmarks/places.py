@@ -1,10 +1,9 @@
 """Real places: the posterior of unknown light, other receptors than a dome, more training places.
 
 ``posterior`` says what `simulator.radiance.incident_light.POSTERIOR` covers in views that it was
-not fitted on. ``receptors`` judges the same policies on the same views where another receptor tells
-the right exposure. ``curve`` trains the regression agent on 5 to all training places, and on all
-without one thing or another: finished trainings lie under ``runs/bench_places``, and one that was
-stopped goes on.
+not fitted on. ``receptors`` judges the same policies where another receptor tells the right
+exposure. ``curve`` trains the regression agent on 5 to all training places, and on all without one
+thing or another: trainings lie under ``runs/bench_places``.
 """
 
 from __future__ import annotations

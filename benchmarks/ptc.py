@@ -1,10 +1,8 @@
 """The photon transfer curve of simulated cameras, measured as EMVA 1288 (release 4.0) measures it.
 
-Pairs of flat fields at a ladder of exposure times, dark ones included, of every built-in camera at
-a few ISOs, from the reference camera and from the transition engine. Measured are green planes:
+Measured are the green planes of pairs of flat fields at a ladder of exposure times:
 
-- mean and temporal variance of a pair; half the variance of its difference, so that what does not
-  change from frame to frame drops out;
+- the temporal variance is half the variance of a pair's difference;
 - the system gain K, digital numbers per electron: the slope, through the origin, of variance over
   mean, both less their dark values, from 0 to 70 % of saturation, where the variance is highest;
 - the dark noise: the square root of the dark variance, in digital numbers, rounding included;

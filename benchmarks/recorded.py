@@ -3,12 +3,10 @@
     ae-env bench recorded
     ae-env bench recorded FOLDER
 
-Of every scene of a recorded grid one capture is kept, the one that an average meter would have
-taken, and all other states are simulated from it. Each is compared with the capture that was
-really taken, and so are the scores. Without a folder: grids that the reference camera takes of
-held-out radiance maps, written to files and read back, and the real brackets of
-``boreal_brackets``, 1 to 32 ms in whole stops, whose exposure ratios are measured, too. The
-alternative is the same capture, scaled by the exposure ratio and clipped.
+All states are simulated from the capture that an average meter would have taken, and each is
+compared with the capture that was really taken; so are the scores. Without a folder: grids that the
+reference camera takes of held-out radiance maps, and the real brackets of ``boreal_brackets``,
+whose exposure ratios are measured, too. The alternative is the same capture, scaled and clipped.
 """
 
 from __future__ import annotations
@@ -141,8 +139,7 @@ def _boreal(grid: ExposureGrid) -> list[Scene]:
 def ratios() -> list[Row]:
     """Exposure ratio of consecutive frames, per plane, on block means.
 
-    Averaging blocks takes out noise and the frames' small shifts; blocks are selected by the mean
-    of both frames, because selecting by one would favour its noise.
+    Blocks are selected by the mean of both frames: selecting by one would favour its noise.
     """
     rows, reduced = [], partial(block_reduce, block_size=(1, BLOCK, BLOCK))
     for name in BRACKETS:

@@ -142,8 +142,7 @@ def _small(
 ) -> Iterator[tuple[str, str, np.ndarray]]:
     """Scene, scorer and scores (S,) of noisy captures without blur of the small test scenes.
 
-    They are taken at ISOs and exposures above that of the incident light [EV]; if `native`, each
-    pixel is one of the sensor's.
+    `taken`: ISOs, and exposures above the incident light's [EV]; `native`: pixels are the sensor's.
     """
     options = EnvOptions(scenes="bundled:small", split="test", resolution=SIZE)
     camera = options.make_camera()

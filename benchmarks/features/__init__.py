@@ -136,12 +136,9 @@ def judge(detects: dict[str, Detect], pairs: Iterator[HeldOutPair]) -> dict[str,
 def measures(first: Features, second: Features, homography: np.ndarray) -> dict[str, float]:
     """Measures of one pair under its true homography, from the first picture to the second.
 
-    Returns:
-        ``repeatability``: share of the keypoints seen by both pictures that the other one has
-        within 2 pixels, mean of both directions; ``accuracy_1`` to ``accuracy_5``: share of the
-        mutual nearest neighbours within so many pixels, 0 where there are none; ``matches``: how
-        many are within 3; ``corner_error``: mean error of the corners [pixel] under the estimated
-        homography, infinite where there is none.
+    ``repeatability``: share of the keypoints seen by both that the other one has within 2 pixels,
+    mean of both ways; ``accuracy_K``: share of the mutual nearest neighbours within K pixels;
+    ``matches``: how many are within 3; ``corner_error``: of the estimated homography [pixel].
     """
     i, j = mutual_matches(first.descriptors, second.descriptors)
     there, back = (f.points.double().numpy() for f in (first, second))
@@ -315,7 +312,6 @@ def measure(seed: int, body: int, quick: bool) -> list[Row]:
 
     `seed` is that of the training, `body` that of the test pairs and of the body that takes them.
     """
-    torch.set_num_threads(1)
     limit, steps = (QUICK_SOURCES, training.QUICK_STEPS) if quick else (None, training.STEPS)
     trained = {arm: training.train(arm, seed, steps, limit) for arm in training.AUGMENTATIONS}
     taken = conditions(*((QUICK_GAPS, QUICK_ISOS) if quick else ()))
@@ -328,7 +324,6 @@ def measure(seed: int, body: int, quick: bool) -> list[Row]:
 
 
 def measure_time(seed: int) -> list[Row]:
-    torch.set_num_threads(1)
     rows = []
     for arm, augmentation in training.AUGMENTATIONS.items():
         row: Row = {"arm": arm}

@@ -100,8 +100,7 @@ def crop_homography(
 ) -> np.ndarray:
     """(3, 3) from a picture to a crop of `size` pixels a side around `centre` (x, y).
 
-    Drawn: a factor of up to `scale` either way, a rotation of up to `turn` degrees, and shifts of
-    the corners of up to `jitter` sides of the crop.
+    `scale` and `turn` [degrees] are the most either way, `jitter` of the corners in sides.
     """
     half = 0.5 * size * scale ** rng.uniform(-1.0, 1.0)
     angle = np.radians(rng.uniform(-turn, turn))
@@ -180,11 +179,7 @@ def _double(channels_in: int, channels: int) -> nn.Sequential:
 
 
 class Detector(nn.Module):
-    """Scores and dense descriptors of a picture, both from one encoder.
-
-    After SuperPoint (DeTone et al. 2018): a softmax over the pixels of a cell and "none of them",
-    and normalised descriptors that are interpolated. It is smaller, and its cells are finer.
-    """
+    """Scores and dense descriptors of a picture: a small SuperPoint (DeTone et al. 2018)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -292,8 +287,7 @@ def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[De
     """The detector trained under an augmentation, or that of an earlier run; and its seconds.
 
     Random weights are trained without augmentation first, once for each seed, and go on under the
-    augmentation for as many steps. All arms see the same crops in the same order, and what they
-    make of the same few of them. `limit` is for photographs, and for maps; None for all.
+    augmentation for as many steps. All arms see the same crops in the same order.
     """
     files, checksum = (ROOT / "simulator" / "augment.py", Path(__file__)), 0
     for path in files:  # weights are those of one state of the code

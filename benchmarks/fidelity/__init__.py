@@ -1,9 +1,8 @@
 """The camera simulator against the reference camera: error and time of every module.
 
-Needs trained weights: ``compact`` comes with the package; ``paper`` and the baselines ``pc`` and
-``dl`` are trained by their configurations, once, where ``runs/simulator`` does not hold them. The
-real files that ``AE_ENV_DATA`` names are used where they are. One thread: what the networks are
-compared with runs on one.
+``compact`` comes with the package; ``paper`` and the baselines ``pc`` and ``dl`` are trained, once,
+where ``runs/simulator`` does not hold them. One thread: what the networks are compared with runs on
+one.
 """
 
 from __future__ import annotations

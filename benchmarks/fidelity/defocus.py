@@ -1,13 +1,11 @@
 """Opening the aperture: error by size of the circle of confusion; pictures in focus.
 
 The source is a noisy capture at f/11, the truth the noise-free mean at f/4 and the same exposure,
-with the reference camera's occlusion-aware defocus. Errors are pooled over the pixels of a class in
-held-out procedural scenes, and in each of the photographs with measured depth.
+with the reference camera's occlusion-aware defocus.
 
-Pictures that are in focus throughout may not change where their depth is not told: views into
-radiance maps, photographs and recorded mosaics of the test split, photographed at f/8 and opened to
-f/4. The change is that of the noise-free light against the same with ``depth="far"``, root mean
-square in units of the source's noise.
+Pictures that are in focus throughout may not change where their depth is not told: photographed at
+f/8 and opened to f/4. The change is that of the noise-free light against the same with
+``depth="far"``, root mean square in units of the source's noise.
 """
 
 from __future__ import annotations

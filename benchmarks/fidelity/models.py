@@ -17,7 +17,7 @@ from benchmarks.harness import Row, clipped, psnr, ssim
 from benchmarks.isolated import ROOT
 from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraProfile, CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.networks.noise_module import SIZES, NoiseModule
+from simulator.networks.noise_module import SIZES
 from simulator.networks.weights import load_modules
 from simulator.reference.reference_camera import ReferenceScene
 from simulator.training.crops import settings_parameters
@@ -27,17 +27,13 @@ from simulator.utils.files import data_folder
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
 FOLDER, CONFIGS = ROOT / "runs" / "simulator", ROOT / "configs" / "simulator"
 PRESETS, BASELINES = ("compact", "paper"), ("pc", "dl")
-#: Procedural groups of the test split, largest size of its scenes and of crops of them [packed
-#: pixel]; views into panoramas are 128 x 128.
-FULL, QUICK = (64, 256, 128), (6, 128, 64)
 
 
 @dataclass(frozen=True, eq=False)
 class Models:
     """Trained networks by name; those that were not trained are left out.
 
-    `corrected` are simulators with the w and b that the exposure module learnt for the body that
-    was trained on, as the paper uses them; `baselines` the paper's; `cards` the model cards.
+    `corrected` have the w and b that the exposure module learnt for the body it was trained on.
     """
 
     simulators: dict[str, CameraSimulator]
@@ -74,12 +70,6 @@ def load_models() -> Models:
     return Models(own, corrected, baselines, {name: card for name, (_, card) in loaded.items()})
 
 
-def trained_noise_modules() -> dict[str, NoiseModule]:
-    """The noise modules that come with the package, and the paper's where it was trained."""
-    names = {n: n for n in SIZES} | ({"paper": w} if (w := weights("paper")) else {})
-    return {n: load_modules(w)[0]["noise"] for n, w in names.items()}  # type: ignore[misc]
-
-
 @torch.no_grad()
 def baseline(network: nn.Module, raw: RawImage, target: CameraSettings) -> Tensor:
     """What one of the paper's baselines makes of a raw, (4, H, W): it is told both settings."""
@@ -92,14 +82,6 @@ def scores(estimate: Tensor, truth: Tensor, camera: CameraProfile) -> Row:
     image, window = clipped(estimate, camera), min(7, *(n - 1 + n % 2 for n in truth.shape[1:]))
     similar = ssim(image.numpy(), truth.numpy(), win_size=window)
     return {"psnr_db": psnr(image, truth), "ssim": similar}
-
-
-@functools.cache
-def held_out_scenes(camera: str, quick: bool) -> tuple[ReferenceScene, ...]:
-    """The test split: procedural groups, photographs and, where present, radiance maps."""
-    number, size, _ = QUICK if quick else FULL
-    profile, folder = get_camera(camera), data_folder()
-    return tuple(reference_scenes("test", profile, number=number, size=size, data=folder))
 
 
 def equal_exposure(reference: CameraSettings, iso: float, f_number: float) -> CameraSettings:

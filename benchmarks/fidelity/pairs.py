@@ -1,9 +1,7 @@
 """The paper's table: every method on pairs of captures that no training saw.
 
-Sources and targets are photographed by the reference camera: the body that was trained on, and one
-of another camera. An estimate is what a method makes of the source before the output's noise is
-added; it is compared with the noisy target, as the paper does, and with the target's noise-free
-mean. Everything is clipped to [-pedestal, 1] first.
+An estimate is what a method makes of the source before the output's noise is added; it is compared
+with the noisy target, as the paper does, and with the target's noise-free mean.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import numpy as np
 import pandas as pd
 from torch import Tensor
 
-from benchmarks.fidelity.models import FULL, QUICK, baseline, held_out_scenes, load_models, scores
+from benchmarks.fidelity.models import baseline, load_models, scores
 from benchmarks.harness import Row, pivot, table
 from simulator import CameraSettings, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
@@ -23,12 +21,15 @@ from simulator.reference.reference_camera import BodyError, ReferenceCamera, Ref
 from simulator.reference.sequences import Pair, any_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.training.crops import draw_sequences
+from simulator.training.scenes import reference_scenes
+from simulator.utils.files import data_folder
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.
 CAMERAS = {"nikon_z6": 1, "canon_70d": 7}
 _NAMES = {"nikon_z6": "Nikon Z6, trained body", "canon_70d": "Canon 70D, unseen"}
-#: Pairs of a camera, and those of a quick run: any two captures of a sequence, as the paper's.
-PAIRS, QUICK_PAIRS = 300, 6
+#: Pairs of a camera: any two captures of a sequence, as the paper's; procedural groups of the test
+#: split, largest size of its scenes and of crops of them [packed pixel]; and those of a quick run.
+FULL, QUICK = (300, 64, 256, 128), (6, 6, 128, 64)
 #: Defocus that can be seen [packed pixel].
 VISIBLE_BLUR = 1.5
 #: PSNR and SSIM that the paper publishes (table 1), on its own photographs.
@@ -42,11 +43,7 @@ PUBLISHED = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One pair, photographed: the noisy input, and the noisy output and its mean.
-
-    `group` is the source group of the scene, `blur` the largest circle of confusion of the source
-    in the crop [pixel].
-    """
+    """One pair, photographed; `blur` is the source's largest circle of confusion [pixel]."""
 
     group: str
     has_depth: bool
@@ -84,15 +81,15 @@ GROUPS: dict[str, Callable[[Case], bool]] = {
 
 
 def measure(camera: str, seed: int, quick: bool) -> list[Row]:
-    number, count = list(CAMERAS).index(camera), QUICK_PAIRS if quick else PAIRS
-    profile = get_camera(camera)
+    count, groups, size, crop = QUICK if quick else FULL
+    number, profile = list(CAMERAS).index(camera), get_camera(camera)
     reference = ReferenceCamera(profile, body=BodyError.draw(profile, CAMERAS[camera]))
-    sequences = draw_sequences(held_out_scenes(camera, quick), profile, seed)
+    scenes = reference_scenes("test", profile, number=groups, size=size, data=data_folder())
+    sequences = draw_sequences(scenes, profile, seed)
     pairs = any_pairs(sequences)
     if count < len(pairs):
         rng = np.random.default_rng([seed, number, 0])
         pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), count, replace=False))]
-    crop = (QUICK if quick else FULL)[2]
     cases = _photographed(pairs, sequences, reference, crop, seed)
     return list(_rows([(case, _scores(case)) for case in cases], camera))
 

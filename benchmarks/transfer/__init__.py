@@ -4,9 +4,8 @@
     ae-env bench transfer --part agents    # trains in every world, judges in the truth
     ae-env bench transfer --part tables    # score tables predicted from one raw
 
-Trained agents lie under ``runs/bench_transfer``, so that a second run continues where the first was
-stopped and trains nothing twice. They are known by their configuration: remove the folder after a
-change of the code that they depend on.
+Trained agents lie under ``runs/bench_transfer``, and are known by their configuration: remove the
+folder after a change of the code that they depend on.
 """
 
 from __future__ import annotations

@@ -188,10 +188,9 @@ Jobs = dict[tuple[str, str], list[TrainingJob]]
 
 
 def measure(seed: int, quick: bool) -> list[Row]:
-    """Trains what is not there yet, judges all agents; a row for each agent and world.
+    """A row for each agent and world, and for all agents of a world, as so many training seeds.
 
-    The agents of a world together are a row, too, as so many training seeds. `seed` is that of the
-    evaluation; the training seeds are the plan's.
+    `seed` is that of the evaluation; the training seeds are the plan's.
     """
     plan = plan_of(quick)
     jobs = training_jobs(plan, RUNS.parent / f"bench_transfer{'_quick' * quick}")
@@ -220,8 +219,7 @@ def measure(seed: int, quick: bool) -> list[Row]:
 def training_jobs(plan: TransferPlan, folder: Path) -> Jobs:
     """The trainings by agent and world: they differ in the environment's options only.
 
-    Seeds change slowest, so that a run that is stopped has some of every world. Worlds whose
-    networks are not there are left out.
+    Seeds change slowest, so that a run that is stopped has some of every world.
     """
     worlds, base = [name for name in plan.worlds if has_weights(name)], training_set(plan)
     jobs: Jobs = {(agent, world): [] for agent in plan.agents for world in worlds}

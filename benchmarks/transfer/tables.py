@@ -83,11 +83,8 @@ def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:
     """Measures of a predicted table, over the states that the scene allows.
 
     `true` is of the scene's own light; `totals` makes scores (S,) of those of the scorer's parts.
-
-    Returns:
-        ``rank_correlation``: Spearman's; ``regret``: what the state that looks best loses in the
-        true table; ``absolute_error``: mean over the states; ``terms``: how much of it there is if
-        only that part of the scorer is the predicted one.
+    ``regret`` is what the state that looks best loses in the true table; ``terms`` how much of the
+    absolute error there is if only that part of the scorer is the predicted one.
     """
     allowed = np.ones(len(true.mean), bool) if true.allowed is None else true.allowed
     right, row = totals(true.parts), Measured()

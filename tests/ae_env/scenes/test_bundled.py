@@ -4,7 +4,6 @@ import functools
 import hashlib
 import logging
 import math
-import pickle
 import threading
 from collections import Counter
 from dataclasses import replace
@@ -27,7 +26,7 @@ from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
 from simulator.radiance.reading import read_radiance
 from simulator.utils.cache import disk_cache
-from tests.ae_env.environments import assert_equal, make_env, make_envs
+from tests.ae_env.environments import make_env
 from tests.ae_env.scene_files import write_hdr
 from tests.ae_env.scorer_images import make_scene
 
@@ -141,7 +140,7 @@ def test_cached_scenes_equal_fresh_ones(tmp_path, monkeypatch, caplog):
     fresh = load()
     assert {scene.kind for scene in fresh} == {"photograph"}
     (file,) = (tmp_path / "scenes").glob("*.safetensors")
-    content, cache, key = file.read_bytes(), disk_cache(), f"scenes/{file.stem}"
+    cache, key = disk_cache(), f"scenes/{file.stem}"
     stored = cache.get(key)
     for a, b in zip(fresh, load(), strict=True):
         assert torch.equal(a.light, b.light)
@@ -150,12 +149,8 @@ def test_cached_scenes_equal_fresh_ones(tmp_path, monkeypatch, caplog):
     assert not caplog.records
     light = stored["light"]
     nan = torch.where(light == light.max(), torch.nan, light)
-    whole = nan, light[1:], light[..., :30]  # files that cannot be right
-    for damaged in (content[: len(content) // 2], *whole):
-        if isinstance(damaged, bytes):
-            file.write_bytes(damaged)
-        else:
-            cache.put(key, {**stored, "light": damaged})
+    for damaged in (nan, light[1:], light[..., :30]):  # files that cannot be right
+        cache.put(key, {**stored, "light": damaged})
         again = load()
         assert "damaged" in caplog.text
         assert all(torch.equal(a.light, b.light) for a, b in zip(fresh, again, strict=True))
@@ -228,26 +223,6 @@ def test_drawn_one_by_one_they_are_those_drawn_together(tmp_path, monkeypatch) -
     assert drawn[-2:] == drawn[:][-2:]
     with pytest.raises(IndexError):
         drawn[len(drawn)]
-
-
-@pytest.mark.usefixtures("empty_cache")
-def test_episodes_do_not_depend_on_when_scenes_are_drawn() -> None:
-    def episodes() -> list[tuple[object, ...]]:
-        _LOADED.clear()
-        envs = make_envs(3, scenes="bundled:spot_light", split="test")
-        core = envs.unwrapped.core
-        loaded.append(len(core.scenes.loaded))
-        found: list[tuple[object, ...]] = [envs.reset(seed=5)]
-        found += [envs.step(np.full(3, action)) for action in range(0, 21, 7)]
-        unpickled = pickle.loads(pickle.dumps(core))
-        assert_equal(unpickled.episodes.columns(), core.episodes.columns())
-        return found
-
-    loaded: list[int] = []
-    first = episodes()
-    load_scenes("bundled:spot_light", "test", camera=CAMERA, resolution=36)  # draws and stores all
-    assert_equal(first, episodes())
-    assert loaded[0] < loaded[1] == 10
 
 
 def test_the_list_splits_places_and_each_kind_is_tested(tmp_path, monkeypatch):

@@ -302,15 +302,6 @@ def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path):
     assert float(whole.std()) > 1e-3
 
 
-def test_maps_are_kept_and_made_again_where_damaged(weights, tmp_path, monkeypatch, caplog) -> None:
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    first = SceneNetworks(weights).resized(noisy_scene(), 40).defocus_map
-    (file,) = (tmp_path / "defocus_maps").iterdir()
-    file.write_bytes(b"damaged")
-    assert torch.equal(SceneNetworks(weights).resized(noisy_scene(), 40).defocus_map, first)
-    assert f"{file} is damaged" in caplog.text
-
-
 def test_it_is_metered_by_its_mean_and_drawn_by_name_and_seed():
     drawn = [simulate_source_raw(random_scene(scene_id=f"scene-{i}")) for i in range(20)]
     isos = [scene.reference.iso for scene in drawn]

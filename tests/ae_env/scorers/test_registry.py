@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ae_env import AutoExposureEnv, AutoExposureVectorEnv
 from ae_env.scenes import Scene
-from ae_env.scorers import Balanced, CompositeScorer, list_scorers, make_scorer, registry
+from ae_env.scorers import CompositeScorer, list_scorers, make_scorer, registry
 from ae_env.scorers.captures import Captures
 from ae_env.scorers.defects import DEFECTS
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
@@ -240,19 +240,6 @@ def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for(
         make_scorer(Own())(None, captures)
 
 
-def test_a_slow_scorer_is_named_once(caplog, monkeypatch):
-    captures, clock = make_captures(random_scene(), [GRID[20]]), [100.0]
-    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
-    for name, seconds in (("quick", 4.9), ("slow", 5.1), ("slow", 5.1)):
-
-        def rate(images, _, seconds=seconds):
-            clock[0] += seconds
-            return mean_signal(images, captures)
-
-        CompositeScorer({name: Own(rate)})(torch.zeros(1, 4, 8, 8), captures)
-    assert [record.args[0] for record in caplog.records] == ["slow"]
-
-
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
 def test_a_scorer_that_raises_is_named_with_its_cause(depends_on: str) -> None:
     env = AutoExposureEnv(scorer=Own(lambda *_: 1 / 0, depends_on=depends_on), **SMALL)
@@ -313,19 +300,6 @@ def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
     with pytest.raises(UserCodeError, match="scorer 'Own' changed its `captures` in place"):
         env.reset(seed=0)
     assert all(torch.equal(s.clean_light, b) for s, b in zip(env.scenes, before, strict=True))
-
-
-@pytest.mark.parametrize("kind", [np.array, torch.tensor])
-def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind):
-    highlights = np.exp(-1.0 / 0.15) * (1.0 - np.array([0.0, 1e-16, 1e-15, 1e-12, 1e-9]))
-    assert (-0.15 * np.log(highlights) > 1.0).any()  # else this shows nothing
-    scores = dict.fromkeys(("brightness", "shadows", "noise", "sharpness"), np.ones(5))
-    scores["highlights"] = highlights
-    totals = Balanced().combine({name: kind(values) for name, values in scores.items()})
-    assert 0.0 <= float(totals.min()) <= float(totals.max()) <= 1.0
-    assert Balanced().combine(dict.fromkeys(scores, kind(np.ones(3)))).tolist() == [1.0] * 3
-    means = CompositeScorer({"own": Own()}).combine({"own": kind([-1e-9, 0.5, 1.0 + 1e-9])})
-    assert means.tolist() == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("total", [math.nan, math.inf, -0.1, 1.1])

@@ -109,11 +109,7 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     noises = [read(18.0**-2), read(18.0**-2 / 16), read(0.0), read(18.0**-2 / 16)]
     noises[2] = NoiseLevelFunction((shot,) * 4, nothing)
     captures = replace(captures, nlf=noises)
-    own = Noise()
-    own.half_snr = 72.0  # (72 / 18)^1.5 = 8
-    wanted = [1 / 9, 0.5, 1 / 9, 0.5]
-    assert own(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
-    wanted = [0.5, 8 / 9, 0.5, 8 / 9]
+    wanted = [0.5, 8 / 9, 0.5, 8 / 9]  # 4^1.5 = 8
     assert make_scorer("noise")(images, captures).tolist() == pytest.approx(wanted, rel=1e-5)
     # A source that brings more noise than the settings have, or less.
     captures = replace(captures, source_noise=[read(18.0**-2 / 100)] * 3 + [read(18.0**-2)])
@@ -272,18 +268,13 @@ def test_ties_go_to_the_lower_iso() -> None:
 
 
 def test_bands_count_whatever_form_the_gain_has() -> None:
-    scene, rows = _flat(0.05), np.full((8, 40), 1.9)
+    scene, rows = _flat(0.05), np.full((2, 40), 1.9)
     rows[:, 20:] = 0.1
-    # Half of the rows each: the standard deviation is half the distance, 2.124 stops.
-    banding = 1.0 / (1.0 + (np.log2(1.9 / 0.1) / 2.0 / 0.1) ** 2)
-    for gain in (1.0, 0.5, np.ones(8)):
-        table = _tables("banding").table(scene, gain=gain, row_gain=rows)
-        np.testing.assert_allclose(table.mean, banding, rtol=1e-6)
     top = Own(lambda images, _: images[:, :, :20].mean(dim=(1, 2, 3)))
     grid = ExposureGrid((100,), (1 / 500, 1 / 250), (4,))
     for noise, gain in ((False, 1.0), (True, np.ones(2))):
         tables = _tables(top, grid=grid, noise=noise)
-        found = tables.table(scene, gain=gain, row_gain=rows[:2]).mean
+        found = tables.table(scene, gain=gain, row_gain=rows).mean
         np.testing.assert_allclose(found, 0.05 * 1.9 * _light(scene, grid), atol=1e-3)
 
 

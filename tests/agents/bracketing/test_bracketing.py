@@ -128,13 +128,6 @@ def test_what_frames_show_is_counted_by_hand() -> None:
     assert dict(zip(BINS[found > 0], found[found > 0], strict=True)) == {-2: 0.4, 0: 0.4, 4: 0.2}
 
 
-def test_blur_costs_what_was_measured() -> None:
-    """A blur of a quarter pixel of a 64-pixel frame costs nothing, one of 4 pixels 0.17 EV."""
-    costs = brackets.blur_error(np.array([0.0, 0.25, 4.0, 8.0, 4.0 * 2**0.5, 1000.0]))
-    expected = [0.0, 0.0, 0.17012548, 0.31782454, (0.17012548 + 0.31782454) / 2, 0.43819642]
-    np.testing.assert_allclose(costs, expected, rtol=1e-6)
-
-
 def test_only_the_planner_that_knows_blur_shortens_the_exposures_of_a_shaken_camera() -> None:
     envs = make_envs(8)
     context, (observations, _) = PolicyContext.from_envs(envs), envs.reset(seed=1)

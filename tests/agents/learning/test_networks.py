@@ -12,7 +12,7 @@ from torch import nn
 from ae_env.grid import ExposureGrid
 from ae_env.lighting.moving import MOVES
 from ae_env.observation import encode_sensors
-from agents.learning import forecaster, networks, ppo
+from agents.learning import forecaster, networks
 from agents.learning.forecaster import ForecasterTraining, LightForecaster, metered
 from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, MeterHistory, StateHead
 from agents.learning.regression import ScoreRegressor, observation_tensors
@@ -281,12 +281,6 @@ def test_training_frames_differ_in_the_raw_and_tell_the_right_exposure(make_tiny
         assert seen["raw"].mean() == pytest.approx(moved["raw"].mean(), rel=0.2)
         for name in ("settings", "sensors"):
             np.testing.assert_array_equal(seen[name], moved[name])
-
-
-def test_a_loss_joins_the_gradient() -> None:
-    tensor, weight = torch.ones(3, requires_grad=True), torch.tensor(3.0, requires_grad=True)
-    (2.0 * ppo._WithLoss.apply(tensor, weight.square())).sum().backward()
-    assert [tensor.grad.tolist(), weight.grad] == [[2.0] * 3, 6.0]
 
 
 def test_it_holds_readings_exposures_and_what_was_asked_for(context, photograph):

@@ -7,7 +7,7 @@ from ae_env.observation import decode_observation
 from agents.metering import reading as readings
 from agents.metering.meters import make_meter, weight_map
 from agents.metering.reading import EVTracker, frame_ev100
-from agents.policy_names import METERS, make_policy
+from agents.policy_names import METERS
 
 GREY = np.ones((64, 64))
 
@@ -147,21 +147,6 @@ def test_steps_go_on_from_the_estimate_and_not_from_the_state(context, photograp
     assert steps[0] > 0.3
 
 
-@pytest.mark.parametrize("name", ["shim", "zhang", "entropy"])
-def test_the_dark_is_left(context, photograph, name):
-    """8 EV under at the start, and again after a flash of EV 35: within 2 EV of the light."""
-    rng = np.random.default_rng(0)
-    light = 1.0 + 0.1 * np.kron(rng.uniform(-1, 1, (16, 16)), np.ones((4, 4)))
-    policy = make_policy(f"{name}:P", context)
-    policy.reset(1)
-    state = np.array([context.grid.nearest(17.0)])
-    for frame in range(26):
-        if frame == 12:
-            assert context.grid.ev100[state[0]] < 9.0 + 1.6
-        state = policy.act(photograph(light, 35.0 if frame in (13, 14) else 9.0, state))
-    assert context.grid.ev100[state[0]] < 9.0 + 1.6
-
-
 def test_highlights_are_exposed_to_nine_tenths_of_white(context, photograph):
     """The 99th percentile of the brightest plane of each pixel; where it is white, by a bound."""
     state, meter = context.grid.nearest(9.0), make_meter("highlight_weighted", context.camera)
@@ -254,14 +239,3 @@ def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
         np.testing.assert_array_equal(reading.ev100, plain.ev100)
         np.testing.assert_array_equal(reading.saturated, plain.saturated)
     assert reading.saturated[0] == 1.0
-
-
-def test_only_zones_that_both_show_are_compared():
-    before = np.array([0.02, 0.1, 0.3, np.nan, 0.5])
-    now = np.array([0.08, 0.4, np.nan, 0.9, np.nan])
-    stops, enough = readings.light_change(before, now)
-    assert stops == pytest.approx(2.0)
-    assert enough
-    for dark in (np.full(5, 1e-4), np.full(5, np.nan)):
-        stops, enough = readings.light_change(dark, now)
-        assert (stops, enough) == (0.0, False)

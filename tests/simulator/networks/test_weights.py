@@ -261,13 +261,6 @@ def test_other_weights_are_seen(change: str) -> None:
     assert not torch.equal(after, before)
 
 
-def test_a_result_changed_in_place_is_made_again() -> None:
-    simulator, raw = _simulator(), _raw()
-    expected = _denoised(simulator, raw).clone()
-    _denoised(simulator, raw).mul_(2.0)
-    assert torch.equal(_denoised(simulator, raw), expected)
-
-
 @pytest.mark.parametrize("wrong", [torch.zeros(4, 3), torch.full((1, 2, 3), torch.nan)])
 def test_an_implausible_result_on_disk_is_made_again(wrong: torch.Tensor, folder: Path) -> None:
     module, image = nn.Identity(), torch.ones(1, 2, 3)
@@ -283,7 +276,6 @@ def test_an_implausible_result_on_disk_is_made_again(wrong: torch.Tensor, folder
 
 #: Planes R, G1, G2, B as R, G1, B, G2, and back.
 SWAP = [0, 1, 3, 2]
-F11, F4 = 2.0 ** (7 / 2), 4.0
 
 
 @pytest.fixture(scope="module")

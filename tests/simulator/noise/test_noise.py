@@ -19,9 +19,8 @@ from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture import sensor
-from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import Layout, PreparedScene
-from simulator.capture.sensor import exposure_table, noise_keys, record
+from simulator.capture.sensor import noise_keys, record
 from simulator.noise import noise_level_function as nlfs
 from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, philox
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
@@ -30,7 +29,6 @@ from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))
-NOISY = NoiseLevelFunction((5e-4, 4e-4, 4e-4, 3e-4), (5e-7, 4e-7, 4e-7, 3e-7))
 ZERO = NoiseLevelFunction.zero()
 
 
@@ -77,18 +75,6 @@ def test_bad_noise_level_functions_are_refused(name: str, value: object) -> None
     arguments = {"shot": (1e-5,) * 4, "read": (1e-8,) * 4, name: value}
     with pytest.raises(ValueError, match=f"`{name}`"):
         NoiseLevelFunction(**arguments)
-
-
-def test_the_table_has_the_differences_in_float64() -> None:
-    first = NoiseLevelFunction((1e-4,) * 4, CLEAN.read)
-    nearly = NoiseLevelFunction((1e-4 * (1 + 1e-12),) * 4, CLEAN.read)
-    table = exposure_table([Exposure(1.0, first, nearly), Exposure(1.0, CLEAN, NOISY)])
-    assert table.shape == (2, 5, 4)
-    assert table[0, 1] == pytest.approx(1e-16, rel=1e-3)
-    assert table[0, 2].tolist() == [0.0] * 4
-    np.testing.assert_allclose(table[1, 1], np.subtract(NOISY.shot, CLEAN.shot), rtol=1e-6)
-    np.testing.assert_allclose(table[1, 3:], [CLEAN.shot, CLEAN.read], rtol=1e-6)
-    assert exposure_table([]).shape == (0, 5, 4)
 
 
 # -- rows and tails of read noise -------------------------------------------------------------

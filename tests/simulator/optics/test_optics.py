@@ -186,25 +186,6 @@ def test_blur_is_a_sum_of_shifts(path: Path, size: tuple[int, int]) -> None:
         np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
-def _apart(light: torch.Tensor, mask: np.ndarray, path: Path, own: Path) -> torch.Tensor:
-    behind = torch.arange(mask.size).reshape(mask.shape)
-    subject, taps = torch.from_numpy(mask), [path_taps(p, *mask.shape) for p in (path, own)]
-    behind[subject] = behind[~subject][0]
-    return motion.path_blur_apart(light, subject[None].float(), behind, *taps)
-
-
-def test_a_moving_subject_keeps_its_light_and_has_no_dark_fringe() -> None:
-    mask = np.zeros((40, 40), bool)
-    mask[15:22, 15:22] = True
-    path, own = Path(6.0, 1.0), Path(6.0, 1.0, drift_x=9.0)
-    even = _apart(torch.full((1, 40, 40), 0.3), mask, path, own)
-    torch.testing.assert_close(even, torch.full((1, 40, 40), 0.3))
-    lamp = torch.from_numpy(np.where(mask, 5.0, 0.0).astype(np.float32))[None]
-    assert float(_apart(lamp, mask, path, own).sum()) == pytest.approx(5.0 * mask.sum(), rel=1e-5)
-    white = _apart(torch.ones(1, 40, 40) - lamp / 5.0, mask, path, own)  # a black subject
-    assert 0.0 <= float(white.min()) < float(white.max()) == pytest.approx(1.0)
-
-
 # -- lamps: light in closed form, by adaptive quadrature and exact fractions -----------------------
 
 TIMES = (1 / 8000, 1 / 1000, 1 / 120, 0.01, 1 / 60, 0.35)

@@ -3,10 +3,8 @@ import os
 import re
 import shutil
 import struct
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import pytest
@@ -106,13 +104,20 @@ def test_a_raw_without_noise_is_read_and_phones_mark_no_stops(tmp_path, caplog):
 
 def test_gain_maps_and_baseline_go_along(tmp_path):
     maps = {f"OpcodeList{i}": ("B", tuple(range(i, i + 40))) for i in (1, 2, 3)}
-    path = write_sample_dng(tmp_path / "a.dng", BaselineExposure=("2i", (3, 2)), **maps)
-    content = path.read_bytes()
-    for name in maps:  # of type UNDEFINED, which tifffile does not write
-        old, new = (struct.pack("<HHI", CODE[name], kind, 40) for kind in (1, 7))
-        content = content.replace(old, new)
-    path.write_bytes(content)
-    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+
+    def read(**tags):
+        path = write_sample_dng(tmp_path / "a.dng", **maps, **tags)
+        content = path.read_bytes()
+        for name in maps:  # of type UNDEFINED, which tifffile does not write
+            old, new = (struct.pack("<HHI", CODE[name], kind, 40) for kind in (1, 7))
+            content = content.replace(old, new)
+        path.write_bytes(content)
+        return read_raw(path, settings=SETTINGS, nlf=NLF)
+
+    # Those of another frame than the visible area are left out.
+    assert list(read(ActiveArea=("I", (2, 4, 64, 96))).metadata["opcodes"][1]) == [*maps][1:]
+    assert "opcodes" not in read(ActiveArea=("I", (1, 1, 63, 95))).metadata  # LibRaw's is even
+    raw = read(BaselineExposure=("2i", (3, 2)))
     write_dng(tmp_path / "b.dng", raw)
     write_dng(tmp_path / "c.dng", replace(raw, data=raw.data[:, 4:, 4:].contiguous()))
     with tifffile.TiffFile(tmp_path / "b.dng") as file:
@@ -124,19 +129,14 @@ def test_gain_maps_and_baseline_go_along(tmp_path):
         assert not set(maps) & {tag.name for tag in file.pages[0].tags}
 
 
-def test_a_pixels_own_black_level_makes_nothing_white_and_may_be_negative(tmp_path):
-    deltas = {"BlackLevelDeltaH": ("2i", (20, 1) * 48 + (-20, 1) * 48)}
-    path, given = tmp_path / "a.dng", {"settings": SETTINGS, "nlf": NLF}
-    raw = read_raw(write_sample_dng(path, MOSAIC * 0 + 4090, **deltas), **given)
-    wanted = np.array([4090 - 20, 4094]) - 64  # 4095 is white
-    np.testing.assert_allclose(raw.data.unique(), wanted / (4095 - 64), rtol=1e-6)
-    assert not raw.saturated.any()
-    for rows in (64, 1024, 1025, 2602):
-        deltas = {"BlackLevelDeltaV": ("2i", (-1, 10) * rows)}
-        mosaic = np.resize(MOSAIC, (rows, 96))
-        raw = read_raw(write_sample_dng(path, mosaic, black=(0,), **deltas), **given)
-        light = (mosaic[: rows // 2 * 2 : 2, ::2] + 0.1) / 4095
-        np.testing.assert_allclose(raw.data[0], light, rtol=1e-6)
+@pytest.mark.parametrize("rows", [64, 1024, 1025, 2602])
+def test_a_rows_own_black_level_may_be_negative(tmp_path, rows):
+    deltas = {"BlackLevelDeltaV": ("2i", (-1, 10) * rows)}
+    mosaic = np.resize(MOSAIC, (rows, 96))
+    path = write_sample_dng(tmp_path / "a.dng", mosaic, black=(0,), **deltas)
+    light = (mosaic[: rows // 2 * 2 : 2, ::2] + 0.1) / 4095
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    np.testing.assert_allclose(raw.data[0], light, rtol=1e-6)
 
 
 def test_levels_colour_and_metadata(tmp_path):
@@ -446,29 +446,13 @@ def test_identities_of_other_containers(tmp_path):
         assert is_raw_container(io.BytesIO(content)) is is_raw  # a whole Canon CRW names its camera
 
 
-@pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
-@pytest.mark.parametrize("kind", [1, 3, 4, 5, 12])
-def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
-    codes = sorted({*range(254, 345), *tifffile.TIFF.TAG_READERS, *range(50706, 50830), 34665})
-    path = tmp_path / "a.dng"
-    path.write_bytes(tiff([(code, kind, count, 4096) for code in codes]))
-    os.truncate(path, 5 * 2**30)
-    tracemalloc.start()
-    with path.open("rb") as stream:
-        read_directories(stream)
-    assert tracemalloc.get_traced_memory()[1] < 64 * 2**20
-    tracemalloc.stop()
-
-
 def test_structures_that_never_end_are_left_and_a_damaged_tag_costs_no_other():
     # A directory that is its own sub-directory, EXIF directory and successor.
     loop = [(CODE[name], 4, 1, 8) for name in ("SubIFDs", "ExifTag")]
     assert read_directories(io.BytesIO(tiff(loop, following=8))) == []
-    # One place very many times (13 s where each waits for its turn), and places that are none.
+    # One place very many times, and places that are none.
     many = tiff([(CODE["SubIFDs"], 4, 2**18 - 1, 26)]).ljust(26, b"\0") + b"\x08\0\0\0" * 2**18
-    began = process_time()
     assert read_directories(io.BytesIO(many)) == []
-    assert process_time() - began < 2.0
     assert read_directories(io.BytesIO(tiff([(CODE["SubIFDs"], 2, 1, 0x41)]))) == []  # text
     # A chain of very many directories.
     entry = struct.pack("<HHII", CODE["Make"], 2, 4, 0x00414141)
@@ -483,15 +467,3 @@ def test_structures_that_never_end_are_left_and_a_damaged_tag_costs_no_other():
     for magic, found in ((42, 1), (0x4F52, 1), (0x5352, 1), (0x55, 1), (0, 0)):
         file = io.BytesIO(content[:2] + struct.pack("<H", magic) + content[4:])
         assert read_directories(file) == found * [{"WhiteLevel": (4095,)}]
-
-
-def test_opcode_lists_of_another_frame_are_left_out(tmp_path):
-    tags = {"StripOffsets": (8,), "ImageLength": (64,), "ImageWidth": (96,)}
-    tags |= {"PhotometricInterpretation": (32803,), "OpcodeList1": (b"1",), "OpcodeList3": (b"3",)}
-    for area, origin, size, left in (
-        ((0, 0, 64, 96), (0, 0), (32, 48), ["OpcodeList1", "OpcodeList3"]),
-        ((2, 4, 64, 96), (2, 4), (31, 46), ["OpcodeList3"]),  # bad pixels: of the whole sensor
-        ((1, 1, 63, 95), (2, 2), (30, 46), []),  # as LibRaw begins an odd area
-    ):
-        found = read_module._passed_on(tmp_path, [tags | {"ActiveArea": area}], origin, size)
-        assert list(found.get("opcodes", (0, {}))[1]) == left
