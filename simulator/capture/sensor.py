@@ -408,7 +408,7 @@ def record_stepwise(
             outputs["codes"][part] = codes.to(torch.uint8)
         if "signals" in outputs:
             outputs["signals"][part] = numbers.sub_(black).div_(span)
-    return counts.cpu().numpy()
+    return counts.cpu().numpy() if count else np.zeros((len(lights), 2), np.int64)
 
 
 def _stacked(shares: Sequence[torch.Tensor | None], like: torch.Tensor) -> torch.Tensor | None:
