@@ -14,10 +14,9 @@ from safetensors.numpy import save_file
 
 from ae_env.grid import ExposureGrid
 from agents.metering import programs
-from agents.metering.metering_policy import MeteringPolicy
+from agents.metering.metering_policy import MeteringPolicy, ScoreRegression
 from agents.metering.programs import ProgramOptions, StateChooser, program_cost
 from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
-from agents.metering.tuned import ScoreRegression
 from agents.policy import PolicyContext
 from agents.policy_names import METERS, make_policy
 from agents.rollouts import make_envs
