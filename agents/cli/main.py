@@ -25,7 +25,7 @@ from typer.core import TyperGroup
 
 from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
-from agents.cli.evaluate import evaluate
+from agents.cli.evaluate import evaluate, stability
 from agents.cli.quickstart import quickstart
 from agents.cli.show import film, judge, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
@@ -137,7 +137,7 @@ app = typer.Typer(
     "mistake in an option or a file, 1 for a failure while running.",
 )
 for command in (
-    *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
+    *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate, stability),
     *(view, judge, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)

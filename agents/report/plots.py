@@ -12,6 +12,7 @@ from PIL import Image
 
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
+from agents.evaluation.stability import DELAYS, LEAD, STEPS, Stability
 from simulator.utils.files import write_picture
 
 if TYPE_CHECKING:
@@ -128,6 +129,51 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
         lines = panels[0].get_lines()
         figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
     return _write(path, figure)
+
+
+def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
+    """Draw frames to settle, margins of the loop gain and three answers to steps, as PNG.
+
+    `rows` are the `stability_rows` of what was `found`.
+    """
+    figure, cases = _figure(12.0, 3.6), found.cases
+    heat, margins, traces = figure.subplots(1, 3, width_ratios=(4, 4, 5))
+    sound = cases[(cases.fault == "none") & (cases.gain == 0.0)]
+    image = heat.imshow(sound.settling.to_numpy().reshape(len(DELAYS), -1), origin="lower")
+    image.cmap.set_bad("0.85")
+    cycling = sound[sound.amplitude > 0.0]
+    places = cycling.step.map(STEPS.index), cycling.delay
+    heat.plot(*places, "x", color="#D55E00", label="limit cycle")
+    heat.set_xticks(range(len(STEPS)), [f"{step:+g}" for step in STEPS])
+    heat.set(xlabel="step of the light [EV]", ylabel="delay [frames]", title="no fault")
+    figure.colorbar(image, ax=heat, label="frames to settle (grey: does not)")
+    for i, (fault, own) in enumerate(rows.groupby("fault", sort=False)):
+        (line,) = margins.plot(own.delay, own.gain_margin, ".-", label=fault)
+        line.set(**line_style(i))
+    margins.plot(rows.delay, rows.analytic, "k:", lw=2.5, label="theory, no fault")
+    margins.set_ylim(-0.1, cases.gain.max() + 0.1)
+    margins.set(xlabel="delay [frames]", ylabel="loop gain up to which it settles [stops]")
+    margins.legend(fontsize=7)
+    plain = cases.gain == 0.0
+    pulse = int(cases.amplitude.where(plain & cases.settling.notna(), 0.0).argmax())
+    for i, (delay, step) in enumerate(((2, 4.0), (6, -8.0))):
+        at = ((sound.delay == delay) & (sound.step == step)).to_numpy()
+        _trace(traces, found, int(sound.index.to_numpy()[at][0]), i)
+    _trace(traces, found, pulse if cases.amplitude[pulse] else int(sound.index[-1]), 2)
+    traces.set(xlabel="frames after the step", ylabel="exposure from the last light's [EV100]")
+    traces.legend(fontsize=7)
+    for panel in (margins, traces):
+        _tidy(panel, labelsize=8)
+    figure.suptitle(_text(found.name), fontsize=11)
+    return _write(path, figure)
+
+
+def _trace(axes: Axes, found: Stability, row: int, index: int) -> None:
+    """The exposure of one case, against where the light is before the step."""
+    case, evs = found.cases.loc[row], found.evs[row] - found.evs[row, LEAD - 1]
+    style: dict[str, Any] = {"lw": 1.2, **line_style(index)}
+    style["label"] = f"{case.step:+g} EV, delay {case.delay}, {case.fault}"
+    axes.plot(np.arange(len(evs)) - LEAD, evs, **style)
 
 
 def line_style(index: int) -> dict[str, str]:
