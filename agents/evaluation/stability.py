@@ -8,7 +8,7 @@ the next exposure. All cases run side by side: NumPy columns of (frames, cases),
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -18,11 +18,12 @@ import numpy as np
 import pandas as pd
 
 from ae_env.grid import ExposureGrid
-from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
+from ae_env.observation import PEDESTAL, encode_settings
+from ae_env.utils.user_files import UserCodeError
 from agents.evaluation.metrics import frames_to_settle, overshoot
 from agents.metering.reading import TARGET_SIGNAL
 from agents.metering.rpi_agc import zone_map
-from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext
+from agents.policy import Floats, Ints, Observations, PolicyContext
 from agents.policy_names import is_metering, make_policy, split_options
 from agents.rollouts import checked_states, choose, errors_of
 from simulator.camera import get_camera
@@ -57,8 +58,9 @@ _PERIODIC, _NEARLY = 0.5, 0.95
 #: levels of the mean signal that a law reads.
 _GREYS = 0.1 * np.array([0, 3, -4, 8, -10, 12, -16, 5, -6, 14, -20, 1, -2, 9, -13])
 _PLANES, _ELECTRONS, LEVELS = np.array([0.5, 1.0, 1.0, 0.6]), 2.0**16, 2**12 - 1
-#: Sides of frames: of meters, and of agents and users' own policies.
-_SMALL, _USUAL = 16, 64
+#: Sides of frames, and most cases at once: of meters, and of agents and users' own policies, of
+#: which more at once would be slower.
+_SMALL, _USUAL = (16, 1024), (64, 32)
 
 
 class Cases(NamedTuple):
@@ -70,8 +72,8 @@ class Cases(NamedTuple):
     step: Floats  # of the light [EV]
     light: Floats
 
-    def take(self, rows: Bools) -> Cases:
-        """The cases that `rows` marks."""
+    def take(self, rows: Ints) -> Cases:
+        """The cases of these indices."""
         columns: Any = (column[rows] for column in self)
         return Cases(*columns)
 
@@ -105,14 +107,12 @@ def split(ev100: Floats) -> Request:
 def carry_out(asked: Request, cases: Cases) -> tuple[Request, Floats]:
     """What the camera reports of a frame, and the EV100 at which it was really exposed."""
     time, gain = asked
-    banding = np.char.startswith(FAULTS, "banding")[cases.fault]
-    mismatch = np.isin(FAULTS, ("gain", "banding and gain"))[cases.fault]
-    lines = cases.fault == FAULTS.index("lines")
+    kinds = [("lines",), ("banding", "banding and gain"), ("gain", "banding and gain")]
+    lines, banding, mismatch = (np.isin(FAULTS, kind)[cases.fault] for kind in kinds)
     seconds = np.exp2(time)
     whole = np.floor(seconds / PERIOD + 1e-9) * PERIOD
-    floored = np.where(banding & (whole > 0.0), np.maximum(whole, PERIOD), seconds)
-    floored = np.where(lines, np.maximum(np.round(seconds / LINE), 1.0) * LINE, floored)
-    shown = np.log2(floored)
+    seconds = np.where(banding & (whole > 0.0), whole, seconds)
+    shown = np.log2(np.where(lines, np.maximum(np.round(seconds / LINE), 1.0) * LINE, seconds))
     made_up = np.where(banding, np.clip(gain + time - shown, 0.0, MOST_GAIN), gain)
     real = AV - shown - made_up * np.where(mismatch, RECIPROCITY, 1.0)
     return Request(shown, made_up), CENTRE_EV + np.exp2(cases.gain) * (real - CENTRE_EV)
@@ -154,9 +154,8 @@ class Proportional:
         error = np.log2(seen / TARGET_SIGNAL)
         error = np.where(np.abs(error) <= self.dead_zone, 0.0, error)
         base = taken.ev100 if self.anchored else self._asked
-        least = AV - TIMES[1] - MOST_GAIN
         move = np.clip(self.gain * error, -self.slew, self.slew)
-        self._asked = np.clip(base + move, least, AV - TIMES[0])
+        self._asked = np.clip(base + move, AV - TIMES[1] - MOST_GAIN, AV - TIMES[0])
         return split(self._asked)
 
 
@@ -164,11 +163,10 @@ class PolicyLoop:
     """A policy of the package or of a user's own, which sees frames of grey zones with noise."""
 
     def __init__(self, name: str, delay: int = 0, seed: int = 0) -> None:
-        side = _SMALL if is_metering(name) else _USUAL
+        side, self.most = _SMALL if is_metering(name) else _USUAL
         raw = gym.spaces.Box(0, 255, (4, side, side), np.uint8)
-        pair = {"settings": 3, "sensors": 2}
-        boxes = {key: gym.spaces.Box(-1.0, 1.0, (size,)) for key, size in pair.items()}
-        space = gym.spaces.Dict({"raw": raw, **boxes})
+        settings, sensors = (gym.spaces.Box(-1.0, 1.0, (size,)) for size in (3, 2))
+        space = gym.spaces.Dict({"raw": raw, "settings": settings, "sensors": sensors})
         context = PolicyContext(GRID, get_camera("nikon_z6"), space, delays=(delay,) * 3)
         self.name, self.policy = name, make_policy(name, context)
         self._zones, self._seed = zone_map(side, side), seed
@@ -182,8 +180,8 @@ class PolicyLoop:
     def reset(self, start: Request) -> None:
         """Begin new episodes at `start`."""
         self._rng = np.random.default_rng(self._seed)
-        side = len(self._zones)
-        self._noise = self._rng.standard_normal((4, side, side)).astype(np.float32)
+        shape = 4, *self._zones.shape
+        self._noise = self._rng.standard_normal(shape).astype(np.float32)
         with errors_of(self.name, "reset"):
             self.policy.reset(len(start.time), seed=self._seed)
 
@@ -204,9 +202,8 @@ class PolicyLoop:
         picture += spread.astype(np.float32)[:, None, None, None] * noise
         raw = np.rint(np.clip(picture, 0.0, 255.0, out=picture), out=picture).astype(np.uint8)
         apex = np.stack([np.full_like(signal, AV), -taken.time, taken.gain + 5.0], axis=1)
-        still, sharp = np.zeros(len(signal)), np.full(len(signal), 2.0**-4)
-        sensors = encode_sensors(still, sharp, np.zeros((len(signal), 2)))
-        return {"raw": raw, "settings": encode_settings(apex), "sensors": sensors}
+        still = np.full((len(signal), 2), -1.0, np.float32)  # and sharp
+        return {"raw": raw, "settings": encode_settings(apex), "sensors": still}
 
 
 Controller = Proportional | PolicyLoop
@@ -217,33 +214,28 @@ def make_controller(name: str, delay: int = 0, seed: int = 0) -> Controller:
 
     A policy is told the `delay`; a law is not.
     """
-    head, _, text = (base := split_options(name))[0].partition(":")
+    base, options = split_options(name)
+    head, _, text = base.partition(":")
     if head != "proportional":
         return PolicyLoop(name, delay, seed)
-    given, options = f"`policy` (={name!r})", base[1]
     try:
-        known = tuple(field.name for field in fields(Proportional))[1:]
         for option in options:
-            check_key("options", option, known)
+            check_key("options", option, ("dead_zone", "slew", "anchored"))
         return Proportional(parse_number(text, "K"), **options)
     except ValueError as error:
-        raise ValueError(f"{given}: {error}") from None
+        raise ValueError(f"`policy` (={name!r}): {error}") from None
 
 
 def check_controller(name: str) -> None:
-    """Raises an error unless the controller called `name` chooses from one frame."""
-    controller = make_controller(name)
-    if isinstance(controller, PolicyLoop):
-        policy = controller.policy
-        if getattr(policy, "privileged", False):
-            raise ValueError(f"`policy` (={name!r}) is told the best states: it controls nothing")
-        if getattr(type(policy), "fit", Policy.fit) is not Policy.fit and not is_metering(name):
-            raise ValueError(f"`policy` (={name!r}) learns from scenes, of which there are none")
-        if getattr(policy, "regression", 0) is None and ":tuned" in policy.name:
-            raise ValueError(f"`policy` (={name!r}) is tuned on scenes first: give its `weights`")
-    start = split(np.array([CENTRE_EV]))
+    """Raises an error unless the controller called `name` chooses after one frame."""
+    controller, start = make_controller(name), split(np.array([CENTRE_EV]))
     controller.reset(start)
-    controller.decide(np.array([TARGET_SIGNAL]), start)
+    try:
+        controller.decide(np.array([TARGET_SIGNAL]), start)
+    except UserCodeError as error:
+        if not isinstance(error.__cause__, ValueError):
+            raise
+        raise ValueError(f"`policy` (={name!r}): {error.__cause__}") from error
 
 
 # -- the loop -------------------------------------------------------------------------------------
@@ -303,11 +295,11 @@ def measure(cases: Cases, evs: Floats) -> pd.DataFrame:
     """
     after, tail = evs.shape[1] - LEAD, (evs.shape[1] - LEAD) // 2
     amplitude, period = limit_cycles(evs[:, -tail:])
-    frames = frames_to_settle(evs, since=LEAD - 1).astype(np.float64)
+    frames = frames_to_settle(evs, since=LEAD).astype(np.float64)
     rest = evs[:, -tail:].mean(axis=1) - evs[:, LEAD // 2 : LEAD].mean(axis=1)
     columns = {**cases._asdict(), "fault": np.array(FAULTS)[cases.fault]}
     columns |= {"settling": np.where(frames <= after - tail, frames, np.nan)}
-    columns |= {"overshoot": overshoot(evs, since=LEAD - 1), "error": cases.step - rest}
+    columns |= {"overshoot": overshoot(evs, since=LEAD), "error": cases.step - rest}
     return pd.DataFrame({**columns, "amplitude": amplitude, "period": period})
 
 
@@ -327,23 +319,28 @@ def judge_stability(
     progress: Callable[[float, float], None] | None = None,
 ) -> Stability:
     """Runs the controller called `name` through all cases."""
-    law = isinstance(make_controller(name), Proportional)
+    controller = make_controller(name)
+    law = isinstance(controller, Proportional)
     cases = all_cases(LAW_GAINS if law else GAINS, seed)
     evs, begun, done = np.empty((len(cases.step), LEAD + frames)), perf_counter(), 0
-    for rows, delay in _batches(cases, law):
+    for rows, delay in _batches(cases, controller):
         evs[rows] = run_loop(make_controller(name, delay, seed), cases.take(rows), frames)
-        done += int(rows.sum())
+        done += len(rows)
         if progress is not None:
             progress(done, len(evs))
     return Stability(name, measure(cases, evs), evs, evs.size / (perf_counter() - begun))
 
 
-def _batches(cases: Cases, law: bool) -> Iterator[tuple[Bools, int]]:
-    """Cases that one controller runs, and the delay that it is told."""
+def _batches(cases: Cases, controller: Controller) -> Iterator[tuple[Ints, int]]:
+    """Cases that run together, and the delay that their controller is told."""
     alternate = cases.fault == FAULTS.index("every other")
-    for delay in (0,) if law else DELAYS:
+    for delay in DELAYS if isinstance(controller, PolicyLoop) else (0,):
+        told = isinstance(controller, Proportional) | (cases.delay == delay)
         for own in (~alternate, alternate):
-            yield own & (law | (cases.delay == delay)), delay
+            rows = np.flatnonzero(own & told)
+            most = controller.most if isinstance(controller, PolicyLoop) else len(rows)
+            for begin in range(0, len(rows), most):
+                yield rows[begin : begin + most], delay
 
 
 # -- what it comes to -----------------------------------------------------------------------------

@@ -36,7 +36,7 @@ from agents.evaluation.result import (
     static_condition,
     training_seed_rows,
 )
-from agents.evaluation.stability import GAINS, Stability, stability_rows
+from agents.evaluation.stability import Stability, stability_rows
 from agents.report.plots import (
     path_sheets,
     plot_convergence,
@@ -510,86 +510,54 @@ def write_stability(
     found: Iterable[Stability], out: Path, *, command: str, seed: int
 ) -> dict[str, Path]:
     """Write ``results.json``, ``report.md`` and a picture of each controller into `out`."""
-    pictures, parts, speeds, tables = dict[str, Path](), list[str](), dict[str, float](), []
+    pictures, shown, tables = dict[str, Path](), [], []
+    meta = result_meta(command, seed) | {"frames_per_second": {}}
     for one in found:
         rows = stability_rows(one)
-        tables.append(rows)
-        name = re.sub(r"[^\w.=-]+", "_", one.name).strip("_")[-100:]
-        name += f"-{len(pictures)}" * (f"{name}.png" in pictures)
-        pictures[f"{name}.png"] = plot_stability(out / f"{name}.png", one, rows)
+        picture = re.sub(r"[^\w.=-]+", "_", one.name).strip("_")[-100:]
+        picture += f"-{len(pictures)}" * (f"{picture}.png" in pictures) + ".png"
+        pictures[picture] = plot_stability(out / picture, one, rows)
         faults = [_fault_row(own) for _, own in rows.groupby("fault", sort=False)]
-        table, speeds[one.name] = to_markdown(faults, _FAULT_COLUMNS), one.speed
-        picture = f"![stability]({name}.png)"
-        parts.append(f"## {escape(one.name)}\n\n{verdict(rows)}\n\n{table}\n\n{picture}\n")
-    meta = result_meta(command, seed)
-    head = f"{code(command)}, {meta['date']}, commit {meta['commit']}."
-    text = "\n".join(["# Stability of controllers\n", f"{head} {_STABILITY_LEGEND}\n", *parts])
-    every = pd.concat(tables)
-    records = _records(every.astype(object).where(every.notna(), None))
-    results = write_results(out / "results.json", records, meta | {"frames_per_second": speeds})
-    report = write_atomically(out / "report.md", text)
-    return {"results.json": results, **pictures, "report.md": report}
-
-
-_STABILITY_LEGEND = (
-    "How everything is defined: `docs/stability.md`. Of each fault: the largest delay up to which "
-    f"every step settles; the largest loop gain, without delay and with {SHOWN_DELAY} frames (- "
-    f"where the loop's own does not settle; {GAINS[-1]:g} is the largest tried); frames to settle "
-    f"(median, longest) and overshoot with {SHOWN_DELAY} frames; over all delays the largest error "
-    "at rest, the share of cases with limit cycles and the largest, and the share and largest of "
-    "those that settle and go on pulsing."
-)
-_FAULT_COLUMNS: dict[str, Cell] = {
-    "fault": "{fault}",
-    "delay [frames]": "{delays:.0f}",
-    "gain [stops]": "{gains[0]:+.3g}",
-    f"at {SHOWN_DELAY} frames": "{gains[1]:+.3g}",
-    "settles in": "{settling:.0f}",
-    "at most": "{settling_max:.0f}",
-    "overshoot [EV]": "{overshoot:.2f}",
-    "error [EV]": "{error:.2f}",
-    "cycles": "{cycles:.1%}",
-    "largest [EV]": "{amplitude:.2f}",
-    "period": "{period:.0f}",
-    "pulses": "{pulses:.1%}",
-    "by [EV]": "{pulse:.2f}",
-}
-
-
-def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
-    """What all delays of one fault come to."""
-    at = _records(own)  # in the order of the delays
-    largest = max(at, key=lambda row: row["amplitude"])
-    settles = [row["settled"] == 1.0 for row in at]
+        own = {"faults": faults, "verdict": verdict(faults), "picture": picture}
+        shown.append({"name": one.name, **own})
+        meta["frames_per_second"][one.name] = one.speed
+        tables.append(rows.astype(object).where(rows.notna(), None))
+    text = fill("stability.md", controllers=shown, meta=meta, shown=SHOWN_DELAY)
     return {
-        **at[SHOWN_DELAY],
-        "delays": float([*settles, False].index(False) - 1),  # -1 where none settles
-        "gains": [at[delay]["gain_margin"] for delay in (0, SHOWN_DELAY)],
-        "error": own.error.max(),
-        "cycles": own.cycles.mean(),
-        "amplitude": largest["amplitude"],
-        "period": largest["period"],
-        "pulses": own.pulses.mean(),
-        "pulse": own.pulse.max(),
+        "results.json": write_results(out / "results.json", _records(pd.concat(tables)), meta),
+        **pictures,
+        "report.md": write_atomically(out / "report.md", text),
     }
 
 
-def verdict(rows: pd.DataFrame) -> str:
-    """One sentence about a controller, from its `stability_rows`."""
-    faults = {str(name): _fault_row(own) for name, own in rows.groupby("fault", sort=False)}
-    sound, most = faults["none"], rows.delay.max()
-    if sound["delays"] < 0:
-        text = "It does not settle after every step, even without delay or fault"
-    elif sound["delays"] == most:
-        text = f"It settles after every step with every delay up to {most} frames"
-    else:
-        text = f"It settles after every step with up to {sound['delays']:.0f} frames of delay"
-        text += f" and swings by up to {sound['amplitude']:.2f} EV beyond"
-    less = [name for name, own in faults.items() if own["delays"] < sound["delays"]]
-    text += f"; with fewer if the fault is {' or '.join(less)}" * bool(less)
-    pulsing = {name: own for name, own in faults.items() if own["pulses"]}
-    if not pulsing:
+def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
+    """What all delays of one fault come to; of the first `reach` delays every step settles."""
+    at = _records(own)  # in the order of the delays
+    largest = max(at, key=lambda row: row["amplitude"])
+    reach = [*(row["settled"] == 1.0 for row in at), False].index(False)
+    return {
+        **at[SHOWN_DELAY],
+        "reach": reach,
+        "delays": at[reach - 1]["delay"] if reach else None,
+        "gains": [at[delay]["gain_margin"] for delay in (0, SHOWN_DELAY)],
+        **{name: largest[name] for name in ("amplitude", "period")},
+        **{name: own[name].max() for name in ("error", "pulse")},
+        **{name: own[name].mean() for name in ("cycles", "pulses")},
+    }
+
+
+def verdict(faults: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence about a controller, from what each fault comes to; the first is none."""
+    sound = faults[0]
+    text = "It does not settle after every step, even without delay or fault"
+    if sound["reach"]:
+        text = f"It settles after every step with up to {sound['delays']} frames of delay"
+        less = [row["fault"] for row in faults if row["reach"] < sound["reach"]]
+        text += f", with fewer if the fault is {' or '.join(less)}" * bool(less)
+    if sound["amplitude"]:
+        text += f", and else swings by up to {sound['amplitude']:.2f} EV"
+    worst = max(faults, key=lambda row: row["pulse"])
+    if not worst["pulse"]:
         return f"{text}; where it settles it rests."
-    worst = max(pulsing, key=lambda name: pulsing[name]["pulse"])
-    share, swing = pulsing[worst]["pulses"], pulsing[worst]["pulse"]
-    return f"{text}; with the fault {worst} {share:.1%} of the cases pulse by up to {swing:.2f} EV."
+    many = f"{worst['pulses']:.1%} of the cases pulse by up to {worst['pulse']:.2f} EV"
+    return f"{text}; with the fault {worst['fault']} {many}."

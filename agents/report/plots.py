@@ -140,7 +140,7 @@ def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
     heat, margins, traces = figure.subplots(1, 3, width_ratios=(4, 4, 5))
     sound = cases[(cases.fault == "none") & (cases.gain == 0.0)]
     image = heat.imshow(sound.settling.to_numpy().reshape(len(DELAYS), -1), origin="lower")
-    image.cmap.set_bad("0.85")
+    heat.set_facecolor("0.85")  # of those that do not settle
     cycling = sound[sound.amplitude > 0.0]
     places = cycling.step.map(STEPS.index), cycling.delay
     heat.plot(*places, "x", color="#D55E00", label="limit cycle")
@@ -154,26 +154,21 @@ def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
     margins.set_ylim(-0.1, cases.gain.max() + 0.1)
     margins.set(xlabel="delay [frames]", ylabel="loop gain up to which it settles [stops]")
     margins.legend(fontsize=7)
-    plain = cases.gain == 0.0
-    pulse = int(cases.amplitude.where(plain & cases.settling.notna(), 0.0).argmax())
-    for i, (delay, step) in enumerate(((2, 4.0), (6, -8.0))):
-        at = ((sound.delay == delay) & (sound.step == step)).to_numpy()
-        _trace(traces, found, int(sound.index.to_numpy()[at][0]), i)
-    _trace(traces, found, pulse if cases.amplitude[pulse] else int(sound.index[-1]), 2)
+    plain = (cases.gain == 0.0) & cases.settling.notna()
+    pulse = int(cases.amplitude.where(plain, 0.0).argmax())
+    # Delay 2 and the last step but one, delay 6 and the first step; the largest pulse.
+    first, wide = sound.index.to_numpy(), len(STEPS)
+    for i, row in enumerate((first[3 * wide - 2], first[6 * wide], pulse)):
+        case, style = cases.loc[row], line_style(i)
+        style["label"] = f"{case.step:+g} EV, delay {case.delay}, {case.fault}"
+        evs = found.evs[row] - found.evs[row, LEAD - 1]
+        traces.plot(np.arange(len(evs)) - LEAD, evs, lw=1.2, **style)
     traces.set(xlabel="frames after the step", ylabel="exposure from the last light's [EV100]")
     traces.legend(fontsize=7)
     for panel in (margins, traces):
         _tidy(panel, labelsize=8)
     figure.suptitle(_text(found.name), fontsize=11)
     return _write(path, figure)
-
-
-def _trace(axes: Axes, found: Stability, row: int, index: int) -> None:
-    """The exposure of one case, against where the light is before the step."""
-    case, evs = found.cases.loc[row], found.evs[row] - found.evs[row, LEAD - 1]
-    style: dict[str, Any] = {"lw": 1.2, **line_style(index)}
-    style["label"] = f"{case.step:+g} EV, delay {case.delay}, {case.fault}"
-    axes.plot(np.arange(len(evs)) - LEAD, evs, **style)
 
 
 def line_style(index: int) -> dict[str, str]:
