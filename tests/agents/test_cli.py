@@ -38,8 +38,8 @@ from simulator.utils.files import sibling
 
 COMMANDS = (
     *("bench", "cache", "evaluate", "export", "film", "hdr", "judge"),
-    *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate", "sweep"),
-    *("train", "train-simulator", "view", "warm-up"),
+    *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate"),
+    *("stability", "sweep", "train", "train-simulator", "view", "warm-up"),
 )
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
@@ -150,6 +150,8 @@ print("loaded", *sys.modules)
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
+        (("stability", "average:tuned"), "`policy` (='average:tuned'): policy"),
+        (("stability", "proportional:1?dead=1"), "did you mean 'dead_zone'?"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`aperture` (=8)"),
