@@ -1,4 +1,4 @@
-"""``ae-env evaluate``: policies compared on the same episodes."""
+"""``ae-env evaluate`` compares policies on the same episodes; ``ae-env stability`` judges loops."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 from agents.cli import console
 
@@ -105,6 +105,42 @@ def evaluate(
     elif author:
         raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
     _run(plan, out, append, author, workers, device)
+
+
+def stability(
+    policy: Annotated[
+        list[str],
+        Argument(
+            metavar="POLICY...",
+            help="Any policy that sees frames, or a law proportional:K, such as "
+            "'proportional:0.5?dead_zone=0.1&slew=1', with anchored=true as libcamera counts.",
+        ),
+    ],
+    frames: Annotated[int, Option(help="Frames after the step.", min=40, max=10_000)] = 160,
+    seed: console.Seed = 0,
+    out: console.Folder = Path("stability"),
+) -> None:
+    """Does a controller come to rest? Over delay, loop gain, step of the light and faults.
+
+    Example: `ae-env stability proportional:0.5 centre_weighted:P my_policy.py:Mine`
+    """
+    from agents.evaluation.stability import check_controller, judge_stability
+    from agents.report.evaluation import write_stability
+
+    names = list(dict.fromkeys(policy))
+    for name in names:
+        check_controller(name)
+    console.make_folder(out)
+    with console.progress_bars() as progress:
+        found = []
+        for name in names:
+            with progress(name) as task:
+                found.append(judge_stability(name, seed, frames, task))
+    files = write_stability(found, out, command=console.command_line(), seed=seed)
+    console.print_line(files["report.md"].read_text(encoding="utf-8"))
+    for one in found:
+        console.print_line(f"{one.name}: {one.speed:,.0f} loop frames a second")
+    console.print_files(files)
 
 
 def _run(

@@ -26,7 +26,7 @@ from typer.core import TyperGroup
 
 from agents.cli import console
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
-from agents.cli.evaluate import evaluate
+from agents.cli.evaluate import evaluate, stability
 from agents.cli.quickstart import quickstart
 from agents.cli.show import cameras, film, judge, lightings, policies, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
@@ -139,7 +139,7 @@ app = typer.Typer(
 #: Commands by the heading of the help that they stand under.
 _HEADINGS: dict[str, tuple[Callable[..., None], ...]] = {
     "Start": (quickstart, view),
-    "Policies": (evaluate, train, policies, scorers, film, judge, record, export),
+    "Policies": (evaluate, stability, train, policies, scorers, film, judge, record, export),
     "Raw files": (simulate, sweep, refocus, hdr),
     "Scenes": (cameras, lightings, score_tables),
     "Maintenance": (cache, warm_up, train_simulator),

@@ -36,7 +36,14 @@ from agents.evaluation.result import (
     static_condition,
     training_seed_rows,
 )
-from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
+from agents.evaluation.stability import Stability, stability_rows
+from agents.report.plots import (
+    path_sheets,
+    plot_convergence,
+    plot_cost,
+    plot_scores,
+    plot_stability,
+)
 from simulator.settings import format_exposure_time
 from simulator.utils.files import result_meta, write_atomically, write_results
 
@@ -491,3 +498,66 @@ def summary(
 
 def _interval(pair: list[float] | None, form: str = ".3f") -> str:
     return cell({"pair": pair}, f"{{pair:{form}}}", "too few groups")
+
+
+# -- stability of controllers ---------------------------------------------------------------------
+
+#: Delay at which settling is told [frames]: that of a Raspberry Pi's camera.
+SHOWN_DELAY = 2
+
+
+def write_stability(
+    found: Iterable[Stability], out: Path, *, command: str, seed: int
+) -> dict[str, Path]:
+    """Write ``results.json``, ``report.md`` and a picture of each controller into `out`."""
+    pictures, shown, tables = dict[str, Path](), [], []
+    meta = result_meta(command, seed) | {"frames_per_second": {}}
+    for one in found:
+        rows = stability_rows(one)
+        picture = re.sub(r"[^\w.=-]+", "_", one.name).strip("_")[-100:]
+        picture += f"-{len(pictures)}" * (f"{picture}.png" in pictures) + ".png"
+        pictures[picture] = plot_stability(out / picture, one, rows)
+        faults = [_fault_row(own) for _, own in rows.groupby("fault", sort=False)]
+        own = {"faults": faults, "verdict": verdict(faults), "picture": picture}
+        shown.append({"name": one.name, **own})
+        meta["frames_per_second"][one.name] = one.speed
+        tables.append(rows.astype(object).where(rows.notna(), None))
+    text = fill("stability.md", controllers=shown, meta=meta, shown=SHOWN_DELAY)
+    return {
+        "results.json": write_results(out / "results.json", _records(pd.concat(tables)), meta),
+        **pictures,
+        "report.md": write_atomically(out / "report.md", text),
+    }
+
+
+def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
+    """What all delays of one fault come to; of the first `reach` delays every step settles."""
+    at = _records(own)  # in the order of the delays
+    largest = max(at, key=lambda row: row["amplitude"])
+    reach = [*(row["settled"] == 1.0 for row in at), False].index(False)
+    return {
+        **at[SHOWN_DELAY],
+        "reach": reach,
+        "delays": at[reach - 1]["delay"] if reach else None,
+        "gains": [at[delay]["gain_margin"] for delay in (0, SHOWN_DELAY)],
+        **{name: largest[name] for name in ("amplitude", "period")},
+        **{name: own[name].max() for name in ("error", "pulse")},
+        **{name: own[name].mean() for name in ("cycles", "pulses")},
+    }
+
+
+def verdict(faults: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence about a controller, from what each fault comes to; the first is none."""
+    sound = faults[0]
+    text = "It does not settle after every step, even without delay or fault"
+    if sound["reach"]:
+        text = f"It settles after every step with up to {sound['delays']} frames of delay"
+        less = [row["fault"] for row in faults if row["reach"] < sound["reach"]]
+        text += f", with fewer if the fault is {' or '.join(less)}" * bool(less)
+    if sound["amplitude"]:
+        text += f", and else swings by up to {sound['amplitude']:.2f} EV"
+    worst = max(faults, key=lambda row: row["pulse"])
+    if not worst["pulse"]:
+        return f"{text}; where it settles it rests."
+    many = f"{worst['pulses']:.1%} of the cases pulse by up to {worst['pulse']:.2f} EV"
+    return f"{text}; with the fault {worst['fault']} {many}."

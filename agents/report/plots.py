@@ -13,6 +13,7 @@ from PIL import Image
 from ae_env.rendering import PATH_COLOURS
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
+from agents.evaluation.stability import DELAYS, LEAD, STEPS, Stability
 from simulator.utils.files import write_picture
 
 if TYPE_CHECKING:
@@ -126,6 +127,46 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
     if len(curves) > 1:
         lines = panels[0].get_lines()
         figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
+    return _write(path, figure)
+
+
+def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
+    """Draw frames to settle, margins of the loop gain and three answers to steps, as PNG.
+
+    `rows` are the `stability_rows` of what was `found`.
+    """
+    figure, cases = _figure(12.0, 3.6), found.cases
+    heat, margins, traces = figure.subplots(1, 3, width_ratios=(4, 4, 5))
+    sound = cases[(cases.fault == "none") & (cases.gain == 0.0)]
+    image = heat.imshow(sound.settling.to_numpy().reshape(len(DELAYS), -1), origin="lower")
+    heat.set_facecolor("0.85")  # of those that do not settle
+    cycling = sound[sound.amplitude > 0.0]
+    places = cycling.step.map(STEPS.index), cycling.delay
+    heat.plot(*places, "x", color="#D55E00", label="limit cycle")
+    heat.set_xticks(range(len(STEPS)), [f"{step:+g}" for step in STEPS])
+    heat.set(xlabel="step of the light [EV]", ylabel="delay [frames]", title="no fault")
+    figure.colorbar(image, ax=heat, label="frames to settle (grey: does not)")
+    for i, (fault, own) in enumerate(rows.groupby("fault", sort=False)):
+        (line,) = margins.plot(own.delay, own.gain_margin, ".-", label=fault)
+        line.set(**line_style(i))
+    margins.plot(rows.delay, rows.analytic, "k:", lw=2.5, label="theory, no fault")
+    margins.set_ylim(-0.1, cases.gain.max() + 0.1)
+    margins.set(xlabel="delay [frames]", ylabel="loop gain up to which it settles [stops]")
+    margins.legend(fontsize=7)
+    plain = (cases.gain == 0.0) & cases.settling.notna()
+    pulse = int(cases.amplitude.where(plain, 0.0).argmax())
+    # Delay 2 and the last step but one, delay 6 and the first step; the largest pulse.
+    first, wide = sound.index.to_numpy(), len(STEPS)
+    for i, row in enumerate((first[3 * wide - 2], first[6 * wide], pulse)):
+        case, style = cases.loc[row], line_style(i)
+        style["label"] = f"{case.step:+g} EV, delay {case.delay}, {case.fault}"
+        evs = found.evs[row] - found.evs[row, LEAD - 1]
+        traces.plot(np.arange(len(evs)) - LEAD, evs, lw=1.2, **style)
+    traces.set(xlabel="frames after the step", ylabel="exposure from the last light's [EV100]")
+    traces.legend(fontsize=7)
+    for panel in (margins, traces):
+        _tidy(panel, labelsize=8)
+    figure.suptitle(_text(found.name), fontsize=11)
     return _write(path, figure)
 
 

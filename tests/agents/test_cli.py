@@ -39,7 +39,7 @@ from simulator.utils.files import sibling
 COMMANDS = (
     *("bench", "cache", "cameras", "evaluate", "export", "film", "hdr", "judge", "lightings"),
     *("policies", "quickstart", "record", "refocus", "scenes", "score-tables", "scorers"),
-    *("simulate", "sweep", "train", "train-simulator", "view", "warm-up"),
+    *("simulate", "stability", "sweep", "train", "train-simulator", "view", "warm-up"),
 )
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "cameras", "lightings", "policies", "scenes", "scorers", "view", "warm-up")
@@ -155,6 +155,8 @@ print("loaded", *sys.modules)
         (("train", "agent.yaml", "--out", "/proc/a"), "`--out` (='/proc/a.json') cannot be"),
         (("score-tables", "IMG_1.dng", "--on", "cluster"), "`--on` (='cluster')"),
         (("bench", "thruput"), "Did you mean 'throughput'?"),
+        (("stability", "average:tuned"), "average:tuned"),
+        (("stability", "proportional:1?dead=1"), "Did you mean 'dead_zone'?"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`--aperture` (=8)"),
