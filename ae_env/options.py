@@ -26,7 +26,14 @@ from simulator.camera import CameraProfile, get_camera
 from simulator.capture.decision import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.decision import MAX_DISC_PX, check_tolerance
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED
-from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
+from simulator.utils.checks import (
+    check_flag,
+    check_integer,
+    check_number,
+    check_type,
+    check_word,
+    did_you_mean,
+)
 from simulator.utils.compute import check_device
 
 #: Smallest frame that the default networks of the common libraries take.
@@ -143,6 +150,7 @@ class EnvOptions:
             check_number(f"costs[{name!r}]", weight, 0.0, MAX_COST)
         check_number("blur_memory", self.blur_memory, 0.0, 2.0**24, more=" MiB")
         if self.device is not None:
+            check_type("device", self.device, str, more=", such as 'cuda', or None")
             check_device(self.device)
         if self.recorded is not None:
             self._check_recorded()

@@ -275,7 +275,8 @@ TAKES = {
     **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
     **{key: [True] for key in ("sensors", "noise", "with_oracle")},
     **{key: [1.5] for key in ("motion", "depth")},
-    **{key: [None] for key in ("grid", "simulator", "render_mode")},
+    **{key: [None] for key in ("grid", "simulator", "render_mode", "device")},
+    "blur_memory": [1.5],
     "costs": [None, {}],
     "tolerance": [1.5, HUGE],
 }
