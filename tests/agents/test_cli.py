@@ -156,7 +156,7 @@ print("loaded", *sys.modules)
         (("score-tables", "IMG_1.dng", "--on", "cluster"), "`--on` (='cluster')"),
         (("bench", "thruput"), "Did you mean 'throughput'?"),
         (("stability", "average:tuned"), "average:tuned"),
-        (("stability", "proportional:1?dead=1"), "Did you mean 'dead_zone'?"),
+        (("stability", "proportional:1?dead=1"), "did you mean 'dead_zone'?"),
         (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`--aperture` (=8)"),
