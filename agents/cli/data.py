@@ -20,6 +20,7 @@ scenes = typer.Typer(no_args_is_help=True)
 #: Environments whose first frames need the compiled code of all environments between them.
 _CASES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("AutoExposure-v0", {}),
+    ("AutoExposure-v0", {"device": "cpu"}),
     ("AutoExposure-v0", {"observation": "statistics"}),
     ("AutoExposure-v0", {"observation": "linear", "lighting": "flicker"}),
     ("AutoExposure-v0", {"observation": "dn", "noise": "exact"}),
