@@ -151,7 +151,10 @@ class EnvOptions:
         check_number("blur_memory", self.blur_memory, 0.0, 2.0**24, more=" MiB")
         if self.device is not None:
             check_type("device", self.device, str, more=", such as 'cuda', or None")
-            check_device(self.device)
+            if check_device(self.device).type == "meta":
+                raise ValueError(
+                    "`device` (='meta') must be one that holds numbers, such as 'cuda'"
+                )
         if self.recorded is not None:
             self._check_recorded()
 

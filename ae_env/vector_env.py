@@ -243,6 +243,7 @@ class AutoExposureVectorEnv(
     def _reset_mask(self, mask: Any) -> np.ndarray:
         if mask is None:
             return np.ones(self.num_envs, dtype=bool)
+        mask = mask.cpu().numpy() if torch.is_tensor(mask) else mask
         fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,)
         if not fits or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(

@@ -18,6 +18,7 @@ import pandas as pd
 
 from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES
+from agents.evaluation.metrics import THIRD_EV
 from agents.evaluation.result import (
     MORE_COLUMNS,
     ROW_COLUMNS,
@@ -546,18 +547,27 @@ def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
     }
 
 
+def _named(fault: str) -> str:
+    return "no fault" if fault == "none" else f"the fault {fault}"
+
+
 def verdict(faults: Sequence[Mapping[str, Any]]) -> str:
-    """One sentence about a controller, from what each fault comes to; the first is none."""
+    """What a controller does in a sentence or two, from each fault's row; the first has none."""
     sound = faults[0]
     text = "It does not settle after every step, even without delay or fault"
     if sound["reach"]:
-        text = f"It settles after every step with up to {sound['delays']} frames of delay"
+        delay = f"up to {sound['delays']} frame{'s' * (sound['delays'] > 1)} of"
+        text = f"It settles after every step with {delay if sound['delays'] else 'no'} delay"
         less = [row["fault"] for row in faults if row["reach"] < sound["reach"]]
         text += f", with fewer if the fault is {' or '.join(less)}" * bool(less)
+    text += "."
     if sound["amplitude"]:
-        text += f", and else swings by up to {sound['amplitude']:.2f} EV"
-    worst = max(faults, key=lambda row: row["pulse"])
-    if not worst["pulse"]:
-        return f"{text}; where it settles it rests."
-    many = f"{worst['pulses']:.1%} of the cases pulse by up to {worst['pulse']:.2f} EV"
-    return f"{text}; with the fault {worst['fault']} {many}."
+        text += f" Where it does not, it swings by up to {sound['amplitude']:.2f} EV."
+    if sound["error"] > THIRD_EV:
+        text += f" Where it does, it may rest {sound['error']:.2f} EV off."
+    pulsing = [
+        f"{row['pulses']:.1%} by up to {row['pulse']:.2f} EV with {_named(row['fault'])}"
+        for row in sorted(faults, key=lambda row: -row["pulse"])
+        if row["pulse"]
+    ]
+    return f"{text} Cases that settle and pulse: {', '.join(pulsing) or 'none'}."

@@ -217,10 +217,13 @@ def check_device(device: str | torch.device) -> torch.device:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         found = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
-    if found.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
+        if found.type == "cuda" and not torch.cuda.is_available():
+            raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
+        if found.type != "meta":  # which holds no numbers
+            torch.zeros(1, device=found).item()
+    except (RuntimeError, TypeError, AssertionError) as error:
+        why = str(error).partition("\n")[0]
+        raise ValueError(f"`device` (={device!r}) cannot be used by torch: {why}") from None
     return found
 
 

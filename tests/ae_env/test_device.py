@@ -78,6 +78,9 @@ def test_actions_may_be_tensors_and_a_wrapper_gives_arrays() -> None:
     first = envs.reset(seed=0)[0]
     shown = envs.step(torch.tensor([3, 9, 63]))
     assert envs.render()[0].dtype == np.uint8
+    masked = make_envs(device="cpu", autoreset_mode="DISABLED", max_episode_steps=1)
+    masked.reset(seed=0)
+    masked.reset(options={"reset_mask": masked.step(np.array([0, 1, 2]))[3]})
     assert shown[0]["raw"].data_ptr() != first["raw"].data_ptr()
     converted = ArrayConversion(make_envs(device="cpu", **SAME), env_xp=torch, target_xp=np)
     converted.reset(seed=0)
@@ -89,7 +92,7 @@ def test_actions_may_be_tensors_and_a_wrapper_gives_arrays() -> None:
 @pytest.mark.parametrize(
     ("make", "arguments", "named"),
     [
-        (make_envs, {"device": "gpu9"}, "device"),
+        *((make_envs, {"device": name}, "device") for name in ("gpu9", "mps", "meta")),
         (make_env, {"device": "cpu"}, "make_vec"),
         (make_envs, {"task": "ae_env/ExposureBracket-v0", "device": "cpu"}, "device"),
     ],
