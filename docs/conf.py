@@ -54,7 +54,7 @@ CONTENTS = {
         *("ae-bench", "clients", "offline", "scale"),
     ],
     "The simulator": [
-        *("simulator", "networks", "dataset", "colour", "performance", "stability"),
+        *("simulator", "cameras", "networks", "dataset", "colour", "performance", "stability"),
         *("refocus", "hdr", "augmentation"),
     ],
     "More": [
