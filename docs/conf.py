@@ -50,11 +50,12 @@ CONTENTS = {
         for name in ("explore_a_raw", "train_an_agent", "judge_a_meter", "plug_in_a_scorer")
     ],
     "The environment": [
-        *("tasks", "environment", "scenes", "incident_light", "scorers", "policies", "agents"),
-        *("evaluation", "ae-bench", "clients", "offline", "scale"),
+        *("tasks", "environment", "scenes", "recorded-grids", "changing-light"),
+        *("incident_light", "scorers", "policies", "agents", "evaluation"),
+        *("ae-bench", "clients", "offline", "scale"),
     ],
     "The simulator": [
-        *("simulator", "networks", "dataset", "colour", "performance", "stability"),
+        *("simulator", "cameras", "networks", "dataset", "colour", "performance", "stability"),
         *("refocus", "hdr", "augmentation"),
     ],
     "More": [
