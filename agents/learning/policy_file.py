@@ -156,6 +156,8 @@ class NetworkPolicy(Policy, ABC):
 
     #: The name of this kind of agent in its files.
     kind: ClassVar[str]
+    #: What a state must promise beyond the last one to replace it: else still frames may swing.
+    hysteresis: ClassVar[float]
 
     def __init__(
         self,
@@ -183,12 +185,10 @@ class NetworkPolicy(Policy, ABC):
         super().reset(num_envs, seed)
         self._asked = np.full(num_envs, -1)  # the last decisions
 
-    def _choose(self, utility: Floats, margin: float, action_masks: Bools | None) -> Ints:
-        """The best allowed state (N,) by `utility` (N, S), which is changed; or else the last
-        decision, unless the best is more than `margin` better: else a still frame may swing.
-        """
+    def _choose(self, utility: Floats, action_masks: Bools | None) -> Ints:
+        """The best allowed state (N,) by `utility` (N, S), which gets the hysteresis."""
         known = np.flatnonzero(self._asked >= 0)
-        utility[known, self._asked[known]] += margin
+        utility[known, self._asked[known]] += self.hysteresis
         self._asked = masked_argmax(utility, action_masks)
         return self._asked.copy()
 

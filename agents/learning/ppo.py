@@ -156,9 +156,6 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         return self.value_net(of_value), distribution.log_prob(actions), entropy
 
 
-#: A state must be so many times as probable as that of the last decision to replace it [log].
-#: Chosen among 0, 0.05, 0.2, 0.5, 1 and 2 for the least that ends all swings of a grey card.
-HYSTERESIS = 0.5
 #: Hyperparameters that are not arguments of Stable-Baselines3's PPO.
 _OF_OURS = {"total_timesteps", "learning_rate", "ev_coef", "width", "history", "seed"}
 
@@ -201,6 +198,9 @@ class PPOPolicy(NetworkPolicy):
     """Takes the most probable state; remembers what its network was trained with, or nothing."""
 
     kind = "ppo"
+    #: Log of how many times as probable; the least of 0, 0.05, 0.2, 0.5, 1 and 2 that ends the
+    #: swings of grey cards.
+    hysteresis = 0.5
 
     @staticmethod
     def make_network(context: PolicyContext, card: dict[str, Any]) -> ExposureActorCritic:
@@ -230,8 +230,7 @@ class PPOPolicy(NetworkPolicy):
         with torch.inference_mode():
             tensors, _ = self.network.obs_to_tensor(shown)
             distribution: Any = self.network.get_distribution(tensors).distribution
-        logits = distribution.logits.double().cpu().numpy()
-        states = self._choose(logits, HYSTERESIS, action_masks)
+        states = self._choose(distribution.logits.double().cpu().numpy(), action_masks)
         if self._history is not None:
             self._history.record_action(states)
         return states

@@ -132,7 +132,7 @@ class RegressionPolicy(NetworkPolicy):
             (`LightForecaster`); or the file of another one, or a pattern of several.
     """
 
-    kind = "regression"
+    kind, hysteresis = "regression", HYSTERESIS_SCORE
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class RegressionPolicy(NetworkPolicy):
         scores, precision = self._predict(codes, settings, sensors)
         self._weighted += precision * scores
         self._precision += precision
-        return self._choose(self._weighted / self._precision, HYSTERESIS_SCORE, action_masks)
+        return self._choose(self._weighted / self._precision, action_masks)
 
     def _predict(self, *inputs: torch.Tensor | None) -> tuple[Floats, Floats]:
         """Scores of all states and their precision, (N, S) each."""

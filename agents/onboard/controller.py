@@ -73,6 +73,8 @@ class Card(_Entries):
     frame_shape: tuple[Literal[4], PositiveInt, PositiveInt]
     sensors: bool
     same_light_ev: Positive
+    #: What a state must promise beyond the last one in the same light; files of before have none.
+    hysteresis: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
     pedestal: Annotated[float, Field(gt=0.0, lt=1.0)]
     ranges: Ranges
     #: Of the whole file, in which `NO_DIGEST` stands in place of it; files of before have none.
@@ -217,8 +219,12 @@ class Controller:
             for camera in good[~sound]:
                 self.reasons[camera] = "the network's output is not finite"
             good, found = good[sound], [values[sound] for values in found]
-            ppo = self.card.kind == "ppo"
-            utility[good] = found[0] if ppo else self._accumulated(good, *found)
+            kept = self._last[good] >= 0
+            if self.card.kind == "regression":
+                found[0], same = self._accumulated(good, *found)
+                kept &= same
+            utility[good] = found[0]
+            utility[good[kept], self._last[good[kept]]] += self.card.hysteresis
         chosen = np.argmax(np.where(masks, utility, -np.inf), axis=1).astype(np.int64)
         self._last[good] = chosen[good]
         return chosen
@@ -307,8 +313,8 @@ class Controller:
 
     def _accumulated(
         self, good: NDArray[Any], scores: NDArray[Any], precision: NDArray[Any], ev: NDArray[Any]
-    ) -> NDArray[np.float64]:
-        """Mean scores of the cameras `good` over the frames of the light that they see."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Mean scores of the cameras `good` in the light that they see; and whether it stayed."""
         moved = np.abs(ev - self._light[good]) > self.card.same_light_ev
         other = good[(self._frames[good] > 0) & moved]
         for sums in (self._weighted, self._precision, self._light, self._frames):
@@ -317,7 +323,7 @@ class Controller:
         self._light[good] += (ev - self._light[good]) / self._frames[good]
         self._weighted[good] += precision.astype(np.float64) * scores
         self._precision[good] += precision
-        return self._weighted[good] / self._precision[good]
+        return self._weighted[good] / self._precision[good], ~moved
 
     def _signal(self, planes: Any) -> NDArray[np.floating]:
         """`planes` as an array; raises what the caller got wrong."""
