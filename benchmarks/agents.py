@@ -12,7 +12,6 @@ import json
 from ast import literal_eval
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
