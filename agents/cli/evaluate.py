@@ -77,12 +77,8 @@ def evaluate(
         Path | None, Option(help="Benchmark table (CSV) to add the results to.")
     ] = None,
     author: Annotated[str, Option(help="For --append: who made the policy.")] = "",
-    trained_on: Annotated[
-        str, Option(help="For --append: scenes that a policy of yours learnt from.")
-    ] = "",
-    frames_seen: Annotated[
-        int | None, Option(help="For --append: frames that it saw of them.", min=1)
-    ] = None,
+    trained_on: Annotated[str, Option(help="For --append: scenes that it learnt from.")] = "",
+    frames_seen: Annotated[int | None, Option(help="Likewise: frames that it saw.", min=1)] = None,
     seed: Annotated[int | None, Option(help="Seed of everything random.", min=0)] = None,
     workers: Annotated[
         int | None, Option(help="Processes; by default one per core if it pays.", min=1)
