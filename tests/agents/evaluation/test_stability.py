@@ -108,9 +108,8 @@ def test_what_a_law_comes_to(ae_env, tmp_path):
     code, text, error = ae_env("stability", "proportional:1", "--out", tmp_path / "a", "--seed", 1)
     assert (code, error) == (0, "")
     assert "with up to 1 frame" not in text  # at a delay of 1 the limit is 1: it oscillates
-    assert "It settles after every step with up to 0 frames of delay" in text
+    assert "It settles after every step with no delay." in text
     content = json.loads((tmp_path / "a" / "results.json").read_text())
-    assert min(content["meta"]["frames_per_second"].values()) > 100_000
     rows = pd.DataFrame(content["rows"])
     assert len(rows) == len(FAULTS) * len(DELAYS)
     assert (tmp_path / "a" / "proportional_1.png").stat().st_size > 5000
