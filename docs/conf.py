@@ -43,6 +43,7 @@ napoleon_use_ivar = True
 
 #: Sections of the side bar, and their pages.
 CONTENTS = {
+    "Start": ["concepts", "faq", "limits"],
     "Jobs": ["train", "judge", "plug-in-a-scorer", "viewer", "raw-files", "on-a-camera"],
     "Tutorials": [
         f"tutorials/{name}"

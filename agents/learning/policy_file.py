@@ -8,13 +8,14 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from pydantic import AliasPath, BaseModel, Field, ValidationError
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from ae_env.grid import ExposureGrid
-from agents.policy import Policy, PolicyContext
+from agents.policy import Bools, Floats, Ints, Policy, PolicyContext, masked_argmax
 from simulator.networks.weights import check_finite, load_into, read_pair, write_pair
 from simulator.utils.checks import check_type
 from simulator.utils.config_file import one_line
@@ -176,6 +177,20 @@ class NetworkPolicy(Policy, ABC):
             network.to(device)
         self.network: Any = network.eval()
         self.reset(0)
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forgets the frames so far."""
+        super().reset(num_envs, seed)
+        self._asked = np.full(num_envs, -1)  # the last decisions
+
+    def _choose(self, utility: Floats, margin: float, action_masks: Bools | None) -> Ints:
+        """The best allowed state (N,) by `utility` (N, S), which is changed; or else the last
+        decision, unless the best is more than `margin` better: else a still frame may swing.
+        """
+        known = np.flatnonzero(self._asked >= 0)
+        utility[known, self._asked[known]] += margin
+        self._asked = masked_argmax(utility, action_masks)
+        return self._asked.copy()
 
     @staticmethod
     @abstractmethod

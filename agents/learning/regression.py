@@ -33,6 +33,7 @@ from agents.learning.networks import (
     random_shift,
 )
 from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
+from agents.metering.metering_policy import HYSTERESIS_SCORE
 from agents.metering.meters import make_meter
 from agents.metering.reading import Reading
 from agents.policy import Bools, Floats, Ints, Observations, PolicyContext, masked_argmax
@@ -49,8 +50,9 @@ RECENT, WHITE_SHARE = 4, 0.5
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
-#: What a state must promise beyond that of the last decision to replace it, with foresight [score].
-#: Chosen among 0, 0.01, 0.03 and 0.06 on training scenes and kinds of light.
+#: What a state must promise beyond that of the last decision to replace it, with foresight [score];
+#: without, as in tuned meters. Chosen among 0, 0.01, 0.03 and 0.06 on training scenes and kinds of
+#: light.
 HYSTERESIS = 0.01
 #: Past frames come in so many parts, each from another step.
 _CHUNKS = 4
@@ -208,7 +210,7 @@ class RegressionPolicy(NetworkPolicy):
         scores, precision = self._predict(codes, settings, sensors)
         self._weighted += precision * scores
         self._precision += precision
-        return masked_argmax(self._weighted / self._precision, action_masks)
+        return self._choose(self._weighted / self._precision, HYSTERESIS_SCORE, action_masks)
 
     def _predict(self, *inputs: torch.Tensor | None) -> tuple[Floats, Floats]:
         """Scores of all states and their precision, (N, S) each."""
@@ -237,6 +239,7 @@ class RegressionPolicy(NetworkPolicy):
         """Forgets the frames of the environments that `done` marks; without foresight."""
         for sums in (self._weighted, self._precision, self._light, self._frames):
             sums[done] = 0.0
+        self._asked[done] = -1
 
 
 # -- training --------------------------------------------------------------------------------------

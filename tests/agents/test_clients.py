@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from filelock import FileLock
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
@@ -70,6 +71,16 @@ def test_torchrl(task: str) -> None:
     assert many.rollout(4, break_when_any_done=False)["next", "rewards.score"].isfinite().all()
     envs = SerialEnv(2, lambda: GymEnv(task, frame_skip=2, **SMALL))
     assert envs.rollout(1)["next", "reward"].shape == (2, 1, 1)
+
+
+def test_ppo_on_one_device() -> None:
+    """Whatever a GPU would run runs on the CPU, and the updates change the network."""
+    program = Path(__file__).parents[2] / "examples" / "ppo_on_device.py"
+    train = runpy.run_path(str(program))["train"]
+    first, second = (train("cpu", updates, num_envs=2, steps=2) for updates in (0, 1))
+    before, after = (torch.nn.utils.parameters_to_vector(n.parameters()) for n in (first, second))
+    assert torch.isfinite(after).all()
+    assert not torch.equal(before, after)
 
 
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

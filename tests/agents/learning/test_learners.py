@@ -120,6 +120,19 @@ def test_predictions_are_weighted_by_their_precision(context: PolicyContext, pho
         assert policy.act(frame, masks).tolist() == best.argmax(axis=1).tolist()
 
 
+def test_a_state_is_kept_unless_another_is_clearly_better(context, photograph) -> None:
+    """By 0.002 of the mean score; a camera that was forgotten has no state to keep."""
+    scores = np.zeros((4, 1, 64))
+    scores[:, 0, 3] = 0.5
+    scores[:, 0, 9] = 0.4, 0.602, 0.5085, 0.501  # means 0.4, 0.501, 0.5035; then alone
+    policy = RegressionPolicy(context, network=Stub(*((s, np.zeros((1, 64))) for s in scores)))
+    policy.reset(1)
+    frame = photograph(np.ones((64, 64)), 8.0, 0)
+    assert [policy.act(frame).item() for _ in range(3)] == [3, 3, 9]
+    policy.reset(1)
+    assert policy.act(frame).item() == 9
+
+
 def test_episodes_do_not_mix_and_frames_of_other_light_are_forgotten(context, photograph):
     """The first camera's light falls by a stop; the second's stays, at other settings."""
     first, then = np.full((2, 2, 64), 0.1)
