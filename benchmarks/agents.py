@@ -11,7 +11,6 @@ import json
 from ast import literal_eval
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,7 @@ EPISODES = 8
 SETS = {
     "bundled": "bundled",
     "polyhaven": "polyhaven",
-    "unknown": "benchmarks.agents:views_of_unknown_light",
+    "unknown": "polyhaven:unknown",
     "raws": "benchmarks.agents:raws",
 }
 #: Scorers that no agent was trained on. `shin` knows nothing of the incident light.
@@ -51,12 +50,6 @@ QUICK = {"regression": {"frames": 2_000}, "ppo": {"total_timesteps": 2_048}}
 #: Meters that get the constant compensation that suits the training places best [EV].
 COMPENSATED = ("average:P", "centre_weighted:P", "matrix:P")
 COMPENSATIONS = np.arange(-1.0, 2.01, 0.25)
-
-
-def views_of_unknown_light(split: Split, camera: CameraProfile, resolution: int) -> list[Scene]:
-    """The views of `polyhaven`, of whose incident light nothing is known."""
-    views = load_scenes("polyhaven", split, camera=camera, resolution=resolution)
-    return [replace(view, illuminance=None) for view in views]
 
 
 def raws(split: Split, camera: CameraProfile, resolution: int) -> list[Scene]:

@@ -62,7 +62,7 @@ CONTENTS = {
         "architecture",
         "gallery",
         "results/README",
-        "ae-bench/v1",
+        *("ae-bench/v1", "ae-bench/v2"),
         "api/simulator",
         "api/ae_env",
         "api/agents",

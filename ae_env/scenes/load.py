@@ -5,7 +5,8 @@ What `scenes=` may be:
 - ``"bundled"``; ``"bundled:small"``: the first two source groups of each kind;
   ``"bundled:large"``: four times the training groups, the same test groups;
   ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
-- ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`); ``"mixed"``:
+- ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`);
+  ``"polyhaven:unknown"``: the same as if nobody had metered their light; ``"mixed"``:
   such views and the procedural scenes of ``"bundled:large"``, as many of each; ``"mixed:10"``:
   views of 10 of the places only;
 - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
@@ -65,7 +66,8 @@ BUNDLED: dict[str, Size] = {"bundled": "normal", "bundled:small": "small", "bund
 #: Those of one kind, or of the hard part.
 BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
 #: Views into Poly Haven's panoramas, alone and with as many procedural scenes.
-REAL = ("polyhaven", "mixed")
+VIEWS_OF_UNKNOWN_LIGHT = "polyhaven:unknown"
+REAL = ("polyhaven", VIEWS_OF_UNKNOWN_LIGHT, "mixed")
 #: All scenes that have a name.
 NAMED = (*BUNDLED, *BUNDLED_PARTS, *REAL)
 #: Ways to name scenes, see `load_scenes`.
@@ -113,7 +115,7 @@ def load_scenes(
     """
     check_word("split", split, get_args(Split))
     named = isinstance(spec, str | Path | Mapping)
-    if split == "validation" and named and spec != "polyhaven":
+    if split == "validation" and named and spec not in REAL[:2]:
         raise ValueError(
             f"`split` (={split!r}) needs `scenes='polyhaven'`: no others have places for it"
         )
@@ -151,6 +153,8 @@ def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
         return _bundled(spec, request)
     if spec == "polyhaven":
         return polyhaven_scenes(request)
+    if spec == VIEWS_OF_UNKNOWN_LIGHT:
+        return [replace(view, illuminance=None) for view in polyhaven_scenes(request)]
     if mixed := re.fullmatch(r"mixed(?::(\d+))?", spec):
         places = None if mixed[1] is None else int(mixed[1])
         assets = split_assets(spec, request.split, places)  # raises before anything is drawn

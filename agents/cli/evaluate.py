@@ -30,8 +30,8 @@ _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 Preset = Annotated[
     str | None,
     Option(
-        help="quick, standard, video, convergence, ablation, bracket, ae_bench_v2_still (_video, "
-        "_bracket), or a .yaml file of one's own."
+        help="quick, standard, video, convergence, ablation, bracket, ae_bench_v3_video (_still, "
+        "_unknown, _bracket), or a .yaml file of one's own."
     ),
 ]
 Scenes = Annotated[
@@ -77,6 +77,8 @@ def evaluate(
         Path | None, Option(help="Benchmark table (CSV) to add the results to.")
     ] = None,
     author: Annotated[str, Option(help="For --append: who made the policy.")] = "",
+    trained_on: Annotated[str, Option(help="For --append: scenes that it learnt from.")] = "",
+    frames_seen: Annotated[int | None, Option(help="Likewise: frames that it saw.", min=1)] = None,
     seed: Annotated[int | None, Option(help="Seed of everything random.", min=0)] = None,
     workers: Annotated[
         int | None, Option(help="Processes; by default one per core if it pays.", min=1)
@@ -99,12 +101,15 @@ def evaluate(
     plan = make_plan(preset, env, policy or [], given)
     if append is not None:
         if plan.hash is None:
-            rule = "takes the results of a benchmark only: give --preset ae_bench_v2_still, _video "
-            raise ValueError(f"`append` (={str(append)!r}) {rule}or _bracket")
+            rule = (
+                "takes the results of a benchmark only: give --preset ae_bench_v3_video, _still, "
+            )
+            raise ValueError(f"`append` (={str(append)!r}) {rule}_unknown or _bracket")
         console.make_folder(append.parent, name="append", file=append, make=False)
-    elif author:
+    elif author or trained_on or frames_seen:
         raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
-    _run(plan, out, append, author, workers, device)
+    row = {"author": author, "trained_on": trained_on, "frames_seen": frames_seen}
+    _run(plan, out, append, row, workers, device)
 
 
 def stability(
@@ -147,7 +152,7 @@ def _run(
     plan: EvaluationPlan,
     out: Path,
     append: Path | None,
-    author: str,
+    row: Mapping[str, Any],
     workers: int | None,
     device: str,
 ) -> None:
@@ -165,7 +170,7 @@ def _run(
     with Jobs(plan, out / "parts", scenes, device=device) as run:
         ranked = run.ranked_policies  # raises before any work where a policy is unknown
         if append is not None and plan.policies:
-            check_append(append, plan, ranked, author=author)
+            check_append(append, plan, ranked, author=row["author"])
             for name in (p for p in plan.policies if p not in ranked):
                 logger.warning("%s gets no row in %s: it is told the best states", name, append)
         console.make_folder(out)
@@ -176,7 +181,7 @@ def _run(
     files = write_report(results, out, command=console.command_line())
     ranking = overall_ranking(results)
     if append is not None:
-        files |= append_rows(append, plan, bench_rows(results, ranking), author=author)
+        files |= append_rows(append, plan, bench_rows(results, ranking), **row)
     print_scores(results, ranking)
     console.print_files(files)
 

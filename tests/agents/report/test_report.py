@@ -364,20 +364,23 @@ def test_plans_of_a_suite_have_one_hash_whatever_a_policy_sees(scenes, tmp_path)
     (tmp_path / "bracket.yaml").write_text(text.format(files, "budgets: [0.2]\n"))
     assert found != ae_bench.bench_hash(still, scenes)
     # The published ones are one.
-    plans = [load_plan(f"ae_bench_v2_{task}") for task in ("still", "video", "bracket")]
-    assert len({(plan.suite, plan.scene_ids, plan.hash) for plan in plans}) == 1
-    rows = ae_bench.read_table(Path("docs/ae-bench/v2.csv"))
+    plans = [load_plan(name) for name in load_plan("ae_bench_v3_still").suite]
+    assert {plan.task for plan in plans} == set(ae_bench._TASKS)
+    assert len({(plan.suite, plan.max_scenes, plan.hash) for plan in plans}) == 1
+    table = Path("docs/ae-bench/v3.csv")
+    rows = ae_bench.read_table(table)
     assert set(rows.hash) == {plans[0].hash}
-    assert rows.to_csv(index=False) == Path("docs/ae-bench/v2.csv").read_text()
+    assert rows.to_csv(index=False) == table.read_text()
+    assert rows[rows.policy == "ppo"].frames_seen.tolist() == 2 * ["500000"]
 
 
 def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog):
     results = run_plan(plan, tmp_path / "parts")
     ranking = overall_ranking(results, resamples=200)
     found = ae_bench.bench_rows(results, ranking)
-    table = tmp_path / "docs" / "ae-bench" / "v2.csv"
+    table = tmp_path / "docs" / "ae-bench" / "v3.csv"
     files = ae_bench.append_rows(table, plan, found, author="first")
-    assert sorted(files) == ["ae-bench.md", "v2.csv"]
+    assert sorted(files) == ["ae-bench.md", "v3.csv"]
     again = found[found.policy == "random"]
     statistics = plan.changed(environment={**plan.environment, "observation": "statistics"})
     ae_bench.append_rows(table, plan, again, author="second")
@@ -391,8 +394,7 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     assert shown == ["matrix:P uint8 first", *named]
     assert tuple(rows[0]) == ae_bench.COLUMNS
     assert float(rows[0]["score"]) == pytest.approx(ranking.normalised_score[0], abs=5e-5)
-    assert rows[0]["real"] == rows[0]["unseen"] == ""  # no real places, no brackets
-    assert float(rows[0]["procedural"]) == pytest.approx(float(rows[0]["score"]), abs=2e-4)
+    assert rows[0]["unseen"] == rows[0]["frames_seen"] == ""  # no brackets, nothing learnt
     page = (tmp_path / "docs" / "ae-bench.md").read_text()
     assert page.index("| matrix:P ") < page.index("| random ")
     assert str(tmp_path) not in page
@@ -409,19 +411,18 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
 
 
 def test_rows_of_brackets_by_hand(tmp_path):
-    """Two groups, one of a real place; two budgets; one seed."""
-    groups = [ae_bench.list_assets()[0].place, "zz"]
+    """Two groups; two budgets; one seed."""
+    groups = ["place", "zz"]
     quality = {"0.1 s": [[0.9, 0.7]], "0.2 s": [[1.0, 0.8]]}
     results = {name: made_brackets(groups, p=np.array(own)) for name, own in quality.items()}
     rows = ae_bench.bench_rows(results, overall_ranking(results))
     row = rows.iloc[0]
     assert row.score == pytest.approx(0.85)
-    assert (row.real, row.procedural) == (pytest.approx(0.95), pytest.approx(0.75))
     assert row.ms_alone == pytest.approx(500.0)
     plan = results["0.1 s"].plan
     ae_bench.append_rows(tmp_path / "mine.csv", plan, rows, author="me")
     page = (tmp_path / "mine.md").read_text().replace(" ", "")
-    assert "|p|uint8|0.8500|-|0.7500|0.9500|" in page
+    assert "|p|uint8|0.8500|-|" in page
 
 
 def _table(file, plan, **entries):
