@@ -1,4 +1,4 @@
-"""A batch of captures in columns: how each is exposed.
+"""Captures in columns: how each is exposed, in a batch of scenes or in a sweep of one.
 
 `plan_frames` is `simulator.capture.decision.decide` for scenes without noise of their own, many at
 a time.
@@ -9,17 +9,28 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
-from simulator.capture.blurred_frames import LAYOUT
-from simulator.capture.decision import RATIO_LIMIT, STREAK_TO_DISC, Exposure, weigh_blurs
-from simulator.capture.prepared_scene import Layout, PreparedScene
+from simulator.capture.blurred_frames import BLUR, LAYOUT
+from simulator.capture.decision import (
+    RATIO_LIMIT,
+    STREAK_TO_DISC,
+    Exposure,
+    Origin,
+    decide,
+    weigh_blurs,
+)
+from simulator.capture.sensor import exposure_table
 from simulator.capture.statistics import curvature
 from simulator.optics.motion import Path, path_length
 from simulator.settings import CameraSettings
 from simulator.utils.compute import kernel
+
+if TYPE_CHECKING:
+    from simulator.capture.prepared_scene import Layout, PreparedScene
 
 #: All of a scene that the exposure of a capture depends on; see `PreparedScene`.
 SCENE = np.dtype(
@@ -121,3 +132,24 @@ def plan_frames(  # type: ignore[no-untyped-def]
             table[row, 0, plane] = ratio
             table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
             table[row, 3, plane] = table[row, 4, plane] = 0.0
+
+
+def plan_sweep(
+    scene: PreparedScene, states: Sequence[CameraSettings], gains: np.ndarray, *, noise: bool
+) -> tuple[Sequence[Origin], np.ndarray, np.ndarray, Sequence[torch.Tensor | None]]:
+    """Captures of one scene at S states, in light (S,) relative to its own; see `decide`.
+
+    Returns:
+        The origins of their light, `BLUR` (S,), (S, 5, 4) of `exposure_table`, and the
+        `Exposure.remaining_variance`.
+    """
+    pairs = zip(states, gains.tolist(), strict=True)
+    exposures = [decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
+    # Of one scene, how far it moves tells its path.
+    kinds = {(exposure.defocus_px, exposure.motion_px): exposure for exposure in exposures}
+    numbers = {kind: number for number, kind in enumerate(kinds)}
+    which = [numbers[exposure.defocus_px, exposure.motion_px] for exposure in exposures]
+    blurs = np.array([*map(blur_column, kinds.values())], BLUR)[which]
+    left = (exposure.remaining_variance for exposure in exposures)
+    shares = [None if share is None else share.float().contiguous() for share in left]
+    return [e.origin for e in exposures], blurs, exposure_table(exposures), shares

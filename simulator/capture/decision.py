@@ -55,6 +55,10 @@ def check_tolerance(tolerance: float) -> float:
     return check_number("tolerance", tolerance, 0.0, sys.float_info.max, more=more)
 
 
+#: A light of a scene: noise-reduced, opened to an effective f-number, or as recorded.
+Origin = tuple[DenoisedLight | None, float | None]
+
+
 @functools.lru_cache(maxsize=4096)
 def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
     """Noise of `box_factor` squared sensor pixels averaged."""
@@ -132,15 +136,9 @@ class Exposure:
         return math.hypot(*(s.error for s in self.steps if s.estimate and not s.runs))
 
     @property
-    def lens_blur(self) -> tuple[object, ...]:
-        """Key of the light behind the lens, before motion and exposure."""
-        layout = self.layout if self.defocus_px else None
-        return self.denoised, self.opened_to, self.defocus_px, layout
-
-    @property
-    def blur(self) -> tuple[object, ...]:
-        """Key of the light on the sensor, before exposure."""
-        return (*self.lens_blur, self.motion_px, self.path, self.subject_path)
+    def origin(self) -> Origin:
+        """The light that it starts from."""
+        return self.denoised, self.opened_to
 
 
 # -- deciding ---------------------------------------------------------------------------------
