@@ -22,11 +22,14 @@ from simulator.capture.blurred_light import new_frames
 from simulator.capture.columns import (
     SCENE,
     blur_column,
+    fits_columns,
+    noise_columns,
     plan_frames,
     scene_column,
     state_columns,
+    statistics_column,
 )
-from simulator.capture.decision import MAX_DISC_PX, Exposure, decide
+from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, exposure_table, noise_keys, record
@@ -245,19 +248,13 @@ class CaptureBatch:
         # Scenes that are shown several times share their light, but not what is blurred of it.
         scene = scene.changed(blurred_light=scene.blurred_light.copy())
         self._light[index] = scene.light.contiguous()
-        if scene.box_factor not in self._targets:
-            noises = [self.camera.nlf(s.iso).scaled(scene.box_factor**-2) for s in self.states]
-            self._targets[scene.box_factor] = np.array([(n.shot, n.read) for n in noises])
-        widest = scene.defocus * 4.0 / self._columns["f_number"].min()
-        largest = max(*scene.light.shape[-2:], MAX_DISC_PX)  # beyond it, `decide` raises
-        self._in_columns[index] = (
-            scene.nlf.is_zero and scene.aperture_blur is None and widest <= largest
-        )
+        box = scene.box_factor
+        if box not in self._targets:
+            self._targets[box] = noise_columns(self.camera, self.states, box)
+        self._in_columns[index] = fits_columns(scene, self._columns)
         if self._in_columns[index]:
-            targets = list(self._targets).index(scene.box_factor)
-            self._scene_columns[index] = scene_column(scene, targets)
-            if scene.defocus or scene.image_speed or scene.movement.subject_speed:
-                self._statistics[index] = scene.statistics.columns
+            self._scene_columns[index] = scene_column(scene, list(self._targets).index(box))
+            self._statistics[index] = statistics_column(scene)
         self._scenes[index] = scene
         return scene
 

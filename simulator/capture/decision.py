@@ -60,7 +60,7 @@ Origin = tuple[DenoisedLight | None, float | None]
 
 
 @functools.lru_cache(maxsize=4096)
-def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
+def averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
     """Noise of `box_factor` squared sensor pixels averaged."""
     return camera.nlf(iso).scaled(1.0 / box_factor**2)
 
@@ -160,7 +160,7 @@ def decide(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
 ) -> Exposure:
     """The exposure of a capture; see `PreparedScene.exposure`."""
-    target = _averaged_nlf(scene.camera, settings.iso, scene.box_factor)
+    target = averaged_nlf(scene.camera, settings.iso, scene.box_factor)
     f_number = settings.effective_f_number
     ratio = 2.0 ** (settings.log2_exposure - scene.reference.log2_exposure)
     ratio = min(scene.gain * gain * ratio, RATIO_LIMIT)

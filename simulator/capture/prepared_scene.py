@@ -382,11 +382,10 @@ class PreparedScene:
         """
         gains = np.ones(len(states)) if gain is None else gain
         origins, blurs, table, remaining = plan_sweep(self, states, gains, noise=noise)
-        parts = [slice(0, len(states))]
-        if len(states) * self.light.nbytes > _TOGETHER_BYTES:
-            extents = blurs["defocus_px"].tolist(), blurs["motion_px"].tolist()
-            kinds = [*zip(origins, *extents, strict=True)]
-            ranks = {kind: rank for rank, kind in enumerate(kinds)}
+        extents = blurs["defocus_px"].tolist(), blurs["motion_px"].tolist()
+        kinds, parts = [*zip(origins, *extents, strict=True)], [slice(0, len(states))]
+        ranks = {kind: rank for rank, kind in enumerate(kinds)}
+        if len(ranks) * self.light.nbytes > _TOGETHER_BYTES:
             order = sorted(range(len(kinds)), key=lambda i: ranks[kinds[i]])
             parts = [slice(i, i + 1) for i in order]
         for some in parts:
