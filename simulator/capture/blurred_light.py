@@ -249,19 +249,20 @@ class BlurredLight:
 
         Those that are alike are one. `layout` is the one whose addresses the `blurs` have.
         """
-        blurred = (blurs["defocus_px"] > 0.0) | (blurs["motion_px"] > 0.0)
-        if not blurred.any():
+        if not (blurs["defocus_px"] + blurs["motion_px"]).any():
             return [self.source(origin) for origin in origins]
+        lens, fields = np.zeros_like(blurs), ["defocus_px", "diameter", "sorts", "num_sorts"]
+        lens[fields] = blurs[fields]
+        moves = blurs["motion_px"] > 0.0
+        blurs = np.where(moves, blurs, lens)
         numbers = blurs.view(f"V{BLUR.itemsize}").tolist()
         keys = [(*key, layout) for key in zip(origins, numbers, strict=True)]
         found = {key: self._cache.get(key) for key in set(keys)}
         some = [*{key: row for row, key in enumerate(keys) if found[key] is None}.values()]
         if some:
             own, origins = blurs[some], [origins[row] for row in some]
-            if (own["motion_px"] > 0.0).any():  # it starts from the light behind the lens
-                lens, fields = np.zeros_like(own), ["defocus_px", "diameter", "sorts", "num_sorts"]
-                lens[fields] = own[fields]
-                lights, own["defocus_px"] = self.lights(origins, lens, layout), 0.0
+            if moves[some].any():  # it starts from the light behind the lens
+                lights, own["defocus_px"] = self.lights(origins, lens[some], layout), 0.0
             else:
                 lights = [self.source(origin) for origin in origins]
             made = self._made(lights, own)
