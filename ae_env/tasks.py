@@ -25,7 +25,6 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.vector_env import AutoExposureVectorEnv
 from simulator.capture.prepared_scene import Layout
-from simulator.optics.motion import Taps, path_blur_apart
 from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
 from simulator.settings import exposure_ratio
 from simulator.utils.checks import check_integer, check_number
@@ -113,8 +112,6 @@ FRAME_GAP = 1.0 / 60.0
 BRACKET_NUMBERS = ("time_left", "frames_left", "white", "noisy")
 #: A merged sample whose standard deviation is a larger share of it counts as noisy.
 NOISY = 0.1
-_NONE = np.zeros(8, np.int64)
-_STAY = Taps(_NONE, _NONE, np.eye(1, 8, dtype=np.float32)[0])
 #: Defaults of the bracket task, and arguments that it does not have.
 BRACKET: dict[str, Any] = {"grid": "bracket", "depth": "far"}
 WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "with_oracle", "device")
@@ -331,17 +328,14 @@ def move_subject(scene: Scene, rows: int, columns: int) -> Scene:
     layout = scene.layout
     if layout is None or layout.subject is None:
         return scene
-    there = Taps(_NONE - rows, _NONE - columns, _STAY.weights)
-    mask = torch.from_numpy(ndimage.shift(layout.mask.numpy(), (0, rows, columns), order=0))
-    behind = layout.behind
+    # Nothing of the subject enters from beyond the border.
+    mask = ndimage.shift(layout.mask[0].numpy(), (rows, columns), order=0)
+    subject, behind = torch.from_numpy(mask > 0.0), layout.behind.flatten()
 
     def moved(planes: torch.Tensor) -> torch.Tensor:
-        # Nothing of the subject enters from beyond the border, which blurs replicate.
-        inside = path_blur_apart(planes, layout.mask, behind, _STAY, there)
-        outside = planes.flatten(1)[:, behind.flatten()].reshape(planes.shape)
-        return torch.where(mask > 0.0, inside, outside)
+        background = planes.flatten(1)[:, behind].reshape(planes.shape)
+        return torch.where(subject, planes.roll((rows, columns), (-2, -1)), background)
 
-    subject = mask[0] > 0.0
     new = Layout(moved(layout.defocus[None])[0].clamp(0.0, 1.0), subject)
     denoised = None if scene.denoised is None else moved(scene.denoised)
     return replace(scene, light=moved(scene.light), denoised=denoised, layout=new)

@@ -204,7 +204,8 @@ def _compared(
         frames, milliseconds = call(), 1e3 * median_seconds(call, least=0.0)
         expected, q = frames, tables.table(replace(light, recorded=frames[there], allowed=there))
         if method == "simulated":
-            expected = clipped(clean.prepared.expected_sweep(grid.states), camera)
+            every = torch.stack([clean.prepared.expected(state) for state in grid.states])
+            expected = clipped(every, camera)
             q = tables.table(clean)
         states = []
         for s in others:

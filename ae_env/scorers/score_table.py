@@ -22,7 +22,6 @@ from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
 from simulator.capture.decision import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.utils.checks import check_integer
 
@@ -166,23 +165,13 @@ class ScoreTables:
         self, prepared: PreparedScene, gain: float | np.ndarray, row_gain: np.ndarray | None
     ) -> np.ndarray:
         """`TermScores.expected` of all states, (S, 3)."""
-        gains = np.broadcast_to(gain, len(self.states)).tolist()
         prepared = prepared.changed(blurred_light=prepared.blurred_light.copy(_LIGHT_BYTES))
-        exposures = [
-            prepared.exposure(state, noise=self.noise, gain=factor)
-            for state, factor in zip(self.states, gains, strict=True)
-        ]
-        groups: dict[tuple[Any, ...], list[int]] = {}
-        for state, exposure in enumerate(exposures):
-            groups.setdefault(exposure.blur, []).append(state)
-        means = np.empty((len(self.states), 3))
-        for states in groups.values():  # one light after the other: large frames fill the memory
-            light = prepared.blurred_light.blurred(exposures[states[0]])
-            found = [exposures[state] for state in states]
-            transitions = Transitions.of([light] * len(states), found)
+        count = len(self.states)
+        gains, means = np.broadcast_to(gain, count), np.empty((count, 3))
+        for some, transitions in prepared.transitions(self.states, noise=self.noise, gain=gains):
+            states, rows = np.arange(count)[some], None if row_gain is None else row_gain[some]
             boxes = np.full(len(states), prepared.box_factor)
-            rows = None if row_gain is None else row_gain[states]
-            means[states] = self.term_scores.expected(transitions, np.array(states), boxes, rows)
+            means[some] = self.term_scores.expected(transitions, states, boxes, rows)
         return means
 
     def _samples(
@@ -198,14 +187,10 @@ class ScoreTables:
         for part in slices(len(self.states), CHUNK):
             states, rows = self.states[part], None if row_gain is None else row_gain[part]
             light: Any = {"gain": gains[part], "row_gain": rows}
+            light["noise"] = "exact" if self.noise else None
             captures, scored = terms.captures.describe(scene, prepared, part, gain, row_gain), []
             for seed in range(self.noise_seeds):
-                if self.noise:
-                    images = prepared.expose(states, seed=seed, **light)
-                else:
-                    images = clip_and_quantise(
-                        prepared.expected_sweep(states, **light), self.camera
-                    )
+                images = prepared.expose(states, seed=seed, **light)
                 scored.append(terms.torch_scores(images.clamp_(0.0, 1.0), captures, "image"))
             chunks.append({name: np.stack([s[name] for s in scored]) for name in scored[0]})
         return {name: np.concatenate([c[name] for c in chunks], axis=1) for name in chunks[0]}

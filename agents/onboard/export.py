@@ -94,7 +94,7 @@ def export_agent(policy: Policy, path: str | Path) -> Path:
         "frame_shape": list(shape),
         "sensors": context.has_sensors,
         "same_light_ev": SAME_LIGHT_EV,
-        "hysteresis": policy.hysteresis,
+        "hysteresis": (PPOPolicy if ppo else RegressionPolicy).hysteresis,
         "pedestal": PEDESTAL,
         "ranges": {"settings": SETTINGS_RANGES.tolist(), "sensors": SENSOR_RANGES.tolist()},
         "sha256": NO_DIGEST,

@@ -17,15 +17,19 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.blurred_frames import BLUR, BlurredFrames
+from simulator.capture.blurred_frames import BLUR
+from simulator.capture.blurred_light import new_frames
 from simulator.capture.columns import (
     SCENE,
     blur_column,
+    fits_columns,
+    noise_columns,
     plan_frames,
     scene_column,
     state_columns,
+    statistics_column,
 )
-from simulator.capture.decision import MAX_DISC_PX, Exposure, decide
+from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, exposure_table, noise_keys, record
@@ -126,13 +130,7 @@ class CaptureBatch:
         self._device = device
         self._columns = state_columns(states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
-        fixed = num_scenes, len(apertures), light_bytes
-        if device is None:
-            self._frames = BlurredFrames(*fixed)
-        else:
-            from simulator.capture.device_frames import DeviceFrames  # few need it
-
-            self._frames = DeviceFrames(*fixed, device)
+        self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
         self._targets: dict[int, np.ndarray] = {}  # by box factor, (S, 2, 4)
         # Scenes as columns; whether their captures are planned in columns, too: where the light has
         # no noise of its own, and no aperture is opened.
@@ -250,19 +248,13 @@ class CaptureBatch:
         # Scenes that are shown several times share their light, but not what is blurred of it.
         scene = scene.changed(blurred_light=scene.blurred_light.copy())
         self._light[index] = scene.light.contiguous()
-        if scene.box_factor not in self._targets:
-            noises = [self.camera.nlf(s.iso).scaled(scene.box_factor**-2) for s in self.states]
-            self._targets[scene.box_factor] = np.array([(n.shot, n.read) for n in noises])
-        widest = scene.defocus * 4.0 / self._columns["f_number"].min()
-        largest = max(*scene.light.shape[-2:], MAX_DISC_PX)  # beyond it, `decide` raises
-        self._in_columns[index] = (
-            scene.nlf.is_zero and scene.aperture_blur is None and widest <= largest
-        )
+        box = scene.box_factor
+        if box not in self._targets:
+            self._targets[box] = noise_columns(self.camera, self.states, box)
+        self._in_columns[index] = fits_columns(scene, self._columns)
         if self._in_columns[index]:
-            targets = list(self._targets).index(scene.box_factor)
-            self._scene_columns[index] = scene_column(scene, targets)
-            if scene.defocus or scene.image_speed or scene.movement.subject_speed:
-                self._statistics[index] = scene.statistics.columns
+            self._scene_columns[index] = scene_column(scene, list(self._targets).index(box))
+            self._statistics[index] = statistics_column(scene)
         self._scenes[index] = scene
         return scene
 
@@ -302,7 +294,7 @@ class CaptureBatch:
         remaining = None if remaining is None else remaining.float().contiguous()
         self._remaining_variance[row] = remaining
         if exposure.opened_to is None:  # else the network runs when the light is made
-            self._source[row] = scene.blurred_light.source(exposure).contiguous()
+            self._source[row] = scene.blurred_light.source(exposure.origin).contiguous()
         excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
         self._excess_variance[row] = excess
         error = exposure.left_out
@@ -321,7 +313,7 @@ class CaptureBatch:
         try:
             opens = [row for row in alone.tolist() if self._exposure[row].opened_to is not None]
             if opens:
-                _each(self._open, [(row,) for row in opens])
+                parallel_ranges(lambda a, b: [*map(self._open, opens[a:b])], len(opens))
                 # Light that was opened before may have had the same address.
                 self._frames.release(np.array(opens) // len(self.states))
             sources = self._source[rows]
@@ -338,7 +330,7 @@ class CaptureBatch:
     def _open(self, row: int) -> None:
         """Opens the aperture; the scene caches its result."""
         exposure, lights = self._exposure[row], self._scenes[row // len(self.states)].blurred_light
-        self._source[row] = lights.source(exposure).contiguous()
+        self._source[row] = lights.source(exposure.origin).contiguous()
         if self._frames.is_full and lights.aperture_blur is not None:
             lights.aperture_blur.forget()
 
@@ -347,11 +339,6 @@ class CaptureBatch:
         if np.isnan(self._excess_variance[row]):
             light = self._frames.at(self._blurred[[row]], tuple(self._source[row].shape))[0]
             self._excess_variance[row], _ = noise_balance(light.cpu(), self._exposure[row])
-
-
-def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
-    """Calls `task` with each of `arguments`, on as many threads as torch may use."""
-    parallel_ranges(lambda a, b: [task(*each) for each in arguments[a:b]], len(arguments))
 
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:

@@ -1,7 +1,7 @@
 """Blurred light of many captures, in memory that is used again.
 
-`BlurredFrames` makes the light behind lens and motion, as
-`simulator.capture.blurred_light.BlurredLight` does for one.
+`BlurredFrames` makes the light behind lens and motion: of the scenes of a batch, and of all states
+of one scene (`simulator.capture.blurred_light.BlurredLight`).
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class BlurredFrames:
         self._diameter = np.zeros(slots)
         self._levels = np.zeros((num_scenes, len(DIAMETERS)), np.uintp)
         self._levels_source, self._moved = np.zeros((2, num_scenes), np.uintp)
-        self._slabs, self._free = list[np.ndarray](), np.empty(0, np.uintp)
+        self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
 
     @property
     def is_full(self) -> bool:
@@ -103,6 +103,11 @@ class BlurredFrames:
         """The frames at `places` (B,), each (4, H, W)."""
         return FramesAt(places, shape)
 
+    def kept(self, places: np.ndarray, shape: tuple[int, ...]) -> list[torch.Tensor]:
+        """The frames at `places` (B,) of this memory, which stays as long as any of them."""
+        frames = {frame.data_ptr(): frame for slab in self._slabs for frame in slab}
+        return [frames[place] for place in places.tolist()]
+
     def _take(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
         """Places of memory for `count` frames."""
         lacking = count - len(self._free)
@@ -113,10 +118,10 @@ class BlurredFrames:
 
     def _more(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
         """Places of new memory for `count` frames or more."""
-        samples = math.prod(shape)
-        slab = np.empty((max(count, _SLAB // samples), samples), np.float32)
+        spare = min(_SLAB, self._most_bytes // 4) // math.prod(shape)
+        slab = torch.empty(max(count, spare), *shape)
         self._slabs.append(slab)
-        return (slab.ctypes.data + np.arange(len(slab)) * slab.strides[0]).astype(np.uintp)
+        return (slab.data_ptr() + np.arange(len(slab)) * slab[0].nbytes).astype(np.uintp)
 
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
@@ -147,10 +152,11 @@ class BlurredFrames:
         source: np.ndarray,
         shape: tuple[int, ...],
     ) -> np.ndarray:
-        """(K,) places of the light of scenes `indices`, all different, behind their blurs.
+        """(K,) places of the light of scenes `indices` behind their blurs.
 
         `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the places of the light
-        (4, H, W) that they start from. Each stays until its scene blurs another.
+        (4, H, W) that they start from. Each stays until its scene blurs another. No two have the
+        scene in common; in new memory, where nothing moves, no two the scene and the aperture.
         """
         if self.is_full:
             self._free_others(indices, slots)
@@ -198,11 +204,13 @@ class BlurredFrames:
     ) -> np.ndarray:
         """(K, 13) places of the light of scenes behind the discs that their blend needs."""
         stale = self._levels_source[indices] != source
-        self._release_levels(indices[stale])
+        self._release_levels(np.unique(indices[stale]))
         self._levels_source[indices] = source
         needed = np.zeros((len(indices), len(DIAMETERS)), bool)
         mark_needed(blurs, _KNOTS, needed)
         frame, level = np.nonzero(needed & (self._levels[indices] == 0))
+        _, first = np.unique(indices[frame] * len(DIAMETERS) + level, return_index=True)
+        frame, level = frame[first], level[first]
         made = self._take(len(frame), shape)
         self._levels[indices[frame], level] = made
         self._blur(np.array(DIAMETERS)[level], source[frame], made, shape)

@@ -11,19 +11,22 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from simulator.capture.decision import LIGHT_LIMIT, Exposure
+from simulator.capture.blurred_frames import BLUR, BlurredFrames
+from simulator.capture.columns import blur_column
+from simulator.capture.decision import LIGHT_LIMIT, Exposure, Origin
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
-from simulator.optics.discs import HALO, DiscBank, disc_blur, kernel_energy
-from simulator.optics.motion import Path, Taps, motion_blur, path_blur, path_blur_apart, path_taps
+from simulator.optics.discs import HALO, DiscBank, kernel_energy
+from simulator.optics.motion import Path, Taps, path_blur, path_taps
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
 
@@ -144,7 +147,11 @@ class MapApertureBlur(ApertureBlur):
             added = self._added(self.diameter[tile.outer], f_number)
             # Close f-numbers share most of their discs; on large frames they take too much memory.
             cache = self._banks if self.diameter.numel() <= TILE**2 else {}
-            return _bank(cache, (tile, denoised), light[tile.outer]).blurred(added)[tile.core]
+            bank = cache.get((tile, denoised))
+            if bank is None:  # beyond the limit sums would no longer resolve the shadows
+                bank = DiscBank(light[tile.outer].clamp(-LIGHT_LIMIT, LIGHT_LIMIT))
+                cache[tile, denoised] = bank
+            return bank.blurred(added)[tile.core]
 
         tiles = make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
         if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
@@ -207,7 +214,6 @@ class BlurredLight:
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
         self._cache_bytes = cache_bytes
-        self._banks: dict[object, DiscBank] = {}
 
     @property
     def known(self) -> tuple[NoiseLevelFunction, ApertureBlur | None]:
@@ -224,39 +230,65 @@ class BlurredLight:
     def _cache(self) -> LruCache[Tensor]:
         return LruCache(self._cache_bytes)  # of a sweep: a batch takes none of it
 
-    def source(self, exposure: Exposure) -> Tensor:
-        """The light (4, H, W) that `exposure` starts from: as recorded, denoised or opened."""
-        if exposure.opened_to is not None and self.aperture_blur is not None:
-            return self.aperture_blur.opened(exposure.opened_to, exposure.denoised)
-        return self.light if exposure.denoised is None else exposure.denoised.light
+    def source(self, origin: Origin) -> Tensor:
+        """The light (4, H, W) as recorded, denoised or opened."""
+        denoised, opened_to = origin
+        if opened_to is not None and self.aperture_blur is not None:
+            return self.aperture_blur.opened(opened_to, denoised)
+        return self.light if denoised is None else denoised.light
 
     def blurred(self, exposure: Exposure) -> Tensor:
-        """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""
-        if not exposure.motion_px:
-            return self._behind_lens(exposure) if exposure.defocus_px else self.source(exposure)
-        light = self._cache.get(exposure.blur)
-        if light is None:
-            light = _motion_blurred(self._behind_lens(exposure), exposure)
-            self._cache.put(exposure.blur, light, light.nbytes)
-        return light
+        """The light (4, H, W) with every blur of `exposure`; see `lights`."""
+        blurs = np.array([blur_column(exposure)], BLUR)
+        return self.lights([exposure.origin], blurs, exposure.layout)[0]
 
-    def _behind_lens(self, exposure: Exposure) -> Tensor:
-        light = self._cache.get(exposure.lens_blur) if exposure.defocus_px else None
-        if light is None:
-            light = self._defocus(self.source(exposure), exposure)
-            if exposure.defocus_px:
-                self._cache.put(exposure.lens_blur, light, light.nbytes)
-        return light
+    def lights(
+        self, origins: Sequence[Origin], blurs: np.ndarray, layout: Layout | None
+    ) -> list[Tensor]:
+        """Lights (4, H, W) with the `blurs` (N,) `BLUR`, not exposed yet; not to be changed.
 
-    def _defocus(self, source: Tensor, exposure: Exposure) -> Tensor:
-        """`source` (4, H, W) behind the lens of `exposure`."""
-        if exposure.layout is None or not exposure.defocus_px:
-            return disc_blur(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure.defocus_px)
-        # Exposures share most of their discs; on large frames they take too much memory.
-        banks = self._banks if source.shape[-2] * source.shape[-1] <= TILE**2 else {}
-        diameter = exposure.layout.defocus.to(source.device) * exposure.defocus_px
-        key = exposure.denoised, exposure.opened_to
-        return _bank(banks, key, source).blurred(diameter)
+        Those that are alike are one. `layout` is the one whose addresses the `blurs` have.
+        """
+        if not (blurs["defocus_px"] + blurs["motion_px"]).any():
+            return [self.source(origin) for origin in origins]
+        lens, fields = np.zeros_like(blurs), ["defocus_px", "diameter", "sorts", "num_sorts"]
+        lens[fields] = blurs[fields]
+        moves = blurs["motion_px"] > 0.0
+        blurs = np.where(moves, blurs, lens)
+        numbers = blurs.view(f"V{BLUR.itemsize}").tolist()
+        keys = [(*key, layout) for key in zip(origins, numbers, strict=True)]
+        found = {key: self._cache.get(key) for key in set(keys)}
+        some = [*{key: row for row, key in enumerate(keys) if found[key] is None}.values()]
+        if some:
+            own, origins = blurs[some], [origins[row] for row in some]
+            if moves[some].any():  # it starts from the light behind the lens
+                lights, own["defocus_px"] = self.lights(origins, lens[some], layout), 0.0
+            else:
+                lights = [self.source(origin) for origin in origins]
+            made = self._made(lights, own)
+            found |= zip((keys[row] for row in some), made, strict=True)
+            for row, light, before in zip(some, made, lights, strict=True):
+                if light is not before:
+                    self._cache.put(keys[row], light, light.nbytes)
+        return [found[key] for key in keys]  # type: ignore[misc]
+
+    def _made(self, lights: list[Tensor], blurs: np.ndarray) -> list[Tensor]:
+        """Lights (4, H, W) behind lenses or in motion; those without blur as they are."""
+        result, device = [*lights], self.light.device
+        todo = np.flatnonzero((blurs["defocus_px"] > 0.0) | (blurs["motion_px"] > 0.0))
+        if not len(todo):
+            return result
+        sources = [lights[i].float().contiguous() for i in todo]
+        shape, slots = tuple(sources[0].shape), np.arange(len(todo))
+        frames = new_frames(len(todo), len(todo), 0, None if device.type == "cpu" else device)
+        places = frames.places(sources)
+        # One light behind several lenses shares discs; each motion has memory of its own.
+        same = np.unique(places, return_inverse=True)[1]
+        indices = np.where(blurs["motion_px"][todo] > 0.0, slots, same)
+        done = frames.make(indices, slots, blurs[todo], places, shape)
+        for i, light in zip(todo.tolist(), frames.kept(done, shape), strict=True):
+            result[i] = light
+        return result
 
     # -- noise of the source ------------------------------------------------------------------
 
@@ -286,23 +318,15 @@ class BlurredLight:
         return replace(exposure, energy=energy, remaining_variance=left)
 
 
-def _motion_blurred(light: Tensor, exposure: Exposure) -> Tensor:
-    """`light` (4, H, W), behind the lens already, as it moves in `exposure`."""
-    if exposure.path is None:
-        return motion_blur(light, exposure.motion_px, limit=LIGHT_LIMIT)
-    height, width = light.shape[-2:]
-    taps = path_taps(exposure.path, height, width)
-    if exposure.subject_path is None or exposure.layout is None:
-        return path_blur(light, taps, limit=LIGHT_LIMIT)
-    own, layout = path_taps(exposure.subject_path, height, width), exposure.layout
-    return path_blur_apart(light, layout.mask, layout.behind, taps, own, limit=LIGHT_LIMIT)
+def new_frames(
+    num_scenes: int, num_apertures: int, most_bytes: int, device: torch.device | None
+) -> BlurredFrames:
+    """Memory for blurred light, see `BlurredFrames`; with a `device`, by torch operations on it."""
+    if device is None:
+        return BlurredFrames(num_scenes, num_apertures, most_bytes)
+    from simulator.capture.device_frames import DeviceFrames  # few need it
 
-
-def _bank(banks: dict[Any, DiscBank], key: object, light: Tensor) -> DiscBank:
-    """The bank of `key`; beyond the limit sums would no longer resolve the shadows."""
-    if key not in banks:
-        banks[key] = DiscBank(light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT))
-    return banks[key]
+    return DeviceFrames(num_scenes, num_apertures, most_bytes, device)
 
 
 @functools.lru_cache(maxsize=2)  # a plan needs the same again

@@ -1,4 +1,4 @@
-"""A batch of captures in columns: how each is exposed.
+"""Captures in columns: how each is exposed, in a batch of scenes or in a sweep of one.
 
 `plan_frames` is `simulator.capture.decision.decide` for scenes without noise of their own, many at
 a time.
@@ -9,17 +9,31 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
-from simulator.capture.blurred_frames import LAYOUT
-from simulator.capture.decision import RATIO_LIMIT, STREAK_TO_DISC, Exposure, weigh_blurs
-from simulator.capture.prepared_scene import Layout, PreparedScene
-from simulator.capture.statistics import curvature
+from simulator.camera import CameraProfile
+from simulator.capture.blurred_frames import BLUR, LAYOUT
+from simulator.capture.decision import (
+    MAX_DISC_PX,
+    RATIO_LIMIT,
+    STREAK_TO_DISC,
+    Exposure,
+    Origin,
+    averaged_nlf,
+    decide,
+    weigh_blurs,
+)
+from simulator.capture.sensor import exposure_table
+from simulator.capture.statistics import BINS, curvature
 from simulator.optics.motion import Path, path_length
 from simulator.settings import CameraSettings
 from simulator.utils.compute import kernel
+
+if TYPE_CHECKING:
+    from simulator.capture.prepared_scene import Layout, PreparedScene
 
 #: All of a scene that the exposure of a capture depends on; see `PreparedScene`.
 SCENE = np.dtype(
@@ -40,6 +54,30 @@ def state_columns(states: Sequence[CameraSettings]) -> np.ndarray:
     """(S,) `STATE`."""
     numbers = [(s.log2_exposure, s.exposure_time, s.effective_f_number) for s in states]
     return np.array(numbers, STATE)
+
+
+def noise_columns(camera: CameraProfile, states: Sequence[CameraSettings], box: int) -> np.ndarray:
+    """(S, 2, 4) shot and read noise of captures, `box` squared sensor pixels averaged."""
+    noises = {iso: averaged_nlf(camera, iso, box) for iso in {state.iso for state in states}}
+    numbers = {iso: (noise.shot, noise.read) for iso, noise in noises.items()}
+    return np.array([numbers[state.iso] for state in states])
+
+
+def fits_columns(scene: PreparedScene, states: np.ndarray) -> bool:
+    """Whether `plan_frames` can plan a scene at `STATE` (S,): without noise or aperture of its own.
+
+    Discs that are too wide do not fit: `decide` raises an error for these.
+    """
+    widest = scene.defocus * 4.0 / states["f_number"].min()
+    largest = max(*scene.light.shape[-2:], MAX_DISC_PX)
+    return scene.nlf.is_zero and scene.aperture_blur is None and bool(widest <= largest)
+
+
+def statistics_column(scene: PreparedScene) -> np.ndarray:
+    """The `LightStatistics.columns` of a scene, which take a pass over its pixels; 0 if unused."""
+    if scene.defocus or scene.image_speed or scene.movement.subject_speed:
+        return scene.statistics.columns
+    return np.zeros((4, 4, BINS))
 
 
 def scene_column(scene: PreparedScene, targets: int) -> tuple[Any, ...]:
@@ -121,3 +159,32 @@ def plan_frames(  # type: ignore[no-untyped-def]
             table[row, 0, plane] = ratio
             table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
             table[row, 3, plane] = table[row, 4, plane] = 0.0
+
+
+def plan_sweep(
+    scene: PreparedScene, states: Sequence[CameraSettings], gains: np.ndarray, *, noise: bool
+) -> tuple[Sequence[Origin], np.ndarray, np.ndarray, Sequence[torch.Tensor | None] | None]:
+    """Captures of one scene at S states, in light (S,) relative to its own; see `decide`.
+
+    Returns:
+        The origins of their light, `BLUR` (S,), (S, 5, 4) of `exposure_table`, and the
+        `Exposure.remaining_variance`, None in place of all where the source has no noise.
+    """
+    # One state alone is decided on in less time than it takes to call a kernel.
+    if len(states) < 2 or not fits_columns(scene, columns := state_columns(states)):
+        pairs = zip(states, gains.tolist(), strict=True)
+        exposures = [decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
+        # Of one scene, how far it moves tells its path.
+        kinds = {(exposure.defocus_px, exposure.motion_px): exposure for exposure in exposures}
+        numbers = {kind: number for number, kind in enumerate(kinds)}
+        which = [numbers[exposure.defocus_px, exposure.motion_px] for exposure in exposures]
+        blurs = np.array([*map(blur_column, kinds.values())], BLUR)[which]
+        left = (exposure.remaining_variance for exposure in exposures)
+        shares = [None if share is None else share.float().contiguous() for share in left]
+        return [e.origin for e in exposures], blurs, exposure_table(exposures), shares
+    count, rows, height = len(states), np.arange(len(states)), scene.light.shape[-2]
+    made = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), np.empty(count)
+    targets = noise_columns(scene.camera, states, scene.box_factor)[None]
+    own = np.array([scene_column(scene, 0)], SCENE), statistics_column(scene)[None]
+    plan_frames(*own, columns, targets, height, 0 * rows, rows, gains.astype(float), *made)
+    return [(None, None)] * count, made[0], made[1], None

@@ -55,8 +55,12 @@ def check_tolerance(tolerance: float) -> float:
     return check_number("tolerance", tolerance, 0.0, sys.float_info.max, more=more)
 
 
+#: A light of a scene: noise-reduced, opened to an effective f-number, or as recorded.
+Origin = tuple[DenoisedLight | None, float | None]
+
+
 @functools.lru_cache(maxsize=4096)
-def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
+def averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
     """Noise of `box_factor` squared sensor pixels averaged."""
     return camera.nlf(iso).scaled(1.0 / box_factor**2)
 
@@ -132,15 +136,9 @@ class Exposure:
         return math.hypot(*(s.error for s in self.steps if s.estimate and not s.runs))
 
     @property
-    def lens_blur(self) -> tuple[object, ...]:
-        """Key of the light behind the lens, before motion and exposure."""
-        layout = self.layout if self.defocus_px else None
-        return self.denoised, self.opened_to, self.defocus_px, layout
-
-    @property
-    def blur(self) -> tuple[object, ...]:
-        """Key of the light on the sensor, before exposure."""
-        return (*self.lens_blur, self.motion_px, self.path, self.subject_path)
+    def origin(self) -> Origin:
+        """The light that it starts from."""
+        return self.denoised, self.opened_to
 
 
 # -- deciding ---------------------------------------------------------------------------------
@@ -162,7 +160,7 @@ def decide(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
 ) -> Exposure:
     """The exposure of a capture; see `PreparedScene.exposure`."""
-    target = _averaged_nlf(scene.camera, settings.iso, scene.box_factor)
+    target = averaged_nlf(scene.camera, settings.iso, scene.box_factor)
     f_number = settings.effective_f_number
     ratio = 2.0 ** (settings.log2_exposure - scene.reference.log2_exposure)
     ratio = min(scene.gain * gain * ratio, RATIO_LIMIT)

@@ -6,6 +6,7 @@ the place of a frame is its number in it, from 1 on.
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -17,12 +18,12 @@ from torch import Tensor
 from simulator.capture.blurred_frames import BlurredFrames, frame_at
 from simulator.capture.decision import LIGHT_LIMIT
 from simulator.optics.discs import DIAMETERS, disc_blur
-from simulator.optics.motion import taps_of
+from simulator.optics.motion import motion_blur, taps_of
 from simulator.utils.compute import kernel
 
-#: Taps that are summed together, samples of them that are read at once, and frames that are added
-#: to the memory at once, at least.
-_TOGETHER, _SAMPLES, _FRAMES = 8, 2**25, 64
+#: Taps that are summed together, samples that are read or added to the memory at once, and frames
+#: that are added at once, at least; samples of a frame that is moved along the rows alone.
+_TOGETHER, _SAMPLES, _FRAMES, _ALONE = 8, 2**25, 64, 2**20
 _KNOTS = torch.tensor(DIAMETERS).square()
 
 
@@ -64,6 +65,10 @@ class DeviceFrames(BlurredFrames):
         """The frames at `places` (B,), a copy (B, 4, H, W)."""
         return self._frames[self._numbers(places)]
 
+    def kept(self, places: np.ndarray, shape: tuple[int, ...]) -> list[Tensor]:
+        """The same, one by one."""
+        return list(self.at(places, shape))
+
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
         super().release(indices)
@@ -87,7 +92,8 @@ class DeviceFrames(BlurredFrames):
         if lacking <= 0:
             return freed
         begin = len(old)
-        self._frames = old.new_empty(begin + max(lacking, begin // 2, _FRAMES), *shape)
+        spare = max(begin // 2, min(_FRAMES, _SAMPLES // math.prod(shape)))
+        self._frames = old.new_empty(begin + max(lacking, spare), *shape)
         if begin:
             self._frames[:begin] = old
         added = np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
@@ -119,9 +125,8 @@ class DeviceFrames(BlurredFrames):
             maps = self._layout_frames(indices[part], blurs[part], shape)
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
             knots = _KNOTS.to(maps.device)
-            squared = (
-                (maps[:, 0].flatten(1) * scale[:, None]).square_().clamp_(max=float(knots[-1]))
-            )
+            squared = (maps[:, 0].flatten(1) * scale[:, None]).square_()
+            squared = squared.clamp_(max=float(knots[-1]))
             below = torch.searchsorted(knots, squared, right=True).sub_(1).clamp_(0, len(knots) - 2)
             share = (squared - knots[below]) / (knots[below + 1] - knots[below])  # (K, H W)
             numbers = self._numbers(levels[part])
@@ -166,17 +171,20 @@ class DeviceFrames(BlurredFrames):
         to: np.ndarray,
         shape: tuple[int, ...],
     ) -> None:
-        apart = blurs["mask"] > 0
-        for part in _parts(np.flatnonzero(~apart), _TOGETHER * shape[0] * shape[1] * shape[2]):
+        apart, samples = blurs["mask"] > 0, math.prod(shape)
+        # Large frames one by one: the time of a streak's running sum is the same for all lengths.
+        alone = blurs["streaks"] & (samples >= _ALONE)
+        for i in np.flatnonzero(alone).tolist():
+            moved = motion_blur(self._clamped(source[[i]]), float(blurs["motion_px"][i]))
+            self._frames[self._numbers(to[[i]])] = moved
+        for part in _parts(np.flatnonzero(~apart & ~alone), _TOGETHER * samples):
             light = self._clamped(source[part])
             moved = moved_sums(light, *tap_columns(blurs[part], False, *shape[1:]))
             self._frames[self._numbers(to[part])] = moved
-        for part in _parts(np.flatnonzero(apart), 2 * _TOGETHER * shape[0] * shape[1] * shape[2]):
-            # See `simulator.optics.motion.path_blur_apart`.
-            light, maps = (
-                self._clamped(source[part]),
-                self._layout_frames(indices[part], blurs[part], shape),
-            )
+        for part in _parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
+            # See `simulator.optics.motion.blur_apart`.
+            light = self._clamped(source[part])
+            maps = self._layout_frames(indices[part], blurs[part], shape)
             mask, behind = maps[:, 1:2], maps[:, 2:3].long().flatten(2)
             back = light.flatten(2).gather(2, behind.expand(-1, shape[0], -1)).view_as(light)
             back = moved_sums(back, *tap_columns(blurs[part], False, *shape[1:]))

@@ -294,7 +294,8 @@ def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Expos
     added = 0.0
     if exposure.opened_to is not None:
         light = scene.light if exposure.denoised is None else exposure.denoised.light
-        lights, white = (light, scene.blurred_light.source(exposure)), 1.0 if noise else math.inf
+        lights = light, scene.blurred_light.source(exposure.origin)
+        white = 1.0 if noise else math.inf
         rows = max(1, _BALANCED // light.shape[-1])
         for top in range(0, light.shape[-2], rows):
             sharp, opened = ((x[:, top : top + rows] * ratio).clamp_(max=white) for x in lights)

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
+from simulator.capture.columns import plan_sweep
 from simulator.capture.decision import DEFAULT_TOLERANCE, Exposure, check_tolerance, decide, disc_px
 from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
 from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
@@ -274,7 +275,8 @@ class PreparedScene:
         """Steps, reasons, error and cost of a capture, or of `expected`; see `exposure`."""
         exposure = self.exposure(settings, noise=noise)
         # A clean source lacks all of the noise: its light need not be made to see that.
-        light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
+        origin = (None, None) if exposure.source.is_zero else exposure.origin
+        light = self.blurred_light.source(origin)
         excess_noise, lacks_noise = noise_balance(light, exposure)
         return SimulationPlan(
             settings=settings,
@@ -303,21 +305,6 @@ class PreparedScene:
         exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
 
-    def expected_sweep(
-        self,
-        states: Sequence[CameraSettings],
-        *,
-        gain: np.ndarray | None = None,
-        row_gain: np.ndarray | None = None,
-    ) -> torch.Tensor:
-        """`expected` at each state, (S, 4, H, W); arguments of `expose`."""
-        gains = np.ones(len(states)) if gain is None else gain
-        pairs = zip(states, gains.tolist(), strict=True)
-        light = torch.stack([self.expected(s, gain=g) for s, g in pairs])
-        if row_gain is None:
-            return light
-        return light * torch.from_numpy(row_gain).to(light)[:, None, :, None]
-
     def capture(
         self, settings: CameraSettings, seed: int = 0, *, noise: Noise = "exact"
     ) -> tuple[torch.Tensor, float]:
@@ -345,25 +332,22 @@ class PreparedScene:
         states: Iterable[CameraSettings],
         *,
         seed: int = 0,
-        noise: Noise = "exact",
+        noise: Noise | None = "exact",
         gain: np.ndarray | None = None,
         row_gain: np.ndarray | None = None,
         out: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """A sweep: one capture per state, (S, 4, H, W) float32.
 
-        States that share their blur follow each other, so that none is computed twice; the order
-        of `states` stays in the result.
-
         Args:
             states: Settings to simulate.
-            seed, noise: See `capture`.
+            seed, noise: See `capture`; None for the light without noise (`expected`), recorded.
             gain: (S,) light of each state relative to this scene's, where it depends on the
                 exposure time, as flickering light does; None for the same.
             row_gain: (S, H) light of each row relative to that; None where all rows have the same.
             out: (S, 4, H, W) contiguous float32 to write to, instead of new memory.
         """
-        check_word("noise", noise, get_args(Noise))
+        check_word("noise", "exact" if noise is None else noise, get_args(Noise))
         states = list(states) if isinstance(states, Iterable) else states
         if not isinstance(states, list) or not all(isinstance(s, CameraSettings) for s in states):
             raise ValueError(f"`states` (={states!r}) must be several CameraSettings")
@@ -372,28 +356,43 @@ class PreparedScene:
         read_noise: list[ReadNoise] | None = None
         if noise == "sensor":
             read_noise = [self.camera.read_noise(s.iso, self.box_factor) for s in states]
-        gains = np.ones(len(states)) if gain is None else gain
-        exposures = [self.exposure(s, gain=g) for s, g in zip(states, gains.tolist(), strict=True)]
-        groups: dict[tuple[object, ...], list[int]] = {}
-        for index, exposure in enumerate(exposures):
-            groups.setdefault(exposure.blur, []).append(index)
-        parts = [slice(0, len(states))]
-        if len(groups) * self.light.nbytes > _TOGETHER_BYTES:
-            parts = [slice(i, i + 1) for group in groups.values() for i in group]
-        for some in parts:
-            chosen = exposures[some]
-            lights = [self.blurred_light.blurred(exposure) for exposure in chosen]
-            transitions = Transitions.of(lights, chosen)
+        for some, transitions in self.transitions(states, noise=noise is not None, gain=gain):
             record(
                 transitions,
                 self.camera,
-                keys=keys[some] if transitions.lacks_noise else None,
-                noise=noise,
+                keys=keys[some] if noise is not None and transitions.lacks_noise else None,
+                noise=noise or "exact",
                 read_noise=None if read_noise is None else read_noise[some],
                 row_gain=None if row_gain is None else row_gain[some],
                 signals=frames[some],
             )
         return frames
+
+    def transitions(
+        self,
+        states: Sequence[CameraSettings],
+        *,
+        noise: bool = True,
+        gain: np.ndarray | None = None,
+    ) -> Iterator[tuple[slice, Transitions]]:
+        """All that captures at `states` depend on, except for their noise: parts of them.
+
+        States that share their blur follow each other, so that none is computed twice; they are one
+        part where the light of all may be held at once. Arguments of `expose` and `exposure`.
+        """
+        gains = np.ones(len(states)) if gain is None else gain
+        origins, blurs, table, remaining = plan_sweep(self, states, gains, noise=noise)
+        extents = blurs["defocus_px"].tolist(), blurs["motion_px"].tolist()
+        kinds, parts = [*zip(origins, *extents, strict=True)], [slice(0, len(states))]
+        ranks = {kind: rank for rank, kind in enumerate(kinds)}
+        if len(ranks) * self.light.nbytes > _TOGETHER_BYTES:
+            order = sorted(range(len(kinds)), key=lambda i: ranks[kinds[i]])
+            parts = [slice(i, i + 1) for i in order]
+        for some in parts:
+            lights = self.blurred_light.lights(origins[some], blurs[some], self.layout)
+            lights = [light.contiguous() for light in lights]
+            shares = None if remaining is None else remaining[some]
+            yield some, Transitions(lights, table[some], shares)
 
     def _frames(self, count: int, out: torch.Tensor | None) -> torch.Tensor:
         """Memory for `count` frames, `out` if that fits."""

@@ -168,7 +168,7 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
         quadrant, reach = _quadrant(disc_radius(diameter_px))
         shape = (quadrant, reach, np.float32(math.inf))
         cost = len(quadrant) ** 2
-        return by_rows(light, None, lambda a, b, i, o: _disc(a, b, height, i, *shape, o), cost)
+        return by_rows(light, lambda a, b, i, o: _disc(a, b, height, i, *shape, o), cost)
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
@@ -185,11 +185,10 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
     """`disc_blur` (P, H, W) by numpy, whose transforms are safe in a forked process."""
     weights = disc_kernel(diameter_px)
     radius = len(weights) // 2
-    clipped = np.clip(light, -limit, limit).astype(np.float64)
-    padded = np.pad(clipped, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
-    size = padded.shape[-2:]
-    spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
-    out[...] = np.fft.irfft2(spectrum, s=size)[:, 2 * radius :, 2 * radius :]
+    for plane, result in zip(light, out, strict=True):  # all at once, large ones fill the memory
+        padded = np.pad(np.clip(plane, -limit, limit).astype(np.float64), radius, mode="edge")
+        spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=padded.shape)
+        result[...] = np.fft.irfft2(spectrum, s=padded.shape)[2 * radius :, 2 * radius :]
 
 
 @_jit()
@@ -283,22 +282,18 @@ class DiscBank:
             self._levels[index] = disc_blur(self._levels[0], DIAMETERS[index])
         return self._levels[index]
 
-    def blurred(self, diameter: Tensor, out: Tensor | None = None) -> Tensor:
-        """The image blurred by `diameter`, differentiable in it.
+    def blurred(self, diameter: Tensor) -> Tensor:
+        """The image blurred by `diameter` (..., H, W) of each pixel [pixel], differentiable in it.
 
-        Args:
-            diameter: (..., H, W) blur diameter of each pixel [pixel], >= 0, broadcast against the
-                image; beyond the largest disc of the bank it stays there.
-            out: Contiguous float32 tensor like the image to write to, instead of a new one, where
-                image and diameters are on the CPU.
+        It is >= 0, broadcast against the image; beyond the largest disc of the bank it stays there.
         """
         image, frame = self._levels[0], _frame_of(diameter)
         if frame is not None and frame.shape == image.shape[-2:] and has_kernels(image):
-            return self._blended(frame, out)
+            return self._blended(frame)
         weights = _weights(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
         return functools.reduce(operator.add, (self.level(i) * weight for i, weight in weights))
 
-    def _blended(self, diameter: Tensor, out: Tensor | None) -> Tensor:
+    def _blended(self, diameter: Tensor) -> Tensor:
         """`blurred` by kernels, by `diameter` (H, W)."""
         diameters, knots = diameter.contiguous().numpy(), _KNOTS.astype(np.float32)
         used = np.zeros(len(knots), np.bool_)
@@ -306,7 +301,7 @@ class DiscBank:
         light = self._levels[0].contiguous()
         # Levels without a share are read too, times 0: any image does.
         levels = [self.level(i).contiguous() if used[i] else light for i in range(len(knots))]
-        out = new_frame(light) if out is None else out
+        out = new_frame(light)
         fixed = (diameters, _ONE, knots, addresses(levels), 0, out.numel())
         result, (height, width) = out.numpy().reshape(-1, *out.shape[-2:]), out.shape[-2:]
         least = 1 + _WORTH_A_THREAD // width

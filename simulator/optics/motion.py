@@ -34,8 +34,8 @@ from torch import Tensor
 from simulator.utils.checks import check_number
 from simulator.utils.compute import kernel, parallel_ranges
 
-#: Samples from which another thread is worth waking, of uniform blurs and of paths.
-_WORTH_A_THREAD, _PATH_WORTH_A_THREAD = 2**16, 2**18
+#: Samples from which another thread is worth waking.
+_WORTH_A_THREAD = 2**16
 #: Samples that are summed together: they stay in the first-level cache.
 GROUP = 2048
 #: Points of a path, per pixel of its length and at most: longer ones are sampled more coarsely.
@@ -151,24 +151,17 @@ def motion_kernel(extent_px: float) -> np.ndarray:
     return weights / (2 * n + 1 + 2.0 * end)
 
 
-def motion_blur(
-    light: Tensor, extent_px: float, out: Tensor | None = None, *, limit: float = math.inf
-) -> Tensor:
-    """Linear light (..., H, W) in uniform motion along the rows during the exposure.
+def motion_blur(light: Tensor, extent_px: float) -> Tensor:
+    """Linear light (..., H, W) as it moves by `extent_px` >= 0 pixels along the rows, uniformly.
 
     The cost of long streaks hardly depends on the extent.
-
-    Args:
-        extent_px: Distance that the image moves, in pixels, >= 0.
-        out: Contiguous float32 tensor on the CPU to write to, instead of a new one.
-        limit: Light beyond it, on either side of 0, is clipped before the blur; float32, CPU only.
     """
     n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
     if not n and not end:
-        return light if out is None else out.copy_(light)
+        return light
     if has_kernels(light):
-        most = np.float32(limit)
-        return by_rows(light, out, lambda a, b, rows, to: move_rows(a, b, rows, n, end, most, to))
+        most = np.float32(math.inf)
+        return by_rows(light, lambda a, b, rows, to: move_rows(a, b, rows, n, end, most, to))
     width, radius = light.shape[-1], n + 1
     covered = 2 * n + 1 + 2.0 * end
     full, edge = 1.0 / covered, end / covered
@@ -191,14 +184,10 @@ def has_kernels(light: Tensor) -> bool:
 
 
 def by_rows(
-    light: Tensor,
-    out: Tensor | None,
-    task: Callable[[int, int, np.ndarray, np.ndarray], None],
-    cost: int = 1,
+    light: Tensor, task: Callable[[int, int, np.ndarray, np.ndarray], None], cost: int = 1
 ) -> Tensor:
-    """`light` by `task` on shares of its rows, into `out`; `cost` is that of a sample."""
-    out = torch.empty(light.shape) if out is None else out
-    width = light.shape[-1]
+    """`light` by `task` on shares of its rows; `cost` is that of a sample."""
+    out, width = torch.empty(light.shape), light.shape[-1]
     rows, result = light.contiguous().reshape(-1, width).numpy(), out.reshape(-1, width).numpy()
     least = 1 + _WORTH_A_THREAD // (cost * width)
     parallel_ranges(lambda a, b: task(a, b, rows, result), len(rows), least=least)
@@ -455,7 +444,13 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
 
 @_jit()
 def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
-    """Background along `taps`, the subject in front of it along `own`; see `path_blur_apart`."""
+    """A subject that moves along its path, in front of a background that moves along another.
+
+    ``(1 - A) (K_b * B) + K_s * (M L)`` of the planes (P, H, W), L, with the `mask` of the subject,
+    M, A = K_s * M, the `own` taps of its path, K_s, those of the background's, K_b, and the
+    background B that continues behind it: which pixel, counted row by row, it shows in place of
+    each is `behind`. Uniform light stays uniform.
+    """
     count, height, width = planes.shape
     rows, columns, weights = own
     # What the subject is smeared over: elsewhere there is nothing of it.
@@ -502,49 +497,8 @@ def blur_planes(planes, rows, columns, weights, limit, out):  # type: ignore[no-
         blur_rows(_TOP, planes.shape[1], planes[plane], rows, columns, weights, limit, out[plane])
 
 
-def path_blur(
-    light: Tensor, taps: Taps, out: Tensor | None = None, *, limit: float = math.inf
-) -> Tensor:
-    """Motion of `light` (P, H, W) float32 along a path; the borders are replicated.
-
-    It is blurred on the CPU wherever it lies; `out` and `limit` are those of `motion_blur`.
-    """
-    most = np.float32(limit)
-    return _by_planes(light, out, lambda planes, to: blur_planes(planes, *taps, most, to))
-
-
-def path_blur_apart(
-    light: Tensor,
-    mask: Tensor,
-    behind: Tensor,
-    taps: Taps,
-    own: Taps,
-    out: Tensor | None = None,
-    *,
-    limit: float = math.inf,
-) -> Tensor:
-    """A subject that moves along its own path, in front of a background that moves along another.
-
-    ``(1 - A) (K_b * B) + K_s * (M L)`` with the mask M of the subject, A = K_s * M, and the
-    background B that continues behind it: uniform light stays uniform.
-
-    Args:
-        light: (P, H, W) float32, L.
-        mask: (1, H, W) float32, M.
-        behind: (H, W) int64, which pixel (counted row by row) B shows in place of each.
-        taps, own: Of the background's path, K_b, and of the subject's, K_s.
-        out, limit: See `motion_blur`.
-    """
-    fixed = (mask[0].numpy(), behind.int().numpy(), tuple(taps), tuple(own), np.float32(limit))
-    return _by_planes(light, out, lambda planes, to: blur_apart(planes, *fixed, to))
-
-
-def _by_planes(
-    light: Tensor, out: Tensor | None, task: Callable[[np.ndarray, np.ndarray], None]
-) -> Tensor:
-    """`light` (P, H, W) by `task` on shares of its planes, into `out`."""
-    out = torch.empty(light.shape) if out is None else out
-    planes, result = light.cpu().contiguous().numpy(), out.numpy()
-    least = 1 + _PATH_WORTH_A_THREAD // planes[0].size
-    parallel_ranges(lambda a, b: task(planes[a:b], result[a:b]), len(planes), least=least)
-    return out.to(light.device)
+def path_blur(light: Tensor, taps: Taps) -> Tensor:
+    """Motion of `light` (P, H, W) float32 along a path, on the CPU; the borders are replicated."""
+    out = torch.empty(light.shape)
+    blur_planes(light.contiguous().numpy(), *taps, np.float32(math.inf), out.numpy())
+    return out

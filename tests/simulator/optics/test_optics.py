@@ -322,13 +322,10 @@ def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(extent, diameter):
     assert discs.kernel_energy(extent, diameter) == pytest.approx((response**2).sum(), rel=rel)
 
 
-def test_outputs_and_no_or_bad_extents():
-    light, out = lamp(4, 8, 8), torch.empty(4, 8, 8)
+def test_no_or_bad_extents():
+    light = lamp(4, 8, 8)
     assert motion_blur(light, 0.0) is light
     assert disc_blur(light, 0.0) is light
-    assert torch.equal(motion_blur(light, 0.0, out), light)
-    assert motion_blur(light, 3.0, out) is out
-    assert torch.equal(out, motion_blur(light, 3.0))
     view = torch.stack([light, light], dim=-1)[..., 0]  # not contiguous
     assert all(torch.equal(blur(view, 4.0), blur(light, 4.0)) for blur in (motion_blur, disc_blur))
     for bad in (-1.0, math.nan, math.inf):
@@ -336,17 +333,6 @@ def test_outputs_and_no_or_bad_extents():
             motion_blur(light, bad)
         with pytest.raises(ValueError, match="`diameter_px`"):
             disc_blur(light, bad)
-
-
-@pytest.mark.parametrize("extent", [3.0, 9.0, 200.0])
-def test_light_beyond_the_limit_is_clipped_first(extent):
-    light = lamp(4, 16, 24)
-    light[0, 3, 4], light[1, 5, 6] = 1e30, -1e30
-    found = motion_blur(light, extent, limit=1e9).numpy()
-    wanted = motion_blur(light.clamp(-1e9, 1e9).double(), extent)
-    np.testing.assert_allclose(found, wanted, rtol=2e-6, atol=300)
-    found = path_blur(light, path_taps(Path(extent), 16, 24), limit=1e9)
-    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=3000)
 
 
 @pytest.mark.slow
