@@ -25,7 +25,7 @@ from simulator.optics.discs import (
     mark_levels,
     wide_disc,
 )
-from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak_share, taps_of
+from simulator.optics.motion import blur_apart, blur_rows, move_rows, streak_share, taps_of
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Addresses of arrays of a layout, 0 for none: (H, W) float32 diameters relative to the largest;
@@ -268,8 +268,11 @@ def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -
     if not len(todo):
         return
     threads = torch.get_num_threads()
-    # Frames are shared out whole, unless they are few and large.
-    parts = 1 if len(todo) >= 2 * threads or math.prod(shape) < _LARGE else shape[0]
+    # Frames are shared out whole, unless they are few and large: then by planes, and by rows where
+    # there are more threads.
+    parts = 1
+    if len(todo) < 2 * threads and math.prod(shape) >= _LARGE:
+        parts = shape[0] * min(1 + (threads - 1) // (len(todo) * shape[0]), shape[1])
     ranked = todo[np.argsort(cost[todo], kind="stable")[::-1]]
     # Dealt out in turn: every thread gets about as much to do.
     order = np.concatenate([ranked[share::threads] for share in range(threads)])
@@ -293,17 +296,13 @@ def mark_needed(blurs, knots, needed):  # type: ignore[no-untyped-def]
         needed[i, 0] = False
 
 
-# Passes do units `first` to `last`: a unit is one of `parts` equal parts of the planes (P, H, W) of
-# a frame. Those of the frame ``order[unit // parts]`` are read and written at addresses (K,). There
+# Passes do units `first` to `last`: a unit is one of `parts` equal shares of the rows of all planes
+# (P, H, W) of a frame, ``order[unit // parts]``, which is read and written at addresses (K,). There
 # is one for each kind of blur: what compiles slowly and is not needed is not compiled.
 @_jit()
-def _part(address, unit, parts, planes, height, width):  # type: ignore[no-untyped-def]
-    """The part of a frame at an address that a unit works on, (P / parts, H, W)."""
-    count = planes // parts
-    samples = count * height * width
-    frame = _array_at(address, (planes * height * width,))
-    begin = unit % parts * samples
-    return frame[begin : begin + samples].reshape((count, height, width))
+def _share(unit, parts, rows):  # type: ignore[no-untyped-def]
+    """The first row of a unit, and the first behind it."""
+    return unit % parts * rows // parts, (unit % parts + 1) * rows // parts
 
 
 @_jit()
@@ -311,11 +310,11 @@ def blur_discs(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, source, to, radii
 ):
     """Light behind one disc each."""
+    shape = planes * height, width
     for unit in range(first, last):
-        i, shape = order[unit // parts], (planes // parts * height, width)
-        image = _part(source[i], unit, parts, planes, height, width).reshape(shape)
-        out = _part(to[i], unit, parts, planes, height, width).reshape(shape)
-        disc_image(image, height, radii[i], _MOST, out)
+        i, rows = order[unit // parts], _share(unit, parts, shape[0])
+        image, out = _array_at(source[i], shape), _array_at(to[i], shape)
+        disc_image(rows[0], rows[1], image, height, radii[i], _MOST, out)
 
 
 @_jit()
@@ -323,13 +322,17 @@ def blend_discs(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, to, blurs, levels
 ):
     """Light behind a disc of its own for each pixel, from `levels` (K, 13)."""
-    samples = planes * height * width
+    samples, count = planes * height * width, max(planes // parts, 1)
     for unit in range(first, last):
-        i = order[unit // parts]
-        diameter = _array_at(blurs[i].diameter, (height, width))
-        scale, begin = np.float32(blurs[i].defocus_px), unit % parts * (samples // parts)
-        out = _part(to[i], unit, parts, planes, height, width)
-        blend_rows(_TOP, height, diameter, scale, _KNOTS, levels[i], begin, samples, out)
+        i, rows = order[unit // parts], _share(unit, parts, planes * height)
+        diameter, scale = (
+            _array_at(blurs[i].diameter, (height, width)),
+            np.float32(blurs[i].defocus_px),
+        )
+        top, plane = rows[0] % height, rows[0] // height
+        out = _array_at(to[i], (planes, height, width))[plane : plane + count]
+        bottom, begin = top + (rows[1] - rows[0]) // count, plane * height * width
+        blend_rows(top, bottom, diameter, scale, _KNOTS, levels[i], begin, samples, out)
 
 
 @_jit()
@@ -337,12 +340,12 @@ def move_along_rows(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, light, to, blurs
 ):
     """Light that moves along the rows."""
+    shape = planes * height, width
     for unit in range(first, last):
-        i, shape = order[unit // parts], (planes // parts * height, width)
-        image = _part(light[i], unit, parts, planes, height, width).reshape(shape)
-        out = _part(to[i], unit, parts, planes, height, width).reshape(shape)
+        i, rows = order[unit // parts], _share(unit, parts, shape[0])
         n, share = streak_share(blurs[i].motion_px)
-        move_rows(_TOP, len(image), image, n, share, _MOST, out)
+        image, out = _array_at(light[i], shape), _array_at(to[i], shape)
+        move_rows(rows[0], rows[1], image, n, share, _MOST, out)
 
 
 @_jit()
@@ -350,19 +353,22 @@ def move_along_paths(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, light, to, blurs
 ):
     """Light that moves along a path, and a subject that moves along its own."""
-    still = 0.0
+    still, shape = 0.0, (planes, height, width)
     for unit in range(first, last):
-        i = order[unit // parts]
-        blur = blurs[i]
-        image = _part(light[i], unit, parts, planes, height, width)
-        out = _part(to[i], unit, parts, planes, height, width)
+        i, rows = order[unit // parts], _share(unit, parts, planes * height)
+        blur, image, out = blurs[i], _array_at(light[i], shape), _array_at(to[i], shape)
+        begin, end = rows[0] // height, (rows[1] + height - 1) // height  # planes
         path = blur.extent, blur.direction, blur.turn
         taps = taps_of(path[0], path[1], path[2], still, still, height, width)
         if blur.mask:
+            if rows[0] % height:  # whoever has the first rows of a plane does all of it
+                continue
             drift = blur.drift_x, blur.drift_y
             own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
             mask = _array_at(blur.mask, (height, width))
             behind = _array_at(blur.behind, (height, width)).view(np.int32)
-            blur_apart(image, mask, behind, taps, own, _MOST, out)
-        else:
-            blur_planes(image, taps[0], taps[1], taps[2], _MOST, out)
+            blur_apart(image[begin:end], mask, behind, taps, own, _MOST, out[begin:end])
+            continue
+        for plane in range(begin, end):
+            top, bottom = max(rows[0] - plane * height, 0), min(rows[1] - plane * height, height)
+            blur_rows(top, bottom, image[plane], taps[0], taps[1], taps[2], _MOST, out[plane])

@@ -248,10 +248,10 @@ def _quadrant(radius):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def disc_image(image, height, radius, limit, out):  # type: ignore[no-untyped-def]
-    """Planes (P * H, W) behind a disc of `radius`."""
+def disc_image(first, last, image, height, radius, limit, out):  # type: ignore[no-untyped-def]
+    """Rows from `first` to `last` of planes (P * H, W) behind a disc of `radius`."""
     weights, reach = _quadrant(radius)
-    _disc(np.int64(0), len(image), height, image, weights, reach, limit, out)
+    _disc(first, last, height, image, weights, reach, limit, out)
 
 
 # -- a bank of discs --------------------------------------------------------------------------

@@ -490,15 +490,9 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
                 result[y, left + x] = seen * result[y, left + x] + front[y, x]
 
 
-@_jit()
-def blur_planes(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
-    """Planes (P, H, W) as sums of their shifts."""
-    for plane in range(len(planes)):
-        blur_rows(_TOP, planes.shape[1], planes[plane], rows, columns, weights, limit, out[plane])
-
-
 def path_blur(light: Tensor, taps: Taps) -> Tensor:
     """Motion of `light` (P, H, W) float32 along a path, on the CPU; the borders are replicated."""
     out = torch.empty(light.shape)
-    blur_planes(light.contiguous().numpy(), *taps, np.float32(math.inf), out.numpy())
+    for plane, to in zip(light.contiguous().numpy(), out.numpy(), strict=True):
+        blur_rows(_TOP, len(plane), plane, *taps, np.float32(math.inf), to)
     return out

@@ -312,8 +312,8 @@ def alone(index, state, gain, key, noise="bank"):
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
 @pytest.mark.parametrize("light_bytes", [2**30, 0])
 def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
-    monkeypatch.setattr(blurred_frames, "_LARGE", light_bytes)  # at 0, planes are shared out
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(blurred_frames, "_LARGE", light_bytes)  # at 0, rows are shared out
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 61)
     scenes, rng, seen = Mock(side_effect=prepared), np.random.default_rng(0), set()
     batch = made(noise, light_bytes=light_bytes, scenes=scenes)
     for _ in range(12):
