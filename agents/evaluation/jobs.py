@@ -90,7 +90,8 @@ class Jobs(EvaluationRun):
 
     def policy_key(self, trained: TrainedPolicy, condition: Condition) -> str:
         """Key of the part with the track of `trained` in `condition`."""
-        own = (trained.name, named_content(trained.name), self.device)
+        # Not the full name: the same weights in another folder do the same.
+        own = (trained.policy, trained.index, named_content(trained.name), self.device)
         shown = (condition.delay, condition.budget, self.plan.starts)
         return cache_key("policy", [self.light_key(condition), *shown, *own])
 
