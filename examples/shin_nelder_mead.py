@@ -22,8 +22,8 @@ from agents.metering.reading import BLACK_SIGNAL, GREEN, WHITE_SIGNAL, frame_sta
 from agents.metering.search_meters import encoded
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 
-#: Share of white, or of black, pixels from which a frame shows nothing.
-NOTHING_SHOWN = 0.9
+#: Share of white, or of black, pixels from which a frame shows nothing, and its metric in a search.
+NOTHING_SHOWN, WORST = 0.9, -100.0
 
 Search = Generator[Floats, float, Floats]
 
@@ -121,12 +121,13 @@ class ShinNelderMead(Policy):
             if camera.asked not in (None, state):
                 continue  # a frame of an older decision
             allowed = None if action_masks is None else action_masks[i]
-            if abs(lost[i]) >= NOTHING_SHOWN:
-                camera.search = camera.held = None
-                point = self._points[state] + self.step * np.sign(lost[i])
-                camera.asked = self._nearest(point, allowed)
-            else:
+            if abs(lost[i]) < NOTHING_SHOWN:
                 camera.asked = self._climb(camera, state, metric[i], allowed)
+            elif camera.search is not None:
+                camera.asked = self._climb(camera, state, WORST, allowed)
+            else:  # nothing to climb: a step of time and one of gain
+                point = self._points[state] + self.step * np.sign(lost[i])
+                camera.asked, camera.held = self._nearest(point, allowed), None
         return np.array([camera.asked for camera in self._cameras], np.int64)
 
     def _climb(self, camera: "_Camera", state: int, metric: float, allowed: Bools | None) -> int:
