@@ -84,8 +84,8 @@ class ShinNelderMead(Policy):
     def __init__(
         self,
         context: PolicyContext,
-        f_number: float = 5.6,
-        step: float = 3.0,
+        f_number: float = 4.0,
+        step: float = 2.0,
         tolerance: float = 1.0,
         threshold: float = 0.3,
     ) -> None:

@@ -7,9 +7,9 @@ r"""Searches the ten parameters of `parametric_meter.py` on training scenes; CPU
 
 A search maximises the mean normalised score over training scenes, bundled and real ones with the
 same weight, each begun dark, right and bright, with settings that take effect at once and two
-frames late. Other source groups of the training split say which of the points that were the best
-so far is kept. Every search sees the same episodes: all states of each are photographed once, so
-an evaluation reads frames and expected scores from tables. No scene of the test split is opened.
+frames late. Other source groups of the training split say which of the twenty best points is kept.
+Every search sees the same episodes: all states of each are photographed once, so an evaluation
+reads frames and expected scores from tables, in 0.1 s. No scene of the test split is opened.
 """
 
 import argparse
