@@ -32,12 +32,12 @@ def test_parametric_meter_exposes_a_card_and_reads_statistics_alike(context, pho
 
 
 def test_a_score_from_tables_is_that_of_the_states_in_effect(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "examples"))
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "examples")
     tune = importlib.import_module("tune_meter")
     table = {key: np.zeros((1, 2, 1)) for key in ("raw", "histogram", "clipped")}
     table |= {"scores": np.array([[0.2, 0.8]]), "allowed": np.ones((1, 2), np.bool_)}
     table |= {"starts": np.zeros((1, 3), int), "sensors": np.zeros((1, tune.FRAMES, 2))}
-    table |= {"sets": np.array(["a"]), "groups": np.array(["g"])}
+    table |= dict.fromkeys(("sets", "groups"), np.array(["a"]))
     second = SimpleNamespace(reset=lambda count: None, act=lambda seen, masks: np.ones(6, int))
     # State 1 is in effect at once, or, with two frames of delay, in all frames but two.
     expected = (0.8 - 0.5 * 2 * (0.8 - 0.2) / tune.FRAMES - 0.5) / (0.8 - 0.5)
@@ -54,8 +54,8 @@ def test_simplex_asks_for_the_points_that_scipy_does(seed):
 
     options, search = {"initial_simplex": simplex, "fatol": np.inf}, nelder_mead(simplex, 1e-4)
     minimize(value, simplex[0], expected, method="Nelder-Mead", options=options)
-    point = next(search)
     with contextlib.suppress(StopIteration):
+        point = next(search)
         while True:
             point = search.send(value(point, asked))
     np.testing.assert_allclose(asked, expected, atol=1e-9)
@@ -65,18 +65,16 @@ def test_shin_rests_on_a_state_and_searches_again_in_other_light(context, photog
     light = np.random.default_rng(0).lognormal(0.0, 1.0, (4, 8, 8)).repeat(8, 1).repeat(8, 2)
     policy, visited = ShinNelderMead(context), [0]
     policy.reset(1)
-    for frame in range(60):
-        seen = photograph(light, 12.0 if frame < 30 else 6.0, visited[-1])
-        visited.append(int(policy.act(seen)[0]))
+    for ev in [12.0] * 30 + [6.0] * 30:
+        visited.append(int(policy.act(photograph(light, ev, visited[-1]))[0]))
     assert len(set(visited[25:31])) == len(set(visited[55:])) == 1
-    fall = context.grid.ev100[visited[30]] - context.grid.ev100[visited[-1]]
+    fall = -np.diff(context.grid.ev100[[visited[30], visited[-1]]])[0]
     assert 3.0 < fall < 9.0  # the light falls by 6, and the grid has steps
 
 
 def test_cql_runs_its_network_as_torch_does(context, photograph, tmp_path):
     seen, path = photograph(1.0, 10.0, np.arange(30)), tmp_path / "q.safetensors"
-    torch.manual_seed(0)
     network = nn.Sequential(nn.Linear(69, 8), nn.ReLU(), nn.Linear(8, len(context.grid)))
     save_file({f"layer{name}": v for name, v in network.state_dict().items()}, path)
-    expected = network(torch.from_numpy(features(*seen.values()))).argmax(1)
-    assert OfflineCQL(context, path).act(seen).tolist() == expected.tolist()
+    expected = network(torch.from_numpy(features(*seen.values()))).argmax(1).tolist()
+    assert OfflineCQL(context, path).act(seen).tolist() == expected
