@@ -3,7 +3,8 @@
     ae-env evaluate --policy examples/shin_nelder_mead.py:ShinNelderMead --policy shim:P
 
 U. Shin, J. Park, G. Shim, F. Rameau, I. S. Kweon, "Camera exposure control for robust robot vision
-with noise-aware image quality assessment", IROS 2019, written from the paper. The metric is
+with noise-aware image quality assessment", IROS 2019; the control is written from its description,
+without the authors' code or settings. The metric is
 `ae_env.scorers.measures.shin_metric`: gradient, entropy and noise, this one of flat pixels that are
 neither dark nor white. Ours are: the size of the first simplex, when a simplex counts as converged,
 the threshold of a restart, the state of the grid nearest to a point, and the way out of frames that
