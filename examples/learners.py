@@ -10,20 +10,19 @@ writes runs/learners/dqn-0.safetensors and a .json with the learning curve, and 
 Learning, CVPR 2024): SAC, changes of the exposure as actions, a history of mean intensities and
 settings as state, a curriculum, and randomised domains. It is no reproduction. What differs:
 
-- Camera: here it is simulated, noise included, with Av, Tv and Sv on a grid of 64 states and delays
-  of 1 (ISO) and 2 frames; there a real camera with continuous exposure time and gain and no
-  aperture, trained on real light.
-- Actions: here changes of Av, Tv and Sv by up to 4 stops, rounded to the grid's nearest state;
-  there relative changes of exposure time and gain.
-- State: here what an average meter read, clipping and what was asked for, in 12 frames, and the
-  settings; there statistics of the intensities of the last frames, by their own normalisation.
-- Reward: here the task's, a score of the frame and minus its visible jump; there a sum of terms of
-  mean intensity, flicker and image quality.
-- Curriculum: here three stages of equal length by kinds of light (drifts and lamps; then ramps and
-  sines, too; then all); there static and dynamic stages with light that they control.
-- Randomised domains: here what every learner's training has, scenes of many places, their light,
-  start, motion, defocus, kinds of light and noise; there the lamps of their training box.
-- Network, budget, hyperparameters: those of configs/learners/drl_ae.yaml; theirs were not copied.
+- Camera: here simulated, with Av, Tv and Sv on a grid of 64 states and delays of 1 (ISO) and 2
+  frames; there a machine-vision camera, whose exposure time and gain are continuous.
+- Actions: here changes of the wanted Av, Tv and Sv by up to 4 stops, of which the grid's nearest
+  state is taken; there changes of exposure time and gain.
+- State: here what an average meter read of the whole frame, clipping and what was asked for, in 12
+  frames, and the settings; there intensities of a patch of the frame, over the last frames.
+- Reward: here the task's, the score of a frame minus its visible jump; there terms of intensity,
+  flicker and attributes of the image.
+- Curriculum: here a third of the frames each in still light, in drifts, lamps and sines, and in all
+  kinds of the training split; there levels from fixed to changing light, in a dark room with lamps.
+- Randomised domains: here what the training of every learner has, scenes of many places and their
+  light, start, motion, defocus and noise; there patches, among others, of that dark room.
+- Network, budget and hyperparameters: those of configs/learners/drl_ae.yaml; none is the paper's.
 """
 
 import importlib
@@ -54,15 +53,9 @@ from simulator.utils.files import data_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "learners"
 NAMES = ("ppo", "a2c", "dqn", "qrdqn", "sac", "ppo_video", "recurrent_ppo", "drl_ae")
-FRAMES, SEEDS, CHECKPOINTS = 40_960, range(5), 10
+FRAMES, SEEDS, CHECKPOINTS, EXAM = 20_480, range(5), 10, ("bundled", "test", 32)
 STILL = "ae_env/AutoExposure-v0"
-#: Unseen scenes, in moving light of kinds that nothing was trained on; by whether the light moves.
-TEST = {"scenes": "bundled", "split": "test", "resolution": 64, "observation": "statistics"}
 DELAY = {"iso": 1, "exposure_time": 2, "f_number": 2}
-CONDITIONS = {
-    False: ("default", 8, {"lighting": "static"}),
-    True: ("video", 48, {"lighting": {"kind": "moving", "kinds": "test"}, "delay": DELAY}),
-}
 
 
 class Statistics(BaseFeaturesExtractor):
@@ -112,12 +105,12 @@ class ApexActions:
 
     def states(self, actions):
         """(N,) int64."""
-        wanted = self.low + (np.clip(actions, -1, 1) + 1) / 2 * (self.high - self.low)
+        actions = np.clip(actions, -1.0, 1.0)
+        wanted = self.low + (actions + 1) / 2 * (self.high - self.low)
         if self.stops is not None:
             wanted = np.clip(self.asked + self.stops * actions, self.low, self.high)
-        states = ((wanted[:, None] - self.apex) ** 2).sum(axis=-1).round(9).argmin(axis=-1)
-        self.asked = self.apex[states]
-        return states
+        self.asked = wanted
+        return ((wanted[:, None] - self.apex) ** 2).sum(axis=-1).round(9).argmin(axis=-1)
 
 
 class ApexVecEnv(VecEnvWrapper):
@@ -205,15 +198,18 @@ class Learnt(Policy):
 class Exam:
     """Normalised score in unseen scenes, 0 of random states and 1 of an oracle."""
 
-    def __init__(self, moving, scenes):
-        grid, frames, condition = CONDITIONS[moving]
-        environment = {**TEST, "grid": grid}
+    def __init__(self, moving, scenes, split, most):
+        grid, condition = "default", {}
+        if moving:  # in light of the kinds of the split
+            lighting = {"kind": "moving", "kinds": split}
+            grid, condition = "video", {"lighting": lighting, "delay": DELAY}
+        shown = {"split": split, "resolution": 64, "observation": "statistics"}
         plan = EvaluationPlan(
-            environment=environment,
+            environment={"scenes": scenes, "grid": grid, **shown},
             conditions={"test": condition},
             starts=("random",),
-            frames=frames,
-            max_scenes=scenes,
+            frames=48 if moving else 8,
+            max_scenes=most,
         )
         self.run, self.condition = EvaluationRun(plan), plan.conditions["test"]
         self.light = self.run.score_light(self.condition, lambda count: None)
@@ -254,10 +250,11 @@ class Checkpoints(BaseCallback):
 EXAMS = {}
 
 
-def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, test_scenes=48, **changed):
+def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, exam=EXAM, **changed):
     """Trains a learner; writes weights and learning curve, and returns the curve's rows.
 
-    `changed` are entries of its configuration, for trials.
+    `exam` is the set that it is judged on, the split, and how many scenes at most; `changed` are
+    settings to try.
     """
     scenes = scenes or ("mixed" if data_folder() else "bundled")
     config, algorithm = load(name)
@@ -273,7 +270,7 @@ def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, test_scen
             observation="statistics",
             autoreset_mode="SAME_STEP",
             **config.get("environment", {}),
-            **({"lighting": {"kind": "moving", "kinds": light}} if light else {}),
+            **({"lighting": light} if light else {}),
         )
         context, venv = PolicyContext.from_envs(envs), SB3VectorAdapter(envs)
         if config.get("history"):
@@ -287,10 +284,10 @@ def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, test_scen
     context, venv = make(stages[0])
     settings["policy_kwargs"] = network_arguments(config)
     model = algorithm(config["policy"], venv, seed=1000 * seed, device="cpu", **settings)
-    if (moving, test_scenes) not in EXAMS:
-        EXAMS[moving, test_scenes] = Exam(moving, test_scenes)
+    if (moving, *exam) not in EXAMS:
+        EXAMS[moving, *exam] = Exam(moving, *exam)
     policy = Learnt(context, network=model.policy, config=config)
-    callback = Checkpoints(EXAMS[moving, test_scenes], policy, frames)
+    callback = Checkpoints(EXAMS[moving, *exam], policy, frames)
     for number, light in enumerate(stages):
         if number:
             model.set_env(make(light)[1])
