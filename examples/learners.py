@@ -53,7 +53,7 @@ from simulator.utils.files import data_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "learners"
 NAMES = ("ppo", "a2c", "dqn", "qrdqn", "sac", "ppo_video", "recurrent_ppo", "drl_ae")
-FRAMES, SEEDS, CHECKPOINTS, EXAM = 20_480, range(5), 10, ("bundled", "test", 32)
+FRAMES, SEEDS, CHECKPOINTS, EXAM = 16_384, range(5), 10, ("bundled", "test", 32)
 STILL = "ae_env/AutoExposure-v0"
 DELAY = {"iso": 1, "exposure_time": 2, "f_number": 2}
 
@@ -290,9 +290,11 @@ def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, exam=EXAM
     callback = Checkpoints(EXAMS[moving, *exam], policy, frames)
     for number, light in enumerate(stages):
         if number:
+            model.env.close()
             model.set_env(make(light)[1])
         share = -(-frames * (number + 1) // len(stages)) - model.num_timesteps
         model.learn(share, callback, reset_num_timesteps=not number)
+    model.env.close()
     path = Path(out) / f"{name}-{seed}"
     path.parent.mkdir(parents=True, exist_ok=True)
     save_model(model.policy, f"{path}.safetensors", {"learner": name})
