@@ -20,25 +20,27 @@ assert spec is not None
 assert spec.loader is not None
 learners = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(learners)
-LATE = {"lighting": {"kind": "moving", "kinds": "test"}, "delay": learners.DELAY}
 
 
 @pytest.mark.parametrize("name", learners.NAMES)
 def test_a_learner_trains_and_its_file_is_judged_alike(name: str, tmp_path: Path) -> None:
     off_policy = name in ("dqn", "qrdqn", "sac", "drl_ae")
     changed = {"learning_starts": 64} if off_policy else {}
-    exam = ("bundled:small", "test", None)
+    moving = learners.load(name)[0]["task"] != learners.STILL
+    exam = ("bundled:small", "test", 2 if moving else None)
     rows = learners.train(name, 1, 1_024, tmp_path, "bundled:small", exam, **changed)
     assert rows[-1]["frames"] == 1_024
     assert rows[-1]["wall_seconds"] > 0.0
-    moving = learners.load(name)[0]["task"] != learners.STILL
     test = {"scenes": "bundled:small", "split": "test", "observation": "statistics"}
-    test |= {"grid": "video", **LATE} if moving else {}
+    test |= {"grid": "video", "delay": learners.DELAY} if moving else {}
     context = PolicyContext.from_envs(envs_of(test, num_envs=1, frames=1))
     weights = tmp_path / f"{name}-1.safetensors"
     policy = make_policy(f"{PROGRAM}:Learnt?weights={weights}", context)
-    judged = evaluate({"it": policy}, test, frames=48 if moving else 8)
-    assert judged.normalised("it") == pytest.approx(rows[-1]["score"], abs=1e-6)
+    if moving:  # without the tables of its light once more, which take longest
+        again = learners.EXAMS[moving, *exam].score(policy)
+    else:
+        again = evaluate({"it": policy}, test).normalised("it")
+    assert again == pytest.approx(rows[-1]["score"], abs=1e-6)
 
 
 def test_actions_as_the_wrapper_has_them_and_changes_of_them() -> None:
