@@ -20,8 +20,9 @@ from benchmarks.isolated import ROOT
 RUNS, SEEDS, KEYS = ROOT / "runs" / "learners", 5, ("frames", "cpu_seconds", "score")
 STILL, MOVING = ("dqn", "qrdqn", "ppo", "a2c", "sac"), ("ppo_video", "recurrent_ppo", "drl_ae")
 DRAWN = ("ppo", "dqn", "sac", "ppo_video", "drl_ae")
-COLUMNS = """learner = {learner} | light = {light} | frames = {frames:,} | minutes = {minutes:.1f} |
-score = {iqm:.3f} | 95 % = {low:.3f} to {high:.3f} | worst seed = {worst:.3f} | seeds = {seeds}"""
+COLUMNS = """learner = {learner} | light = {light} | frames = {frames:,} |
+CPU minutes = {minutes:.2f} | score = {iqm:.3f} | 95 % = {low:.3f} to {high:.3f} |
+worst seed = {worst:.3f} | seeds = {seeds}"""
 
 
 def trained(learner: str, seed: int, quick: bool) -> list[Row]:
@@ -50,7 +51,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         mean = partial(trim_mean, proportiontocut=0.25)  # of the quartiles between
         low, high = bootstrap((scores,), mean, method="percentile", rng=0).confidence_interval
         x = {k: np.mean([row[k] for row in own], axis=0) for k in KEYS}
-        row = {"learner": learner, "light": light, "frames": int(x["frames"][-1])}
+        row: Row = {"learner": learner, "light": light, "frames": int(x["frames"][-1])}
         row |= {"minutes": x["cpu_seconds"][-1] / 60.0, "iqm": mean(scores)[-1], "low": low[-1]}
         shown.append(row | {"high": high[-1], "worst": scores[:, -1].min(), "seeds": len(own)})
         for axis, key in zip(axes, KEYS if learner in DRAWN else (), strict=False):
@@ -59,8 +60,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             axis.set(xlabel=key.replace("cpu_", "CPU "))
     axes[0].set(ylabel="score: 0 random, 1 oracle")
     axes[1].legend(fontsize=7)
-    tables = {"learners": table(shown, COLUMNS)}
-    return Report(sum(results.values(), []), tables, figures={"curves.png": figure})
+    rows = [row for own in results.values() for row in own]
+    return Report(rows, {"learners": table(shown, COLUMNS)}, figures={"curves.png": figure})
 
 
 run = benchmark("curves", parts, report)
