@@ -11,7 +11,7 @@ Learning, CVPR 2024): SAC, changes of the exposure as actions, a history of mean
 settings as state, a curriculum, and randomised domains. It is no reproduction. What differs:
 
 - Camera: here simulated, with Av, Tv and Sv on a grid of 64 states and delays of 1 (ISO) and 2
-  frames; there a machine-vision camera, whose exposure time and gain are continuous.
+  frames; there a real camera, whose exposure time and gain are set.
 - Actions: here changes of the wanted Av, Tv and Sv by up to 4 stops, of which the grid's nearest
   state is taken; there changes of exposure time and gain.
 - State: here what an average meter read of the whole frame, clipping and what was asked for, in 12
@@ -180,7 +180,7 @@ class Learnt(Policy):
         self.memory = self.mapping = None
 
     def act(self, observations, action_masks=None):
-        """The best state by the network; of SAC the state that is nearest to its mean."""
+        """The best state by the network, of SAC that nearest to its mean; masks are not heeded."""
         shown, begins = dict(observations), np.full(self.num_envs, self.memory is None)
         if self.history:
             shown["history"] = self.history.observe(observations)
