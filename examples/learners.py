@@ -49,6 +49,7 @@ from agents.evaluation.engine import EvaluationRun, TrainedPolicy
 from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.learning.networks import MeterHistory, with_history
 from agents.learning.sb3_adapter import SB3VectorAdapter, WithHistory
+from simulator.utils.checks import check_word
 from simulator.utils.files import data_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "learners"
@@ -139,6 +140,7 @@ class ApexVecEnv(VecEnvWrapper):
 
 def load(name):
     """The configuration of a learner, and its class."""
+    check_word("learner", name, NAMES)
     config = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
     module, _, algorithm = config["algorithm"].rpartition(".")
     return config, getattr(importlib.import_module(module), algorithm)
@@ -155,10 +157,13 @@ class Learnt(Policy):
     def __init__(self, context, weights=None, network=None, config=None):
         super().__init__(context)
         if network is None:
-            if not Path(weights).is_file():
-                raise ValueError(f"there is no {weights}: run `python examples/learners.py` first")
+            if weights is None or not Path(weights).is_file():
+                rule = "must be a file that `python examples/learners.py` wrote"
+                raise ValueError(f"`weights` (={weights!r}) {rule}")
+            if "histogram" not in context.observation_space.spaces:
+                raise ValueError('learners see statistics: give `observation="statistics"`')
             with safe_open(weights, "pt") as file:
-                config, algorithm = load(file.metadata()["learner"])
+                config, algorithm = load((file.metadata() or {}).get("learner"))
             space, continuous = context.observation_space, gym.spaces.Box(-1, 1, (3,))
             if config.get("history"):
                 space = with_history(space, config["history"])
@@ -303,6 +308,9 @@ def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, exam=EXAM
 
 
 if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        if name not in NAMES:
+            sys.exit(f"usage: python examples/learners.py [LEARNER ...], of {', '.join(NAMES)}")
     for seed, name in itertools.product(SEEDS, sys.argv[1:] or NAMES):
         if not Path(f"runs/learners/{name}-{seed}.json").is_file():
             print(name, seed, train(name, seed)[-1], flush=True)

@@ -32,7 +32,7 @@ from agents.metering.reading import (
     signal_codes,
 )
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_number, check_word
 
 #: Contrasts [stops] at which highlights and shadows change nothing, their upper bound, and the
 #: EV100 at which brightness does not.
@@ -97,13 +97,26 @@ class Parameters:
 
         A file that `tune_meter.py` wrote has ``runs``; `run` names one of them.
         """
-        found: Any = json.loads(Path(path).read_text(encoding="utf-8"))
-        if run is not None:
+        try:
+            found: Any = json.loads(Path(path).read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"`parameters` (={path!r}) is no JSON file: {error}") from None
+        if isinstance(found, Mapping) and "runs" in found:
+            check_word("run", run, tuple(found["runs"]))
             found = found["runs"][run]["parameters"]
+        return cls.of(found)
+
+    @classmethod
+    def of(cls, values: Mapping[str, float] | Sequence[float]) -> Self:
+        """Parameters from a mapping of names to numbers, or from ten numbers in their order."""
         names = [field.name for field in fields(cls)]
-        return cls(
-            **(found if isinstance(found, Mapping) else dict(zip(names, found, strict=True)))
-        )
+        if not isinstance(values, Mapping):
+            if len(values) != len(names):
+                raise ValueError(f"`parameters` (={values!r}) must be {len(names)} numbers")
+            values = dict(zip(names, values, strict=True))
+        for name in values:
+            check_word("parameters", name, tuple(names))
+        return cls(**values)
 
 
 class ParametricMeter(Policy):
@@ -126,9 +139,10 @@ class ParametricMeter(Policy):
         super().__init__(context)
         if isinstance(parameters, str):
             parameters = Parameters.load(parameters, run)
+        elif run is not None:
+            raise ValueError(f"`run` (={run!r}) is one of a file's: give `parameters` too")
         elif not isinstance(parameters, Parameters):
-            names = RANGES if parameters is not None else ()
-            parameters = Parameters(**dict(zip(names, parameters or (), strict=True)))
+            parameters = Parameters() if parameters is None else Parameters.of(parameters)
         self.parameters = parameters
         self._chooser = StateChooser(context.grid, "P", ProgramOptions())
         self.reset(0)

@@ -69,7 +69,7 @@ def improve(network: ActorCritic, optimiser: torch.optim.Optimizer, rollout) -> 
         for rows in torch.randperm(len(actions), device=actions.device).split(BATCH):
             choice, values = network(*(frame[rows] for frame in frames))
             advantages = rewards[rows] - values.detach()
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+            advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
             ratio = torch.exp(choice.log_prob(actions[rows]) - log_probs[rows])
             gain = torch.min(ratio * advantages, ratio.clamp(1 - CLIP, 1 + CLIP) * advantages)
             off = 0.5 * (rewards[rows] - values).square()

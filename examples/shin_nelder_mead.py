@@ -22,6 +22,7 @@ from ae_env.scorers.measures import shin_metric
 from agents.metering.reading import BLACK_SIGNAL, GREEN, WHITE_SIGNAL, frame_states
 from agents.metering.search_meters import encoded
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
+from simulator.utils.checks import check_number
 
 #: Share of white, or of black, pixels from which a frame shows nothing, and its metric in a search.
 NOTHING_SHOWN, WORST = 0.9, -100.0
@@ -91,9 +92,10 @@ class ShinNelderMead(Policy):
         threshold: float = 0.3,
     ) -> None:
         super().__init__(context)
-        if min(f_number, step, tolerance, threshold) <= 0.0:
-            raise ValueError("`f_number`, `step`, `tolerance` and `threshold` must be > 0")
-        self.step, self.tolerance, self.threshold = step, tolerance, threshold
+        self.step = check_number("step", step, 0.01, 20.0)
+        self.tolerance = check_number("tolerance", tolerance, 0.01, 20.0)
+        self.threshold = check_number("threshold", threshold, 0.0, 100.0)
+        f_number = check_number("f_number", f_number, 0.5, 1024.0)
         apex = np.array([(-s.time_value, s.speed_value) for s in context.grid.states])
         self._points: Floats = apex  # (S, 2) log2 time [s] and gain, both brighter upwards
         self._low, self._high = apex.min(axis=0), apex.max(axis=0)

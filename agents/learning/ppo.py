@@ -195,7 +195,7 @@ class PPOTraining(Configuration):
 
 
 class PPOPolicy(NetworkPolicy):
-    """Takes the most probable state; remembers what its network was trained with, or nothing."""
+    """Takes the most probable state; remembers its last one, and what its network learnt with."""
 
     kind = "ppo"
     #: Log of how many times as probable; the least of 0, 0.05, 0.2, 0.5, 1 and 2 that ends the
@@ -223,9 +223,9 @@ class PPOPolicy(NetworkPolicy):
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Most probable allowed state (N,)."""
+        self.check_reset(observations)
         shown = dict(observations)
         if self._history is not None:
-            self.check_reset(observations)
             shown["history"] = self._history.observe(observations)
         with torch.inference_mode():
             tensors, _ = self.network.obs_to_tensor(shown)

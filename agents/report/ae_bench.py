@@ -272,6 +272,10 @@ def read_table(table: Path) -> pd.DataFrame:
             line = int(wrong.argmax())
             given = f"`{name}` (={rows[name][line]!r})"
             raise ValueError(f"{table}, line {line + 2}: {given} must be a number")
+    for line, task in enumerate(rows.task):
+        if task not in _TASKS:
+            rule = f"`task` (={task!r}) must be one of {', '.join(_TASKS)}"
+            raise ValueError(f"{table}, line {line + 2}: {rule}")
     return rows
 
 
