@@ -63,5 +63,5 @@ def test_actions_as_the_wrapper_has_them_and_changes_of_them() -> None:
 
 def test_missing_weights_are_named() -> None:
     context = PolicyContext.from_envs(make_envs(1))
-    with pytest.raises(ValueError, match=r"there is no none\.safetensors"):
+    with pytest.raises(ValueError, match=r"`weights` \(=.none\.safetensors.\)"):
         make_policy(f"{PROGRAM}:Learnt?weights=none.safetensors", context)
