@@ -204,6 +204,8 @@ def append_rows(
     A row of the same task, policy, observation and author is replaced, and logged. The table is
     made where missing, refused with rows of another hash. Another process that appends waits.
     """
+    if not author.strip():
+        logger.warning("%s: rows without an author are never replaced: give --author", table)
     training = [training_of(policy, plan) for policy in rows.policy]
     found = rows.assign(
         trained_on=[scenes or trained_on for scenes, _ in training],
