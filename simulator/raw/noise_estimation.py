@@ -15,6 +15,7 @@ import torch
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 
+#: Blocks overlap by half: each is four cells.
 _BLOCK, _STEP = 8, 4
 #: Share of each level's blocks that is used: those with the least slope.
 _SMOOTH = 0.3
@@ -99,21 +100,18 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
-def _sums(image: np.ndarray) -> np.ndarray:
-    """(H + 1, W + 1) sums over all pixels above and to the left of each corner."""
-    return np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+def _cells(image: np.ndarray) -> np.ndarray:
+    """Means of cells of `_STEP` x `_STEP` pixels, four of which make a block."""
+    height, width = (n // _STEP for n in image.shape)
+    rows = image[: height * _STEP].reshape(height, _STEP, -1).sum(axis=1)
+    cells = rows[:, : width * _STEP].reshape(height, width, _STEP).sum(axis=2)
+    return np.asarray(cells / _STEP**2)
 
 
-def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.ndarray:
-    """Means of size x size windows, one in each block, at (`top`, `left`) in the block."""
-    rows, columns = (range(0, n - _BLOCK, _STEP) for n in total.shape)
-    corners = [
-        total[top + i : top + i + rows.stop : _STEP, left + j : left + j + columns.stop : _STEP]
-        for i in (0, size)
-        for j in (0, size)
-    ]
-    first, right, below, last = corners
-    return np.asarray((last - right - below + first) / (size * size))
+def _quarters(image: np.ndarray) -> list[np.ndarray]:
+    """Means of the four quarters of each block."""
+    cells = _cells(image)
+    return [cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]]
 
 
 def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarray, ...]:
@@ -128,12 +126,13 @@ def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarra
     high_pass = (rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]) / 6.0
     inner = plane[1:-1, 1:-1]
     clipped = ((inner >= white) | (inner <= floor)).astype(np.float64)
-    half, total = _BLOCK // 2, _sums(inner)
-    quarters = [_box_mean(total, half, i, j) for i in (0, half) for j in (0, half)]
+    quarters = _quarters(inner)
     slope = np.maximum.reduce(quarters) - np.minimum.reduce(quarters)
-    keep = _box_mean(_sums(clipped), _BLOCK) <= _CLIPPED
-    energy = _box_mean(_sums(high_pass**2), _BLOCK)
-    return _box_mean(total, _BLOCK)[keep], energy[keep], slope[keep]
+    mean, energy, share = (
+        np.mean(parts, axis=0) for parts in (quarters, _quarters(high_pass**2), _quarters(clipped))
+    )
+    keep = share <= _CLIPPED
+    return mean[keep], energy[keep], slope[keep]
 
 
 def _level_sets(mean: np.ndarray, slope: np.ndarray) -> list[np.ndarray]:
