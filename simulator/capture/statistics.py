@@ -25,7 +25,8 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 from simulator.utils.compute import kernel, parallel_ranges
 
-#: Bins of about equal population per plane, and pixels of a plane that are sampled, at most.
+#: Bins of about equal population per plane, a power of two; pixels of a plane that are sampled, at
+#: most.
 BINS = 64
 SAMPLES = 65_536
 #: Pixels of a plane that are sorted to find the bins, at most about this many.
@@ -75,31 +76,24 @@ def _find(values, limits, indices):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[no-untyped-def]
+def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyped-def]
     """Adds each pixel of some rows of light (P, H, W) to the bin of its light, by `edges` (P, B-1).
 
-    `sums` (4, P, B): number, light of at least 0, square of the Laplacian, square of the second
-    difference along the row; `levels` (2, P, B): least and most light, at least 0.
+    `bins` (P, B, 6), where what is known of a bin lies together: number, light of at least 0,
+    square of the Laplacian, square of the second difference along the row; least and most light, at
+    least 0.
     """
     _, height, width = light.shape
-    half = 1
-    while 2 * half <= edges.shape[1]:
-        half *= 2
-    limits = np.full(2 * half - 1, np.inf, np.float32)
     indices = np.empty(width, np.uint32)
-    bins = np.empty((2 * half, 6))
     for plane in range(first, last):
-        for index in range(edges.shape[1]):  # an array's copy takes a second more to compile
-            limits[index] = edges[plane, index]
-        bins[:] = 0.0  # what is known of a bin lies together
-        bins[:, 4] = np.inf
+        limits, own = edges[plane], bins[plane]
         for y in rows:
             centre = light[plane, y]
             above, below = light[plane, max(y - 1, 0)], light[plane, min(y + 1, height - 1)]
             _find(centre, limits, indices)
             for x in range(width):
                 value = centre[x]
-                found = bins[indices[x]]
+                found = own[indices[x]]
                 twice = 2.0 * np.float64(value)
                 left, right = centre[max(x - 1, 0)], centre[min(x + 1, width - 1)]
                 along = np.float64(left) + np.float64(right) - twice
@@ -111,11 +105,6 @@ def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[
                 found[3] += along * along
                 found[4] = min(found[4], level)
                 found[5] = max(found[5], level)
-        for index in range(sums.shape[2]):
-            for kind in range(4):
-                sums[kind, plane, index] += bins[index, kind]
-            levels[0, plane, index] = min(levels[0, plane, index], bins[index, 4])
-            levels[1, plane, index] = max(levels[1, plane, index], bins[index, 5])
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
@@ -286,18 +275,19 @@ class LightStatistics:
         light, rows = self._rows
         samples = len(rows) * light.shape[-1]
         edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
-        sums, levels = np.zeros((4, 4, BINS)), np.zeros((2, 4, BINS))
-        levels[0] = np.inf
+        bins = np.zeros((4, BINS, 6))
+        bins[..., 4] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
-        fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
+        fixed = (light, rows, np.ascontiguousarray(edges), bins)
         parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
-        counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
+        number, sums, levels = bins[..., 0], np.moveaxis(bins[..., 1:4], 2, 0), bins[..., 4:]
+        light, disc, row = sums / np.maximum(number, 1.0)  # equal light leaves bins empty
         return _Bins(
-            share=sums[0] / (4.0 * samples),
-            light=sums[1] / counts,
-            edges=np.where(sums[0] > 0, levels, 0.0),
-            disc=sums[2] / counts,
-            row=sums[3] / counts,
+            share=number / (4.0 * samples),
+            light=light,
+            edges=np.where(number > 0, np.moveaxis(levels, 2, 0), 0.0),
+            disc=disc,
+            row=row,
         )
 
 
@@ -443,22 +433,22 @@ class ResidualStatistics:
 
     def _of(self, residual: Residual) -> tuple[np.ndarray, np.ndarray]:
         """Squared bias and variance of a network by plane and level of light, (4, L) each."""
-        found = self._gathered.get(residual)
-        if found is None:
-            error, _, place, counts = self._measured
-            sums = [
-                np.stack([np.bincount(p, v, _LEVELS) for p in place]) for v in residual.at(error)
-            ]
-            found = sums[0] / np.maximum(counts, 1), sums[1] / np.maximum(counts, 1)
-            self._gathered[residual] = found
-        return found
+        if residual not in self._gathered:
+            bias, variance = map(self._by_level, residual.at(self._measured[0]))
+            self._gathered[residual] = bias, variance
+        return self._gathered[residual]
+
+    def _by_level(self, values: np.ndarray) -> np.ndarray:
+        """(4, L) means of `values` of the blocks, (4, N) or (N,) for all planes."""
+        _, _, place, counts = self._measured
+        each = zip(place, np.broadcast_to(values, place.shape), strict=True)
+        return np.stack([np.bincount(p, v, _LEVELS) for p, v in each]) / np.maximum(counts, 1)
 
     @functools.cached_property
     def _levels(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean light, and share of all samples, by plane and level, (4, L) each."""
-        _, light, place, counts = self._measured
-        sums = [np.bincount(p, v, _LEVELS) for p, v in zip(place, light, strict=True)]
-        return np.stack(sums) / np.maximum(counts, 1), counts / counts.sum()
+        _, light, _, counts = self._measured
+        return self._by_level(light), counts / counts.sum()
 
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
