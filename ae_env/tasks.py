@@ -329,7 +329,7 @@ def move_subject(scene: Scene, rows: int, columns: int) -> Scene:
     if layout is None or layout.subject is None:
         return scene
     # Nothing of the subject enters from beyond the border.
-    mask = ndimage.shift(layout.mask[0].numpy(), (rows, columns), order=0)
+    mask = ndimage.shift(layout.subject.float().numpy(), (rows, columns), order=0)
     subject, behind = torch.from_numpy(mask > 0.0), layout.behind.flatten()
 
     def moved(planes: torch.Tensor) -> torch.Tensor:

@@ -136,12 +136,6 @@ class Layout:
         return np.stack([defocus, subject, counts / levels.size])
 
     @cached_property
-    def mask(self) -> torch.Tensor:
-        """(1, H, W) float32, 1 where the subject is."""
-        assert self.subject is not None
-        return self.subject[None].float()
-
-    @cached_property
     def behind(self) -> torch.Tensor:
         """(H, W) int64, the pixel of the background nearest to each, counted row by row."""
         from scipy.ndimage import distance_transform_edt  # not above: it takes long
@@ -157,11 +151,12 @@ class Layout:
         """Arrays that kernels find by their addresses: they never move, as tensors may.
 
         (H, W) float32 `defocus`, and (K,) that of `shares`; of a subject also its (H, W) float32
-        `mask`, and int32 `behind`.
+        mask, and int32 `behind`.
         """
         found = [self.defocus.numpy().copy(), self.shares[0].astype(np.float32)]
         if self.subject is not None:
-            found += [self.mask.numpy().copy(), self.behind.numpy().astype(np.int32)]
+            found += [self.subject.numpy().astype(np.float32)]
+            found += [self.behind.numpy().astype(np.int32)]
         return tuple(found)
 
 
@@ -175,8 +170,6 @@ class FramesAt(Sequence[torch.Tensor]):
         return len(self.addresses)
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
         return torch.from_numpy(frame_at(int(self.addresses[index]), self._shape))
 
 

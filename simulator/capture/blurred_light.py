@@ -337,10 +337,11 @@ def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: 
     if own is None:
         return path_blur(left[None], taps)[0]
     # Taps of pixels that differ leave the mean of what each of these would leave alone.
-    taps_own = path_taps(own, height, width)
+    assert layout.subject is not None
+    taps_own, mask = path_taps(own, height, width), layout.subject[None].float()
     left = path_blur(left.flatten()[layout.behind][None], taps)
-    subject = path_blur(layout.mask * discs.remaining_variance(diameter, taps_own), taps_own)
-    seen = 1.0 - path_blur(layout.mask, taps_own)
+    subject = path_blur(mask * discs.remaining_variance(diameter, taps_own), taps_own)
+    seen = 1.0 - path_blur(mask, taps_own)
     return (seen.square() * left + subject)[0].clamp(max=1.0)
 
 

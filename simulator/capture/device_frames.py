@@ -36,8 +36,7 @@ class DeviceFrames(BlurredFrames):
         self._frames = torch.empty(0, device=device)
         # The lights of scenes by `id`, as long as they exist, and their places.
         self._known: dict[int, tuple[weakref.ref[Tensor], int]] = {}
-        # Addresses of diameters and masks that the layouts were copied from.
-        self._diameters, self._masks = np.zeros((2, num_scenes), np.uintp)
+        self._masks = np.zeros(num_scenes, np.uintp)  # addresses that layouts have theirs from
 
     @property
     def is_full(self) -> bool:
@@ -126,8 +125,8 @@ class DeviceFrames(BlurredFrames):
 
     def _layout_frames(self, indices: np.ndarray, blurs: np.ndarray) -> Tensor:
         """(K, 4, H, W) diameters, masks, and pixels behind the subjects."""
-        stale = (self._layouts[indices] == 0) | (self._diameters[indices] != blurs["diameter"])
-        stale |= (blurs["mask"] > 0) & (self._masks[indices] != blurs["mask"])
+        stale = (blurs["mask"] > 0) & (self._masks[indices] != blurs["mask"])
+        stale |= self._layouts[indices] == 0
         if stale.any():
             lacking = indices[stale & (self._layouts[indices] == 0)]
             self._layouts[lacking] = self._take(len(lacking))
@@ -140,7 +139,6 @@ class DeviceFrames(BlurredFrames):
                     frame[2] = frame_at(blur["behind"].item(), plane).view(np.int32)
                 frames.append(torch.from_numpy(frame))
             self._put(self._layouts[indices[stale]], frames)
-            self._diameters[indices[stale]] = blurs["diameter"][stale]
             self._masks[indices[stale]] = blurs["mask"][stale]
         return self._frames[self._numbers(self._layouts[indices])]
 

@@ -194,18 +194,6 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
 
 
 @_jit()
-def _add_scaled(a, weight, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] += weight * a[x]
-
-
-@_jit()
-def _add_product(a, b, weight, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] += weight * (a[x] + b[x])
-
-
-@_jit()
 def _disc(first, last, height, rows, weights, reach, limit, out):  # type: ignore[no-untyped-def]
     width, radius = rows.shape[1], len(weights) - 1
     pitch = width + 2 * radius
@@ -227,9 +215,13 @@ def _disc(first, last, height, rows, weights, reach, limit, out):  # type: ignor
             else:
                 copy_row(flat[above:], both)
                 inner[:] = np.float32(0)
-            _add_scaled(both[radius:], weights[i, 0], inner)
+            weight, middle = weights[i, 0], both[radius:]
+            for x in range(len(inner)):
+                inner[x] += weight * middle[x]
             for j in range(1, reach[i] + 1):
-                _add_product(both[radius - j :], both[radius + j :], weights[i, j], inner)
+                weight, left, right = weights[i, j], both[radius - j :], both[radius + j :]
+                for x in range(len(inner)):
+                    inner[x] += weight * (left[x] + right[x])
         for i in range(count):
             row = np.uint64(y + i)
             for x in range(width):
@@ -289,9 +281,11 @@ class DiscBank:
 
         It is >= 0, broadcast against the image; beyond the largest disc of the bank it stays there.
         """
-        image, frame = self._levels[0], _frame_of(diameter)
-        if frame is not None and frame.shape == image.shape[-2:] and has_kernels(image):
-            return self._blended(frame)
+        image = self._levels[0]
+        size, own = image.shape[-2:], diameter if torch.is_grad_enabled() else diameter.detach()
+        one = diameter.shape[-2:] == size and diameter.numel() == size.numel()  # for all planes
+        if one and has_kernels(image) and has_kernels(own):
+            return self._blended(own.reshape(size))
         weights = _weights(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
         return functools.reduce(operator.add, (self.level(i) * weight for i, weight in weights))
 
@@ -309,16 +303,6 @@ class DiscBank:
         least = 1 + _WORTH_A_THREAD // width
         parallel_ranges(lambda a, b: blend_rows(a, b, *fixed, result), height, least=least)
         return out
-
-
-def _frame_of(diameter: Tensor) -> Tensor | None:
-    """The diameters as one frame (H, W) for the kernels, which pass no gradient; else None."""
-    learns = diameter.requires_grad and torch.is_grad_enabled()
-    frame = diameter.detach()
-    if learns or not has_kernels(frame) or frame.ndim < 2 or frame.numel() == 0:
-        return None
-    size = frame.shape[-2:]
-    return frame.reshape(size) if frame.numel() == size.numel() else None
 
 
 def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
