@@ -1,7 +1,7 @@
 """Blurred light of many captures, in memory that is used again.
 
 `BlurredFrames` makes the light behind lens and motion: of the scenes of a batch, and of all states
-of one scene (`simulator.capture.blurred_light.BlurredLight`).
+of one scene (`simulator.capture.blurred_light.BlurredLight`). `Layout` says what is out of focus.
 """
 
 from __future__ import annotations

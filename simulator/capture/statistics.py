@@ -14,7 +14,7 @@ import math
 import reprlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,7 +108,7 @@ def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyp
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ignore[no-untyped-def]
+def _excess_error(share, edges, ratio, source, target):  # type: ignore[no-untyped-def]
     """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
     total = 0.0
     for plane in range(share.shape[0]):
@@ -120,8 +120,8 @@ def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ig
             for index in range(len(shares)):
                 wanted = read + shot * light[index]
                 given = source_read + source_shot * light[index]
-                shows = ratio * light[index] - sure * np.sqrt(given) <= 1.0
-                beyond = np.sqrt(given / (wanted if wanted > floor else floor)) - 1.0
+                shows = ratio * light[index] - SURE * np.sqrt(given) <= 1.0
+                beyond = np.sqrt(given / (wanted if wanted > _FLOOR else _FLOOR)) - 1.0
                 beyond = beyond if beyond > 0.0 and shows else 0.0
                 total += shares[index] * beyond * beyond
     return np.sqrt(total / 2.0)
@@ -181,7 +181,7 @@ class LightStatistics:
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = noise_numbers(source), noise_numbers(target)
-        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR, SURE))
+        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises))
 
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
@@ -385,7 +385,7 @@ class Residual:
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _error(bias, variance, level, share, ratio, source, target, noise, sure):  # type: ignore[no-untyped-def]
+def _error(bias, variance, level, share, ratio, source, target, noise):  # type: ignore[no-untyped-def]
     """`ResidualStatistics.error`, over levels of light; bias and variance are the network's."""
     total = 0.0
     for plane in range(level.shape[0]):
@@ -396,7 +396,7 @@ def _error(bias, variance, level, share, ratio, source, target, noise, sure):  #
             relative = own * ratio * ratio / (wanted if wanted > _FLOOR else _FLOOR)
             left = variance[plane, index] * relative
             if noise:
-                if ratio * (light - sure * np.sqrt(own)) > 1.0:
+                if ratio * (light - SURE * np.sqrt(own)) > 1.0:
                     continue
                 beyond = np.sqrt(1.0 + left) - 1.0
                 left = beyond * beyond
@@ -429,7 +429,7 @@ class ResidualStatistics:
         """
         level, share = self._levels
         noises = noise_numbers(self.nlf), noise_numbers(target)
-        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise, SURE))
+        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise))
 
     def _of(self, residual: Residual) -> tuple[np.ndarray, np.ndarray]:
         """Squared bias and variance of a network by plane and level of light, (4, L) each."""
@@ -479,45 +479,31 @@ def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
 # -- denoised light ---------------------------------------------------------------------------
 
 
+@dataclass(eq=False, repr=False)
 class DenoisedLight:
     """Light with its noise removed by a noise module.
 
     The network, the most expensive step there is, runs when `light` is first read.
-
-    Args:
-        light: (4, H, W) float32, or a function that works it out.
-        name: Of the network.
-        residual: Its error; None where that was not measured.
-        rounding: What bfloat16 changes of it; None where it was worked out in float32.
-        operations: Arithmetic operations that it takes, all pixels together.
-        seconds: Estimates how long that takes on this machine.
-        everywhere: Whether the noise is also removed where a positive tolerance needs no network.
     """
 
-    def __init__(
-        self,
-        light: torch.Tensor | Callable[[], torch.Tensor],
-        *,
-        name: str = "network",
-        residual: Residual | None = None,
-        rounding: Residual | None = None,
-        operations: int = 0,
-        seconds: Callable[[], float] = float,
-        everywhere: bool = True,
-    ) -> None:
-        if isinstance(light, torch.Tensor):
-            light = check_packed("denoised", light)
-        self._light, self.everywhere = light, everywhere
-        self.name, self.residual, self.operations = name, residual, operations
-        self.seconds, self.rounding = seconds, rounding
+    _light: torch.Tensor | Callable[[], torch.Tensor]  # (4, H, W) float32, or what works it out
+    _: KW_ONLY
+    name: str = "network"
+    residual: Residual | None = None  # error of the network; None where that was not measured
+    rounding: Residual | None = None  # what bfloat16 changes; None where it ran in float32
+    operations: int = 0  # arithmetic operations that it takes, all pixels together
+    seconds: Callable[[], float] = float  # estimates how long that takes on this machine
+    everywhere: bool = True  # whether also where a positive tolerance needs no network
+
+    def __post_init__(self) -> None:
+        if isinstance(self._light, torch.Tensor):
+            self._light = check_packed("denoised", self._light)
         self._lock = threading.RLock()
 
     def __reduce__(self) -> tuple[Callable[..., DenoisedLight], tuple[torch.Tensor]]:
-        return functools.partial(DenoisedLight, **self._known()), (self.light,)
-
-    def _known(self) -> dict[str, Any]:
         names = ("name", "residual", "rounding", "operations", "everywhere")
-        return {name: getattr(self, name) for name in names}
+        known = {name: getattr(self, name) for name in names}
+        return functools.partial(DenoisedLight, **known), (self.light,)
 
     @property
     def light(self) -> torch.Tensor:
@@ -542,4 +528,4 @@ class DenoisedLight:
         light = self._light
         if isinstance(light, torch.Tensor) and light.device == device:
             return self
-        return DenoisedLight(lambda: self.light.to(device), seconds=self.seconds, **self._known())
+        return replace(self, _light=lambda: self.light.to(device))
