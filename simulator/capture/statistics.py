@@ -280,12 +280,12 @@ class LightStatistics:
         least = 1 + _WORTH_A_THREAD // samples
         fixed = (light, rows, np.ascontiguousarray(edges), bins)
         parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
-        number, sums, levels = bins[..., 0], np.moveaxis(bins[..., 1:4], 2, 0), bins[..., 4:]
-        light, disc, row = sums / np.maximum(number, 1.0)  # equal light leaves bins empty
+        found = np.ascontiguousarray(np.moveaxis(bins, 2, 0))
+        light, disc, row = found[1:4] / np.maximum(found[0], 1.0)  # equal light leaves bins empty
         return _Bins(
-            share=number / (4.0 * samples),
+            share=found[0] / (4.0 * samples),
             light=light,
-            edges=np.where(number > 0, np.moveaxis(levels, 2, 0), 0.0),
+            edges=np.where(found[0] > 0, found[4:], 0.0),
             disc=disc,
             row=row,
         )
