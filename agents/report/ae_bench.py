@@ -68,7 +68,7 @@ def scene_signature(scene: Scene) -> list[Any]:
     codes = np.rint(exposed / STEP_EV).astype(int)
     planes = [] if scene.layout is None else [scene.layout.defocus[None]]
     if scene.layout is not None and scene.layout.subject is not None:
-        planes.append(scene.layout.mask)
+        planes.append(scene.layout.subject[None].float())
     places = [np.rint(_blocks(plane) / 0.1).astype(int).tolist() for plane in planes]
     names = [scene.scene_id, scene.group, scene.kind, bool(scene.hard), round(scene.ev100, 2)]
     return [*names, codes.tolist(), places]

@@ -18,16 +18,16 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.statistics import DenoisedLight
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.discs import kernel_energy
 from simulator.optics.motion import Path
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
 from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
-    from simulator.capture.prepared_scene import Layout, PreparedScene
+    from simulator.capture.prepared_scene import PreparedScene
 
 #: Error that a capture may have, in units of the target's noise: by default the distribution of a
 #: pixel may move by a tenth of its noise's standard deviation.
@@ -35,9 +35,6 @@ DEFAULT_TOLERANCE = 0.1
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
 SIGNAL_LIMIT = 1e6
-#: Light beyond this many times the reference's white is clipped before it is blurred: it is white
-#: at every exposure, and sums of larger numbers would no longer resolve the shadows.
-LIGHT_LIMIT = 1e9
 #: Exposure ratios are limited to this: float32 must hold them, and any two settings keep below.
 RATIO_LIMIT = 2.0**107
 #: Most negative signal that a companded 8-bit code shows; the offset under its square root.
@@ -100,8 +97,7 @@ class Exposure:
     layout: Layout | None = None
     path: Path | None = None  # of the background; None for a streak along the rows
     subject_path: Path | None = None  # of the layout's subject where it moves on its own
-    #: Share of the source's noise variance that blurs leave; None for what a disc and streak leave.
-    energy: float | None = None
+    energy: float = 1.0  # share of the source's noise variance that blurs leave
     #: Noise-reduced light that it starts from, `source` is zero then; None for the recorded one.
     denoised: DenoisedLight | None = None
     #: Effective f-number whose wider aperture blurs what the source shows out of focus, if any.
@@ -120,10 +116,8 @@ class Exposure:
         """Noise of the source on the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
-        exposed, energy = self.source.exposed(self.ratio), self.energy
-        if energy is None and (self.motion_px or self.defocus_px):
-            energy = kernel_energy(self.motion_px, self.defocus_px)
-        return exposed if energy is None else exposed.scaled(energy)
+        exposed = self.source.exposed(self.ratio)
+        return exposed if self.energy == 1.0 else exposed.scaled(self.energy)
 
     @property
     def is_uniform(self) -> bool:

@@ -146,20 +146,11 @@ def noise_bank() -> np.ndarray:
     return bank
 
 
-@kernel()
-def _singles(keys, bank, out):  # type: ignore[no-untyped-def]
-    for i in range(len(out)):
-        for j in range(out.shape[1]):
-            word = mixed_word((keys[i] ^ _SINGLES) + KEY_STEP * np.uint64(j + 1))
-            value = np.float64(bank[word & np.uint64(BANK_SIZE - 1)])
-            out[i, j] = -value if word >> np.uint64(63) else value
-
-
 def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
     """(B, count) float64: `count` standard normals for each key, apart from its frame's noise."""
-    out = np.empty((len(keys), count))
-    _singles(keys, noise_bank(), out)
-    return out
+    words = mixed((keys[:, None] ^ _SINGLES) + KEY_STEP * np.arange(1, count + 1, dtype=np.uint64))
+    values = noise_bank()[words & np.uint64(BANK_SIZE - 1)].astype(np.float64)
+    return np.where(words >> np.uint64(63), -values, values)
 
 
 def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
@@ -167,16 +158,9 @@ def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> n
 
     They are what `record` adds, as an array: for other devices and for tests.
     """
-    planes, height, width = shape
     if noise != "bank":
-        return drawn_normals(key, (planes, height, width))
-    blocks = -(-height * width // BLOCK)
-    turns = np.arange(1, planes * blocks + 1, dtype=np.uint64) * KEY_STEP
-    words = mixed(np.uint64(key) + turns)
-    starts = (words & _START_BITS).astype(np.int64) * STRIDE
-    signs = np.where(words >> np.uint64(63), np.float32(-1), np.float32(1))
-    values = noise_bank()[starts[:, None] + np.arange(BLOCK)] * signs[:, None]
-    return values.reshape(planes, blocks * BLOCK)[:, : height * width].reshape(shape)
+        return drawn_normals(key, shape)
+    return _normals(np.array([key], np.uint64), shape, noise, torch.device("cpu"))[0].numpy()
 
 
 # -- a batch of frames ------------------------------------------------------------------------
@@ -424,8 +408,8 @@ def _normals(
     keys: np.ndarray, shape: tuple[int, ...], noise: Noise, device: torch.device
 ) -> torch.Tensor:
     """`frame_normals` (B, P, H, W) of frames, on any device; drawn ones are drawn on the CPU."""
-    if noise != "bank" or len(keys) == 1:
-        each = [frame_normals(key, shape, noise) for key in keys.tolist()]
+    if noise != "bank":
+        each = [drawn_normals(key, shape) for key in keys.tolist()]
         return torch.from_numpy(np.stack(each)).to(device)
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)

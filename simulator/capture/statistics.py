@@ -14,7 +14,7 @@ import math
 import reprlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +25,8 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 from simulator.utils.compute import kernel, parallel_ranges
 
-#: Bins of about equal population per plane, and pixels of a plane that are sampled, at most.
+#: Bins of about equal population per plane, a power of two; pixels of a plane that are sampled, at
+#: most.
 BINS = 64
 SAMPLES = 65_536
 #: Pixels of a plane that are sorted to find the bins, at most about this many.
@@ -75,31 +76,24 @@ def _find(values, limits, indices):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[no-untyped-def]
+def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyped-def]
     """Adds each pixel of some rows of light (P, H, W) to the bin of its light, by `edges` (P, B-1).
 
-    `sums` (4, P, B): number, light of at least 0, square of the Laplacian, square of the second
-    difference along the row; `levels` (2, P, B): least and most light, at least 0.
+    `bins` (P, B, 6), where what is known of a bin lies together: number, light of at least 0,
+    square of the Laplacian, square of the second difference along the row; least and most light, at
+    least 0.
     """
     _, height, width = light.shape
-    half = 1
-    while 2 * half <= edges.shape[1]:
-        half *= 2
-    limits = np.full(2 * half - 1, np.inf, np.float32)
     indices = np.empty(width, np.uint32)
-    bins = np.empty((2 * half, 6))
     for plane in range(first, last):
-        for index in range(edges.shape[1]):  # an array's copy takes a second more to compile
-            limits[index] = edges[plane, index]
-        bins[:] = 0.0  # what is known of a bin lies together
-        bins[:, 4] = np.inf
+        limits, own = edges[plane], bins[plane]
         for y in rows:
             centre = light[plane, y]
             above, below = light[plane, max(y - 1, 0)], light[plane, min(y + 1, height - 1)]
             _find(centre, limits, indices)
             for x in range(width):
                 value = centre[x]
-                found = bins[indices[x]]
+                found = own[indices[x]]
                 twice = 2.0 * np.float64(value)
                 left, right = centre[max(x - 1, 0)], centre[min(x + 1, width - 1)]
                 along = np.float64(left) + np.float64(right) - twice
@@ -111,15 +105,10 @@ def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[
                 found[3] += along * along
                 found[4] = min(found[4], level)
                 found[5] = max(found[5], level)
-        for index in range(sums.shape[2]):
-            for kind in range(4):
-                sums[kind, plane, index] += bins[index, kind]
-            levels[0, plane, index] = min(levels[0, plane, index], bins[index, 4])
-            levels[1, plane, index] = max(levels[1, plane, index], bins[index, 5])
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ignore[no-untyped-def]
+def _excess_error(share, edges, ratio, source, target):  # type: ignore[no-untyped-def]
     """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
     total = 0.0
     for plane in range(share.shape[0]):
@@ -131,8 +120,8 @@ def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ig
             for index in range(len(shares)):
                 wanted = read + shot * light[index]
                 given = source_read + source_shot * light[index]
-                shows = ratio * light[index] - sure * np.sqrt(given) <= 1.0
-                beyond = np.sqrt(given / (wanted if wanted > floor else floor)) - 1.0
+                shows = ratio * light[index] - SURE * np.sqrt(given) <= 1.0
+                beyond = np.sqrt(given / (wanted if wanted > _FLOOR else _FLOOR)) - 1.0
                 beyond = beyond if beyond > 0.0 and shows else 0.0
                 total += shares[index] * beyond * beyond
     return np.sqrt(total / 2.0)
@@ -192,7 +181,7 @@ class LightStatistics:
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = noise_numbers(source), noise_numbers(target)
-        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR, SURE))
+        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises))
 
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
@@ -286,18 +275,19 @@ class LightStatistics:
         light, rows = self._rows
         samples = len(rows) * light.shape[-1]
         edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
-        sums, levels = np.zeros((4, 4, BINS)), np.zeros((2, 4, BINS))
-        levels[0] = np.inf
+        bins = np.zeros((4, BINS, 6))
+        bins[..., 4] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
-        fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
+        fixed = (light, rows, np.ascontiguousarray(edges), bins)
         parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
-        counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
+        found = np.ascontiguousarray(np.moveaxis(bins, 2, 0))
+        light, disc, row = found[1:4] / np.maximum(found[0], 1.0)  # equal light leaves bins empty
         return _Bins(
-            share=sums[0] / (4.0 * samples),
-            light=sums[1] / counts,
-            edges=np.where(sums[0] > 0, levels, 0.0),
-            disc=sums[2] / counts,
-            row=sums[3] / counts,
+            share=found[0] / (4.0 * samples),
+            light=light,
+            edges=np.where(found[0] > 0, found[4:], 0.0),
+            disc=disc,
+            row=row,
         )
 
 
@@ -395,7 +385,7 @@ class Residual:
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _error(bias, variance, level, share, ratio, source, target, noise, sure):  # type: ignore[no-untyped-def]
+def _error(bias, variance, level, share, ratio, source, target, noise):  # type: ignore[no-untyped-def]
     """`ResidualStatistics.error`, over levels of light; bias and variance are the network's."""
     total = 0.0
     for plane in range(level.shape[0]):
@@ -406,7 +396,7 @@ def _error(bias, variance, level, share, ratio, source, target, noise, sure):  #
             relative = own * ratio * ratio / (wanted if wanted > _FLOOR else _FLOOR)
             left = variance[plane, index] * relative
             if noise:
-                if ratio * (light - sure * np.sqrt(own)) > 1.0:
+                if ratio * (light - SURE * np.sqrt(own)) > 1.0:
                     continue
                 beyond = np.sqrt(1.0 + left) - 1.0
                 left = beyond * beyond
@@ -439,26 +429,26 @@ class ResidualStatistics:
         """
         level, share = self._levels
         noises = noise_numbers(self.nlf), noise_numbers(target)
-        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise, SURE))
+        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise))
 
     def _of(self, residual: Residual) -> tuple[np.ndarray, np.ndarray]:
         """Squared bias and variance of a network by plane and level of light, (4, L) each."""
-        found = self._gathered.get(residual)
-        if found is None:
-            error, _, place, counts = self._measured
-            sums = [
-                np.stack([np.bincount(p, v, _LEVELS) for p in place]) for v in residual.at(error)
-            ]
-            found = sums[0] / np.maximum(counts, 1), sums[1] / np.maximum(counts, 1)
-            self._gathered[residual] = found
-        return found
+        if residual not in self._gathered:
+            bias, variance = map(self._by_level, residual.at(self._measured[0]))
+            self._gathered[residual] = bias, variance
+        return self._gathered[residual]
+
+    def _by_level(self, values: np.ndarray) -> np.ndarray:
+        """(4, L) means of `values` of the blocks, (4, N) or (N,) for all planes."""
+        _, _, place, counts = self._measured
+        each = zip(place, np.broadcast_to(values, place.shape), strict=True)
+        return np.stack([np.bincount(p, v, _LEVELS) for p, v in each]) / np.maximum(counts, 1)
 
     @functools.cached_property
     def _levels(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean light, and share of all samples, by plane and level, (4, L) each."""
-        _, light, place, counts = self._measured
-        sums = [np.bincount(p, v, _LEVELS) for p, v in zip(place, light, strict=True)]
-        return np.stack(sums) / np.maximum(counts, 1), counts / counts.sum()
+        _, light, _, counts = self._measured
+        return self._by_level(light), counts / counts.sum()
 
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -489,45 +479,31 @@ def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
 # -- denoised light ---------------------------------------------------------------------------
 
 
+@dataclass(eq=False, repr=False)
 class DenoisedLight:
     """Light with its noise removed by a noise module.
 
     The network, the most expensive step there is, runs when `light` is first read.
-
-    Args:
-        light: (4, H, W) float32, or a function that works it out.
-        name: Of the network.
-        residual: Its error; None where that was not measured.
-        rounding: What bfloat16 changes of it; None where it was worked out in float32.
-        operations: Arithmetic operations that it takes, all pixels together.
-        seconds: Estimates how long that takes on this machine.
-        everywhere: Whether the noise is also removed where a positive tolerance needs no network.
     """
 
-    def __init__(
-        self,
-        light: torch.Tensor | Callable[[], torch.Tensor],
-        *,
-        name: str = "network",
-        residual: Residual | None = None,
-        rounding: Residual | None = None,
-        operations: int = 0,
-        seconds: Callable[[], float] = float,
-        everywhere: bool = True,
-    ) -> None:
-        if isinstance(light, torch.Tensor):
-            light = check_packed("denoised", light)
-        self._light, self.everywhere = light, everywhere
-        self.name, self.residual, self.operations = name, residual, operations
-        self.seconds, self.rounding = seconds, rounding
+    _light: torch.Tensor | Callable[[], torch.Tensor]  # (4, H, W) float32, or what works it out
+    _: KW_ONLY
+    name: str = "network"
+    residual: Residual | None = None  # error of the network; None where that was not measured
+    rounding: Residual | None = None  # what bfloat16 changes; None where it ran in float32
+    operations: int = 0  # arithmetic operations that it takes, all pixels together
+    seconds: Callable[[], float] = float  # estimates how long that takes on this machine
+    everywhere: bool = True  # whether also where a positive tolerance needs no network
+
+    def __post_init__(self) -> None:
+        if isinstance(self._light, torch.Tensor):
+            self._light = check_packed("denoised", self._light)
         self._lock = threading.RLock()
 
     def __reduce__(self) -> tuple[Callable[..., DenoisedLight], tuple[torch.Tensor]]:
-        return functools.partial(DenoisedLight, **self._known()), (self.light,)
-
-    def _known(self) -> dict[str, Any]:
         names = ("name", "residual", "rounding", "operations", "everywhere")
-        return {name: getattr(self, name) for name in names}
+        known = {name: getattr(self, name) for name in names}
+        return functools.partial(DenoisedLight, **known), (self.light,)
 
     @property
     def light(self) -> torch.Tensor:
@@ -552,4 +528,4 @@ class DenoisedLight:
         light = self._light
         if isinstance(light, torch.Tensor) and light.device == device:
             return self
-        return DenoisedLight(lambda: self.light.to(device), seconds=self.seconds, **self._known())
+        return replace(self, _light=lambda: self.light.to(device))

@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.networks.noise_module import ResidualBlock
+from simulator.networks.noise_module import ResidualBlock, box_mean
 from simulator.networks.unet import AttentionUNet
-from simulator.optics.discs import DiscBank, added_blur, box_mean, disc_blur
+from simulator.optics.discs import DiscBank, added_blur, disc_blur
 from simulator.utils.checks import check_word
 
 AperturePreset = Literal["compact", "paper", "ncs"]

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from simulator.capture.sensor import frame_normals, noise_keys
 from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet, padded
-from simulator.optics.discs import box_mean
 from simulator.utils.checks import check_word
 
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]
@@ -298,3 +297,32 @@ def smoothed(image: Tensor) -> Tensor:
     A noise level read from single noisy pixels would be too low where noise made them dark.
     """
     return box_mean(image, _SMOOTHING)
+
+
+def box_mean(x: Tensor, window: int) -> Tensor:
+    """Mean of `x` (B, C, H, W) over `window` x `window` pixels, an odd number, borders repeated.
+
+    Sums over 1, 2, 4, 8 ... pixels are doubled from one another: a few additions of whole images
+    where pooling would read every pixel `window` times.
+    """
+    height, width = x.shape[-2:]
+    padded = F.pad(x, (window // 2,) * 4, mode="replicate")
+    rows = _running_sum(padded, window, -2, height)
+    return _running_sum(rows, window, -1, width) / (window * window)
+
+
+def _running_sum(x: Tensor, window: int, axis: int, size: int) -> Tensor:
+    """Sums of `window` neighbours along `axis`, the first `size` of them."""
+    total: Tensor | None = None
+    done, span = 0, 1
+    while True:
+        if window & span:
+            part = x.narrow(axis, done, size)
+            total = part if total is None else total + part
+            done += span
+        if 2 * span > window:
+            assert total is not None
+            return total
+        length = x.shape[axis] - span
+        x = x.narrow(axis, 0, length) + x.narrow(axis, span, length)
+        span *= 2

@@ -138,8 +138,8 @@ def _draw(first, last, key, blocks, out):  # type: ignore[no-untyped-def]
         part[:] = drawn[: len(part)]
 
 
-def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
-    """`simulator.capture.sensor.frame_normals`, drawn."""
+def drawn_normals(key: int, shape: tuple[int, ...]) -> np.ndarray:
+    """`simulator.capture.sensor.frame_normals` of `shape` (P, H, W), drawn."""
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     out = np.empty((planes, samples), np.float32)

@@ -38,6 +38,9 @@ from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
+#: Light beyond this many times the reference's white is clipped before it is blurred: it is white
+#: at every exposure, and sums of larger numbers would no longer resolve the shadows.
+LIGHT_LIMIT = 1e9
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32
 #: Streaks longer than this [pixel] are not written out: they leave next to no noise in any case.
@@ -165,10 +168,9 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
         return light
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
-        quadrant, reach = _quadrant(disc_radius(diameter_px))
-        shape = (quadrant, reach, np.float32(math.inf))
-        cost = len(quadrant) ** 2
-        return by_rows(light, lambda a, b, i, o: _disc(a, b, height, i, *shape, o), cost)
+        fixed = height, disc_radius(diameter_px), np.float32(math.inf)
+        cost = (taps // 2 + 1) ** 2
+        return by_rows(light, lambda a, b, rows, to: disc_image(a, b, rows, *fixed, to), cost)
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
@@ -189,18 +191,6 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
         padded = np.pad(np.clip(plane, -limit, limit).astype(np.float64), radius, mode="edge")
         spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=padded.shape)
         result[...] = np.fft.irfft2(spectrum, s=padded.shape)[2 * radius :, 2 * radius :]
-
-
-@_jit()
-def _add_scaled(a, weight, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] += weight * a[x]
-
-
-@_jit()
-def _add_product(a, b, weight, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] += weight * (a[x] + b[x])
 
 
 @_jit()
@@ -225,9 +215,13 @@ def _disc(first, last, height, rows, weights, reach, limit, out):  # type: ignor
             else:
                 copy_row(flat[above:], both)
                 inner[:] = np.float32(0)
-            _add_scaled(both[radius:], weights[i, 0], inner)
+            weight, middle = weights[i, 0], both[radius:]
+            for x in range(len(inner)):
+                inner[x] += weight * middle[x]
             for j in range(1, reach[i] + 1):
-                _add_product(both[radius - j :], both[radius + j :], weights[i, j], inner)
+                weight, left, right = weights[i, j], both[radius - j :], both[radius + j :]
+                for x in range(len(inner)):
+                    inner[x] += weight * (left[x] + right[x])
         for i in range(count):
             row = np.uint64(y + i)
             for x in range(width):
@@ -287,9 +281,11 @@ class DiscBank:
 
         It is >= 0, broadcast against the image; beyond the largest disc of the bank it stays there.
         """
-        image, frame = self._levels[0], _frame_of(diameter)
-        if frame is not None and frame.shape == image.shape[-2:] and has_kernels(image):
-            return self._blended(frame)
+        image = self._levels[0]
+        size, own = image.shape[-2:], diameter if torch.is_grad_enabled() else diameter.detach()
+        one = diameter.shape[-2:] == size and diameter.numel() == size.numel()  # for all planes
+        if one and has_kernels(image) and has_kernels(own):
+            return self._blended(own.reshape(size))
         weights = _weights(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
         return functools.reduce(operator.add, (self.level(i) * weight for i, weight in weights))
 
@@ -307,16 +303,6 @@ class DiscBank:
         least = 1 + _WORTH_A_THREAD // width
         parallel_ranges(lambda a, b: blend_rows(a, b, *fixed, result), height, least=least)
         return out
-
-
-def _frame_of(diameter: Tensor) -> Tensor | None:
-    """The diameters as one frame (H, W) for the kernels, which pass no gradient; else None."""
-    learns = diameter.requires_grad and torch.is_grad_enabled()
-    frame = diameter.detach()
-    if learns or not has_kernels(frame) or frame.ndim < 2 or frame.numel() == 0:
-        return None
-    size = frame.shape[-2:]
-    return frame.reshape(size) if frame.numel() == size.numel() else None
 
 
 def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
@@ -340,12 +326,13 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
 
     `taps` are those of a motion behind the discs; `diameter` is (..., H, W) [pixel].
     """
-    products = _kernel_products()
+    correlations = _correlations()
+    products = correlations[..., correlations.shape[-1] // 2, correlations.shape[-1] // 2]
     if taps is not None:
         count = min(int(np.searchsorted(DIAMETERS, float(diameter.max()))) + 1, len(DIAMETERS))
         products, weights = np.zeros_like(products), taps.weights.astype(np.float64)
-        _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
-    ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
+        _sum_products(correlations[:count], taps.rows, taps.columns, weights, products)
+    ends = np.column_stack([products[:-1], products[1:, 0]])
     frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
     out = torch.empty(frame.shape)
     fixed = (frame.contiguous().numpy(), _KNOTS.astype(np.float32), ends.astype(np.float32))
@@ -355,33 +342,16 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
 
 
 @functools.cache
-def _kernel_products() -> np.ndarray:
-    """(K, K) sums of products of the weights of each disc and itself or its successor."""
-    kernels = [disc_kernel(d) for d in DIAMETERS]
-    products = np.zeros((len(kernels), len(kernels)))
-    for i, disc in enumerate(kernels):
-        for j, other in enumerate(kernels[i : i + 2]):
-            inner = slice((len(other) - len(disc)) // 2, (len(other) + len(disc)) // 2)
-            products[i, i + j] = (disc * other[inner, inner]).sum()
-    return products
-
-
-@functools.cache
 def _correlations() -> np.ndarray:
-    """(K, 2, R, R) correlations of a disc with itself and its successor; the middle is no shift."""
-    from scipy.signal import fftconvolve  # not above: it takes a second
+    """(K, 2, R, R) correlations of a disc with itself and its successor; the middle is no shift.
 
-    kernels = [disc_kernel(d) for d in DIAMETERS]
-    size = 2 * kernels[-1].shape[0] - 1
-    found = np.zeros((len(kernels), 2, size, size))
-    for i, disc in enumerate(kernels):
-        for j, other in enumerate(kernels[i : i + 2]):
-            # Discs are symmetric: their convolution is their correlation.
-            both = fftconvolve(disc, other)
-            margin = (size - len(both)) // 2
-            inner = slice(margin, margin + len(both))
-            found[i, j, inner, inner] = both
-    return found
+    The last disc's successor is the first.
+    """
+    discs = [disc_kernel(diameter) for diameter in DIAMETERS]
+    size = 2 * len(discs[-1]) - 1
+    spectra = np.fft.rfft2([np.pad(disc, (size - len(disc)) // 2) for disc in discs])
+    pairs = np.stack([spectra, np.roll(spectra, -1, axis=0)], 1) * spectra[:, None].conj()
+    return np.fft.fftshift(np.fft.irfft2(pairs, s=(size, size)), axes=(2, 3))
 
 
 # Each pixel is interpolated between the two images around its squared diameter: no weight is ever
@@ -480,47 +450,12 @@ def _evaluate(first, last, diameter, knots, ends, out):  # type: ignore[no-untyp
 
 @_blend_jit()
 def _sum_products(correlations, rows, columns, weights, products):  # type: ignore[no-untyped-def]
-    """Sums of correlations over all pairs of taps, by their products of weights."""
-    count, _, size, _ = correlations.shape
-    middle = size // 2
+    """Sums (K, 2) of correlations over all pairs of taps, by their products of weights."""
+    middle = correlations.shape[2] // 2
     for k in range(len(weights)):
         for n in range(len(weights)):
             y, x = rows[k] - rows[n] + middle, columns[k] - columns[n] + middle
-            if 0 <= y < size and 0 <= x < size:
-                for i in range(count):
-                    both = weights[k] * weights[n]
-                    products[i, i] += both * correlations[i, 0, y, x]
-                    if i + 1 < len(products):
-                        products[i, i + 1] += both * correlations[i, 1, y, x]
-
-
-# -- boxes ------------------------------------------------------------------------------------
-
-
-def box_mean(x: Tensor, window: int) -> Tensor:
-    """Mean of `x` (B, C, H, W) over `window` x `window` pixels, an odd number, borders repeated.
-
-    Sums over 1, 2, 4, 8 ... pixels are doubled from one another: a few additions of whole images
-    where pooling would read every pixel `window` times.
-    """
-    height, width = x.shape[-2:]
-    padded = F.pad(x, (window // 2,) * 4, mode="replicate")
-    rows = _running_sum(padded, window, -2, height)
-    return _running_sum(rows, window, -1, width) / (window * window)
-
-
-def _running_sum(x: Tensor, window: int, axis: int, size: int) -> Tensor:
-    """Sums of `window` neighbours along `axis`, the first `size` of them."""
-    total: Tensor | None = None
-    done, span = 0, 1
-    while True:
-        if window & span:
-            part = x.narrow(axis, done, size)
-            total = part if total is None else total + part
-            done += span
-        if 2 * span > window:
-            assert total is not None
-            return total
-        length = x.shape[axis] - span
-        x = x.narrow(axis, 0, length) + x.narrow(axis, span, length)
-        span *= 2
+            if 0 <= y <= 2 * middle and 0 <= x <= 2 * middle:
+                for i in range(len(correlations)):
+                    for j in range(2):
+                        products[i, j] += weights[k] * weights[n] * correlations[i, j, y, x]

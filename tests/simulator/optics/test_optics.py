@@ -19,6 +19,7 @@ from scipy import ndimage
 from scipy.integrate import quad
 from scipy.ndimage import correlate
 
+from simulator.networks.noise_module import box_mean
 from simulator.optics import discs, motion
 from simulator.optics.discs import DIAMETERS, DiscBank, disc_blur, disc_kernel
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
@@ -356,7 +357,7 @@ def test_box_mean_is_scipys_uniform_filter(window, size):
     image = uniform(2, 3, *size)
     sides = (1, 1, window, window)
     expected = ndimage.uniform_filter(image.double().numpy(), sides, mode="nearest")
-    found = discs.box_mean(image, window).numpy()
+    found = box_mean(image, window).numpy()
     np.testing.assert_allclose(found, expected, rtol=2e-6, atol=1e-6)
 
 
