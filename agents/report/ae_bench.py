@@ -268,9 +268,8 @@ def read_table(table: Path) -> pd.DataFrame:
     except (OSError, ValueError) as error:  # pandas' errors of parsing are ValueErrors
         raise ValueError(f"{table} cannot be read as a table: {error}") from error
     if version := next((own for name, own in _OLDER.items() if name in rows), None):
-        raise _refusal(
-            table, f"is a table of AE-Bench {version}: give docs/ae-bench/v3.csv or a new file"
-        )
+        rule = f"is a table of AE-Bench {version}, which takes no rows: give docs/ae-bench/v3.csv"
+        raise _refusal(table, f"{rule}, or a new file")
     if wrong := [name for name in (*COLUMNS, *rows) if (name in COLUMNS) != (name in rows)]:
         rule = f"must be a table of AE-Bench v3 or a new file: column {wrong[0]!r} is not as there"
         raise _refusal(table, rule)

@@ -464,8 +464,8 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         (_table(tmp_path / "b.csv", plan, hash="0"), ["random"], "me", r"b\.csv .*hash"),
         (_table(tmp_path / "d.csv", plan, score="x"), ["random"], "me", r"d\.csv, line 2: `score`"),
         (broken, ["random"], "me", "broken.csv"),
-        (Path("docs/ae-bench/v1.csv"), ["random"], "me", "AE-Bench v1: give"),
-        (Path("docs/ae-bench/v2.csv"), ["random"], "me", "AE-Bench v2: give"),
+        (Path("docs/ae-bench/v1.csv"), ["random"], "me", "AE-Bench v1, which"),
+        (Path("docs/ae-bench/v2.csv"), ["random"], "me", "AE-Bench v2, which"),
     ):
         with pytest.raises(ValueError, match=message):
             check(file, plan, policies, author=author)
