@@ -1,14 +1,12 @@
-"""Policies of `examples` that were tuned with a stated budget, beside tuned meters and agents.
+"""Judges the tuned policies of this folder beside tuned meters and agents, on unseen scenes.
 
-The searches are those of `examples/tune_meter.py` in ``docs/results/tuned_meters_runs.json``; CQL
-is judged where `examples/offline_cql.py` has written its network.
+`python examples/judge_tuned_meters.py` writes ``docs/results/tuned_meters.json`` and the tables of
+its page, in ten minutes. The searches are those of `tune_meter.py` in ``tuned_meters_runs.json``
+there; CQL is judged where `offline_cql.py` has written its network.
 """
 
-from __future__ import annotations
-
-import importlib
 import json
-import sys
+import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parametric_meter import Parameters, ParametricMeter
+from tune_meter import load_frames
 
 from agents.evaluation.evaluation_plan import load_plan
 from agents.evaluation.intervals import difference_interval, score_interval
@@ -23,10 +23,10 @@ from agents.evaluation.jobs import run_plan
 from agents.evaluation.result import Results, overall_gains
 from agents.policy import Floats
 from agents.report.evaluation import Cell
-from benchmarks.harness import Part, Report, Row, benchmark, rounded, table
-from benchmarks.isolated import ROOT
+from benchmarks.harness import Report, Row, rounded, table, write_report
+from simulator.utils.files import result_meta
 
-RESULTS, CQL = Path("docs/results"), Path("runs/cql.safetensors")
+ROOT, RESULTS, CQL = Path(__file__).parents[1], Path("docs/results"), Path("runs/cql.safetensors")
 RUNS, SETS = RESULTS / "tuned_meters_runs.json", ("bundled", "polyhaven")
 METER = "examples/parametric_meter.py:ParametricMeter"
 AGAINST = {"average": "average:tuned", "centre": "centre_weighted:P"}
@@ -37,22 +37,22 @@ TAKEN_BACK = "cma-250"
 def _searches() -> dict[str, dict[str, Any]]:
     """Runs of each search, ``"cma-250"`` and so on, by their names."""
     found: dict[str, dict[str, Any]] = {}
-    for name, run in json.loads((ROOT / RUNS).read_text())["runs"].items():
+    for name, run in json.loads(RUNS.read_text())["runs"].items():
         found.setdefault(name.rpartition("-")[0], {})[name] = run
     return found
 
 
-def judge(scenes: str, quick: bool) -> list[Row]:
-    plan = load_plan(str(ROOT / RESULTS / "tuned_meters.yaml"))
+def judge(scenes: str) -> list[Row]:
+    """A row for each policy, the best first; the runs of a search are one policy's seeds."""
+    plan = load_plan(str(RESULTS / "tuned_meters.yaml"))
     named = {name: [name] for name in plan.policies}
     named |= {"defaults": [METER], "shin": ["examples/shin_nelder_mead.py:ShinNelderMead"]}
-    if (ROOT / CQL).is_file():
+    if CQL.is_file():
         named["cql"] = [f"examples/offline_cql.py:OfflineCQL?weights={CQL}"]
     for search, own in _searches().items():
         named[search] = [f"{METER}?parameters={RUNS}&run={run}" for run in own]
-    changed: dict[str, Any] = {"environment": {**plan.environment, "scenes": scenes}}
-    changed |= {"max_scenes": 3} if quick else {}
-    plan = plan.changed(policies=[policy for own in named.values() for policy in own], **changed)
+    policies = [policy for own in named.values() for policy in own]
+    plan = plan.changed(policies=policies, environment={**plan.environment, "scenes": scenes})
     with tempfile.TemporaryDirectory() as folder:
         results = run_plan(plan, folder)
     gains = {name: _gains(results, own) for name, own in named.items()}
@@ -78,18 +78,13 @@ def _gains(results: Results, policies: Sequence[str]) -> tuple[Floats, Floats]:
     return np.concatenate([gains for gains, _ in own]), own[0][1]
 
 
-def parameters(quick: bool) -> dict[str, list[Row]]:
+def parameters() -> dict[str, list[Row]]:
     """What each parameter adds on the scenes that validate, and the scores of the searches."""
-    sys.path.insert(0, str(ROOT / "examples"))
-    tune: Any = importlib.import_module("tune_meter")
-    runs = _searches()
-    tune.SCENES = 3 if quick else tune.SCENES
-    train, held, context = tune.load_frames()
+    (train, held, context), runs, base = load_frames(), _searches(), Parameters()
 
-    def score(frames: Any, parameters: Any) -> float:
-        return float(frames.score(tune.ParametricMeter(context, parameters)))
+    def score(frames: Any, parameters: Parameters) -> float:
+        return float(frames.score(ParametricMeter(context, parameters)))
 
-    base = tune.Parameters()
     searches: list[Row] = [
         {"search": "defaults", "train": [score(train, base)], "held": [score(held, base)]}
     ]
@@ -98,18 +93,13 @@ def parameters(quick: bool) -> dict[str, list[Row]]:
         for key, name in (("train", "train_score"), ("held", "validation_score")):
             row[key] = [run[name] for run in own.values()]
         searches.append(row | {"minutes": [run["cpu_seconds"] / 60.0 for run in own.values()]})
-    found = [tune.Parameters(**run["parameters"]) for run in runs[TAKEN_BACK].values()]
+    found = [Parameters(**run["parameters"]) for run in runs[TAKEN_BACK].values()]
     scores, lost = [score(held, own) for own in found], list[Row]()
     for name, default in vars(base).items():
         without = [score(held, replace(own, **{name: default})) for own in found]
         row = {"parameter": name, "default": default, "found": [getattr(p, name) for p in found]}
         lost.append(row | {"lost": np.subtract(scores, without).tolist()})
     return {"searches": searches, "parameters": lost}
-
-
-def parts(seed: int, quick: bool) -> list[Part]:
-    judged = [Part(name, judge, {"scenes": name}, 1) for name in SETS]
-    return [*judged, Part("parameters", parameters, threads=1)]
 
 
 _JUDGED = """policy = {policy} | seeds = {seeds} | score = {score:.3f} |
@@ -139,12 +129,18 @@ def _spread(values: Sequence[float], form: str) -> str:
     return f"{text} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else text
 
 
-def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    tables = {name: table(results[name], _JUDGED) for name in SETS}
+def main() -> None:
+    """Judges, and writes what was found."""
+    os.chdir(ROOT)
+    judged = {name: judge(name) for name in SETS}
+    more = parameters()
+    tables = {name: table(own, _JUDGED) for name, own in judged.items()}
     for name, columns in (("searches", _SEARCHED), ("parameters", _LOST)):
-        tables[name] = table(results["parameters"][name], columns)
-    rows = [row for name in SETS for row in results[name]]
-    return Report(sum(results["parameters"].values(), rows), tables)
+        tables[name] = table(more[name], columns)
+    rows = [row for own in (*judged.values(), *more.values()) for row in own]
+    meta = result_meta("python examples/judge_tuned_meters.py", 0)
+    write_report(Report(rows, tables), RESULTS, "tuned_meters", meta)
 
 
-run = benchmark("tuned_meters", parts, report)
+if __name__ == "__main__":
+    main()
