@@ -101,11 +101,18 @@ class Policy:
 
 
 def masked_argmax(utility: NDArray[np.floating], action_masks: Bools | None) -> Ints:
-    """Index of the highest allowed utility per row, ties to the lower index.
+    """Index of the highest allowed utility (N, S) per row (N,), ties to the lower index.
+
+    A `ValueError` unless the masks are of the utility's shape and allow a state in every row.
 
     >>> masked_argmax(np.array([[1.0, 3.0, 2.0]]), np.array([[True, False, True]]))
     array([2])
     """
     if action_masks is not None:
+        if np.shape(action_masks) != utility.shape:
+            shape = np.shape(action_masks)
+            raise ValueError(f"`action_masks` (shape {shape}) must be of shape {utility.shape}")
+        if not np.any(action_masks, axis=-1).all():
+            raise ValueError("`action_masks` must allow a state to every camera")
         utility = np.where(action_masks, utility, -np.inf)
     return np.asarray(np.argmax(utility, axis=-1), np.int64)

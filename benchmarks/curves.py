@@ -1,11 +1,11 @@
 """Scores of every learner of configs/learners against frames and seconds of training.
 
-Runs of `examples/learners.py` that are not in ``runs/learners`` are trained first.
+Runs of `examples/learners.py` that are not in ``runs/learners``, or are there with other frames or
+settings, are trained first.
 """
 
 from __future__ import annotations
 
-import json
 import runpy
 from functools import partial
 from typing import Any
@@ -26,13 +26,11 @@ worst seed = {worst:.3f} | seeds = {seeds}"""
 
 
 def trained(learner: str, seed: int, quick: bool) -> list[Row]:
+    train = runpy.run_path(str(ROOT / "examples" / "learners.py"))["train"]
     out, found = RUNS / "quick" if quick else RUNS, []
     short: Row = {"frames": 2_048, "exam": ("bundled", "test", 8)} if quick else {}
     for s in range(seed, seed + (2 if quick else SEEDS)):
-        if not (path := out / f"{learner}-{s}.json").is_file():
-            program = runpy.run_path(str(ROOT / "examples" / "learners.py"))
-            program["train"](learner, s, out=out, **short)
-        points = json.loads(path.read_text())
+        points = train(learner, s, out=out, **short)
         columns = {key: [point[key] for point in points] for key in KEYS}
         found.append({"learner": learner, "seed": s, **columns})
     return found

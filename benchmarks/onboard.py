@@ -1,7 +1,10 @@
-"""Exported agents beside themselves in torch: size, time of one camera; smaller frames."""
+"""Exported agents beside themselves in torch: size, time; smaller frames; the firmware guide."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -16,7 +19,7 @@ from agents import PolicyContext, make_policy
 from agents.onboard.controller import Controller
 from agents.onboard.export import export_agent
 from benchmarks.harness import Part, Report, Row, benchmark, table
-from benchmarks.isolated import median_seconds, timed
+from benchmarks.isolated import ROOT, median_seconds, timed
 
 AGENTS = ("regression", "ppo")
 #: Episodes, in light that jumps by `STOPS` in the middle, and their frames.
@@ -27,6 +30,13 @@ TIMED = 400
 FRAME_SIZES = ((64, 64), (240, 320), (760, 1014), (1520, 2028))
 #: Sides of the frame that the agents are given less and less of.
 SIDES = (64, 32, 16, 8, 4, 2)
+#: Commands of the firmware guide in docs/on-a-camera.md, on the agent of the package.
+GUIDE = (
+    "evaluate --workers 1 --grid third_stop --policy rpi_agc?max_gain=8&speed=0.15 "
+    "--policy matrix:P --policy regression",
+    "stability rpi_agc?max_gain=8&speed=0.15",
+    "export regression -o policy.onnx",
+)
 
 
 def _prepared(policy: str, quick: bool) -> tuple[int, Any, Any]:
@@ -94,8 +104,24 @@ def encoding(quick: bool) -> list[Row]:
     return rows
 
 
+def guide(quick: bool) -> list[Row]:
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for command in GUIDE[1:] if quick else GUIDE:
+            before = os.times()
+            program = [sys.executable, "-m", "agents.cli", *command.split()]
+            paths = {"PYTHONPATH": str(ROOT)}
+            subprocess.run(
+                program, cwd=folder, env=os.environ | paths, check=True, capture_output=True
+            )
+            after = os.times()
+            seconds = sum(after[2:4]) - sum(before[2:4])  # of processes that have ended
+            rows.append({"command": f"ae-env {command}", "cpu_seconds": seconds})
+    return rows
+
+
 def parts(seed: int, quick: bool) -> list[Part]:
-    found = [Part("frames", encoding, threads=1)]
+    found = [Part("frames", encoding, threads=1), Part("guide", guide, threads=1)]
     for agent in AGENTS:
         found.append(Part(agent, measure, {"policy": agent}, threads=1))
         found.append(Part(f"smaller {agent}", smaller, {"policy": agent}, threads=1))
@@ -116,7 +142,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         row |= {"speedup": row["us_torch"] / row["us_onnx"], "mb": row["bytes"] / 1e6}
     tables = {"agents": table(rows, _COLUMNS), "smaller": table(less, _SMALLER)}
     tables["frames"] = table(frames, "planes = 4 x {height} x {width} | ms = {ms:.2f}")
-    return Report([*rows, *less, *frames], tables)
+    steps = results["guide"]
+    tables["guide"] = table(steps, "step = `{command:md}` | CPU [s] = {cpu_seconds:.0f}")
+    return Report([*rows, *less, *frames, *steps], tables)
 
 
 run = benchmark("onboard", parts, report)

@@ -1,7 +1,8 @@
 """Learners of Stable-Baselines3 as they are, on the statistics of an image processor.
 
 `python examples/learners.py dqn sac` trains the learners of configs/learners, five seeds each, and
-writes runs/learners/dqn-0.safetensors and a .json with the learning curve, and so on. Then:
+writes runs/learners/dqn-0.safetensors and a .json with the run and its learning curve, and so on.
+A run that is finished is not trained again, one of other frames, scenes or settings is. Then:
 
     ae-env evaluate --observation statistics \\
         --policy "examples/learners.py:Learnt?weights=runs/learners/dqn-0.safetensors"
@@ -258,13 +259,20 @@ EXAMS = {}
 def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, exam=EXAM, **changed):
     """Trains a learner; writes weights and learning curve, and returns the curve's rows.
 
-    `exam` is the set that it is judged on, the split, and how many scenes at most; `changed` are
-    settings to try.
+    The rows of a finished run are read instead if frames, seed, scenes, exam and configuration are
+    the same. `exam` is the set that it is judged on, the split, and how many scenes at most;
+    `changed` are settings to try.
     """
     scenes = scenes or ("mixed" if data_folder() else "bundled")
     config, algorithm = load(name)
     config["settings"] |= changed
     settings, moving = dict(config["settings"]), config["task"] != STILL
+    run = {"seed": seed, "frames": frames, "scenes": scenes, "exam": [*exam], "config": config}
+    run, path = json.loads(json.dumps(run)), Path(out) / f"{name}-{seed}.json"
+    if path.is_file():
+        found = json.loads(path.read_text())
+        if "run" in found and found["run"] == run:  # files of before have a list of rows
+            return found["rows"]
 
     def make(light):
         envs = gym.make_vec(
@@ -300,10 +308,9 @@ def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, exam=EXAM
         share = -(-frames * (number + 1) // len(stages)) - model.num_timesteps
         model.learn(share, callback, reset_num_timesteps=not number)
     model.env.close()
-    path = Path(out) / f"{name}-{seed}"
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_model(model.policy, f"{path}.safetensors", {"learner": name})
-    path.with_suffix(".json").write_text(json.dumps(callback.rows))
+    save_model(model.policy, str(path.with_suffix(".safetensors")), {"learner": name})
+    path.write_text(json.dumps({"run": run, "rows": callback.rows}))
     return callback.rows
 
 
@@ -312,5 +319,4 @@ if __name__ == "__main__":
         if name not in NAMES:
             sys.exit(f"usage: python examples/learners.py [LEARNER ...], of {', '.join(NAMES)}")
     for seed, name in itertools.product(SEEDS, sys.argv[1:] or NAMES):
-        if not Path(f"runs/learners/{name}-{seed}.json").is_file():
-            print(name, seed, train(name, seed)[-1], flush=True)
+        print(name, seed, train(name, seed)[-1], flush=True)

@@ -441,11 +441,14 @@ def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataF
     names = [name for name, track in first.tracks.items() if not track.privileged]
     if not names:
         return pd.DataFrame(columns=list(RANK_COLUMNS))
-    gains = {
-        name: np.mean([r.group_gains(name)[0] for r in results.values()], axis=0) for name in names
-    }
-    spans = [result.group_gains(names[0])[1] for result in results.values()]
-    return rank(gains, np.mean(spans, axis=0), resamples=resamples)
+    gains = {name: overall_gains(results, name)[0] for name in names}
+    return rank(gains, overall_gains(results, names[0])[1], resamples=resamples)
+
+
+def overall_gains(results: Results, policy: str, part: str = "all") -> tuple[Floats, Floats]:
+    """Means over all conditions of what `EvaluationResult.group_gains` gives for each."""
+    gains, spans = zip(*(r.group_gains(policy, part) for r in results.values()), strict=True)
+    return np.mean(gains, axis=0), np.mean(spans, axis=0)
 
 
 def training_seed_rows(result: EvaluationResult) -> pd.DataFrame:

@@ -6,7 +6,7 @@ import datetime
 import io
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,9 @@ from torch import Tensor
 
 from ae_env.scenes import Scene
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
-from agents.evaluation.result import Results, static_condition
+from agents.evaluation.intervals import score_interval
+from agents.evaluation.metrics import group_means
+from agents.evaluation.result import Results, overall_gains, static_condition
 from agents.policy_names import (
     LEARNT_AGENTS,
     WITH_FILE,
@@ -26,7 +28,7 @@ from agents.policy_names import (
     split_options,
     training_seeds,
 )
-from agents.report.evaluation import fill
+from agents.report.evaluation import Cell, cell, fill
 from simulator.utils.files import machine, sibling, versions, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -37,24 +39,24 @@ BLOCKS, STEP_EV = 4, 0.1
 #: Raised when an episode or its score is made otherwise. 2: depth and motion of each pixel, terms
 #: that are measured on the capture. 3: the right exposure is what a dome reads, within bounds.
 RULES = 3
-COLUMNS = (
-    *("task", "policy", "observation", "author", "date", "score", "ci95_low", "ci95_high"),
-    *("hard", "rest", "regret", "ev_within_third", "frames_to_converge", "converged"),
+#: Columns with a value over all conditions or budgets, and the ends of its 95 % interval beside it.
+_MEASURED = (
+    *("score", "hard", "rest", "regret", "ev_within_third", "frames_to_converge", "converged"),
     *("reversals", "jump", "clipped_high", "clipped_low", "log_error", "unseen", "frames"),
+)
+COLUMNS = (
+    *("task", "policy", "observation", "author", "date"),
+    *(f"{name}{end}" for name in _MEASURED for end in ("", "_low", "_high")),
     *("ms_alone", "cpu", "trained_on", "frames_seen", "training_seeds", "version", "hash"),
 )
+#: Tables that take no more rows, by a column that they alone have.
+_OLDER = {"normalised_score": "v1", "real": "v2", "ci95_low": "v3 without intervals"}
 #: Columns that hold no numbers.
 _TEXT = ("task", "policy", "observation", "author", "date", "cpu", "trained_on", "version", "hash")
 #: What identifies a row.
 _KEY = ["task", "policy", "observation", "author"]
-#: Metrics of a row that are means over all conditions, by the measure of the plan.
-_MEANS = {
-    "score": (
-        *("regret", "ev_within_third", "frames_to_converge", "converged", "reversals", "jump"),
-        *("clipped_high", "clipped_low"),
-    ),
-    "quality": ("log_error", "unseen", "frames", "seconds"),
-}
+#: Metrics of a row that are means over places, by the measure of the plan.
+_MEANS = {"score": _MEASURED[3:11], "quality": (*_MEASURED[11:], "seconds")}
 #: In the order of the page.
 _TASKS = ("video", "still", "unknown", "bracket")
 #: What tells a page that this module wrote.
@@ -265,8 +267,12 @@ def read_table(table: Path) -> pd.DataFrame:
         rows = _parse(table.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:  # pandas' errors of parsing are ValueErrors
         raise ValueError(f"{table} cannot be read as a table: {error}") from error
-    if tuple(rows.columns) != COLUMNS:
-        raise ValueError(f"{table}: its columns must be {', '.join(COLUMNS)}")
+    if version := next((own for name, own in _OLDER.items() if name in rows), None):
+        rule = f"is a table of AE-Bench {version}, which takes no rows: give docs/ae-bench/v3.csv"
+        raise _refusal(table, f"{rule}, or a new file")
+    if wrong := [name for name in (*COLUMNS, *rows) if (name in COLUMNS) != (name in rows)]:
+        rule = f"must be a table of AE-Bench v3 or a new file: column {wrong[0]!r} is not as there"
+        raise _refusal(table, rule)
     for name in (name for name in COLUMNS if name not in _TEXT):
         numbers = pd.to_numeric(rows[name], errors="coerce")
         wrong = ~np.isfinite(numbers) & ((rows[name] != "") | (name == "score"))
@@ -292,29 +298,39 @@ def page_of(table: Path) -> Path:
 
 
 def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the policies that are ranked: means over all conditions or budgets."""
+    """The rows of the policies that are ranked: means over all conditions or budgets.
+
+    All columns are resampled as the score is: the places, and the training seeds.
+    """
     first, rows = results[static_condition(results)], []
-    for one in ranking.to_dict("records"):
-        means = {
-            key: np.mean([result.mean(one["policy"], key) for result in results.values()])
-            for key in _MEANS[first.measure]
+    for policy in ranking.policy:
+        found = {
+            name: score_interval(*overall_gains(results, policy, part))
+            for name, part in zip(("score", "hard", "rest"), first.parts, strict=False)
         }
-        scores = {
-            part: np.mean([r.normalised(one["policy"], part) for r in results.values()])
-            for part in first.parts[1:]
-        }
-        track = first.tracks[one["policy"]]
-        low, high = one["ci95"] or (None, None)
-        row = {
-            "policy": one["policy"],
-            "score": one["normalised_score"],
-            "ci95_low": low,
-            "ci95_high": high,
-            "ms_alone": 1000.0 * means["seconds"] if "seconds" in means else track.ms_alone,
-            "training_seeds": track.num_seeds,
-        }
-        rows.append(row | scores | means)
+        for key in _MEANS[first.measure]:
+            values = [
+                group_means(r.episode_metrics(policy)[key], r.groups) for r in results.values()
+            ]
+            mean = np.mean(values, axis=0)  # (K, G)
+            found[key] = score_interval(mean, np.ones(mean.shape[1]))
+        track = first.tracks[policy]
+        alone = 1000.0 * found["seconds"].value if "seconds" in found else track.ms_alone
+        row = {"policy": policy, "ms_alone": alone, "training_seeds": track.num_seeds}
+        for name, own in found.items():
+            row |= {name: own.value, f"{name}_low": own.low, f"{name}_high": own.high}
+        rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _measured(name: str, form: str) -> Cell:
+    """Cells with a value and half the width of its interval, if it has one: "0.841 ± 0.030"."""
+
+    def shown(row: Mapping[str, Any]) -> str:
+        half = {"half": (row[f"{name}_high"] - row[f"{name}_low"]) / 2.0}
+        return cell(row, f"{{{name}:{form}}}") + cell(half, f" ± {{half:{form}}}", "")
+
+    return shown
 
 
 def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
@@ -328,4 +344,4 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     )
     by_task = {str(task): own for task, own in numbers.groupby("task")}
     names = {"table": shown(table), "page": shown(page_of(table))}
-    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, **names)
+    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, measured=_measured, **names)

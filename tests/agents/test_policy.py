@@ -185,6 +185,18 @@ def test_shipped_agents_beat_a_plain_meter_and_differ_by_their_seed():
         assert not any((a == b).all() for a, b in combinations(weights, 2))
 
 
+@pytest.mark.parametrize("name", ["ppo", "regression", "matrix:P"])
+def test_masks_that_do_not_fit_or_allow_nothing_are_refused(name):
+    with closing(make_envs({"scenes": "bundled:small"}, num_envs=2, frames=1)) as envs:
+        policy = make_policy(training_seeds(name)[0], PolicyContext.from_envs(envs))
+        (seen, _), masks = envs.reset(seed=0), np.ones((2, len(policy.context.grid)), bool)
+    rules = {"shape": (masks[:1], masks[:, 1:], masks[0]), "allow a state": (masks & [[1], [0]],)}
+    for rule, wrong in ((rule, one) for rule, own in rules.items() for one in own):
+        policy.reset(2)
+        with pytest.raises(ValueError, match=f"`action_masks` .*{rule}"):
+            policy.act(seen, wrong)
+
+
 def test_agents_for_moving_light_come_with_their_forecasts():
     """They foresee with what ships, and refuse a grid that they were not trained on."""
     video = {**SCENES, "grid": "video", "delay": {"iso": 1, "exposure_time": 2, "f_number": 2}}

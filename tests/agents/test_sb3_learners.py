@@ -65,3 +65,13 @@ def test_missing_weights_are_named() -> None:
     context = PolicyContext.from_envs(make_envs(1))
     with pytest.raises(ValueError, match=r"`weights` \(=.none\.safetensors.\)"):
         make_policy(f"{PROGRAM}:Learnt?weights=none.safetensors", context)
+
+
+def test_a_finished_run_is_read_unless_frames_or_settings_differ(tmp_path: Path) -> None:
+    given = {"out": tmp_path, "scenes": "bundled:small", "exam": ("bundled:small", "test", 2)}
+    rows = learners.train("a2c", 1, 640, **given)
+    assert learners.train("a2c", 1, 640, **given) == rows  # measured times are the same
+    assert learners.train("a2c", 1, 1_280, **given)[-1]["frames"] == 1_280
+    seconds = learners.train("a2c", 1, 640, **given)[-1]["cpu_seconds"]
+    changed = learners.train("a2c", 1, 640, **given, learning_rate=1e-4)
+    assert len({seconds, rows[-1]["cpu_seconds"], changed[-1]["cpu_seconds"]}) == 3

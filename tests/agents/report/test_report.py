@@ -16,6 +16,7 @@ import torch
 from markdown_it import MarkdownIt
 from matplotlib.text import Text
 from PIL import Image
+from scipy.stats import bootstrap
 
 from ae_env.grid import ExposureGrid
 from ae_env.rendering import PATH_COLOURS
@@ -425,6 +426,18 @@ def test_rows_of_brackets_by_hand(tmp_path):
     assert "|p|uint8|0.8500|-|" in page
 
 
+def test_columns_have_the_interval_of_their_mean_over_places():
+    results = {"static": (result := made_result())}
+    rows = ae_bench.bench_rows(results, overall_ranking(results))
+    row = rows.set_index("policy").loc["spot:P"]
+    own = np.take_along_axis(result.scores, result.tracks["spot:P"].states[0][..., None], -1)
+    places = (result.scores.max(-1) - own[..., 0]).mean(-1).reshape(20, 2).mean(-1)
+    ends = bootstrap((places,), np.mean, method="percentile", rng=1).confidence_interval
+    assert row.regret == pytest.approx(places.mean())
+    assert (row.regret_low, row.regret_high) == pytest.approx(tuple(ends), abs=0.004)
+    assert row[["hard_low", "rest_high"]].isna().all()  # of ten places each
+
+
 def _table(file, plan, **entries):
     known = {"hash": plan.hash, "task": "still", "observation": "uint8", "score": "0.5"}
     row = dict.fromkeys(ae_bench.COLUMNS, "") | known | entries
@@ -451,6 +464,8 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         (_table(tmp_path / "b.csv", plan, hash="0"), ["random"], "me", r"b\.csv .*hash"),
         (_table(tmp_path / "d.csv", plan, score="x"), ["random"], "me", r"d\.csv, line 2: `score`"),
         (broken, ["random"], "me", "broken.csv"),
+        (Path("docs/ae-bench/v1.csv"), ["random"], "me", "AE-Bench v1, which"),
+        (Path("docs/ae-bench/v2.csv"), ["random"], "me", "AE-Bench v2, which"),
     ):
         with pytest.raises(ValueError, match=message):
             check(file, plan, policies, author=author)
