@@ -55,6 +55,7 @@ class MeteringPolicy(Policy):
         compensation: Exposure compensation [EV], positive is brighter.
         damping: Share of the distance to the metered EV that remains after a frame, in [0, 0.999].
         shutter_cap: Longest exposure time that may be used [s].
+        iso_cap: Highest ISO speed that may be used.
         f_number: Aperture that A and M keep; None: f/8.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
@@ -74,6 +75,7 @@ class MeteringPolicy(Policy):
         compensation: float = 0.0,
         damping: float = 0.0,
         shutter_cap: float | None = None,
+        iso_cap: float | None = None,
         f_number: float | None = None,
         exposure_time: float | None = None,
         iso: float | None = None,
@@ -92,7 +94,7 @@ class MeteringPolicy(Policy):
         by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
         check_used(program, weights=weights, **by_hand)
         given = {name: value for name, value in by_hand.items() if value is not None}
-        self.options = ProgramOptions(compensation, damping, shutter_cap, **given)
+        self.options = ProgramOptions(compensation, damping, shutter_cap, iso_cap=iso_cap, **given)
         self.meter = make_meter(meter, context.camera)
         self._meter_name = meter
         self.name = f"{meter}:{program}"
