@@ -11,8 +11,8 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,7 +23,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 
 from ae_env.observation import linear_signal
 from agents.metering.programs import PRIORITY_TIME, ProgramOptions, StateChooser, check_used
-from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100
+from agents.metering.reading import GREEN, TARGET_SIGNAL, Region, frame_ev100, parts_of
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import MANUAL_PROGRAMS
 from simulator.utils.checks import check_integer, check_number, check_word
@@ -44,19 +44,16 @@ FAST_REDUCE = 0.4
 PISP_SIDE = 15
 
 
-def _check_zones(weights: tuple[float, ...]) -> tuple[float, ...]:
+def _check_zones(weights: list[float]) -> list[float]:
     if len(weights) not in (15, PISP_SIDE**2) or not sum(weights) > 0.0:
         raise ValueError(f"must be 15 or {PISP_SIDE**2} weights, one of them above 0")
     return weights
 
 
-def _pairs(numbers: Any) -> Any:
-    """The entries of a `Target`, from a list of pairs."""
-    if not isinstance(numbers, list) or len(numbers) % 2 or not numbers:
-        raise ValueError("must be a list of pairs: illuminance and signal")
-    if any(a >= b for a, b in pairwise(numbers[::2])):
-        raise ValueError("must be sorted by illuminance")
-    return {"lux": numbers[::2], "signals": numbers[1::2]}
+def _check_pairs(numbers: list[float]) -> list[float]:
+    if len(numbers) % 2 or not numbers or any(a >= b for a, b in pairwise(numbers[::2])):
+        raise ValueError("must be pairs of illuminance and signal, sorted by illuminance")
+    return numbers
 
 
 def _in_seconds(ladder: Ladder) -> Ladder:
@@ -69,13 +66,9 @@ def _in_seconds(ladder: Ladder) -> Ladder:
 _Number = Annotated[float, Field(ge=0.0, lt=np.inf)]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Name = Annotated[str, AfterValidator(lambda name: name.replace("-", "_"))]
-
-
-@dataclass(frozen=True)
-class Metering:
-    """Weights of the zones: 15 of them, the first is the centre; on the Pi 5 15 x 15, by rows."""
-
-    weights: Annotated[tuple[_Number, ...], AfterValidator(_check_zones)]
+#: Signal aimed at, 1 is white, by illuminance [lux]: pairs; linear between, constant outside.
+_Target = Annotated[list[_Number], AfterValidator(_check_pairs)]
+_Weights = Annotated[list[_Number], AfterValidator(_check_zones)]
 
 
 @dataclass(frozen=True)
@@ -90,39 +83,54 @@ class Ladder:
 
 
 @dataclass(frozen=True)
-class Target:
-    """The signal aimed at, 1 is white, by illuminance [lux]: linear between, constant outside."""
-
-    lux: tuple[_Number, ...]
-    signals: tuple[_Number, ...]
-
-
-@dataclass(frozen=True)
 class Constraint:
     """The mean of the pixels between two quantiles is at least (LOWER), or at most, a target."""
 
     bound: Annotated[Literal["LOWER", "UPPER"], BeforeValidator(lambda word: str(word).upper())]
     q_lo: _Share
     q_hi: _Share
-    y_target: Annotated[Target, BeforeValidator(_pairs)]
+    y_target: _Target
 
 
-ZONE_WEIGHTS = {
-    "centre_weighted": Metering((3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0)),
-    "spot": Metering((2, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)),
-    "matrix": Metering((1,) * 15),
-}
-LADDERS = {
-    "normal": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-    "short": Ladder((100e-6, 5e-3, 10e-3, 20e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-    "long": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 120e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-}
-_TOP = Constraint("LOWER", 0.98, 1.0, Target((0.0,), (0.3,)))
-CONSTRAINTS = {
-    "normal": [_TOP],
-    "highlight": [_TOP, Constraint("UPPER", 0.98, 1.0, Target((0.0,), (0.8,)))],
-    "shadows": [Constraint("LOWER", 0.0, 0.5, Target((0.0,), (0.17,)))],
-}
+class Tuning(BaseModel, frozen=True):
+    """``rpi.agc`` of a tuning file, with libcamera's defaults; the first mode of each is the usual.
+
+    In memory times are in seconds, in the file in microseconds. Weights are of 15 zones, the centre
+    first, or row by row of the 15 x 15 of the Pi 5.
+    """
+
+    metering_modes: dict[_Name, dict[Literal["weights"], _Weights]] = Field(min_length=1)
+    exposure_modes: dict[_Name, Annotated[Ladder, AfterValidator(_in_seconds)]]
+    constraint_modes: dict[_Name, list[Constraint]] = Field(min_length=1)
+    y_target: _Target
+    speed: float = Field(SPEED, gt=0.0, le=1.0)
+    startup_frames: int = Field(STARTUP_FRAMES, ge=0)
+    base_ev: float = Field(1.0, gt=0.0, lt=np.inf)  # factor of all targets
+    stable_region: _Share = STABLE
+    fast_reduce_threshold: _Share = FAST_REDUCE
+
+
+_TOP = Constraint("LOWER", 0.98, 1.0, [0.0, 0.3])
+_GAINS = (1.0, 2.0, 4.0, 6.0, 16.0)
+#: That of the imx477.
+IMX477 = Tuning.model_construct(
+    metering_modes={
+        "centre_weighted": {"weights": [3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0]},
+        "spot": {"weights": [2, 1, 1] + [0] * 12},
+        "matrix": {"weights": [1] * 15},
+    },
+    exposure_modes={
+        "normal": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 66.666e-3), _GAINS),
+        "short": Ladder((100e-6, 5e-3, 10e-3, 20e-3, 66.666e-3), _GAINS),
+        "long": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 120e-3), _GAINS),
+    },
+    constraint_modes={
+        "normal": [_TOP],
+        "highlight": [_TOP, Constraint("UPPER", 0.98, 1.0, [0.0, 0.8])],
+        "shadows": [Constraint("LOWER", 0.0, 0.5, [0.0, 0.17])],
+    },
+    y_target=[0.0, 0.16, 1000.0, 0.165, 10000.0, 0.17],
+)
 #: Illuminance that is assumed where none is known [lux].
 DEFAULT_LUX = 400.0
 #: No target is above this, whatever the compensation: close to white a mean says nothing.
@@ -133,35 +141,6 @@ HISTOGRAM_BINS = 128
 GAIN_PASSES, GAIN_LIMIT, GAIN_DONE = 8, 10.0, 1.01
 #: Added to a mean by which a target is divided.
 _LEAST_SIGNAL = 1e-3
-
-
-_Rungs = Annotated[Ladder, AfterValidator(_in_seconds)]
-
-
-class Tuning(BaseModel, frozen=True):
-    """``rpi.agc`` of a tuning file, with libcamera's defaults; the first mode of each is the usual.
-
-    In memory times are in seconds, in the file in microseconds.
-    """
-
-    metering_modes: dict[_Name, Metering] = Field(min_length=1)
-    exposure_modes: dict[_Name, _Rungs] = Field(min_length=1)
-    constraint_modes: dict[_Name, list[Constraint]] = Field(min_length=1)
-    y_target: Annotated[Target, BeforeValidator(_pairs)]
-    speed: float = Field(SPEED, gt=0.0, le=1.0)
-    startup_frames: int = Field(STARTUP_FRAMES, ge=0)
-    base_ev: float = Field(1.0, gt=0.0, lt=np.inf)  # factor of all targets
-    stable_region: _Share = STABLE
-    fast_reduce_threshold: _Share = FAST_REDUCE
-
-
-#: That of the imx477.
-IMX477 = Tuning.model_construct(
-    metering_modes=ZONE_WEIGHTS,
-    exposure_modes=LADDERS,
-    constraint_modes=CONSTRAINTS,
-    y_target=Target((0.0, 1000.0, 10000.0), (0.16, 0.165, 0.17)),
-)
 
 
 def read_tuning(path: str | os.PathLike[str]) -> Tuning:
@@ -177,13 +156,11 @@ def read_tuning(path: str | os.PathLike[str]) -> Tuning:
         if found.get("channels"):
             found, prefix = found["channels"][0], f"{prefix}channels.0."
         return Tuning.model_validate(found)
-    except OSError as error:
-        raise ValueError(f"{name} cannot be read: {error.strerror}") from error
     except ValidationError as error:
         raise ValueError(f"{name}: {one_line(error, prefix)}") from error
-    except (ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{name} must be a JSON file: {error}") from error
-    except (AttributeError, KeyError, TypeError, StopIteration):
+    except (AttributeError, LookupError, TypeError, StopIteration):
         raise ValueError(f"{name} must have an entry 'rpi.agc' in its 'algorithms'") from None
 
 
@@ -203,7 +180,7 @@ class LibcameraAgc:
     tuning: Tuning = IMX477
     metering: str = "centre_weighted"  # name of the tuning's `metering_modes`
     constraint: str = "normal"  # name of the tuning's `constraint_modes`
-    ladder: Ladder = LADDERS["normal"]  # an exposure mode, of a tuning or of one's own
+    ladder: Ladder = IMX477.exposure_modes["normal"]  # a tuning's, or of one's own
     compensation: float = 0.0
     max_exposure_time: float = np.inf  # longest that the sensor or the user allows [s]
     exposure_time: float | None = None  # a fixed one [s], in place of the ladder's
@@ -211,7 +188,9 @@ class LibcameraAgc:
     flicker_period: float | None = None
 
     def __post_init__(self) -> None:
-        self.weights = np.array(self.tuning.metering_modes[self.metering].weights, np.float64)
+        #: Of the zones, (Z,); or (N, Z), of each camera's own.
+        self.weights = np.array(self.tuning.metering_modes[self.metering]["weights"], np.float64)
+        self.all_weights = self.weights
         self._filtered, self._frames = np.full(self.num_cameras, np.nan), 0
 
     def update(
@@ -225,8 +204,8 @@ class LibcameraAgc:
         """
         brighter = self.tuning.base_ev * 2.0**self.compensation
 
-        def aim(target: Target) -> Floats:
-            aimed = np.broadcast_to(np.interp(lux, target.lux, target.signals), len(zones))
+        def aim(target: list[float]) -> Floats:
+            aimed = np.broadcast_to(np.interp(lux, target[::2], target[1::2]), len(zones))
             return np.asarray(np.minimum(aimed * brighter, TARGET_LIMIT))
 
         wanted = aim(self.tuning.y_target)
@@ -291,7 +270,8 @@ def zone_factor(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
     factor = np.ones(len(zones))
     done = np.zeros(len(zones), bool)
     for _ in range(GAIN_PASSES):
-        mean = np.minimum(zones * factor[:, None], 1.0) @ weights / weights.sum()
+        mean = (np.minimum(zones * factor[:, None], 1.0) * weights).sum(axis=1)
+        mean /= weights.sum(axis=-1)
         extra = np.minimum(GAIN_LIMIT, wanted / (mean + _LEAST_SIGNAL))
         factor = np.where(done, factor, factor * extra)
         done |= extra < GAIN_DONE
@@ -354,6 +334,7 @@ class RpiAgc(Policy):
         speed: Share of the distance to the target that the filter goes per frame, in (0, 1]; by
             default the tuning's.
         startup_frames: Frames of an episode in which it goes all of the way; likewise.
+        roi, mask: Pixels that are metered, see `Region`; the zones are those of the box around.
     """
 
     def __init__(
@@ -376,6 +357,8 @@ class RpiAgc(Policy):
         flicker_period: float | None = None,
         speed: float | None = None,
         startup_frames: int | None = None,
+        roi: str | Sequence[float] | None = None,
+        mask: str | NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__(context)
         check_word("program", program, MANUAL_PROGRAMS)
@@ -384,11 +367,9 @@ class RpiAgc(Policy):
         metering = _chosen("metering", metering, found.metering_modes)
         mode = _chosen("mode", mode, found.exposure_modes)
         constraint = _chosen("constraint", constraint, found.constraint_modes)
-        own: dict[str, float] = {}
-        if speed is not None:
-            own["speed"] = check_number("speed", speed, 1e-3, 1.0)
-        if startup_frames is not None:
-            own["startup_frames"] = check_integer("startup_frames", startup_frames, 0)
+        speed = check_number("speed", found.speed if speed is None else speed, 1e-3, 1.0)
+        frames = found.startup_frames if startup_frames is None else startup_frames
+        own = {"speed": speed, "startup_frames": check_integer("startup_frames", frames, 0)}
         time = PRIORITY_TIME if exposure_time is None else exposure_time
         lens = context.grid.f_numbers[0] if f_number is None else f_number
         self.options = ProgramOptions(compensation, damping, shutter_cap, lens, time, iso, iso_cap)
@@ -396,11 +377,13 @@ class RpiAgc(Policy):
         most = gains[-1] if max_gain is None else check_number("max_gain", max_gain, 1.0, 1e5)
         most = min(most, np.inf if iso_cap is None else iso_cap / 100.0)
         if flicker_period is not None:
-            flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
+            check_number("flicker_period", flicker_period, 1e-6, 10.0)
         self.name = f"rpi_agc:{program}"
+        self.region = Region(roi, mask, context.frame_size)
+        self.needs_subject = self.region.of_subject
         gains = tuple(min(g, most) for g in (*gains[:-1], most))
-        self._make_agc = functools.partial(
-            LibcameraAgc,
+        self.agc = LibcameraAgc(
+            0,
             tuning=found.model_copy(update=own),
             metering=metering,
             constraint=constraint,
@@ -417,23 +400,23 @@ class RpiAgc(Policy):
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Begin the start-up frames of `num_envs` cameras."""
         super().reset(num_envs, seed)
-        self.agc = self._make_agc(num_envs)
+        self.agc = replace(self.agc, num_cameras=num_envs)
         self._damped = np.full(num_envs, np.nan)
         self._previous: Ints | None = None
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Meter the frames, filter the exposure, split it."""
         self.check_reset(observations)
-        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
-        signal = np.maximum(signal, 0.0).reshape(len(signal), -1)
-        zones = signal @ _zone_matrix(*observations["raw"].shape[2:], len(self.agc.weights))
-        frame_ev = frame_ev100(observations)
-        brightness = zones @ self.agc.weights / self.agc.weights.sum()
+        parts = parts_of(observations, self.region.masks(observations))
+        found = [self._statistics(cut) for _, cut in parts]
+        zones, weights, histogram = map(np.concatenate, zip(*found, strict=True))
+        frame_ev, self.agc.weights = frame_ev100(observations), weights
+        brightness = (zones * weights).sum(axis=1) / weights.sum(axis=1)
         light = np.log2(np.maximum(brightness, _DARKEST) / TARGET_SIGNAL)
         lux = 2.5 * np.exp2(frame_ev + light)
         # As exposure time x gain at the lens's own f-number, which may not be the frame's.
         area = self.options.f_number**2
-        exposure = self.agc.update(zones, signal_histogram(signal), area * np.exp2(-frame_ev), lux)
+        exposure = self.agc.update(zones, histogram, area * np.exp2(-frame_ev), lux)
         ev = -np.log2(exposure / area)
         states = self.context.grid.ev100
         before = np.clip(self._damped, states.min(), states.max())
@@ -441,6 +424,19 @@ class RpiAgc(Policy):
         self._damped = ev + np.where(np.isnan(distance), 0.0, distance)
         self._previous = masked_argmax(self._utility(self._damped), action_masks)
         return self._previous.copy()
+
+    def _statistics(self, observations: Observations) -> tuple[Floats, ...]:
+        """Means of the zones (n, Z), their weights (n, Z), and histograms of n frames."""
+        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
+        places = _zone_members(*signal.shape[1:], len(self.agc.all_weights))
+        seen = observations.get("mask", np.ones(signal.shape[1:], bool))
+        pixels = np.maximum(signal, 0.0)[:, seen]
+        some = places[seen.ravel()]
+        share = some.sum(axis=0) / np.maximum(places.sum(axis=0), 1.0)
+        weights = self.agc.all_weights * share
+        weights = weights if weights.any() else share
+        zones = pixels @ (some / np.maximum(some.sum(axis=0), 1.0))
+        return zones, np.tile(weights, (len(pixels), 1)), signal_histogram(pixels)
 
     def _utility(self, ev: Floats) -> Floats:
         """How well each state fits the exposures and the ladder, ``(N, S)``."""
@@ -507,9 +503,7 @@ def zone_map(height: int, width: int, zones: int = 15) -> Ints:
 
 
 @functools.lru_cache(maxsize=8)
-def _zone_matrix(height: int, width: int, zones: int) -> Floats:
-    """Weights of the pixels in the mean of each zone, ``(height * width, zones)``."""
+def _zone_members(height: int, width: int, zones: int) -> Floats:
+    """Whether each pixel is in each zone, ``(height * width, zones)``, 1 or 0."""
     places = zone_map(height, width, zones).ravel()
-    matrix: Floats = (places[:, None] == np.arange(zones)).astype(np.float64)
-    matrix /= np.maximum(matrix.sum(axis=0), 1.0)
-    return matrix
+    return (places[:, None] == np.arange(zones)).astype(np.float64)

@@ -16,7 +16,7 @@ from ae_env.grid import ExposureGrid
 from agents.metering import metering_policy, programs
 from agents.metering.metering_policy import MeteringPolicy, ScoreRegression
 from agents.metering.programs import ProgramOptions, StateChooser, program_cost
-from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
+from agents.metering.rpi_agc import IMX477, LibcameraAgc, signal_histogram, zone_map
 from agents.policy import PolicyContext
 from agents.policy_names import METERS, make_policy
 from agents.rollouts import make_envs
@@ -524,7 +524,7 @@ def _played(recording, zone_factors):
         1,
         metering=recording["metering"].replace("-", "_"),
         constraint=recording["constraint"],
-        ladder=LADDERS[recording["exposure_mode"]],
+        ladder=IMX477.exposure_modes[recording["exposure_mode"]],
         max_exposure_time=66e-3,
         flicker_period=recording["flicker_period_us"] * 1e-6 or None,
     )
