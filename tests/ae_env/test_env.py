@@ -281,7 +281,7 @@ ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], 
 TAKES = {
     **{key: [] for key in ("split", "scorer", "observation", "resolution", "crop")},
     **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
-    **{key: [True] for key in ("sensors", "noise", "with_oracle")},
+    **{key: [True] for key in ("sensors", "noise", "with_oracle", "with_subject")},
     **{key: [1.5] for key in ("motion", "depth")},
     **{key: [None] for key in ("grid", "simulator", "render_mode", "device")},
     "blur_memory": [1.5],
