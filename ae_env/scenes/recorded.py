@@ -352,7 +352,8 @@ def index_recorded(
     paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
     shots = [path for path in paths if not _TRUTH.search(str(path.relative_to(folder)))]
     if len(shots) < len(paths):
-        logger.warning(f"{len(paths) - len(shots)} files of ground truth are left out of {folder}")
+        count = f"{len(paths) - len(shots)} of {len(paths)} files"
+        logger.warning(f"{str(folder)!r}: ground truth is left out, {count}")
     found = [_recorded(folder, path, tables, known, numbers) for path in shots]
     if not found:
         raise ValueError(
@@ -406,7 +407,7 @@ def _recorded(
     except ValueError as error:
         raise ValueError(f"recorded file {str(path)!r}: {error}") from error
     names = [name for name in left if name] or [printable(folder.resolve().name)]
-    subject = [name for name in left[last + 1 :] if name] or names
+    subject = [name for name in left[last + 1 :] if name and not numbers] or names
     frames = [match for name in names if (match := _FRAME.fullmatch(name))]
     still = "/".join(name for name in names if not _FRAME.fullmatch(name))
     return RecordedFile(

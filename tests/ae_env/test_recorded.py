@@ -269,7 +269,7 @@ def test_grids_of_other_people(tmp_path: Path, caplog) -> None:
     assert scene.scene_id == "desk/17"
     assert scene.recorded.shape[0] == len(scene.allowed) == 2  # 4 ms is no state
     truth, single = caplog.messages
-    assert "2 files of ground truth are left out" in truth
+    assert "ground truth is left out, 2 of 5 files" in truth
     assert "1 of 2 recorded scenes have fewer than two states" in single
     options = recorded.RecordedOptions.of(
         f"recorded:{tmp_path}?folder=exposure_us&iso=1&f_number=4"
