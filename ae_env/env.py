@@ -340,7 +340,10 @@ class AutoExposureBase(SpecProperty):
 
     def info_of(self, columns: Mapping[str, np.ndarray], row: int) -> dict[str, Any]:
         """The info of one environment, plain numbers and names, from the columns of many."""
-        info: dict[str, Any] = {name: values.item(row) for name, values in columns.items()}
+        info: dict[str, Any] = {
+            name: values.item(row) if values.ndim == 1 else values[row]
+            for name, values in columns.items()
+        }
         info["scene_id"] = self.scene_ids[info["scene_id"]]
         info["modules"] = self.module_names[info["modules"]]
         return info
@@ -437,6 +440,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `modules` | steps of the simulator that this capture took |
     | `rewards.score`, `rewards.noise`, ... | the score, each part of the scorer, and the costs |
     | `oracle_state`, `regret` | best state, and its expected score minus that of `state`; only with `with_oracle` |
+    | `subject` | (R, R) bool, the pixels of the scene's subject; none where it has no subject; only with `with_subject` |
 
     ## Starting State
 
@@ -477,6 +481,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
+    | `with_subject` | `False` | adds `subject` to `info` |
     | `device` | `None` | of environments side by side: torch device on which frames are made and stay, `"cpu"`, `"cuda"` or `"auto"`; `None`: compiled loops on the CPU |
     | `blur_memory` | 512 | memory that blurred light may take before less of it is cached [MiB] |
     | `render_mode` | `None` | `"rgb_array"`: `render()` returns the developed capture, (H, W, 3) uint8, with its settings and score written on it; `None`: it returns None |

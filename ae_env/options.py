@@ -78,6 +78,7 @@ class EnvArguments(TypedDict, total=False):
     tolerance: float
     reward: Reward
     with_oracle: bool
+    with_subject: bool
     device: str | None
     blur_memory: float
 
@@ -106,6 +107,7 @@ class EnvOptions:
     tolerance: float = DEFAULT_TOLERANCE
     reward: Reward = "capture"
     with_oracle: bool = False
+    with_subject: bool = False
     device: str | None = None
     blur_memory: float = 512.0
 
@@ -118,7 +120,7 @@ class EnvOptions:
         for name, kind in (kinds | {"reward": Reward, "source": Source}).items():
             check_word(name, getattr(self, name), get_args(kind))
         check_word("noise", self.noise, get_args(Noise), True, False)  # True is "bank"
-        for name in ("sensors", "with_oracle"):
+        for name in ("sensors", "with_oracle", "with_subject"):
             check_flag(name, getattr(self, name))
         check_tolerance(self.tolerance)
         why = ": the default CNNs of RL libraries take no smaller image"

@@ -112,9 +112,10 @@ FRAME_GAP = 1.0 / 60.0
 BRACKET_NUMBERS = ("time_left", "frames_left", "white", "noisy")
 #: A merged sample whose standard deviation is a larger share of it counts as noisy.
 NOISY = 0.1
-#: Defaults of the bracket task, and arguments that it does not have.
+#: What other tasks add to the info; defaults of the bracket task, and arguments it does not have.
+SHOWN = ("with_oracle", "with_subject")
 BRACKET: dict[str, Any] = {"grid": "bracket", "depth": "far"}
-WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "with_oracle", "device")
+WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "device", *SHOWN)
 #: Time of all frames together [s], and how many there may be.
 BUDGET, MAX_FRAMES = 0.3, 3
 _MOST_SECONDS, _MOST_FRAMES = 3600.0, 16

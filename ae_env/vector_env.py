@@ -226,7 +226,7 @@ class AutoExposureVectorEnv(
         masks[:, env_indices] = True
         for mask, (name, values) in zip(masks, columns.items(), strict=True):
             if len(env_indices) < self.num_envs:
-                some, values = values, np.zeros(self.num_envs, values.dtype)
+                some, values = values, np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
                 values[env_indices] = some
             info[name], info[f"_{name}"] = values, mask
         return info

@@ -51,6 +51,11 @@ class PolicyContext:
         return cls(base.grid, base.camera, space, delays=base.delays, bracket=limits)
 
     @property
+    def frame_size(self) -> tuple[int, ...]:
+        """Height and width of a frame [packed pixel]."""
+        return (self.observation_space["raw"].shape or ())[1:]
+
+    @property
     def has_sensors(self) -> bool:
         """Whether the observation has image speed and defocus spread."""
         return "sensors" in self.observation_space.spaces
@@ -66,6 +71,8 @@ class Policy:
 
     #: Only a privileged policy's `act` gets ``info=`` as well; its scores are upper bounds.
     privileged: bool = False
+    #: Whether the observations of `act` must have ``info["subject"]``, too.
+    needs_subject: bool = False
     #: Frames a policy takes for one decision (a bracketing policy takes more).
     captures_per_decision: float = 1.0
 

@@ -71,6 +71,7 @@ def record_dataset(
     check_dataset_id(dataset_id)
     minari, report = _minari(), progress or (lambda *_: None)
     oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
+    oracle |= {"with_subject": True} if getattr(policy, "needs_subject", False) else {}
     with ExitStack() as opened:
         with _writing(dataset_id):  # reserved while the environment loads, too
             folder = opened.enter_context(_reserved(dataset_id))
@@ -185,7 +186,7 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
     while not done:
         shown = {key: np.asarray(value)[None] for key, value in observation.items()}
         masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
-        told = {"oracle_state": np.array([info.get("oracle_state")])}
+        told = {name: np.array([info.get(name)]) for name in ("oracle_state", "subject")}
         actions = choose(name, policy, shown, masks, told)
         state = checked_states(name, actions, masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)

@@ -25,7 +25,8 @@ def make_envs(
     env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Environments of the arguments `env_options`, without autoreset, for `frames` actions."""
-    options = {**env_options, "with_oracle": with_oracle, "autoreset_mode": "DISABLED"}
+    shown = {"with_oracle": with_oracle, "with_subject": True}
+    options = {**env_options, **shown, "autoreset_mode": "DISABLED"}
     # One frame more than is used: the episode must not end inside the evaluation.
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
 
@@ -161,10 +162,16 @@ def errors_of(policy: str, method: str) -> Iterator[None]:
 def choose(
     name: str, policy: Policy, observations: Observations, masks: Bools, info: Mapping[str, Any]
 ) -> Any:
-    """What `act` returns, see `errors_of`; `info` is for a privileged policy only."""
+    """What `act` returns, see `errors_of`; `info` is for policies that ask for it only."""
     told: dict[str, Any] = {"info": info} if getattr(policy, "privileged", False) else {}
     with errors_of(name, "act"):
-        return policy.act(observations, masks, **told)
+        return policy.act(shown_to(policy, observations, info), masks, **told)
+
+
+def shown_to(policy: Policy, observations: Observations, info: Mapping[str, Any]) -> Observations:
+    """The observations, with the subject's mask if `policy` needs it and `info` has it."""
+    needs = getattr(policy, "needs_subject", False) and "subject" in info
+    return {**observations, "subject": info["subject"]} if needs else observations
 
 
 def checked_states(name: str, actions: Any, masks: Bools) -> Ints:

@@ -29,7 +29,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import load_scenes
 from ae_env.scenes.load import DEFAULT_SIMULATOR, SceneNetworks
 from ae_env.scenes.recorded import PREFIX, RecordedOptions, merged_scene
-from ae_env.scenes.scene import Crop, Scene
+from ae_env.scenes.scene import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from benchmarks.fidelity.models import radiance_views
@@ -88,10 +88,8 @@ def _options(folder: str) -> RecordedOptions:
 
 
 def _of_folder(folder: str) -> list[Scene]:
-    def smaller(scene: Scene, resolution: int | None, crop: Crop) -> Scene:
-        return scene.resized(min(RESOLUTION, *scene.light.shape[1:]), crop)
-
-    options: Any = {"camera": get_camera(CAMERA), "resolution": RESOLUTION, "resize": smaller}
+    options: Any = {"camera": get_camera(CAMERA), "resolution": RESOLUTION}
+    options["resize"] = lambda s, _, crop: s.resized(min(RESOLUTION, *s.light.shape[1:]), crop)
     return load_scenes(_options(folder), "all", **options)
 
 
@@ -103,16 +101,14 @@ BRACKETS, TIMES_MS = ("left_c0", "left_c5"), (1, 2, 4, 8, 16, 32)
 LINEAR_BELOW = 0.4
 #: Side of the blocks that exposure ratios are measured on [packed pixel].
 BLOCK = 8
-_SOURCE = "measurement only: BorealHDR, left camera"
-#: The largest code that the files hold is 4094: saturation, 4089 after linearising.
-_BOREAL = CameraProfile("boreal_left", BayerPattern.RGGB, (0.0,) * 4, 4089, 12, source=_SOURCE)
+#: For measurement only. The files' largest code is 4094: saturation, 4089 after linearising.
+_BOREAL = CameraProfile("boreal_left", BayerPattern.RGGB, (0.0,) * 4, 4089, 12, source="BorealHDR")
 
 
 def _bracket(name: str) -> dict[int, RawImage]:
     """Frames by time [ms], linearised as the data's README says; gain and aperture are fixed."""
     folder = real_files(BOREAL)
-    (curve_path,) = folder.glob("pcalib*.txt")
-    curve = 16.0 * np.loadtxt(curve_path).ravel()
+    curve = 16.0 * np.loadtxt(next(folder.glob("pcalib*.txt"))).ravel()
     curve[0], curve[-1] = 0.0, 4095.0
     frames = {}
     for time in TIMES_MS:
@@ -219,6 +215,7 @@ def _compared(
             ours, theirs = (texture(frame[s], whole) for frame in (frames, real))
             if min(ours, theirs) > 0.0:
                 state["noise_error_stops"] = abs(float(np.log2(ours / theirs)))
+                state["distance"] = _distance(state["psnr_db"], state["ceiling_db"], ours - theirs)
             states.append(state)
         frame = pd.DataFrame(states)
         bounds, apart = [*STOPS.values(), np.inf], np.log2(ratios)[others]
@@ -241,6 +238,14 @@ def texture(image: torch.Tensor, use: torch.Tensor) -> float:
     """
     a, b, c, d = (image[:, i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
     return float(((a - b - c + d) / 2.0)[:, use].square().mean()) if use.any() else 0.0
+
+
+def _distance(psnr_db: float, ceiling_db: float, added: float) -> float:
+    """Distance of distributions, from a frame of each; `added`: variance beyond the real one's."""
+    square, noise = 10.0 ** (-psnr_db / 10.0), 0.5 * 10.0 ** (-ceiling_db / 10.0)
+    spread = max(noise + added, 0.0)
+    apart = max(square - spread - noise, 0.0) + (spread**0.5 - noise**0.5) ** 2
+    return float((apart / noise) ** 0.5) if noise else np.nan
 
 
 def _ceiling(scene: Scene, grid: ExposureGrid, state: int, mask: torch.Tensor) -> float:
@@ -267,7 +272,8 @@ def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
 
 _COLUMNS = """PSNR, all pixels [dB] = {psnr_all_db:.1f} | PSNR, known [dB] = {psnr_db:.1f} |
 two real captures [dB] = {ceiling_db:.1f} | without its noise [dB] = {psnr_expected_db:.1f} |
-noise off by [stop] = {noise_error_stops:.2f} | score error = {score_error:.3f} |
+distance of distributions = {distance:.2f} | noise off by [stop] = {noise_error_stops:.2f} |
+score error = {score_error:.3f} |
 oracle's regret = {oracle_regret:.3f}"""
 _TIME = " | ms a state = {ms_per_state:.1f}"
 _REGRET = "mean = {mean:.3f} | upper quartile = {upper:.3f} | largest = {most:.3f}"

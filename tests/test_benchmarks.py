@@ -171,6 +171,10 @@ def test_the_noise_of_two_real_captures_is_told(tmp_path):
         error = (again - capture(settings, 0).data).double().square().mean()
         ceiling = recorded._ceiling(scene, GRID, state, everywhere)
         assert ceiling == pytest.approx(-10.0 * np.log10(float(error)), abs=0.3)
+    # Variances of 4 and 1 (of 1e-6), and a mean that is 2e-3 off: 2 and 1 of the real deviation.
+    ceiling, error = (-10.0 * np.log10(v * 1e-6) for v in (2.0, 4.0 + 1.0 + 4.0))
+    assert recorded._distance(error, ceiling, 3e-6) == pytest.approx(5.0**0.5)
+    assert recorded._distance(ceiling, ceiling, 0.0) == pytest.approx(0.0, abs=1e-6)
 
 
 # -- local features -------------------------------------------------------------------------------

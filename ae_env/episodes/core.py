@@ -277,6 +277,12 @@ class EpisodeCore:
         info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
         info |= zip(_STATE_INFO, self._state_info[:, states], strict=True)
         info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
+        if options.with_subject:
+            info["subject"] = np.zeros((len(states), *[options.resolution] * 2), bool)
+            for mask, scene in zip(info["subject"], info["scene_id"].tolist(), strict=True):
+                layout = self.scenes[scene].layout
+                if layout is not None and layout.subject is not None:
+                    mask[:] = layout.subject.numpy()
         return Frames(observation, info, reward, raw)
 
     def _memory(self, count: int, name: str) -> Any:

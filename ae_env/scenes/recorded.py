@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,7 +37,14 @@ from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import marks_stops, read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
-from simulator.utils.checks import UNITS, check_key, check_number, parse_number
+from simulator.utils.checks import (
+    UNITS,
+    check_key,
+    check_number,
+    check_word,
+    import_extra,
+    parse_number,
+)
 from simulator.utils.files import (
     PICTURE_SUFFIXES,
     RAW_SUFFIXES,
@@ -75,18 +83,27 @@ _IN_NAMES = (
     ("exposure_time", re.compile(rf"(?<![\d.]){_NUMBER} ?(s|ms|us)(?![a-z])", re.I)),
 )
 _FRAME = re.compile(r"frame[_-]?(\d+)", re.I)
+#: What a folder that is a bare number may state, with the size of its unit.
+FOLDERS = {"iso": 1.0, "f_number": 1.0, "exposure_s": 1.0, "exposure_ms": 1e-3, "exposure_us": 1e-6}
+#: Part of the path of a picture that no exposure took, but was averaged from many.
+_TRUTH = re.compile(r"(?<![a-z])(gt|ground[_\-. ]?truth)(?![a-z])", re.I)
 
 
 @dataclass(frozen=True)
 class RecordedOptions:
-    """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs."""
+    """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs.
+
+    `numbers`, one of `FOLDERS`, is what its folders state that are bare numbers.
+    """
 
     folder: Path
     iso: float | None = None
     exposure_time: float | None = None
     f_number: float | None = None
+    numbers: str | None = None
 
     def __post_init__(self) -> None:
+        check_word("scenes['folder']", self.numbers, tuple(FOLDERS), None)
         for name, value in self.known.items():
             check_number(name, value, 1e-9, 1e8)
 
@@ -105,28 +122,30 @@ class RecordedOptions:
             folder, mark, given = spec.removeprefix(PREFIX).partition("?")
             pairs = [part.partition("=")[::2] for part in given.split("&")] if mark else []
             try:
-                spec = {KEY: folder, **{name: parse_number(text) for name, text in pairs}}
+                values = {n: v if n == "folder" else parse_number(v) for n, v in pairs}
+                spec = {KEY: folder, **values}
             except ValueError as error:
                 form = f"must be written {PREFIX}FOLDER?iso=100&f_number=4"
                 raise ValueError(f"`scenes` (={spec!r}) {form}: {error}") from None
         if not isinstance(spec, Mapping) or KEY not in spec:
             return None
         for name in spec:
-            check_key("scenes", name, (KEY, *_SETTINGS))
+            check_key("scenes", name, (KEY, "folder", *_SETTINGS))
         if not isinstance(spec[KEY], str | Path) or not str(spec[KEY]):
             raise ValueError(f"`scenes[{KEY!r}]` (={spec[KEY]!r}) must be the path of a folder")
         settings = {name: spec[name] for name in _SETTINGS if name in spec}
-        return cls(Path(spec[KEY]).expanduser(), **settings)
+        return cls(Path(spec[KEY]).expanduser(), **settings, numbers=spec.get("folder"))
 
     @cached_property
     def files(self) -> tuple[RecordedFile, ...]:
         """Every capture of the folder; see `index_recorded`."""
-        return tuple(index_recorded(self.folder, self.known))
+        return tuple(index_recorded(self.folder, self.known, self.numbers))
 
     @cached_property
     def grid(self) -> ExposureGrid:
-        """Every combination of the settings of its captures."""
-        return recorded_grid(self.files)
+        """Every combination of the settings of its captures, but of scenes with one state only."""
+        states = Counter(scene for scene, _ in {(f.scene, f.settings) for f in self.files})
+        return recorded_grid([f for f in self.files if states[f.scene] > 1] or self.files)
 
     @cached_property
     def _body(self) -> CameraProfile | None:
@@ -154,17 +173,29 @@ def recorded_scenes(
     """The recorded scenes of a split, frames of one video after the other.
 
     Each capture is resized before the next is read. Captures at settings that are not in `grid` are
-    left out, states without a capture are forbidden (`Scene.allowed`). A `ValueError` if a capture
-    cannot be read, or a scene's captures are no grid of one size.
+    left out, and scenes with fewer than two states; states without a capture are forbidden
+    (`Scene.allowed`). A `ValueError` if a capture cannot be read, no scene is left, or a scene's
+    captures are no grid of one size.
     """
     camera = options.camera(request.camera)
     scenes: list[Scene] = []
+    single: list[RecordedFile] = []
     for name, group in groupby(options.files, lambda file: file.scene):
         files = list(group)
         states = _states(name, files, grid)
+        if len(states) < 2:
+            single.append(files[0])
+            continue
         raws = _raws_of_one_size(states, camera)
         merged = merged_scene(name, raws, grid, camera, resize=request.sized)
         scenes.append(replace(merged, group=files[0].group, sequence=files[0].sequence))
+    if single:
+        said = f"{len(single)} of {len(scenes) + len(single)} recorded scenes have fewer than two "
+        said += f"states of the grid and are left out, such as {str(single[0].path)!r}"
+        if not scenes:
+            rule = "settings that files share are one state, the rest of a name is the scene's"
+            raise ValueError(f"`scenes` (='recorded:{options.folder}'): {said}: {rule}")
+        logger.warning(said)
     holes = {s.scene_id: ~s.allowed for s in scenes if s.allowed is not None}
     lacking = {name: missing for name, missing in holes.items() if missing.any()}
     for name, missing in list(lacking.items())[:1]:
@@ -191,12 +222,6 @@ def _states(
                 f"{str(places[state].path)!r} and {str(file.path)!r} are both {grid[state]}"
             )
         places[state] = file
-    if len(places) < 2:
-        raise ValueError(
-            f"recorded scene {scene!r} ({len(places)} of {len(files)} captures in the grid, such "
-            f"as {str(files[0].path)!r}) must have two states or more: settings that its files "
-            "share are one state, and what is left of a name without them is the scene's name"
-        )
     return dict(sorted(places.items()))
 
 
@@ -278,10 +303,17 @@ def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
             return read_raw(file.path, settings=file.settings)
         except (OSError, ValueError) as error:
             raise ValueError(f"recorded file {str(file.path)!r} cannot be read: {error}") from error
-    with open_picture(file.path) as picture:
+    with open_picture(file.path, bits=16) as picture:
         if picture.mode.startswith(("I", "F")):
             raise ValueError(f"it must have 8 bits a sample, not mode {picture.mode!r}")
-        rgb = np.array(ImageOps.exif_transpose(picture).convert("RGB"))
+        if picture.info["deep"]:
+            cv2 = import_extra("cv2", "cv", f"picture {str(file.path)!r}, of 16 bits,")
+            content, how = np.fromfile(file.path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+            if (bgr := cv2.imdecode(content, how)) is None or bgr.dtype != np.uint16:
+                raise ValueError("its pixels cannot be decoded")
+            rgb = bgr[:, :, ::-1] / np.float32(65535.0)
+        else:
+            rgb = np.array(ImageOps.exif_transpose(picture).convert("RGB"))
     assert camera is not None
     data = develop_inverse(torch.from_numpy(rgb).permute(2, 0, 1)[None])[0]
     return RawImage(data, file.settings, camera)
@@ -307,15 +339,22 @@ class RecordedFile:
         return self.path.suffix.lower() in PICTURE_SUFFIXES
 
 
-def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
+def index_recorded(
+    folder: Path, known: Mapping[str, float], numbers: str | None = None
+) -> list[RecordedFile]:
     """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
-    `known` are settings by name that the files do not state; those that they do come first. A
-    `ValueError` if there is no capture, one does not state its settings, or a table is wrong.
+    So is ground truth, with ``gt`` or ``ground_truth`` in a name of its path. `known` are settings
+    by name that the files do not state; those that they do come first. A `ValueError` if there is
+    no capture, one does not state its settings, or a table is wrong.
     """
     tables = _read_tables(folder)
     paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
-    found = [_recorded(folder, path, tables, known) for path in paths]
+    shots = [path for path in paths if not _TRUTH.search(str(path.relative_to(folder)))]
+    if len(shots) < len(paths):
+        count = f"{len(paths) - len(shots)} of {len(paths)} files"
+        logger.warning(f"{str(folder)!r}: ground truth is left out, {count}")
+    found = [_recorded(folder, path, tables, known, numbers) for path in shots]
     if not found:
         raise ValueError(
             f"`scenes` (='recorded:{folder}') must be an existing folder that has captures: raws "
@@ -329,6 +368,7 @@ def _recorded(
     path: Path,
     tables: Mapping[Path | str, dict[str, float]],
     known: Mapping[str, float],
+    numbers: str | None,
 ) -> RecordedFile:
     """`path` with its settings, and with what is left of its name once those are taken out."""
     parts = [printable(p) for p in (*path.relative_to(folder).parts[:-1], path.stem)]
@@ -337,6 +377,9 @@ def _recorded(
     last = -1  # part that states a setting
     for number, part in enumerate(parts):
         named, rest = settings_in_name(part)
+        if numbers and number < len(parts) - 1 and re.fullmatch(_NUMBER, part):
+            name = "exposure_time" if numbers.startswith("exposure") else numbers
+            named, rest = {name: float(part) * FOLDERS[numbers]}, ""
         place = [path, *path.parents][len(parts) - 1 - number]
         row = tables.get(place) or tables.get(place.with_suffix("")) or {}
         if not row and not place.suffix:  # a folder anywhere by its name
@@ -364,7 +407,7 @@ def _recorded(
     except ValueError as error:
         raise ValueError(f"recorded file {str(path)!r}: {error}") from error
     names = [name for name in left if name] or [printable(folder.resolve().name)]
-    subject = [name for name in left[last + 1 :] if name] or names
+    subject = [name for name in left[last + 1 :] if name and not numbers] or names
     frames = [match for name in names if (match := _FRAME.fullmatch(name))]
     still = "/".join(name for name in names if not _FRAME.fullmatch(name))
     return RecordedFile(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -139,29 +140,36 @@ def shim_response(luma: torch.Tensor) -> torch.Tensor:
     return above.log1p_().mul_(1.0 / math.log1p(_LAMBDA * (1.0 - _DELTA)))
 
 
-def shim_gradient(luma: torch.Tensor) -> torch.Tensor:
+def shim_gradient(luma: torch.Tensor, mask: Any = None) -> torch.Tensor:
     """Shim's gradient information: mean over the pixels of `shim_response`, in [0, 1].
 
-    The paper sums over the pixels; the mean does not depend on the size.
+    The paper sums over the pixels; the mean does not depend on the size. Of `mask` (H, W) bool are
+    the pixels that count.
 
     Source: I. Shim, J.-Y. Lee, I. S. Kweon, "Auto-adjusting camera exposure for outdoor robotics
     using gradient information", IROS 2014; delta 0.06, lambda 1000.
     """
-    return shim_response(luma).mean(dim=(1, 2), dtype=torch.float64)
+    return _within(shim_response(luma), mask).mean(dim=(1, 2), dtype=torch.float64)
 
 
-def zhang_gradient(luma: torch.Tensor) -> torch.Tensor:
+def _within(values: torch.Tensor, mask: Any) -> torch.Tensor:
+    """Those of (B, H, W) within `mask` (H, W), as one row (B, 1, K); all without a mask."""
+    return values if mask is None else values[:, torch.as_tensor(mask)][:, None]
+
+
+def zhang_gradient(luma: torch.Tensor, mask: Any = None) -> torch.Tensor:
     """Zhang's soft percentile of the squared gradient [(grey levels of 255 per pixel)^2].
 
     The squared gradients G (Scharr's filter over 32) of the S pixels are sorted, ascending, and
     averaged with weights ``sin(pi/2 i / (n - 1))^k`` for i < n and
     ``sin(pi/2 - pi/2 (i - n + 1) / (S - n))^k`` above, n = floor(p S), i from 0. Its range is
     0 to 2 * 127.5^2. The percentile p = 0.7 counts most, k = 5 is the concentration around it.
+    Of `mask` (H, W) bool are the pixels that count.
 
     Source: Z. Zhang, C. Forster, D. Scaramuzza, "Active exposure control for robust visual odometry
     in HDR environments", ICRA 2017; p 0.7, k 5.
     """
-    squares = squared_gradient(check_luma(luma), SCHARR).flatten(1)
+    squares = _within(squared_gradient(check_luma(luma), SCHARR), mask).flatten(1)
     if squares.device.type == "cpu":  # numpy sorts several times as fast
         ascending = torch.from_numpy(np.sort(squares.detach().numpy(), axis=1))
     else:

@@ -154,7 +154,7 @@ def film(
     options: dict[str, Any] = {"scenes": console.scene_files(scenes, "stop", source)}
     options |= {"split": "test", "max_episode_steps": frames + 1}
     options |= {"lighting": {"kind": "moving", "kinds": light}, "with_oracle": True}
-    options["render_mode"] = "rgb_array"
+    options |= {"with_subject": True, "render_mode": "rgb_array"}
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", num_envs=1, **options)
     with closing(envs), progress_bars() as progress:
         if scene is not None:

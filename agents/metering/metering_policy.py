@@ -17,10 +17,10 @@ from ae_env.observation import SENSOR_RANGES, decode_sensors
 from agents.foresight import Foresight, TrendTracker
 from agents.metering.meters import make_meter
 from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
-from agents.metering.reading import EVTracker, ReferenceFrames
+from agents.metering.reading import EVTracker, ReferenceFrames, Region, read_part
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import PROGRAMS
-from agents.rollouts import RolloutPlan, expected_scores, scenes_of
+from agents.rollouts import RolloutPlan, expected_scores, scenes_of, shown_to
 from simulator.networks.weights import read_weights
 from simulator.utils.cache import cache_key, disk_cache
 from simulator.utils.checks import check_word
@@ -55,10 +55,12 @@ class MeteringPolicy(Policy):
         compensation: Exposure compensation [EV], positive is brighter.
         damping: Share of the distance to the metered EV that remains after a frame, in [0, 0.999].
         shutter_cap: Longest exposure time that may be used [s].
+        iso_cap: Highest ISO speed that may be used.
         f_number: Aperture that A and M keep; None: f/8.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
         weights: File of a tuned program, as `save` writes it.
+        roi, mask: Pixels that are metered, see `Region`; by default all.
         foresight: ``"none"``; ``"trend"``: the program works on the EV that is expected in the
             first frame that has all of the decision (an alpha-beta filter); ``"model"``, of a tuned
             program: the trend is rolled through the delay of each control, and the state is taken
@@ -74,11 +76,14 @@ class MeteringPolicy(Policy):
         compensation: float = 0.0,
         damping: float = 0.0,
         shutter_cap: float | None = None,
+        iso_cap: float | None = None,
         f_number: float | None = None,
         exposure_time: float | None = None,
         iso: float | None = None,
         weights: str | os.PathLike[str] | None = None,
         foresight: str = "none",
+        roi: str | Sequence[float] | None = None,
+        mask: str | NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__(context)
         check_word("program", program, PROGRAMS)
@@ -92,8 +97,10 @@ class MeteringPolicy(Policy):
         by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
         check_used(program, weights=weights, **by_hand)
         given = {name: value for name, value in by_hand.items() if value is not None}
-        self.options = ProgramOptions(compensation, damping, shutter_cap, **given)
+        self.options = ProgramOptions(compensation, damping, shutter_cap, iso_cap=iso_cap, **given)
         self.meter = make_meter(meter, context.camera)
+        self.region = Region(roi, mask, context.frame_size)
+        self.needs_subject = self.region.of_subject
         self._meter_name = meter
         self.name = f"{meter}:{program}"
         self.uses_sensors = context.has_sensors and program != "tuned_blind"
@@ -144,9 +151,11 @@ class MeteringPolicy(Policy):
         """
         self.check_reset(observations)
         self._frames += 1
-        metered = observations if self._reference is None else self._reference.update(observations)
+        masks, metered = self.region.masks(observations), observations
+        if self._reference is not None:
+            metered = self._reference.update(observations, masks)
         held = np.clip(self._tracker.ev100, *self._tracker.ev_range)  # no farther than can be set
-        reading = self.meter(metered, held)
+        reading = read_part(self.meter, metered, held, masks)
         ev = self._tracker.update(reading)
         if self._foresight is not None:
             self._foresight.observe(reading, observations)
@@ -214,7 +223,7 @@ class MeteringPolicy(Policy):
         `env_options` are the arguments that `envs` were made with, JSON values.
         """
         context, sizes = self.context, (FIT_EPISODES, FIT_PER_SCENE, FIT_FRAMES)
-        own = (self._meter_name, self.program, self.options, self.uses_sensors)
+        own = (self._meter_name, self.program, self.options, self.uses_sensors, self.region.key)
         seen = (context.grid, context.camera, context.observation_space)
         key = cache_key("fits", [repr((own, seen, sizes)), dict(env_options), seed])
         if key not in _FITS:
@@ -240,11 +249,12 @@ class MeteringPolicy(Policy):
         )
         for batch in drawn.batches(envs):
             self.reset(envs.num_envs)
-            observations, masks = batch.observations, batch.action_masks
+            shown = shown_to(self, batch.observations, batch.info)
             for _ in range(FIT_FRAMES - 1):
-                actions = self.act(observations, masks)
-                observations = envs.step(actions)[0]
-            columns = self.observe(observations), expected_scores(envs), batch.groups
+                actions = self.act(shown, batch.action_masks)
+                observations, _, _, _, info = envs.step(actions)
+                shown = shown_to(self, observations, info)
+            columns = self.observe(shown), expected_scores(envs), batch.groups
             found.append([column[batch.valid] for column in columns])
         features, scores, groups = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return features, scores, groups

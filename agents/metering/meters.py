@@ -86,7 +86,11 @@ def weighted_reading(
 ) -> Reading:
     """EV of the weighted mean signal, with the weights of `weight_map`."""
     signal = linear_signal(observations["raw"], camera, GREEN)
-    weights = weight_map(name, *signal.shape[-2:]).ravel() / 2
+    weights: NDArray[Any] = weight_map(name, *signal.shape[-2:])
+    if (mask := observations.get("mask")) is not None:
+        weights = weights * mask if (weights * mask).any() else mask.astype(np.float32)
+        weights /= weights.sum()
+    weights = weights.ravel() / 2
     flat = signal.reshape(len(signal), 2, -1)
     mean = np.einsum("ncp,p->n", flat, weights, dtype=np.float64)
     saturated = np.einsum("ncp,p->n", (flat >= WHITE_SIGNAL).astype(np.float32), weights)
@@ -102,19 +106,23 @@ def matrix_reading(
     the zones' *log2* signals, so a lamp or the sun in one zone does not darken the rest. Then, as
     in the ``normal`` and ``highlight`` constraint modes of the Raspberry Pi's AGC, the brightest
     2 % of the pixels should be recorded between 0.5 and 0.8 of white at the
-    metered EV: snow is lifted, a lit figure in front of the dark is held.
+    metered EV: snow is lifted, a lit figure in front of the dark is held. Under a mask, a zone
+    weighs by its share in it.
     """
     signal = linear_signal(observations["raw"], camera, GREEN).mean(axis=1)  # (N, h, w)
     ev = frame_ev100(observations)
-    level = np.log2(np.maximum(_zone_means(signal), BLACK_SIGNAL))
+    seen = observations.get("mask", np.ones(signal.shape[1:], bool))
+    share = _zone_means(seen[None])  # (1, zones)
+    known = np.where(share > 0.0, share, 1.0)
+    level = np.log2(np.maximum(_zone_means(signal * seen) / known, BLACK_SIGNAL))
     offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
     profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
-    weights = np.outer(profile, profile).ravel()
+    weights = np.outer(profile, profile).ravel() * share[0]
     weights /= weights.sum()
-    saturated = _zone_means(signal >= WHITE_SIGNAL) @ weights
+    saturated = _zone_means((signal >= WHITE_SIGNAL) & seen) / known @ weights
     reading = mean_reading(np.exp2(level @ weights), saturated, ev)
     # Signal of the top pixels if the frame were taken at the metered EV.
-    top = np.quantile(signal.reshape(len(ev), -1), 1.0 - TOP_SHARE, axis=1)
+    top = np.quantile(signal[:, seen], 1.0 - TOP_SHARE, axis=1)
     top_level = np.log2(np.maximum(top, BLACK_SIGNAL)) + (ev - reading.ev100)
     # A saturated top is brighter than it says, so it cannot be known to be too dark.
     too_bright = np.maximum(top_level - np.log2(TOP_AT_MOST), 0.0)
@@ -127,6 +135,8 @@ def matrix_reading(
 def _zone_means(images: NDArray[Any]) -> Floats:
     """Means over the zones, ``(N, zones)``, row by row."""
     for axis in (1, 2):
+        if images.shape[axis] < MATRIX_ZONES:
+            images = images.repeat(MATRIX_ZONES, axis=axis)
         size = images.shape[axis]
         starts = np.arange(MATRIX_ZONES) * size // MATRIX_ZONES
         counts = np.diff(starts, append=size)

@@ -41,6 +41,7 @@ _RANGES = {
     "f_number": (0.1, 1000.0),
     "exposure_time": (1e-7, 1e5),
     "shutter_cap": (1e-7, 1e5),
+    "iso_cap": (1.0, 1e7),
     "iso": (1.0, 1e7),
 }
 #: Weights of what comes first, second and third in the choice of a state.
@@ -59,11 +60,12 @@ class ProgramOptions:
     f_number: float = PRIORITY_F_NUMBER
     exposure_time: float = PRIORITY_TIME
     iso: float | None = None
+    iso_cap: float | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
-            if value is not None or name not in ("shutter_cap", "iso"):
+            if value is not None or name not in ("shutter_cap", "iso_cap", "iso"):
                 object.__setattr__(self, name, check_number(name, value, low, high))
 
 
@@ -83,11 +85,13 @@ class StateChooser:
         self.ceiling = ceiling
         self.step = ev_step(grid)
         self.hysteresis = HYSTERESIS_STEPS * self.step
-        #: Stops by which each state is slower than the cap, ``(S,)``.
+        #: Stops by which each state is slower than its cap and has more gain, ``(S,)``.
         self.over_cap = np.zeros(len(grid))
-        if options.shutter_cap is not None:
-            times = np.array([s.exposure_time for s in grid.states])
-            self.over_cap = np.maximum(np.log2(times / options.shutter_cap) - 1e-6, 0.0)
+        caps = {"exposure_time": options.shutter_cap, "iso": options.iso_cap}
+        for name, cap in caps.items():
+            if cap is not None:
+                values = np.array([getattr(s, name) for s in grid.states])
+                self.over_cap += np.maximum(np.log2(values / cap) - 1e-6, 0.0)
         wanted = []  # by hand
         if program in ("A", "M"):
             wanted.append((self.aperture, 2.0 * np.log2(options.f_number)))
@@ -118,7 +122,7 @@ class StateChooser:
         return np.asarray(np.abs(darker) + _ABOVE_CEILING_EV * (self.ceiling & (darker < -1e-9)))
 
     def _least_distance(self, distance: Floats) -> Floats:
-        """Of the states that the cap and what is set by hand leave, ``(N, 1)``."""
+        """Of the states that the caps and what is set by hand leave, ``(N, 1)``."""
         return np.asarray(distance[:, self._allowed].min(axis=1, keepdims=True))
 
     def nearby(self, target: Floats, limit: float) -> Bools:
@@ -130,7 +134,7 @@ class StateChooser:
     def utility(self, target: Floats, preference: Floats) -> Floats:
         """How well each state fits the EV100 `target` (N,), ``(N, S)``; the highest is to be taken.
 
-        The shutter cap comes first, what is set by hand second, then the EV; among states of the
+        The caps come first, what is set by hand second, then the EV; among states of the
         same exposure, `preference` decides: further cost, well below 1000, ``(S,)`` or ``(N, S)``.
         """
         distance = self._distance(target)

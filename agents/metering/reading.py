@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,6 +64,7 @@ class Reading:
 
 #: A light meter: a function of the observations of N cameras and, optionally, the EV100 ``(N,)``
 #: that the controller holds, NaN in the first frame; one that goes step by step continues there.
+#: The observations may have a ``mask`` (h, w) bool: other pixels count for nothing.
 Meter = Callable[..., Reading]
 
 
@@ -97,6 +99,92 @@ def mean_reading(mean: Floats, saturated: Floats, ev: Floats) -> Reading:
     level = np.log2(np.maximum(mean, BLACK_SIGNAL) / TARGET_SIGNAL)
     black = mean <= BLACK_SIGNAL * 1.001
     return Reading(ev + level + SATURATED_STEP_EV * saturated, saturated, black)
+
+
+# -- a part of the frame ---------------------------------------------------------------------------
+
+#: The word for the mask of each scene's own subject, and where observations have it.
+SUBJECT = "subject"
+
+
+class Region:
+    """The pixels of frames of `shape` (h, w) that a meter reads: all of them by default.
+
+    Give one of `roi`: left, top, width and height in [0, 1] of the frame, in a sequence or a text
+    with commas; and `mask`: (h, w) bool, or ``"subject"``.
+    """
+
+    def __init__(self, roi: Any, mask: Any, shape: tuple[int, ...]) -> None:
+        if roi is not None and mask is not None:
+            raise ValueError("give `roi` or `mask`, not both")
+        self.of_subject, self._shape = isinstance(mask, str) and mask == SUBJECT, shape
+        mask = mask if roi is None else _rectangle(roi, shape)
+        #: (1, h, w) bool, the same for all cameras; None for all pixels, and of a subject.
+        self._fixed = None if mask is None or self.of_subject else self._checked(mask)[None]
+        self.key = mask if self._fixed is None else self._fixed.tobytes()  # for caches
+
+    def masks(self, observations: Observations) -> Bools | None:
+        """The pixels to read, (N or 1, h, w) bool; None for all."""
+        if not self.of_subject:
+            return self._fixed
+        if SUBJECT not in observations:
+            need = "needs `info['subject']` of environments made with_subject=True"
+            raise ValueError(f"`mask` (='subject') {need}")
+        return np.stack([self._checked(mask) for mask in observations[SUBJECT]])
+
+    def _checked(self, mask: Any) -> Bools:
+        found = np.asarray(mask)
+        if found.dtype != bool or found.shape != self._shape or not found.any():
+            none = ": the scene has no subject" if self.of_subject and not found.any() else ""
+            rule = f"{SUBJECT!r} or bool, {self._shape}, True somewhere{none}"
+            raise ValueError(f"`mask` ({found.dtype}, {found.shape}) must be {rule}")
+        return found
+
+
+def _rectangle(roi: Any, shape: tuple[int, ...]) -> Bools:
+    """The pixels (h, w) that `roi` touches."""
+    found = np.zeros(shape, bool)
+    with suppress(TypeError, ValueError):  # which is said below
+        left, top, width, height = map(float, roi.split(",") if isinstance(roi, str) else roi)
+        ends = np.array([[top, left], [top + height, left + width]])
+        if min(left, top) >= 0.0 < min(width, height) and ends.max() <= 1.0 + 1e-9:
+            first, last = (ends * shape).round(6)
+            rows, columns = map(slice, np.floor(first).astype(int), np.ceil(last).astype(int))
+            found[rows, columns] = True
+    if not found.any():
+        rule = "left, top, width, height in [0, 1], within the frame, such as 0.25,0.25,0.5,0.5"
+        raise ValueError(f"`roi` (={roi!r}) must be {rule}")
+    return found
+
+
+def parts_of(
+    observations: Observations, masks: Bools | None
+) -> Iterator[tuple[slice, Observations]]:
+    """Cameras, and their frames cut to the box around their mask, with the ``mask`` in it."""
+    if masks is None:
+        yield slice(None), observations
+        return
+    for number, mask in enumerate(masks):
+        cameras = slice(None) if len(masks) == 1 else slice(number, number + 1)
+        rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        cut = {"raw": observations["raw"][cameras][:, :, *box], "mask": mask[box]}
+        yield cameras, {**cut, "settings": observations["settings"][cameras]}
+
+
+def read_part(
+    meter: Meter, observations: Observations, estimate: Floats, masks: Bools | None
+) -> Reading:
+    """The reading of a part of each frame: the box around it is the meter's frame."""
+    found = [meter(cut, estimate[cameras]) for cameras, cut in parts_of(observations, masks)]
+    columns = zip(*(vars(one).values() for one in found), strict=True)
+    return Reading(*map(np.concatenate, columns))
+
+
+def inside(observations: Observations) -> NDArray[Any]:
+    """The raw frames, or what a mask leaves of each in one row (N, 4, 1, K), for histograms."""
+    raw, mask = observations["raw"], observations.get("mask")
+    return raw if mask is None else raw[..., mask][..., None, :]
 
 
 # -- over the frames of an episode -----------------------------------------------------------------
@@ -158,17 +246,23 @@ class ReferenceFrames:
         #: Codes (N, 4, h, w), settings, quantiles of the signal, saturated share and EV100.
         self._best: tuple[NDArray[Any], ...] | None = None
 
-    def update(self, observations: Observations) -> Observations:
-        """Take in the frames in hand; returns the best ones, raw and settings."""
+    def update(self, observations: Observations, masks: Bools | None = None) -> Observations:
+        """Take in the frames in hand; returns the best ones, raw and settings.
+
+        Of `masks` (N or 1, h, w) are the pixels to look at.
+        """
         raw = signal_codes(observations["raw"], self.camera)
         settings = np.asarray(observations["settings"])
         ev = frame_ev100(observations)
         green = raw[:, GREEN].reshape(len(raw), -1)
-        ordered = np.sort(green, axis=1)
-        ranks = np.rint(_QUANTILES * (green.shape[1] - 1)).astype(np.intp)
-        quantiles = CODE_SIGNALS[ordered[:, ranks]]
+        count = np.full((1, 1), green.shape[1])
+        if masks is not None:  # codes below all others, which come first
+            seen = np.tile(masks.reshape(len(masks), -1), 2)
+            green, count = np.where(seen, green, np.int16(-1)), seen.sum(axis=1, keepdims=True)
+        ranks = green.shape[1] - count + np.rint(_QUANTILES * (count - 1)).astype(np.intp)
+        quantiles = CODE_SIGNALS[np.take_along_axis(np.sort(green, axis=1), ranks, axis=1)]
         white = np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)
-        saturated = (green >= white).mean(axis=1)
+        saturated = (green >= white).sum(axis=1) / count[:, 0]
         if self._best is None:
             self._best = (raw.copy(), settings.copy(), quantiles, saturated, ev)
         else:

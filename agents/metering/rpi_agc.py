@@ -3,73 +3,35 @@
 `LibcameraAgc` works on continuous settings. It is written from libcamera's published behaviour
 ("Raspberry Pi Camera Algorithm and Tuning Guide", and its tuning of the imx477), and held to
 recordings of libcamera's own, frame by frame (``tests/agents/metering``). `RpiAgc` takes the
-nearest states of a grid. The numbers of that tuning come first.
+nearest states of a grid. The numbers of that tuning come first; a file has others (`read_tuning`).
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import KW_ONLY, dataclass
-from typing import Any, NamedTuple
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 
 from ae_env.observation import linear_signal
 from agents.metering.programs import PRIORITY_TIME, ProgramOptions, StateChooser, check_used
-from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100
+from agents.metering.reading import GREEN, TARGET_SIGNAL, Region, frame_ev100, parts_of
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import MANUAL_PROGRAMS
 from simulator.utils.checks import check_integer, check_number, check_word
+from simulator.utils.config_file import one_line
+from simulator.utils.files import read_bounded
 
-#: Weights of the 15 zones in each metering mode; the first is the centre.
-ZONE_WEIGHTS = {
-    "centre_weighted": (3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0),
-    "spot": (2, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0),
-    "matrix": (1,) * 15,
-}
+# -- tuning files ---------------------------------------------------------------------------------
 
-
-class Ladder(NamedTuple):
-    """How an exposure mode splits an exposure: the shutter up to a rung, then the gain, and so on.
-
-    Rungs are exposure times [s], and gains that are 1 at ISO 100.
-    """
-
-    shutter: tuple[float, ...]
-    gain: tuple[float, ...]
-
-
-LADDERS = {
-    "normal": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-    "short": Ladder((100e-6, 5e-3, 10e-3, 20e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-    "long": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 120e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-}
-
-
-class Constraint(NamedTuple):
-    """The mean of the pixels between two quantiles is at least (`lower`), or at most, a target."""
-
-    lower: bool
-    quantiles: tuple[float, float]
-    target: float  # signal, white is 1
-
-
-_TOP = Constraint(True, (0.98, 1.0), 0.3)
-CONSTRAINTS = {
-    "normal": (_TOP,),
-    "highlight": (_TOP, Constraint(False, (0.98, 1.0), 0.8)),
-    "shadows": (Constraint(True, (0.0, 0.5), 0.17),),
-}
-
-#: Illuminance [lux] and the mean signal aimed at; linear between, constant outside. And the
-#: illuminance that is assumed where none is known [lux].
-TARGET_LUX, TARGET_SIGNALS = (0.0, 1000.0, 10000.0), (0.16, 0.165, 0.17)
-DEFAULT_LUX = 400.0
-#: No target is above this, whatever the compensation: close to white a mean says nothing.
-TARGET_LIMIT = 0.9
-#: Bins of the histogram that constraints read.
-HISTOGRAM_BINS = 128
 #: Share of the distance to the target that the filter goes per frame, and frames of the start, in
 #: which it goes all of the way.
 SPEED, STARTUP_FRAMES = 0.2, 10
@@ -78,10 +40,128 @@ NEAR, STABLE = 0.2, 0.02
 #: A target above this that the picture exceeds is approached from below, at this part of the
 #: exposure.
 FAST_REDUCE = 0.4
+#: Zones a side on the Pi 5.
+PISP_SIDE = 15
+
+
+def _check_zones(weights: list[float]) -> list[float]:
+    if len(weights) not in (15, PISP_SIDE**2) or not sum(weights) > 0.0:
+        raise ValueError(f"must be 15 or {PISP_SIDE**2} weights, one of them above 0")
+    return weights
+
+
+def _check_pairs(numbers: list[float]) -> list[float]:
+    if len(numbers) % 2 or not numbers or any(a >= b for a, b in pairwise(numbers[::2])):
+        raise ValueError("must be pairs of illuminance and signal, sorted by illuminance")
+    return numbers
+
+
+def _in_seconds(ladder: Ladder) -> Ladder:
+    """`ladder` with times in seconds, from microseconds."""
+    if len(ladder.shutter) != len(ladder.gain) or len(ladder.gain) < 2 or 0.0 in ladder.gain:
+        raise ValueError("must have as many times as gains, two or more, all above 0")
+    return Ladder(tuple(time / 1e6 for time in ladder.shutter), ladder.gain)
+
+
+_Number = Annotated[float, Field(ge=0.0, lt=np.inf)]
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+_Name = Annotated[str, AfterValidator(lambda name: name.replace("-", "_"))]
+#: Signal aimed at, 1 is white, by illuminance [lux]: pairs; linear between, constant outside.
+_Target = Annotated[list[_Number], AfterValidator(_check_pairs)]
+_Weights = Annotated[list[_Number], AfterValidator(_check_zones)]
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """How an exposure mode splits an exposure: the shutter up to a rung, then the gain, and so on.
+
+    Rungs are exposure times [s], and gains that are 1 at ISO 100.
+    """
+
+    shutter: tuple[_Number, ...]
+    gain: tuple[_Number, ...]
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """The mean of the pixels between two quantiles is at least (LOWER), or at most, a target."""
+
+    bound: Annotated[Literal["LOWER", "UPPER"], BeforeValidator(lambda word: str(word).upper())]
+    q_lo: _Share
+    q_hi: _Share
+    y_target: _Target
+
+
+class Tuning(BaseModel, frozen=True):
+    """``rpi.agc`` of a tuning file, with libcamera's defaults; the first mode of each is the usual.
+
+    In memory times are in seconds, in the file in microseconds. Weights are of 15 zones, the centre
+    first, or row by row of the 15 x 15 of the Pi 5.
+    """
+
+    metering_modes: dict[_Name, dict[Literal["weights"], _Weights]] = Field(min_length=1)
+    exposure_modes: dict[_Name, Annotated[Ladder, AfterValidator(_in_seconds)]]
+    constraint_modes: dict[_Name, list[Constraint]] = Field(min_length=1)
+    y_target: _Target
+    speed: float = Field(SPEED, gt=0.0, le=1.0)
+    startup_frames: int = Field(STARTUP_FRAMES, ge=0)
+    base_ev: float = Field(1.0, gt=0.0, lt=np.inf)  # factor of all targets
+    stable_region: _Share = STABLE
+    fast_reduce_threshold: _Share = FAST_REDUCE
+
+
+_TOP = Constraint("LOWER", 0.98, 1.0, [0.0, 0.3])
+_GAINS = (1.0, 2.0, 4.0, 6.0, 16.0)
+#: That of the imx477.
+IMX477 = Tuning.model_construct(
+    metering_modes={
+        "centre_weighted": {"weights": [3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0]},
+        "spot": {"weights": [2, 1, 1] + [0] * 12},
+        "matrix": {"weights": [1] * 15},
+    },
+    exposure_modes={
+        "normal": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 66.666e-3), _GAINS),
+        "short": Ladder((100e-6, 5e-3, 10e-3, 20e-3, 66.666e-3), _GAINS),
+        "long": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 120e-3), _GAINS),
+    },
+    constraint_modes={
+        "normal": [_TOP],
+        "highlight": [_TOP, Constraint("UPPER", 0.98, 1.0, [0.0, 0.8])],
+        "shadows": [Constraint("LOWER", 0.0, 0.5, [0.0, 0.17])],
+    },
+    y_target=[0.0, 0.16, 1000.0, 0.165, 10000.0, 0.17],
+)
+#: Illuminance that is assumed where none is known [lux].
+DEFAULT_LUX = 400.0
+#: No target is above this, whatever the compensation: close to white a mean says nothing.
+TARGET_LIMIT = 0.9
+#: Bins of the histogram that constraints read.
+HISTOGRAM_BINS = 128
 #: Passes in which the gain is found (zones saturate), the most that one may add, and when to stop.
 GAIN_PASSES, GAIN_LIMIT, GAIN_DONE = 8, 10.0, 1.01
 #: Added to a mean by which a target is divided.
 _LEAST_SIGNAL = 1e-3
+
+
+def read_tuning(path: str | os.PathLike[str]) -> Tuning:
+    """That of a tuning file of the Raspberry Pi's libcamera, of its first channel.
+
+    A `ValueError` names the file, and the entry that is missing or wrong.
+    """
+    name, prefix = f"`tuning` (={os.fspath(path)!r})", "rpi.agc."
+    try:
+        content: Any = json.loads(read_bounded(Path(path).expanduser()))
+        entries = content.get("algorithms", [content])  # files of version 1 have no list
+        found = next(e["rpi.agc"] for e in entries if isinstance(e, dict) and "rpi.agc" in e)
+        if found.get("channels"):
+            found, prefix = found["channels"][0], f"{prefix}channels.0."
+        return Tuning.model_validate(found)
+    except ValidationError as error:
+        raise ValueError(f"{name}: {one_line(error, prefix)}") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{name} must be a JSON file: {error}") from error
+    except (AttributeError, LookupError, TypeError, StopIteration):
+        raise ValueError(f"{name} must have an entry 'rpi.agc' in its 'algorithms'") from None
 
 
 @dataclass
@@ -97,19 +177,20 @@ class LibcameraAgc:
 
     num_cameras: int
     _: KW_ONLY
-    metering: str = "centre_weighted"  # name of `ZONE_WEIGHTS`
-    constraint: str = "normal"  # name of `CONSTRAINTS`
-    ladder: Ladder = LADDERS["normal"]  # an exposure mode, of `LADDERS` or of one's own
+    tuning: Tuning = IMX477
+    metering: str = "centre_weighted"  # name of the tuning's `metering_modes`
+    constraint: str = "normal"  # name of the tuning's `constraint_modes`
+    ladder: Ladder = IMX477.exposure_modes["normal"]  # a tuning's, or of one's own
     compensation: float = 0.0
     max_exposure_time: float = np.inf  # longest that the sensor or the user allows [s]
     exposure_time: float | None = None  # a fixed one [s], in place of the ladder's
     gain: float | None = None  # a fixed one, in place of the ladder's
     flicker_period: float | None = None
-    speed: float = SPEED
-    startup_frames: int = STARTUP_FRAMES
 
     def __post_init__(self) -> None:
-        self.weights = np.array(ZONE_WEIGHTS[self.metering], np.float64)
+        #: Of the zones, (Z,); or (N, Z), of each camera's own.
+        self.weights = np.array(self.tuning.metering_modes[self.metering]["weights"], np.float64)
+        self.all_weights = self.weights
         self._filtered, self._frames = np.full(self.num_cameras, np.nan), 0
 
     def update(
@@ -117,25 +198,30 @@ class LibcameraAgc:
     ) -> Floats:
         """Takes in one frame of each camera; returns the exposure [s] that is wanted, ``(N,)``.
 
-        Of the frame are the mean signal of each of `zones` ``(N, 15)``, where white is 1; the
+        Of the frame are the mean signal of each of `zones` ``(N, Z)``, where white is 1; the
         `histogram` of all signals from 0 to 1, counts ``(N, bins)``; the `exposure` ``(N,)`` that
         it was taken with, time x gain [s]; and the illuminance.
         """
-        brighter, count = 2.0**self.compensation, len(zones)
-        aimed = np.broadcast_to(np.interp(lux, TARGET_LUX, TARGET_SIGNALS), count)
-        wanted: Floats = np.minimum(aimed * brighter, TARGET_LIMIT)
+        brighter = self.tuning.base_ev * 2.0**self.compensation
+
+        def aim(target: list[float]) -> Floats:
+            aimed = np.broadcast_to(np.interp(lux, target[::2], target[1::2]), len(zones))
+            return np.asarray(np.minimum(aimed * brighter, TARGET_LIMIT))
+
+        wanted = aim(self.tuning.y_target)
         factor = zone_factor(zones, self.weights, wanted)
-        for constraint in CONSTRAINTS[self.constraint]:
-            bound = np.full(count, min(constraint.target * brighter, TARGET_LIMIT))
-            other = bound / inter_quantile_mean(histogram, *constraint.quantiles)
-            adopted = other > factor if constraint.lower else other < factor
+        for constraint in self.tuning.constraint_modes[self.constraint]:
+            bound = aim(constraint.y_target)
+            other = bound / inter_quantile_mean(histogram, constraint.q_lo, constraint.q_hi)
+            adopted = other > factor if constraint.bound == "LOWER" else other < factor
             factor, wanted = np.where(adopted, other, factor), np.where(adopted, bound, wanted)
         time = self.ladder.shutter[-1] if self.exposure_time is None else self.exposure_time
         gain = self.ladder.gain[-1] if self.gain is None else self.gain
         most = min(time, self.max_exposure_time) * gain
         self._follow(np.minimum(exposure * factor, most))
-        reduce = (wanted > FAST_REDUCE) & (factor < np.sqrt(wanted))
-        return self._filtered * np.where(reduce, FAST_REDUCE, 1.0)
+        fast = self.tuning.fast_reduce_threshold
+        reduce = (wanted > fast) & (factor < np.sqrt(wanted))
+        return self._filtered * np.where(reduce, fast, 1.0)
 
     def _follow(self, target: Floats) -> None:
         """Moves the filtered exposure by `speed` of the (linear) distance to `target`, ``(N,)``.
@@ -146,10 +232,11 @@ class LibcameraAgc:
         self._frames += 1
         old = self._filtered
         near = (old < (1.0 + NEAR) * target) & (old > (1.0 - NEAR) * target)
-        speed = np.where(near, np.sqrt(self.speed), self.speed)
+        tuning, stays = self.tuning, self.tuning.stable_region
+        speed = np.where(near, np.sqrt(tuning.speed), tuning.speed)
         moved = speed * target + (1.0 - speed) * old
-        stable = (old * (1.0 - STABLE) < target) & (old * (1.0 + STABLE) > target)
-        begins = np.isnan(old) | (self._frames <= self.startup_frames)
+        stable = (old * (1.0 - stays) < target) & (old * (1.0 + stays) > target)
+        begins = np.isnan(old) | (self._frames <= tuning.startup_frames)
         self._filtered = np.where(begins, target, np.where(stable, old, moved))
 
     def split(self, exposure: Floats) -> tuple[Floats, Floats]:
@@ -176,14 +263,15 @@ class LibcameraAgc:
 
 
 def zone_factor(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
-    """Factor that brings the weighted mean of `zones` (N, 15) to the signals `wanted`, ``(N,)``.
+    """Factor that brings the weighted mean of `zones` (N, Z) to the signals `wanted`, ``(N,)``.
 
     A zone that saturates gives no more, so the factor is raised in several passes.
     """
     factor = np.ones(len(zones))
     done = np.zeros(len(zones), bool)
     for _ in range(GAIN_PASSES):
-        mean = np.minimum(zones * factor[:, None], 1.0) @ weights / weights.sum()
+        mean = (np.minimum(zones * factor[:, None], 1.0) * weights).sum(axis=1)
+        mean /= weights.sum(axis=-1)
         extra = np.minimum(GAIN_LIMIT, wanted / (mean + _LEAST_SIGNAL))
         factor = np.where(done, factor, factor * extra)
         done |= extra < GAIN_DONE
@@ -232,17 +320,21 @@ class RpiAgc(Policy):
         program: ``"P"``: the ladder, at an aperture of `f_number`; ``"A"``: the same, and no other
             aperture; ``"S"``: shutter by hand, the gain follows, and the aperture where the gain
             alone comes less near to the EV; ``"M"``: aperture and shutter by hand.
-        metering: ``"centre_weighted"``, ``"spot"`` or ``"matrix"``: weights of the zones.
+        tuning: A tuning file of libcamera (`read_tuning`); by default that of the imx477.
+        metering: ``"centre_weighted"``, ``"spot"`` or ``"matrix"``: weights of the zones. Of this
+            and the next two, a file may have others; the default is its first.
         mode: ``"normal"``, ``"short"`` or ``"long"``: the ladder.
         constraint: ``"normal"``, ``"highlight"`` or ``"shadows"``.
-        compensation, damping, shutter_cap, exposure_time, iso: As of `MeteringPolicy`.
+        compensation, damping, shutter_cap, iso_cap, exposure_time, iso: As of `MeteringPolicy`.
         f_number: Aperture of the lens; by default the widest of the grid, which is nearest to the
             f/1.8 and f/2 of the Raspberry Pi's own cameras.
-        max_gain: Gain at the end of the ladder, 1 at ISO 100.
+        max_gain: Gain at the end of the ladder, 1 at ISO 100; by default the tuning's.
         flicker_period: Period of the lamps' light [s], such as 0.01: shutters of a period and more
             are whole periods, and the gain makes up for it (P and A). None: lamps are steady.
-        speed: Share of the distance to the target that the filter goes per frame, in (0, 1].
-        startup_frames: Frames of an episode in which it goes all of the way.
+        speed: Share of the distance to the target that the filter goes per frame, in (0, 1]; by
+            default the tuning's.
+        startup_frames: Frames of an episode in which it goes all of the way; likewise.
+        roi, mask: Pixels that are metered, see `Region`; the zones are those of the box around.
     """
 
     def __init__(
@@ -250,47 +342,57 @@ class RpiAgc(Policy):
         context: PolicyContext,
         program: str = "P",
         *,
-        metering: str = "centre_weighted",
-        mode: str = "normal",
-        constraint: str = "normal",
+        tuning: str | os.PathLike[str] | None = None,
+        metering: str | None = None,
+        mode: str | None = None,
+        constraint: str | None = None,
         compensation: float = 0.0,
         damping: float = 0.0,
         shutter_cap: float | None = None,
+        iso_cap: float | None = None,
         f_number: float | None = None,
         exposure_time: float | None = None,
         iso: float | None = None,
-        max_gain: float = 16.0,
+        max_gain: float | None = None,
         flicker_period: float | None = None,
-        speed: float = SPEED,
-        startup_frames: int = STARTUP_FRAMES,
+        speed: float | None = None,
+        startup_frames: int | None = None,
+        roi: str | Sequence[float] | None = None,
+        mask: str | NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__(context)
         check_word("program", program, MANUAL_PROGRAMS)
         check_used(program, exposure_time=exposure_time, iso=iso, flicker_period=flicker_period)
-        check_word("metering", metering, tuple(ZONE_WEIGHTS))
-        check_word("mode", mode, tuple(LADDERS))
-        check_word("constraint", constraint, tuple(CONSTRAINTS))
+        found = IMX477 if tuning is None else read_tuning(tuning)
+        metering = _chosen("metering", metering, found.metering_modes)
+        mode = _chosen("mode", mode, found.exposure_modes)
+        constraint = _chosen("constraint", constraint, found.constraint_modes)
+        speed = check_number("speed", found.speed if speed is None else speed, 1e-3, 1.0)
+        frames = found.startup_frames if startup_frames is None else startup_frames
+        own = {"speed": speed, "startup_frames": check_integer("startup_frames", frames, 0)}
         time = PRIORITY_TIME if exposure_time is None else exposure_time
         lens = context.grid.f_numbers[0] if f_number is None else f_number
-        self.options = ProgramOptions(compensation, damping, shutter_cap, lens, time, iso)
-        max_gain = check_number("max_gain", max_gain, 1.0, 1e5)
+        self.options = ProgramOptions(compensation, damping, shutter_cap, lens, time, iso, iso_cap)
+        gains = found.exposure_modes[mode].gain
+        most = gains[-1] if max_gain is None else check_number("max_gain", max_gain, 1.0, 1e5)
+        most = min(most, np.inf if iso_cap is None else iso_cap / 100.0)
         if flicker_period is not None:
-            flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
+            check_number("flicker_period", flicker_period, 1e-6, 10.0)
         self.name = f"rpi_agc:{program}"
-        shutter, gains = LADDERS[mode]
-        gains = tuple(min(g, max_gain) for g in (*gains[:-1], max_gain))
-        self._make_agc = functools.partial(
-            LibcameraAgc,
+        self.region = Region(roi, mask, context.frame_size)
+        self.needs_subject = self.region.of_subject
+        gains = tuple(min(g, most) for g in (*gains[:-1], most))
+        self.agc = LibcameraAgc(
+            0,
+            tuning=found.model_copy(update=own),
             metering=metering,
             constraint=constraint,
-            ladder=Ladder(shutter, gains),
+            ladder=Ladder(found.exposure_modes[mode].shutter, gains),
             compensation=compensation,
             max_exposure_time=np.inf if shutter_cap is None else shutter_cap,
             exposure_time=time if program in ("S", "M") else None,
             gain=None if iso is None else iso / 100.0,
             flicker_period=flicker_period,
-            speed=check_number("speed", speed, 1e-3, 1.0),
-            startup_frames=check_integer("startup_frames", startup_frames, 0),
         )
         self._chooser = StateChooser(context.grid, program, self.options)
         self.reset(0)
@@ -298,23 +400,23 @@ class RpiAgc(Policy):
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Begin the start-up frames of `num_envs` cameras."""
         super().reset(num_envs, seed)
-        self.agc = self._make_agc(num_envs)
+        self.agc = replace(self.agc, num_cameras=num_envs)
         self._damped = np.full(num_envs, np.nan)
         self._previous: Ints | None = None
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Meter the frames, filter the exposure, split it."""
         self.check_reset(observations)
-        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
-        signal = np.maximum(signal, 0.0).reshape(len(signal), -1)
-        zones = signal @ _zone_matrix(*observations["raw"].shape[2:])
-        frame_ev = frame_ev100(observations)
-        brightness = zones @ self.agc.weights / self.agc.weights.sum()
+        parts = parts_of(observations, self.region.masks(observations))
+        found = [self._statistics(cut) for _, cut in parts]
+        zones, weights, histogram = map(np.concatenate, zip(*found, strict=True))
+        frame_ev, self.agc.weights = frame_ev100(observations), weights
+        brightness = (zones * weights).sum(axis=1) / weights.sum(axis=1)
         light = np.log2(np.maximum(brightness, _DARKEST) / TARGET_SIGNAL)
         lux = 2.5 * np.exp2(frame_ev + light)
         # As exposure time x gain at the lens's own f-number, which may not be the frame's.
         area = self.options.f_number**2
-        exposure = self.agc.update(zones, signal_histogram(signal), area * np.exp2(-frame_ev), lux)
+        exposure = self.agc.update(zones, histogram, area * np.exp2(-frame_ev), lux)
         ev = -np.log2(exposure / area)
         states = self.context.grid.ev100
         before = np.clip(self._damped, states.min(), states.max())
@@ -322,6 +424,19 @@ class RpiAgc(Policy):
         self._damped = ev + np.where(np.isnan(distance), 0.0, distance)
         self._previous = masked_argmax(self._utility(self._damped), action_masks)
         return self._previous.copy()
+
+    def _statistics(self, observations: Observations) -> tuple[Floats, ...]:
+        """Means of the zones (n, Z), their weights (n, Z), and histograms of n frames."""
+        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
+        places = _zone_members(*signal.shape[1:], len(self.agc.all_weights))
+        seen = observations.get("mask", np.ones(signal.shape[1:], bool))
+        pixels = np.maximum(signal, 0.0)[:, seen]
+        some = places[seen.ravel()]
+        share = some.sum(axis=0) / np.maximum(places.sum(axis=0), 1.0)
+        weights = self.agc.all_weights * share
+        weights = weights if weights.any() else share
+        zones = pixels @ (some / np.maximum(some.sum(axis=0), 1.0))
+        return zones, np.tile(weights, (len(pixels), 1)), signal_histogram(pixels)
 
     def _utility(self, ev: Floats) -> Floats:
         """How well each state fits the exposures and the ladder, ``(N, S)``."""
@@ -367,8 +482,18 @@ ZONE_LAYOUT = np.array(
 )
 
 
-def zone_map(height: int, width: int) -> Ints:
-    """Zone of each pixel, ``(height, width)``, 0 to 14."""
+def _chosen(name: str, word: str | None, known: Mapping[str, Any]) -> str:
+    """`word`, an argument called `name`; the first of those `known` where it is None."""
+    found = next(iter(known)) if word is None else str(word).replace("-", "_")
+    check_word(name, found, tuple(known))
+    return found
+
+
+def zone_map(height: int, width: int, zones: int = 15) -> Ints:
+    """Zone of each pixel, ``(height, width)``: 0 to 14, or row by row of the Pi 5's 15 x 15."""
+    if zones != 15:
+        rows, columns = (np.arange(size) * PISP_SIDE // size for size in (height, width))
+        return np.asarray(rows[:, None] * PISP_SIDE + columns)
     places = []
     for size, inner in ((height, 3), (width, 5)):
         place = (np.arange(size) + 0.5) / size
@@ -378,9 +503,7 @@ def zone_map(height: int, width: int) -> Ints:
 
 
 @functools.lru_cache(maxsize=8)
-def _zone_matrix(height: int, width: int) -> Floats:
-    """Weights of the pixels in the mean of each zone, ``(height * width, 15)``."""
-    zones = zone_map(height, width).ravel()
-    matrix: Floats = (zones[:, None] == np.arange(15)).astype(np.float64)
-    matrix /= np.maximum(matrix.sum(axis=0), 1.0)
-    return matrix
+def _zone_members(height: int, width: int, zones: int) -> Floats:
+    """Whether each pixel is in each zone, ``(height * width, zones)``, 1 or 0."""
+    places = zone_map(height, width, zones).ravel()
+    return (places[:, None] == np.arange(zones)).astype(np.float64)

@@ -30,6 +30,7 @@ from agents.metering.reading import (
     WHITE_SIGNAL,
     Reading,
     frame_ev100,
+    inside,
     signal_codes,
 )
 from agents.policy import Bools, Floats, Observations
@@ -72,7 +73,7 @@ def highlight_weighted_reading(
     Of each pixel the brightest of its four planes counts. A frame in which more than 1 % of the
     pixels are saturated says only that the light is brighter than that: it reads 1.5 to 3 EV more.
     """
-    shares = _shares(signal_codes(observations["raw"], camera).max(axis=1))
+    shares = _shares(signal_codes(inside(observations), camera).max(axis=1))
     top = CODE_SIGNALS[np.argmax(np.cumsum(shares, axis=1) >= HIGHLIGHT_QUANTILE - 1e-12, axis=1)]
     blown = shares[:, CODE_SIGNALS >= WHITE_SIGNAL].sum(axis=1)
     share = HIGHLIGHT_SATURATED + (1.0 - HIGHLIGHT_SATURATED) * blown
@@ -92,7 +93,7 @@ def skewness_reading(
     is 0 is looked for. (About the *mean*, as textbooks have it, the skewness of a power-law code
     does not depend on the exposure until something clips.)
     """
-    shares = _shares(signal_codes(observations["raw"], camera, GREEN))
+    shares = _shares(signal_codes(inside(observations), camera, GREEN))
     exposed = _exposed(shares, SEARCH_EV, _DEVELOPED_GAIN)  # (N, K, BINS)
     centres = (np.arange(BINS) + 0.5) / BINS - encoded(np.array(0.18))
     moment = np.cbrt(exposed @ centres**3)  # (N, K), rising with the exposure
@@ -107,7 +108,7 @@ def entropy_reading(
 
     Noise counts as detail: entropy likes gain.
     """
-    shares = _shares(signal_codes(observations["raw"], camera, GREEN))
+    shares = _shares(signal_codes(inside(observations), camera, GREEN))
     exposed = _exposed(shares, SEARCH_EV)  # (N, K, BINS)
     entropy = -(exposed * np.log2(np.maximum(exposed, 1e-30))).sum(axis=2)
     return _search_reading(shares, frame_ev100(observations), peak(entropy, SEARCH_EV))
@@ -203,7 +204,7 @@ def shim_reading(
     frame = _Frame(observations, estimate, camera)
     base = _table(frame.shift)  # (N, CODES)
     shown = [torch.from_numpy(frame.luma(base**gamma)) for gamma in GAMMAS]
-    metric = np.stack([shim_gradient(luma).numpy() for luma in shown], axis=1)
+    metric = np.stack([shim_gradient(luma, frame.mask).numpy() for luma in shown], axis=1)
     found = peak(metric, np.array(GAMMAS), metric.argmax(axis=1))
     gamma = np.where(metric.max(axis=1) > _NO_GRADIENT, found, 1.0)
     ratio = SHIM_SHAPE * np.tan((1.0 - gamma) * math.atan(1.0 / SHIM_SHAPE))  # R - 1
@@ -254,7 +255,10 @@ class _Frame:
         #: How much brighter than the frame its simulation is [EV].
         self.shift = np.clip(self.ev - held, -SIMULATED_EV, SIMULATED_EV)
         self.codes = signal_codes(observations["raw"], camera, GREEN)
-        signal = CODE_SIGNALS.astype(np.float32)[self.codes].reshape(len(self.codes), -1)
+        #: Pixels that count, (h, w) bool; None for all.
+        self.mask = observations.get("mask")
+        shown = inside({**observations, "raw": self.codes})
+        signal = CODE_SIGNALS.astype(np.float32)[shown].reshape(len(self.codes), -1)
         self._mean = signal.mean(axis=1, dtype=np.float64)
         self._share = (signal >= WHITE_SIGNAL).mean(axis=1)
 
@@ -263,13 +267,13 @@ class _Frame:
         shown = zip(tables.astype(np.float32), self.codes, strict=True)
         return np.stack([table[codes].mean(axis=0) for table, codes in shown])
 
-    def metric(self, function: Callable[[Any], Any]) -> Callable[[Floats], Floats]:
+    def metric(self, function: Callable[..., Any]) -> Callable[[Floats], Floats]:
         """`function` of the luma, as one of how much brighter than the estimate it is [EV]."""
         import torch
 
         def measure(brighter: Floats) -> Floats:
             luma = torch.from_numpy(self.luma(_table(self.shift + brighter)))
-            return np.asarray(function(luma))
+            return np.asarray(function(luma, self.mask))
 
         return measure
 

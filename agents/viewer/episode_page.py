@@ -62,7 +62,7 @@ def play(
     fitted_on: dict[str, Any] = {"scenes": "bundled"}
     options: dict[str, Any] = {"scenes": [scene], "camera": scene.camera}
     options |= {"resolution": scene.light.shape[-1], "max_episode_steps": frames + 1}
-    options |= {"render_mode": "rgb_array", "with_oracle": True}
+    options |= {"render_mode": "rgb_array", "with_oracle": True, "with_subject": True}
     if light != STILL:
         options["lighting"] = {"kind": "moving", "kinds": light}
         fitted_on["grid"] = "video"

@@ -157,7 +157,7 @@ def open_picture(
 
     A `ValueError`, here and within, names the file if it is missing (a link that leads nowhere), no
     whole picture, larger than `MAX_PICTURE_PIXELS` or `MAX_FLAT_PIXELS`, or has colours of more
-    than `bits`: Pillow reads the upper 8 of 16, which others decode.
+    than `bits`: Pillow reads the upper 8 of 16, which others decode where ``info["deep"]``.
     """
     from PIL import Image
 
@@ -178,6 +178,7 @@ def open_picture(
             deep = max(stored) > 8 or any(";16" in str(t[3]) for t in getattr(picture, "tile", ()))
             if deep and bits == 8 and len(picture.getbands()) > 1:
                 raise ValueError("it has colours of 16 bits: save it with 8, or give raws")
+            picture.info["deep"] = deep
             yield picture
     except (OSError, SyntaxError, EOFError, ValueError, Image.DecompressionBombError) as error:
         dangling = path.is_symlink() and not path.exists()

@@ -33,7 +33,15 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from ae_env.utils.user_files import find_config, load_from_file
 from simulator import develop
-from tests.ae_env.environments import ID, SMALL, assert_equal, make_env, make_envs, rollout
+from tests.ae_env.environments import (
+    ID,
+    SMALL,
+    assert_equal,
+    check_parity,
+    make_env,
+    make_envs,
+    rollout,
+)
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
 #: Pages of memory of this process.
@@ -273,7 +281,7 @@ ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], 
 TAKES = {
     **{key: [] for key in ("split", "scorer", "observation", "resolution", "crop")},
     **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
-    **{key: [True] for key in ("sensors", "noise", "with_oracle")},
+    **{key: [True] for key in ("sensors", "noise", "with_oracle", "with_subject")},
     **{key: [1.5] for key in ("motion", "depth")},
     **{key: [None] for key in ("grid", "simulator", "render_mode", "device")},
     "blur_memory": [1.5],
@@ -591,3 +599,14 @@ def test_a_second_process_compiles_where_nothing_was_compiled(monkeypatch) -> No
         monkeypatch.setattr("ae_env.first_frame.is_compiled", lambda known=compiled: known)
         compile_beside()
         assert started.call_count == children
+
+
+def test_the_subjects_pixels_are_told_where_asked():
+    env, envs = make_env(with_subject=True), make_envs(2, with_subject=True)
+    together = envs.reset(seed=0)[1]["subject"]
+    for seed in range(2):
+        info = env.reset(seed=seed)[1]
+        scene = env.unwrapped.scenes[env.unwrapped.scene_ids.index(info["scene_id"])]
+        np.testing.assert_array_equal(info["subject"], scene.layout.subject.numpy())
+        np.testing.assert_array_equal(together[seed], info["subject"])
+    check_parity(0, 3, max_episode_steps=2, with_subject=True)

@@ -126,13 +126,6 @@ def only_16_bits(path: Path) -> None:
     Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
 
 
-def colours_of_16_bits(path: Path) -> None:
-    path.unlink()
-    # In planes each of which looks like one of 8 bits.
-    colours, rgb = np.full((3, 32, 40), 30000, np.uint16), {"photometric": "rgb"}
-    tifffile.imwrite(path.with_suffix(".tif"), colours, planarconfig="separate", **rgb)
-
-
 def bomb(side: int, path: Path) -> None:
     Image.new("1", (side, side)).save(path.with_suffix(".png"))  # some kB
     path.unlink()
@@ -151,14 +144,13 @@ def link(path: Path) -> None:
         (lambda file: Image.new("RGB", (44, 40)).save(file), r"val_1.JPEG' \(\(40, 44\) packed"),
         (lambda file: (file.parents[3] / "grid-options-2x2x2.csv").unlink(), "val_0.JPEG"),
         (only_16_bits, r"val_1.png' cannot be read: it must have 8 bits a sample, not mode 'I;16'"),
-        (colours_of_16_bits, r"val_1.tif' cannot be read: it has colours of 16 bits"),
         (partial(bomb, 4200), r"val_1.png' cannot be read: it claims 4200 x 4200 pixels in \d+ "),
         (partial(bomb, 9500), r"val_1.png' cannot be read: it has 9500 x 9500 pixels"),
         (partial(bomb, 14000), r"val_1.png' cannot be read: Image size"),
         (link, r"val_1.JPEG' cannot be read: the link leads nowhere"),
         (lambda file: (file.unlink(), os.mkfifo(file)), "val_1.JPEG' cannot .* no ordinary file"),
         (None, r"`resolution` \(=64\).*val_0, ISO 100, 1/1000 s, f/4' has 40 x 40"),
-        (only_one_state, "1 of 1 captures in the grid, .*param_3"),
+        (only_one_state, "2 of 2 recorded scenes have fewer than two .*param_3"),
     ],
 )
 def test_bad_files_get_one_line_that_names_them(tmp_path, spoil, message):
@@ -254,6 +246,40 @@ def test_imagenet_es_and_video_stacks(tmp_path: Path) -> None:
     flat = touch(tmp_path / "flat", *(f"v/frame_{i}_1-{t}s.png" for i in (9, 10) for t in (8, 15)))
     files = recorded.index_recorded(flat, {"iso": 400.0, "f_number": 4.0})
     assert [(f.sequence, f.frame) for f in files] == [("v", 9), ("v", 9), ("v", 10), ("v", 10)]
+
+
+def test_pictures_of_16_bits_keep_them(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    codes = np.random.default_rng(0).integers(2000, 60000, (2, 36, 40, 3), np.uint16)
+    tifffile.imwrite(tmp_path / "iso100_1s_f4.tif", codes[0], photometric="rgb")
+    cv2.imwrite(str(tmp_path / "iso100_2s_f4.png"), codes[1][:, :, ::-1])
+    (scene,) = load(f"recorded:{tmp_path}")
+    shown = develop(scene.recorded, scene.white_balance, None).permute(0, 2, 3, 1).numpy()
+    np.testing.assert_allclose(shown * 65535.0, codes, atol=1.0)  # 8 bits would be 257 apart
+
+
+def test_grids_of_other_people(tmp_path: Path, caplog) -> None:
+    """Folders that are bare numbers, ground truth, and shots at one setting."""
+    for time, settings in ((1, GRID[0]), (8, GRID[2])):
+        write_picture(tmp_path / "desk" / f"{time}.0" / "17.png", settings)
+    write_picture(tmp_path / "desk" / "gt" / "17.png", GRID[0])
+    write_picture(tmp_path / "desk" / "8.0" / "17_GT.png", GRID[0])
+    write_picture(tmp_path / "walk" / "4.0" / "3.png", GRID[0])
+    (scene,) = load(f"recorded:{tmp_path}?folder=exposure_ms&iso=100&f_number=4")
+    assert scene.scene_id == "desk/17"
+    assert scene.recorded.shape[0] == len(scene.allowed) == 2  # 4 ms is no state
+    truth, single = caplog.messages
+    assert "ground truth is left out, 2 of 5 files" in truth
+    assert "1 of 2 recorded scenes have fewer than two states" in single
+    options = recorded.RecordedOptions.of(
+        f"recorded:{tmp_path}?folder=exposure_us&iso=1&f_number=4"
+    )
+    assert options.grid.exposure_times == (1e-6, 8e-6)
+    with pytest.raises(ValueError, match=r"`scenes\['folder'\]` \(='ms'\) must be"):
+        load(f"recorded:{tmp_path}?folder=ms")
+    names = ["GT_SRGB_010", "0001_gt", "ground truth", "GroundTruth", "room-gt"]
+    assert all(map(recorded._TRUTH.search, names))
+    assert not any(map(recorded._TRUTH.search, ["gtx", "night", "length", "background"]))
 
 
 #: States that scene "b" lacks: the brightest, and one with others as bright.

@@ -7,7 +7,8 @@ from ae_env.observation import decode_observation
 from agents.metering import reading as readings
 from agents.metering.meters import make_meter, weight_map
 from agents.metering.reading import EVTracker, frame_ev100
-from agents.policy_names import METERS
+from agents.policy_names import METERS, make_policy
+from agents.rollouts import shown_to
 
 GREY = np.ones((64, 64))
 
@@ -239,3 +240,73 @@ def test_a_frame_without_shadows_keeps_its_reading(context, photograph):
         np.testing.assert_array_equal(reading.ev100, plain.ev100)
         np.testing.assert_array_equal(reading.saturated, plain.saturated)
     assert reading.saturated[0] == 1.0
+
+
+# -- a part of the frame ---------------------------------------------------------------------------
+
+BELL = np.add.outer(np.arange(64) < 40, np.arange(64) < 24) > 0  # all but the lower right
+
+
+@pytest.mark.parametrize("name", METERS)
+def test_other_pixels_count_for_nothing(context, photograph, name):
+    light = np.random.default_rng(0).uniform(0.3, 2.0, (64, 64))
+    state, meter = context.grid.nearest(9.0), make_meter(name, context.camera)
+    frame, estimate = photograph(light, 9.0, state), np.array([9.5])
+
+    def read(frame, **part):
+        masks = readings.Region(part.get("roi"), part.get("mask"), (64, 64)).masks(frame)
+        return readings.read_part(meter, frame, estimate, masks).ev100[0]
+
+    whole = meter(frame, estimate).ev100[0]
+    assert read(frame) == whole
+    # Only the mean that a zone's samples are summed up in differs.
+    assert read(frame, mask=np.ones((64, 64), bool)) == pytest.approx(whole, abs=1e-5)
+    # A quarter is as a frame of its own.
+    quarter = {"raw": frame["raw"][:, :, 8:40, 32:], "settings": frame["settings"]}
+    own = meter(quarter, estimate).ev100[0]
+    assert read(frame, roi="0.5,0.125,0.5,0.5") == pytest.approx(own, abs=1e-5)
+    light[44:, 28:] = 30.0  # no neighbour of what counts
+    part = read(frame, mask=BELL)
+    assert read(photograph(light, 9.0, state), mask=BELL) == pytest.approx(part, abs=1e-9)
+
+
+#: A grey card, and what the meters say of it beside its EV; matrix: its top is at 0.12, not at 0.5.
+CARD = {**dict.fromkeys(("average", "centre_weighted", "spot", "skewness"), 0.0)}
+CARD |= {"highlight_weighted": math.log2(0.12 / 0.9), "matrix": 0.7 + math.log2(0.12 / 0.5)}
+CARD |= {"rpi_agc:P?constraint=shadows&": math.log2(0.12 / 0.17)}
+
+
+@pytest.mark.parametrize("name", CARD)
+def test_each_camera_meters_its_own_subject(context, photograph, name):
+    """A card in a world three stops brighter, seen through a fence; and a lone one of 3 pixels."""
+    fence = np.indices((64, 64)).sum(axis=0) % 2 == 0
+    small = np.zeros((64, 64), bool)
+    small[60, 1:4] = True
+    frames = [
+        photograph(np.where(m, 1.0, 8.0), 9.0, context.grid.nearest(9.0)) for m in (fence, small)
+    ]
+    both = {key: np.concatenate([frame[key] for frame in frames]) for key in frames[0]}
+    policy = make_policy(f"{name}{'' if '?' in name else ':P?'}mask=subject", context)
+    policy.reset(2)
+    policy.act(shown_to(policy, both, {"subject": np.stack([fence, small])}))
+    found = policy._damped if name.startswith("rpi") else policy._tracker.ev100
+    np.testing.assert_allclose(found, 9.0 + CARD[name], atol=0.06)
+    with pytest.raises(ValueError, match="the scene has no subject"):
+        policy.act(shown_to(policy, both, {"subject": np.stack([fence, ~(small | ~small)])}))
+    with pytest.raises(ValueError, match="with_subject=True"):
+        policy.act(shown_to(policy, both, {}))
+
+
+def test_what_a_part_may_be(context):
+    for roi in ("0,0,1", "0,0,0,1", "0.5,0,0.6,1", (-0.1, 0, 1, 1), "a,b,c,d", 3, (math.nan,) * 4):
+        with pytest.raises(ValueError, match="`roi`"):
+            make_policy("average", context, roi=roi)
+    for mask in ("subjects", np.ones((64, 64)), np.ones((3, 3), bool), np.zeros((64, 64), bool)):
+        with pytest.raises(ValueError, match="`mask`"):
+            make_policy("rpi_agc", context, mask=mask)
+    with pytest.raises(ValueError, match="not both"):
+        make_policy("average?roi=0,0,1,1&mask=subject", context)
+    # Pixels that are touched: 6.4 to 12.8 across, 32 to 33 down.
+    (found,) = readings.Region((0.1, 0.5, 0.1, 1 / 64), None, (64, 64)).masks({})
+    assert np.argwhere(found)[[0, -1]].tolist() == [[32, 6], [32, 12]]
+    assert found.sum() == 7

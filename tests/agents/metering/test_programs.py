@@ -16,7 +16,7 @@ from ae_env.grid import ExposureGrid
 from agents.metering import metering_policy, programs
 from agents.metering.metering_policy import MeteringPolicy, ScoreRegression
 from agents.metering.programs import ProgramOptions, StateChooser, program_cost
-from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram, zone_map
+from agents.metering.rpi_agc import IMX477, LibcameraAgc, signal_histogram, zone_map
 from agents.policy import PolicyContext
 from agents.policy_names import METERS, make_policy
 from agents.rollouts import make_envs
@@ -59,6 +59,9 @@ def best(found: StateChooser, target: float, preference=0.0) -> list[int]:
         ("S", {"exposure_time": 1 / 4, "shutter_cap": 1 / 30}, 8.0, [4]),  # the cap comes first
         ("P", {"shutter_cap": 1 / 8}, 4.0, [4]),  # 1/64 s and as near as that allows
         ("P", {"shutter_cap": 1 / 1000}, 12.0, [1]),  # none is shorter: the shortest
+        ("P", {"iso_cap": 200}, 8.0, [3]),  # ISO 100
+        ("M", {"iso": 400, "iso_cap": 100}, 8.0, [1]),  # f/8 and 1/125 s by hand
+        ("P", {"iso_cap": 100, "shutter_cap": 1 / 8}, 4.0, [0]),
     ],
 )
 def test_states_that_fit_best(program, options, target, states):
@@ -128,6 +131,7 @@ def test_step_of_a_grid():
     [
         *(("compensation", -32.0, 32.0), ("damping", 0.0, 0.999), ("f_number", 0.1, 1000.0)),
         *(("exposure_time", 1e-7, 1e5), ("shutter_cap", 1e-7, 1e5), ("iso", 1.0, 1e7)),
+        ("iso_cap", 1.0, 1e7),
     ],
 )
 def test_ranges_of_the_options(option, low, high):
@@ -234,9 +238,11 @@ def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_pa
         wanted = _best_state(np.array([[looked_up, np.log2(speed), np.log2(defocus)]]))[0]
         path = _run(policy, photograph, ev, speed=speed, defocus=defocus, start=wanted)
         assert path[-1] == wanted
-    policy = make_policy("average:tuned?shutter_cap=1/100", context, weights=weights)
-    path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
-    assert all(context.grid[s].exposure_time <= 1 / 100 for s in path)
+    for cap, limit in (("shutter_cap=1/100", (1 / 100, 6400)), ("iso_cap=100", (1, 100))):
+        policy = make_policy(f"average:tuned?{cap}", context, weights=weights)
+        path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
+        taken = [context.grid[s] for s in path]
+        assert all(s.exposure_time <= limit[0] and s.iso <= limit[1] for s in taken)
     make_policy("average:P", context).fit(None)  # it has nothing to learn
     with pytest.raises(ValueError, match="call fit"):
         _run(make_policy("average:tuned", context), photograph, 8.0)
@@ -453,6 +459,58 @@ def test_lamps_do_not_flicker_on_a_grid_with_other_shutters(context):
     assert used["rpi_agc?flicker_period=0.01"] <= {1 / 100, 1 / 50, 1 / 120}
 
 
+#: A tuning file of one's own: a corner is metered, at 0.2 in the dark and 0.4 from 100 lux on.
+CORNER = {
+    "metering_modes": {"cor-ner": {"weights": [0] * 11 + [1, 0, 0, 0]}},
+    "exposure_modes": {"slow": {"shutter": [500, 1000000], "gain": [1.0, 5.0]}},
+    "constraint_modes": {"none": []},
+    "y_target": [0, 0.2, 100, 0.4],
+    "base_ev": 0.5,
+}
+PISP = CORNER | {"metering_modes": {"corner": {"weights": [1.0] + [0] * 224}}}
+
+
+@pytest.mark.parametrize("agc", [CORNER, {"channels": [CORNER, {}]}, PISP])
+def test_a_tuning_file_decides(context, photograph, tmp_path, agc):
+    entries = [{"rpi.awb": {}}, {"rpi.agc": agc}]
+    (tmp_path / "own.json").write_text(json.dumps({"version": 2.0, "algorithms": entries}))
+    policy = make_policy(f"rpi_agc?tuning={tmp_path}/own.json", context)
+    light = np.full((64, 64), 3.0)
+    side = 5 if agc is PISP else 11  # of 64 / 15 and 64 / 6 pixels
+    light[:side, :side] = 1.0
+    # 2.5 * 2^9 lux; half of 0.4.
+    frame = photograph(light, 9.0, context.grid.nearest(9.0))
+    assert _wanted_ev(policy, frame) == pytest.approx(9.0 - math.log2(0.2 / 0.12), abs=0.03)
+    # 100 lux are not reached: between 0.2 and 0.4.
+    frame = photograph(light, 4.0, context.grid.nearest(4.0))
+    target = 0.5 * (0.2 + 0.2 * 2.5 * 2.0**4 / 100)
+    assert _wanted_ev(policy, frame) == pytest.approx(4.0 - math.log2(target / 0.12), abs=0.03)
+    splits = policy.agc.split(np.array([1e-4, 0.01, 3.0, 9.0]))
+    np.testing.assert_allclose(splits, [[5e-4, 0.01, 1.0, 1.0], [1.0, 1.0, 3.0, 5.0]])
+    capped = make_policy(f"rpi_agc?tuning={tmp_path}/own.json&iso_cap=200", context)
+    assert np.ravel(capped.agc.split(np.array([9.0]))).tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("agc", "message"),
+    [
+        ({**CORNER, "y_target": [0, 0.2, 0, 0.3]}, r"own.json'\): rpi.agc.y_target"),
+        (
+            {**CORNER, "exposure_modes": {"a": {"gain": [1]}}},
+            r"modes.a.shutter: Field req",
+        ),
+        ({"channels": [{**CORNER, "speed": 2}]}, r"rpi.agc.channels.0.speed \(=2\)"),
+        ({**CORNER, "metering_modes": {"a": {"weights": [1] * 16}}}, "a.weights .* 15 or 225"),
+        (None, "must have an entry 'rpi.agc'"),
+        (CORNER, r"`mode` \(='short'\) must be one of 'slow'"),
+    ],
+)
+def test_errors_of_a_tuning_file_name_it_and_the_entry(context, tmp_path, agc, message):
+    (tmp_path / "own.json").write_text(json.dumps({"algorithms": [{"rpi.agc": agc}]}))
+    with pytest.raises(ValueError, match=message):
+        make_policy("rpi_agc", context, tuning=tmp_path / "own.json", mode="short")
+
+
 #: Six of the 36 recordings, so that nothing else is needed.
 OURS = Path(__file__).with_name("libcamera_traces.json")
 
@@ -466,7 +524,7 @@ def _played(recording, zone_factors):
         1,
         metering=recording["metering"].replace("-", "_"),
         constraint=recording["constraint"],
-        ladder=LADDERS[recording["exposure_mode"]],
+        ladder=IMX477.exposure_modes[recording["exposure_mode"]],
         max_exposure_time=66e-3,
         flicker_period=recording["flicker_period_us"] * 1e-6 or None,
     )
