@@ -1,10 +1,9 @@
 """Real cameras with counted photons (EMVA 1288), and the simulator as each of them.
 
-A folder holds a ``.npz`` for each camera: ``bright`` and ``dark`` (exposures, 2, H, W) digital
-numbers, ``bright_exposure_ns``, and ``bright_photons`` per pixel. The quantities are those of EMVA
-1288 (release 4.0, linear model), see `benchmarks.ptc` for the gain; intervals are Student's over 16
-parts of the frames. A simulated camera is made of gain, responsivity, dark signal and dark noise.
-The package `emva1288` (LGPL) stands beside our estimates where it is installed.
+A folder holds a ``.npz`` for each camera, see `simulator.camera_files.read_flat_fields`. The
+quantities are those of EMVA 1288 (release 4.0, linear model); intervals are Student's over 16 parts
+of the frames. A simulated camera is made of gain, responsivity, dark signal and dark noise. The
+package `emva1288` (LGPL) stands beside our estimates where it is installed.
 """
 
 from __future__ import annotations
@@ -12,17 +11,17 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import norm
 from scipy.stats import t as student
 
 from benchmarks.harness import Part, Report, Row, benchmark, panels, real_files, table
-from benchmarks.ptc import FITTED
-from simulator import CameraProfile, CameraSettings, CameraSimulator
+from simulator import CameraProfile, CameraSettings, CameraSimulator, get_camera
+from simulator.camera_files import FITTED, FlatFields, pair_moments, read_flat_fields
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
@@ -39,8 +38,6 @@ QUANTITIES = {
     "LE_max": ("greatest linearity error [%]", "{:.2f}", 0.4804),
 }
 KINDS = ("real", "simulated")
-#: Dark variance [DN²] that the standard takes at least: rounding hides smaller ones.
-LEAST = 0.24
 #: Half of the 95 % interval of the mean of 16 values of standard deviation 1.
 HALF = student.ppf(0.975, 15) / 4
 _TABLE = """quantity = {quantity} | published = {published} | real, ours = {real} |
@@ -53,113 +50,73 @@ variance, median [%] = {variance:.1f} | variance, largest [%] = {variance_most:.
 variance within its noise [%] = {held:.0f}"""
 
 
-class Stack(NamedTuple):
-    """Pairs of frames of a camera: (exposures, 2, H, W) in DN, and the light of each exposure."""
-
-    bright: np.ndarray
-    dark: np.ndarray
-    photons: np.ndarray
-    times: np.ndarray
-
-
-def moments(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and temporal variance of each pair."""
-    change = np.diff(frames.astype(float), axis=1)
-    return frames.mean(axis=(1, 2, 3)), change.var(axis=(1, 2, 3)) / 2
-
-
-def estimate(stack: Stack, dark_variance: float | None = None) -> Row:
-    """The quantities; `dark_variance` [DN²] is for the gain, in place of the dark frames' own."""
-    (mean, variance), (dark, noise), photons = *map(moments, stack[:2]), stack.photons
-    full, signal = variance.argmax(), mean - dark
+def estimate(stack: FlatFields) -> Row:
+    (mean, variance), (dark, _) = pair_moments(stack.bright), pair_moments(stack.dark)
+    full, signal, photons, gain = variance.argmax(), mean - dark, stack.photons, stack.gain()
     fit = signal <= FITTED * signal[full]
-    extra = variance - (noise if dark_variance is None else dark_variance)
-    gain = signal[fit] @ extra[fit] / (signal[fit] @ signal[fit])
     response = photons[fit] @ signal[fit] / (photons[fit] @ photons[fit])
-    floor = max(np.polyfit(stack.times, noise, 1)[1], LEAST)
     judged = (signal >= 0.05 * signal[full]) & (signal <= 0.95 * signal[full])
     x, y = photons[judged], signal[judged]
     errors = 100 * (y / np.polyval(np.polyfit(x, y, 1, w=1 / y), x) - 1)
-    electrons = (floor - 1 / 12) ** 0.5 / gain, photons[full], photons[full] * response / gain
-    values = gain, 100 * response / gain, floor**0.5, *electrons, errors.min(), errors.max()
+    noise, most = stack.dark_variance, photons[full]
+    electrons = (noise - 1 / 12) ** 0.5 / gain, most, most * response / gain
+    values = gain, 100 * response / gain, noise**0.5, *electrons, errors.min(), errors.max()
     return dict(zip(QUANTITIES, map(float, values), strict=True))
 
 
-def profile(name: str, stack: Stack) -> CameraProfile:
-    """The camera; noise that rounding hides is that of the shares of the dark numbers."""
-    dark, white = stack.dark, 2 ** int(stack.bright.max()).bit_length() - 1
-    black, variance = dark.mean(), estimate(stack)["sigma_y_dark"] ** 2
-    if variance <= LEAST:
-        share = np.cumsum(np.bincount(dark.ravel())) / dark.size
-        told = (share > 1e-3) & (share < 1 - 1e-3)
-        slope, start = np.polyfit(np.flatnonzero(told) + 0.5, norm.ppf(share[told]), 1)
-        # The mean of all frames shows what pixels differ by, which is no noise.
-        black, variance = -start / slope, slope**-2 - dark.mean(axis=(0, 1)).var() + 1 / 12
-    span, gain = white - black, estimate(stack, variance)["K"]
-    nlf = {100.0: NoiseLevelFunction((gain / span,) * 4, (variance / span**2,) * 4)}
-    fields: Any = {"cfa": "RGGB", "black_level": black, "white_level": white, "nlf_by_iso": nlf}
-    return CameraProfile(name, bit_depth=white.bit_length(), **fields)
-
-
-def simulated(camera: CameraProfile, stack: Stack, response: float, seed: int) -> Stack:
+def simulated(camera: CameraProfile, stack: FlatFields, response: float, seed: int) -> FlatFields:
     """The same exposures by the transition engine; `response` is in DN per photon."""
     size, base = [n // 2 for n in stack.bright.shape[2:]], CameraSettings(100, 1 / 64, 4)
     simulator, clean = CameraSimulator(device="cpu", cache=None), NoiseLevelFunction.zero()
     found, rng = [], np.random.default_rng(seed)
-    for level in (1.0, 0.0):
-        light = torch.full((4, *size), level)
+    for light in (torch.ones(4, *size), torch.zeros(4, *size)):
         scene = simulator.prepare(PreparedScene(light, base, camera, clean))
         for signal in np.repeat(response * stack.photons / camera.span[0], 2):
             state = [replace(base, exposure_time=max(signal, 1e-6) / 64)]
             frame = scene.expose(state, seed=int(rng.integers(2**31)), noise="exact")
             found.append(np.rint(frame.double().numpy() * camera.span[0] + camera.black_level[0]))
-    frames = np.reshape(found, (2, len(stack.photons), 2, 2 * size[0], 2 * size[1]))
+    frames = np.reshape(found, (2, *stack.bright.shape))
     return stack._replace(bright=frames[0], dark=frames[1])
 
 
-def by_package(stack: Stack) -> Row:
+def by_package(stack: FlatFields) -> Row:
     vars(np).setdefault("asfarray", partial(np.asarray, dtype=float))  # it was written for NumPy 1
     try:
         from emva1288.process import Data1288, Results1288, routines
     except ImportError:
         return {}
-    lights, sums = [], []
-    for light, bright, dark in zip(stack.photons, stack.bright, stack.dark, strict=True):
+    spatial, temporal = {}, {}
+    for bright, dark, light, time in zip(*stack, strict=True):
         pair = {p: routines.get_int_imgs(list(f)) for p, f in ((light, bright), (0.0, dark))}
-        lights.append(pair)
-        sums.append({p: {k: np.sum(v) for k, v in one.items()} for p, one in pair.items()})
-    middle, (height, width) = len(lights) // 2, stack.bright.shape[2:]
-    data: Row = {"temporal": dict(zip(stack.times, sums, strict=True)), "height": height}
-    data |= {"spatial": {stack.times[middle]: lights[middle]}, "width": width}
-    results = Results1288(Data1288(data).data)
+        spatial[time] = pair
+        temporal[time] = {p: {k: np.sum(v) for k, v in one.items()} for p, one in pair.items()}
+    middle, (height, width) = stack.times[len(spatial) // 2], stack.bright.shape[2:]
+    data = {"temporal": temporal, "spatial": {middle: spatial[middle]}}
+    results = Results1288(Data1288({**data, "height": height, "width": width}).data)
     return {name: float(getattr(results, name)) for name in QUANTITIES}
 
 
-def measured(stack: Stack) -> Row:
-    found: Row = {"estimate": estimate(stack), "package": by_package(stack)}
-    (*count, height, width), parts = stack.bright.shape, []
-    blocks = [f.reshape(*count, 4, height // 4, 4, width // 4) for f in stack[:2]]
-    for cut in ((..., i, slice(None), j, slice(None)) for i in range(4) for j in range(4)):
-        parts.append(stack._replace(bright=blocks[0][cut], dark=blocks[1][cut]))
+def measured(stack: FlatFields) -> Row:
+    (mean, variance), own = pair_moments(stack.bright), estimate(stack)
+    high, wide = (size // 4 for size in stack.bright.shape[2:])
+    corners = [(high * i, wide * j) for i in range(4) for j in range(4)]
+    cuts = [(..., slice(y, y + high), slice(x, x + wide)) for y, x in corners]
+    parts = [stack._replace(bright=stack.bright[c], dark=stack.dark[c]) for c in cuts]
     half = HALF * np.std([[*estimate(part).values()] for part in parts], axis=0, ddof=1)
     step = np.diff(stack.photons).max()  # the saturation is that of a step
-    half[[4, 5]] += step, step * found["estimate"]["QE"] / 100
-    spread = HALF * np.std([moments(part.bright)[1] for part in parts], axis=0, ddof=1)
-    (mean, variance), (dark, _) = map(moments, stack[:2])
-    found |= {"half": half.tolist(), "signal": (mean - dark).tolist()}
+    half[[4, 5]] += step, step * own["QE"] / 100
+    spread = HALF * np.std([pair_moments(part.bright)[1] for part in parts], axis=0, ddof=1)
+    found = {"estimate": own, "package": by_package(stack), "half": half.tolist()}
+    found |= {"signal": (mean - pair_moments(stack.dark)[0]).tolist()}
     return found | {"variance": variance.tolist(), "variance_half": spread.tolist()}
 
 
 def measure(path: str, seed: int, quick: bool) -> Row:
-    with np.load(path) as file:
-        names = ("bright", "dark", "bright_photons", "bright_exposure_ns")
-        read = [file[name] for name in names]
-    # Exposures for spatial measurements come after those that rise.
-    rising = int(np.argmax(np.append(np.diff(read[-1]) <= 0, True))) + 1
-    real = Stack(*(values[: rising : 4 if quick else 1] for values in read))
-    camera, found = profile(Path(path).stem, real), estimate(real)
+    step = slice(None, None, 4 if quick else 1)
+    real = FlatFields(*(values[step] for values in read_flat_fields(path)))
+    camera, found = get_camera(f"emva:{path}"), estimate(real)
     made = simulated(camera, real, found["QE"] / 100 * found["K"], seed)
-    row = {"camera": camera.name, "real": measured(real), "simulated": measured(made)}
+    row = {"camera": Path(path).stem, "real": measured(real), "simulated": measured(made)}
     return row | {"levels": [camera.black_level[0], camera.white_level]}
 
 
@@ -201,12 +158,10 @@ def quantities(row: Row) -> list[Row]:
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     rows, drawn = list(results.values()), list[Row]()
-    for row in rows:
-        gain = row["real"]["estimate"]["K"]
-        for name, style in zip(KINDS, ({"c": "C0", "marker": "."}, {"c": "C1"}), strict=True):
-            x, y = (np.array(row[name][k]) / gain**p for k, p in (("signal", 1), ("variance", 2)))
-            drawn.append({"panel": row["camera"], "x": x, "y": y, "label": name, "style": style})
-    figure = panels(drawn, 5.0, xlabel="signal [e-]", ylabel="temporal variance [e-²]")
+    for row, (kind, colour, marker) in product(rows, zip(KINDS, ("C0", "C1"), ".,", strict=True)):
+        x, y, style = row[kind]["signal"], row[kind]["variance"], {"c": colour, "marker": marker}
+        drawn.append({"panel": row["camera"], "x": x, "y": y, "label": kind, "style": style})
+    figure = panels(drawn, 5.0, xlabel="signal [DN]", ylabel="temporal variance [DN²]")
     blocks = [f"### {row['camera']}\n\n{table(quantities(row), _TABLE)}" for row in rows]
     judged = [steps(row, *e) for row in rows for e in ((0.05, 0.35), (0.35, 0.7), (0.7, 0.95))]
     tables = {"quantities": "\n\n".join(blocks), "steps": table(judged, _STEPS)}

@@ -240,9 +240,10 @@ def list_cameras() -> list[str]:
 def get_camera(name: str) -> CameraProfile:
     """The camera called `name`: a built-in one, or one of a file (`simulator.camera_files`).
 
-    A file's is ``"ctt:FILE"``, a tuning of Raspberry Pi's, or ``"darktable:MAKER MODEL"`` with the
-    noise of darktable's profile: of a built-in camera all else stays, another one has an RGGB array
-    and levels of 14 bits unless options say more. A `ValueError` proposes the nearest name.
+    A file's is ``"ctt:FILE"``, a tuning of Raspberry Pi's, ``"emva:FILE"``, flat fields, or
+    ``"darktable:MAKER MODEL"`` with the noise of darktable's profile: of a built-in camera all else
+    stays, another one has an RGGB array and levels of 14 bits unless options say more. A
+    `ValueError` proposes the nearest name.
     """
     fields = read_camera_file(name) if isinstance(name, str) else None
     if fields is None:

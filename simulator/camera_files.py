@@ -1,7 +1,7 @@
-"""Camera bodies from calibrations of others: Raspberry Pi's tuning files, darktable's profiles.
+"""Camera bodies from files of a user: Raspberry Pi's tuning, darktable's profiles, flat fields.
 
-The files don't come with the package, because a user has them. Both say how noisy a body is, on
-scales of their own:
+The files don't come with the package. The first two say how noisy a body is, on scales of their
+own; the noise of flat fields is measured:
 
 - *The camera tuning tool* (ctt) of Raspberry Pi fits ``constant + slope * sqrt(mean)`` to the
   standard deviation of the patches of a ColorChecker, less black, in numbers of 16 bits, at gain 1.
@@ -13,6 +13,8 @@ scales of their own:
   `GREEN_SHARE` of a photosite's variance. Red and blue inherit the noise of the greens around them,
   so their numbers depend on the colour of the profiled picture, and are not used: planes with equal
   white levels and gains have equal `shot`.
+- *Flat fields* are measured as EMVA 1288 (release 4.0, linear model) has it. The system gain is the
+  slope of the variance over the mean, both less their dark values, up to 70 % of the saturation.
 """
 
 from __future__ import annotations
@@ -22,8 +24,9 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -72,9 +75,10 @@ def _letters(text: str) -> str:
 def read_camera_file(name: str) -> dict[str, Any] | None:
     """Fields of the `CameraProfile` that ``"ctt:FILE"`` or ``"darktable:MAKER MODEL"`` names.
 
-    None if `name` is not of this form. Options follow a question mark: ``bits`` (10 by default) and
-    ``cfa`` (RGGB) of a tuned sensor; ``black``, ``white``, ``bits`` and ``cfa`` of darktable's
-    body, which are missing from the fields where they are not given; darktable's ``file``.
+    ``"emva:FILE"`` is a ``.npz`` of flat fields (`read_flat_fields`). None if `name` has no such
+    form. Options follow a question mark: ``bits`` (by default 10 of a tuned sensor, those of the
+    largest number of flat fields) and ``cfa`` (RGGB); darktable's ``file``, and ``black``,
+    ``white``, ``bits`` and ``cfa`` of its body, which are missing from the fields otherwise.
 
     Raises:
         ValueError: If the file or the body is not there, or is not what it should be.
@@ -91,9 +95,10 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
         return reader(stem, options)
     except (KeyError, TypeError, AttributeError) as error:
         what = {"ctt": "tuning file of libcamera", "darktable": "noiseprofiles.json of darktable"}
+        what["emva"] = "npz of flat fields"
         fault = f"lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"`camera` (={name!r}) must name a {what[kind]}: it {fault}") from None
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, EOFError, BadZipFile) as error:
         raise ValueError(f"`camera` (={name!r}) cannot be used: {error}") from None
 
 
@@ -214,7 +219,77 @@ def _from_darktable(body: str, options: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
+# -- flat fields ----------------------------------------------------------------------------------
+
+#: Up to this share of the saturation, where the variance is highest, the gain is fitted.
+FITTED = 0.7
+#: Least dark variance [DN²] that frames can show (EMVA 1288): rounding hides smaller ones.
+LEAST_VARIANCE = 0.24
+
+
+class FlatFields(NamedTuple):
+    """Pairs of flat fields of a monochrome sensor, or of one colour, at a ladder of exposures."""
+
+    bright: np.ndarray  # (N, 2, H, W) [DN]
+    dark: np.ndarray  # the same without light
+    photons: np.ndarray  # (N,) mean photons of a pixel; zeros if unknown
+    times: np.ndarray  # (N,) exposure times
+
+    @property
+    def dark_variance(self) -> float:
+        """Temporal variance in the dark after no time [DN²], at least `LEAST_VARIANCE`."""
+        return max(float(np.polyfit(self.times, pair_moments(self.dark)[1], 1)[1]), LEAST_VARIANCE)
+
+    def gain(self, dark_variance: float | None = None) -> float:
+        """System gain [DN per electron]; `dark_variance` takes the place of the dark frames'."""
+        (mean, variance), (dark, noise) = pair_moments(self.bright), pair_moments(self.dark)
+        signal, extra = mean - dark, variance - (noise if dark_variance is None else dark_variance)
+        fit = signal <= FITTED * signal[variance.argmax()]
+        return float(signal[fit] @ extra[fit] / (signal[fit] @ signal[fit]))
+
+
+def pair_moments(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and temporal variance of each pair of frames (N, 2, H, W): two arrays (N,)."""
+    change = np.diff(frames.astype(float), axis=1)
+    return frames.mean(axis=(1, 2, 3)), change.var(axis=(1, 2, 3)) / 2
+
+
+def read_flat_fields(path: str | os.PathLike[str]) -> FlatFields:
+    """Flat fields of a ``.npz``: bright, dark, bright_photons (optional), bright_exposure_ns.
+
+    Exposures after those whose times rise are of other measurements, and are left out.
+    """
+    with np.load(Path(path).expanduser()) as file:
+        bright, dark, times = (file[name] for name in ("bright", "dark", "bright_exposure_ns"))
+        photons = file["bright_photons"] if "bright_photons" in file.files else 0.0 * times
+    count = int(np.argmax(np.append(np.diff(times) <= 0, True))) + 1
+    return FlatFields(*(values[:count] for values in (bright, dark, photons, times)))
+
+
+def _from_flat_fields(path: str, options: Mapping[str, str]) -> dict[str, Any]:
+    from scipy.stats import norm
+
+    fields = read_flat_fields(path)
+    dark, most = fields.dark, int(fields.bright.max()).bit_length()
+    bits = check_integer("bits", _number("bits", options.get("bits", str(most))), most, 16)
+    black, variance = float(dark.mean()), fields.dark_variance
+    if variance <= LEAST_VARIANCE:  # the normal distribution with the shares of the dark numbers
+        share = np.cumsum(np.bincount(dark.ravel())) / dark.size
+        told = (share > 1e-3) & (share < 1 - 1e-3)
+        slope, start = np.polyfit(np.flatnonzero(told) + 0.5, norm.ppf(share[told]), 1)
+        # The mean of all frames shows what pixels differ by, which is no noise.
+        black, variance = -start / slope, slope**-2 - dark.mean(axis=(0, 1)).var() + 1 / 12
+    span, source = 2**bits - 1 - black, f"flat fields {path}"
+    shot, read = fields.gain(variance) / span, variance / span**2
+    nlf = NoiseLevelFunction((shot,) * 4, (read,) * 4, source=source)
+    levels = {"black_level": black, "white_level": 2**bits - 1, "bit_depth": bits}
+    name = Path(path).stem
+    body = {"name": f"emva_{name.lower()}", "model": name, "cfa": options.get("cfa", "RGGB")}
+    return {**body, "make": "unknown", **levels, "nlf_by_iso": {100.0: nlf}, "source": source}
+
+
 _READERS = {
     "ctt": (_from_ctt, ("bits", "cfa")),
     "darktable": (_from_darktable, (*_FIELDS, "file")),
+    "emva": (_from_flat_fields, ("bits", "cfa")),
 }

@@ -141,11 +141,9 @@ def test_a_camera_of_counted_photons(benchmarks_here):
         noisy = black + gain * electrons + dark * rng.standard_normal(electrons.shape)
         return np.clip(np.rint(noisy), 0, 4095).astype(np.uint16)
 
-    folder = benchmarks_here / "cameras"
-    folder.mkdir()
     light = {"bright_photons": photons, "bright_exposure_ns": times}
-    np.savez(folder / "mine.npz", bright=pairs(photons), dark=pairs(0 * photons), **light)
-    emva.run(benchmarks_here / "out", folder=folder)
+    np.savez(benchmarks_here / "mine.npz", bright=pairs(photons), dark=pairs(0 * photons), **light)
+    emva.run(benchmarks_here / "out", folder=benchmarks_here)
     (row,) = json.loads((benchmarks_here / "out" / "emva.json").read_text())["rows"]
     known = [gain, 100 * efficiency, (dark**2 + 1 / 12) ** 0.5, dark / gain]
     for kind in ("real", "simulated"):

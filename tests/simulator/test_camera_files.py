@@ -63,12 +63,9 @@ def test_colours_of_a_tuning_file(tmp_path):
 
 
 def noise_profiles(path, *profiles, maker="Canon", model="EOS 70D"):
-    rows = [{"name": "", "iso": i, "a": [9, a, 9], "b": [9, b, 9], **more}
-            for i, a, b, more in profiles]  # fmt: skip
-    models = [{"comment": "", "model": model, "profiles": rows}]
-    path.write_text(
-        json.dumps({"version": 0, "noiseprofiles": [{"maker": maker, "models": models}]})
-    )
+    rows = [{"iso": i, "a": [9, a, 9], "b": [9, b, 9], **more} for i, a, b, more in profiles]
+    makers = [{"maker": maker, "models": [{"model": model, "profiles": rows}]}]
+    path.write_text(json.dumps({"version": 0, "noiseprofiles": makers}))
     return path
 
 
@@ -128,6 +125,7 @@ def test_bodies_of_darktable(tmp_path, monkeypatch):
     [
         *[("ctt:none.json", "none.json"), ("ctt:b.json", "it lacks 'rpi.noise'")],
         *[("ctt:c.json", "must name a tuning file"), ("ctt:d.json", "cannot be used")],
+        *[("emva:none.npz", "none.npz"), ("emva:d.json", "cannot be used")],
         ("ctt:a.json?bits=7", r"`bits` \(=7\) must be an integer in \[8, 16\]"),
         ("ctt:a.json?bit=12", "did you mean 'bits'"),
         ("ctt:a.json?cfa=RGB", "`cfa`"),
@@ -140,9 +138,8 @@ def test_bodies_of_darktable(tmp_path, monkeypatch):
 def test_errors_name_the_camera(tmp_path, monkeypatch, name, message):
     monkeypatch.chdir(tmp_path)
     tuning(tmp_path / "a.json", 3.0)
-    (tmp_path / "b.json").write_text("{}")
-    (tmp_path / "c.json").write_text("[1]")
-    (tmp_path / "d.json").write_text("{")
+    for file, text in (("b.json", "{}"), ("c.json", "[1]"), ("d.json", "{")):
+        (tmp_path / file).write_text(text)
     monkeypatch.setenv(DARKTABLE_VARIABLE, str(noise_profiles(tmp_path / "n.json")))
     with pytest.raises(ValueError, match=message):
         get_camera(name)
