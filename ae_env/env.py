@@ -475,7 +475,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
     | `delay` | 0 | frames between an action and the first capture that has it; a mapping by control, such as `{"exposure_time": 2, "iso": 1}`, where some are slower |
     | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |
-    | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
+    | `camera` | `"nikon_z6"` | built-in camera, `"ctt:FILE"`, `"darktable:MAKER MODEL"`, `"emva:FILE"`, or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
     | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.capture.sensor`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |

@@ -18,7 +18,8 @@ import torch
 from ae_env.scorers.measures import srgb_decode
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, real_files, rounded, table
 from simulator import RawImage, develop, read_raw
-from simulator.raw.develop import XYZ_FROM_SRGB, srgb_from_camera
+from simulator.camera_files import XYZ_FROM_SRGB
+from simulator.raw.develop import srgb_from_camera
 
 #: CIE L*a*b*, D50, 2 degree, of charts made after November 2014. X-Rite, "New color specifications
 #: for ColorChecker SG and Classic charts" (2016).

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from simulator.camera_files import normalised_model, read_camera_file
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.utils.checks import check_integer, check_number, check_word
 
@@ -22,6 +23,8 @@ from simulator.utils.checks import check_integer, check_number, check_word
 LOW_CLIP = 2.0**-10
 #: A sample at or above this signal counts as clipped high.
 HIGH_CLIP = 1.0 - 1e-6
+#: Of a body whose file has none: `read_raw` takes those of the raw.
+_LEVELS_OF_MANY = {"cfa": "RGGB", "black_level": 1024, "white_level": 16383, "bit_depth": 14}
 #: Least and greatest ISO.
 _ISOS = (sys.float_info.min, sys.float_info.max)
 
@@ -235,6 +238,19 @@ def list_cameras() -> list[str]:
 
 
 def get_camera(name: str) -> CameraProfile:
-    """The built-in camera called `name`; a `ValueError` proposes the nearest one."""
-    check_word("camera", name, tuple(list_cameras()))
-    return _built_in()[name]
+    """The camera called `name`: a built-in one, or one of a file (`simulator.camera_files`).
+
+    A file's is ``"ctt:FILE"``, a tuning of Raspberry Pi's, ``"emva:FILE"``, flat fields, or
+    ``"darktable:MAKER MODEL"`` with the noise of darktable's profile: of a built-in camera all else
+    stays, another one has an RGGB array and levels of 14 bits unless options say more. A
+    `ValueError` proposes the nearest name.
+    """
+    fields = read_camera_file(name) if isinstance(name, str) else None
+    if fields is None:
+        check_word("camera", name, tuple(list_cameras()))
+        return _built_in()[name]
+    known = {normalised_model(c.make, c.model): c for c in _built_in().values()}
+    base = known.get(normalised_model(fields["make"], fields["model"]))
+    if base is None:
+        return CameraProfile(**{**_LEVELS_OF_MANY, **fields})
+    return replace(base, **{**fields, "make": base.make, "model": base.model})

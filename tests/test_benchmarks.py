@@ -18,7 +18,7 @@ from ae_env.scenes.load import simulate_source_raw
 from ae_env.scorers.score_table import ScoreTable
 from agents.cli.main import BENCHMARKS
 from agents.learning import training as learning
-from benchmarks import features, harness, paper, recorded, transfer
+from benchmarks import emva, features, harness, paper, recorded, transfer
 from benchmarks import paper_baselines as baselines
 from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.features import training
@@ -116,6 +116,7 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("ptc", "data"), "`folder` (='data')"),
         (("ptc", "--weights", "a"), "`--weights` (='a')"),
         (("throughput", "--against", "none"), "`--against` (='none')"),
+        (("emva", "runs"), "`folder` (="),
         (("recorded", "none"), "`scenes` (='recorded:"),
         (("recorded", "runs"), "`scenes` (='recorded:runs')"),
     ],
@@ -127,6 +128,32 @@ def test_errors_before_any_work(ae_env, benchmarks_here, arguments, named):
     assert (code, error.strip().count("\n")) == (2, 0), error
     assert named in error
     assert {path.name for path in benchmarks_here.iterdir()} == {"data", "runs"}
+
+
+def test_a_camera_of_counted_photons(benchmarks_here):
+    """12 bits, 0.2 DN an electron, 60 % of the photons, 2 DN of dark noise, as NumPy draws them."""
+    rng, size, (gain, efficiency, dark, black) = np.random.default_rng(0), 64, (0.2, 0.6, 2.0, 100)
+    photons = np.append(np.linspace(0.0, 40_000.0, 21), 50_000.0)
+    times = np.append(np.arange(21.0), 5.0)  # the last is of another measurement
+
+    def pairs(light):
+        electrons = rng.poisson(efficiency * light[:, None, None, None], (22, 2, size, size))
+        noisy = black + gain * electrons + dark * rng.standard_normal(electrons.shape)
+        return np.clip(np.rint(noisy), 0, 4095).astype(np.uint16)
+
+    light = {"bright_photons": photons, "bright_exposure_ns": times}
+    np.savez(benchmarks_here / "mine.npz", bright=pairs(photons), dark=pairs(0 * photons), **light)
+    emva.run(benchmarks_here / "out", folder=benchmarks_here)
+    (row,) = json.loads((benchmarks_here / "out" / "emva.json").read_text())["rows"]
+    known = [gain, 100 * efficiency, (dark**2 + 1 / 12) ** 0.5, dark / gain]
+    for kind in ("real", "simulated"):
+        found = row[kind]
+        assert [*found["estimate"].values()][:4] == pytest.approx(known, rel=0.02)
+        assert found["signal"][10] == pytest.approx(gain * efficiency * photons[10], rel=1e-3)
+        assert max(map(abs, [*found["estimate"].values()][6:])) < 0.2  # linear [%]
+        assert found["estimate"]["u_p_sat"] == pytest.approx(3995 / gain / efficiency, abs=2001)
+    assert len(row["real"]["signal"]) == 21
+    assert "| system gain K" in (benchmarks_here / "out" / "emva.md").read_text()
 
 
 # -- measures -------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ from simulator.utils.checks import NOTE, check_word
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
     *("agents", "bracketing", "cluster", "colour_checker", "curves", "defects", "denoising"),
-    *("features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
+    *("emva", "features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
     *("scorers", "simulator", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
@@ -50,7 +50,7 @@ def bench(
         Path | None,
         Argument(
             help="Of paper, required: sequences of captures (docs/dataset.md). Of recorded, "
-            "optional: recorded grids; by default those of the page."
+            "optional: recorded grids; by default those of the page. Of emva, optional: cameras."
         ),
     ] = None,
     out: Annotated[
@@ -97,7 +97,7 @@ def bench(
 _PARTS = {"places": ("posterior", "receptors", "curve"), "transfer": ("agents", "tables")}
 _TAKES = {
     "against": ("throughput",),
-    "folder": ("paper", "recorded"),
+    "folder": ("emva", "paper", "recorded"),
     "part": tuple(_PARTS),
     "weights": ("paper",),
 }

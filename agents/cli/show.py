@@ -217,6 +217,7 @@ def cameras() -> None:
         by = camera.source.partition(";")[0]
         rows.append((camera.name, f"{camera.make} {camera.model}", calibrated, by))
     _print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
+    print_line("others by a file: ctt:FILE, darktable:MAKER MODEL, emva:FILE (docs/cameras.md)")
 
 
 def lightings() -> None:

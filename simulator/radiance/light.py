@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.raw.develop import XYZ_FROM_SRGB
+from simulator.camera_files import XYZ_FROM_SRGB
 from simulator.reference.reference_camera import lens_blur, sample_mosaic
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 

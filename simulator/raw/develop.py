@@ -16,14 +16,13 @@ import torch
 import torch.nn.functional as F
 
 from simulator.camera import BayerPattern
+from simulator.camera_files import XYZ_FROM_SRGB
 from simulator.raw.image import RawImage, check_packed
 from simulator.utils.checks import check_number, check_type, check_word
 
 if TYPE_CHECKING:
     from PIL import Image
 
-#: Linear sRGB (D65) to CIE XYZ, IEC 61966-2-1:1999.
-XYZ_FROM_SRGB = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))
 #: Signal of an 18 % grey card in incident-light exposure: 0.18 * 0.6635 of sensor white.
 GREY_CARD_SIGNAL = 0.18 * 0.6635
 #: Schlick's parameter that shows that card at 18 % of the display's white.

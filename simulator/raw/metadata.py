@@ -11,7 +11,6 @@ import itertools
 import json
 import logging
 import math
-import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -276,17 +275,6 @@ def _read_at(stream: BinaryIO, offset: int, size: int) -> bytes:
 
 def _text(content: bytes) -> str:
     return content.split(b"\0")[0].decode("ascii", "replace").strip()
-
-
-def normalised_model(make: str, model: str) -> str:
-    """Make and model for comparison: lower case, letters and digits, the maker's name once.
-
-    >>> normalised_model("NIKON CORPORATION", "NIKON Z 6"), normalised_model("Nikon", "Z 6")
-    ('nikonz6', 'nikonz6')
-    """
-    words = re.findall(r"[a-z0-9]+", make.lower())
-    maker = words[0] if words else ""
-    return maker + "".join(re.findall(r"[a-z0-9]+", model.lower())).removeprefix(maker)
 
 
 # -- the meaning of DNG tags that LibRaw does not pass on -----------------------------------------

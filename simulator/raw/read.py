@@ -18,6 +18,7 @@ import numpy as np
 import rawpy
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
+from simulator.camera_files import normalised_model
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.dng import OPCODES, ORIENTATIONS, OwnRecord
 from simulator.raw.image import RawImage, pack_mosaic
@@ -29,7 +30,6 @@ from simulator.raw.metadata import (
     first_numbers,
     is_raw_container,
     missing_bytes,
-    normalised_model,
     numbers,
     plane_letters,
     read_black_level,

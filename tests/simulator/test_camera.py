@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
+from hypothesis import strategies as st
 
 import simulator
+from simulator import CameraSimulator, PreparedScene
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, snap_exposure_time
@@ -252,6 +255,24 @@ def test_unknown_names_propose_the_nearest() -> None:
     for wrong in ("qqqq", ["nikon_z6"]):
         with pytest.raises(ValueError, match=r"`camera` .*'canon_5d4', .*'sony_a7s2'"):
             get_camera(wrong)
+
+
+@pytest.mark.parametrize("name", list_cameras())
+@given(level=st.floats(0.05, 0.5), iso=st.floats(100, 800), stops=st.integers(1, 3))
+def test_more_gain_for_less_time_keeps_brightness_and_adds_noise(name, level, iso, stops):
+    """As Android's camera tests have it: the same mean, and variance that grows with gain.
+
+    Shot noise doubles with each stop; read noise grows less than its square."""
+    base = CameraSettings(iso, 1 / 64, 4)
+    other = replace(base, iso=iso * 2**stops, exposure_time=base.exposure_time / 2**stops)
+    light = torch.full((4, 64, 64), level)
+    scene = PreparedScene(light, base, get_camera(name), NoiseLevelFunction.zero())
+    simulator = CameraSimulator(device="cpu", cache=None)
+    frames = simulator.prepare(scene).expose([base, other], seed=0, noise="exact").double()
+    means, variances = frames.mean(dim=(1, 2, 3)), frames.var(dim=(1, 2, 3))
+    error = (variances.max() / light.numel()) ** 0.5
+    assert (means - level).abs().max() < 5 * error
+    assert 2 ** (0.8 * stops) < variances[1] / variances[0] < 2 ** (2 * stops)
 
 
 def test_public_names_are_all_there_is() -> None:
