@@ -24,7 +24,7 @@ from ae_env.options import EnvArguments, takes_env_arguments
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.vector_env import AutoExposureVectorEnv
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
 from simulator.settings import exposure_ratio
 from simulator.utils.checks import check_integer, check_number

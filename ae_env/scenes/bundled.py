@@ -18,7 +18,7 @@ import torch
 
 from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.radiance.depth import draw_layout
 from simulator.radiance.incident_light import picture_illuminance
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings

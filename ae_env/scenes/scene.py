@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
-from simulator.capture.prepared_scene import Layout, PreparedScene
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.incident_light import POSTERIOR, IncidentLight, known_light

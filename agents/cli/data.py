@@ -254,7 +254,6 @@ def _use_rest() -> None:
     from simulator.optics.discs import disc_blur
     from simulator.optics.motion import motion_blur
     from simulator.radiance.procedural import draw
-    from simulator.utils.compute import addresses
 
     library = find_scenes(DEFAULT_SCENES)
     viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))
@@ -268,5 +267,6 @@ def _use_rest() -> None:
     disc_blur(motion_blur(light, 2.5), 2.5)
     blurs = np.array([(0.0, 2.5, True, *[0] * 10)], BLUR)
     first = np.zeros(1, np.int64)
-    BlurredFrames(1, 1, 0).make(first, first, blurs, addresses([light]), tuple(light.shape))
+    frames = BlurredFrames(1, 1, 0)
+    frames.make(first, first, blurs, frames.places([light]))
     draw("dead_leaves", np.random.default_rng(0))  # the scenes may all have been in the cache

@@ -194,8 +194,7 @@ class CaptureBatch:
         places = self._frames.places(sources)
         if self._any_blurs:
             places = np.where(self._blurs[rows], self._blurred[rows], places)
-        light = self._frames.at(places, tuple(sources[0].shape))
-        return Transitions(light, self._table[rows], remaining)
+        return Transitions(self._frames.at(places), self._table[rows], remaining)
 
     def record(
         self,
@@ -316,9 +315,8 @@ class CaptureBatch:
                 parallel_ranges(lambda a, b: [*map(self._open, opens[a:b])], len(opens))
                 # Light that was opened before may have had the same address.
                 self._frames.release(np.array(opens) // len(self.states))
-            sources = self._source[rows]
-            light, shape = self._frames.places(sources), tuple(sources[0].shape)
-            made = self._frames.make(indices, self._slots[states], self._blur[rows], light, shape)
+            light = self._frames.places(self._source[rows])
+            made = self._frames.make(indices, self._slots[states], self._blur[rows], light)
             self._blurred[rows] = made
             for row in alone.tolist():
                 self._balance(row)
@@ -337,7 +335,7 @@ class CaptureBatch:
     def _balance(self, row: int) -> None:
         """Computes the excess variance where it depends on the pixels."""
         if np.isnan(self._excess_variance[row]):
-            light = self._frames.at(self._blurred[[row]], tuple(self._source[row].shape))[0]
+            light = self._frames.at(self._blurred[[row]])[0]
             self._excess_variance[row], _ = noise_balance(light.cpu(), self._exposure[row])
 
 

@@ -10,14 +10,17 @@ import ctypes
 import functools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
 import torch
+import torch.nn.functional as F
 
-from simulator.capture.decision import LIGHT_LIMIT
 from simulator.optics.discs import (
     DIAMETERS,
+    LIGHT_LIMIT,
     WIDE_PX,
     blend_rows,
     disc_image,
@@ -26,6 +29,7 @@ from simulator.optics.discs import (
     wide_disc,
 )
 from simulator.optics.motion import blur_apart, blur_rows, move_rows, streak_share, taps_of
+from simulator.utils.checks import check_number, check_type
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Addresses of arrays of a layout, 0 for none: (H, W) float32 diameters relative to the largest;
@@ -45,11 +49,120 @@ BLUR = np.dtype(
 )
 #: Samples of memory that are made at once, and of a frame whose planes are shared out.
 _SLAB, _LARGE = 2**20, 2**16
-#: Steps in which `Layout.shares` counts defocus, and a bit more than half of one.
-_HALF_STEP = np.float32(0.51 / 255)
+#: Levels that `Layout.shares` counts defocus in.
+_LEVELS = 255
+#: A bit more than half of a level.
+_HALF_STEP = np.float32(0.51 / _LEVELS)
 _KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
 _MOST, _TOP = np.float32(LIGHT_LIMIT), np.int64(0)  # of their types, lest they compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where a scene is out of focus, and where its subject is."""
+
+    #: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's `defocus`; 0 is
+    #: the plane of focus.
+    defocus: torch.Tensor
+    #: (H, W) bool, the subject's pixels, which may move apart from the rest, or None.
+    subject: torch.Tensor | None = None
+
+    def __post_init__(self) -> None:
+        found, mask = self.defocus, self.subject
+        check_type("defocus", found, torch.Tensor)
+        check_type("subject", mask, torch.Tensor, None)
+        if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
+            raise ValueError(f"`defocus` (shape {tuple(found.shape)}) must be (H, W) in [0, 1]")
+        object.__setattr__(self, "defocus", found.detach().float().cpu().contiguous())
+        if mask is None:
+            return
+        if mask.dtype != torch.bool or mask.shape != found.shape:
+            raise ValueError(
+                f"`subject` ({mask.dtype}, shape {tuple(mask.shape)}) must be bool of the shape of "
+                f"`defocus`, {tuple(found.shape)}"
+            )
+        count = int(mask.count_nonzero())
+        known = mask.cpu().contiguous() if 0 < count < mask.numel() else None
+        object.__setattr__(self, "subject", known)
+
+    @classmethod
+    def from_depth(cls, depth: torch.Tensor, distance: float, *, in_focus: float) -> Layout:
+        """The layout of a scene whose depth is known; the subject is what is in focus.
+
+        The circle of confusion goes with the difference of the inverse distances.
+
+        Args:
+            depth: (H, W) distance [m], above 0.
+            distance: At which the lens is focused [m].
+            in_focus: Largest relative circle of confusion of the subject.
+        """
+        if not isinstance(depth, torch.Tensor) or not bool((depth > 0.0).all()):
+            raise ValueError("`depth` must be a torch tensor with every value above 0 and not NaN")
+        if not 0.0 < distance < math.inf:
+            raise ValueError(f"`distance` (={distance}) must be above 0 and finite")
+        check_number("in_focus", in_focus, 0.0, 1.0)
+        apart = (1.0 / depth.double() - 1.0 / distance).abs()
+        relative = (apart / apart.max().clamp(min=1e-12)).float()
+        return cls(relative, relative <= in_focus)
+
+    def averaged(self, factor: int) -> Layout:
+        """Means over `factor` x `factor` pixels; the subject is where it has most of them."""
+
+        def mean(values: torch.Tensor) -> torch.Tensor:
+            return F.avg_pool2d(values[None].double(), factor)[0]
+
+        subject = None if self.subject is None else mean(self.subject) > 0.5
+        return Layout(mean(self.defocus).float().clamp(max=1.0), subject)
+
+    def cut(self, rows: slice, columns: slice) -> Layout:
+        """A window of it."""
+        subject = None if self.subject is None else self.subject[rows, columns]
+        return Layout(self.defocus[rows, columns], subject)
+
+    @cached_property
+    def shares(self) -> np.ndarray:
+        """(3, K) the pixels, counted by defocus (in steps of 1/255) and subject, in K sorts.
+
+        Their circle of confusion relative to the largest, whether they are the subject's, and
+        their share of all pixels.
+        """
+        levels = (self.defocus * _LEVELS).round().int().numpy()
+        if self.subject is not None:
+            levels = levels + (_LEVELS + 1) * self.subject.numpy()
+        sorts, counts = np.unique(levels, return_counts=True)
+        subject = sorts > _LEVELS
+        defocus = (sorts - (_LEVELS + 1) * subject) / _LEVELS
+        return np.stack([defocus, subject, counts / levels.size])
+
+    @cached_property
+    def mask(self) -> torch.Tensor:
+        """(1, H, W) float32, 1 where the subject is."""
+        assert self.subject is not None
+        return self.subject[None].float()
+
+    @cached_property
+    def behind(self) -> torch.Tensor:
+        """(H, W) int64, the pixel of the background nearest to each, counted row by row."""
+        from scipy.ndimage import distance_transform_edt  # not above: it takes long
+
+        assert self.subject is not None
+        rows, columns = distance_transform_edt(
+            self.subject.numpy(), return_distances=False, return_indices=True
+        )
+        return torch.from_numpy(rows.astype(np.int64) * self.subject.shape[1] + columns)
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Arrays that kernels find by their addresses: they never move, as tensors may.
+
+        (H, W) float32 `defocus`, and (K,) that of `shares`; of a subject also its (H, W) float32
+        `mask`, and int32 `behind`.
+        """
+        found = [self.defocus.numpy().copy(), self.shares[0].astype(np.float32)]
+        if self.subject is not None:
+            found += [self.mask.numpy().copy(), self.behind.numpy().astype(np.int32)]
+        return tuple(found)
 
 
 class FramesAt(Sequence[torch.Tensor]):
@@ -74,20 +187,24 @@ def frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class BlurredFrames:
-    """Blurred light of a batch's scenes, each frame (4, H, W), in memory that is used again.
+    """Blurred light of a batch's scenes, in memory that is used again.
 
     The light behind the lens is cached for each of `num_apertures`, and the discs that it is
-    blended of; where all memory together exceeds `most_bytes`, only the latest light. A frame is
-    known by its place, here the address of its memory; 0 is none.
+    blended of; where all memory together exceeds `most_bytes`, only the latest light. Frames are
+    (4, H, W), as the lights are that `places` is given. Each is known by its place, here the
+    address of its memory; 0 is none.
     """
 
     def __init__(self, num_scenes: int, num_apertures: int, most_bytes: int) -> None:
-        self._most_bytes, slots = most_bytes, (num_scenes, num_apertures)
-        # Places, and the light and the diameter that they were made of.
-        self._lens, self._source = np.zeros((2, *slots), np.uintp)
-        self._diameter = np.zeros(slots)
-        self._levels = np.zeros((num_scenes, len(DIAMETERS)), np.uintp)
-        self._levels_source, self._moved = np.zeros((2, num_scenes), np.uintp)
+        self._most_bytes, self._shape = most_bytes, tuple[int, ...]()
+        # Places that each scene holds: behind the lens at each aperture, behind each disc, in
+        # motion, and of its layout where that is a frame, too.
+        self._held = np.zeros((num_scenes, num_apertures + len(DIAMETERS) + 2), np.uintp)
+        self._lens, self._levels = self._held[:, :num_apertures], self._held[:, num_apertures:-2]
+        self._moved, self._layouts = self._held[:, -2], self._held[:, -1]
+        # The light, and the diameter of the disc, that they were made of.
+        self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
+        self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
 
     @property
@@ -97,60 +214,53 @@ class BlurredFrames:
 
     def places(self, lights: Sequence[torch.Tensor]) -> np.ndarray:
         """(B,) places of lights (4, H, W) of scenes, contiguous float32."""
+        self._shape = tuple(lights[0].shape)
         return addresses(lights)
 
-    def at(self, places: np.ndarray, shape: tuple[int, ...]) -> Sequence[torch.Tensor]:
-        """The frames at `places` (B,), each (4, H, W)."""
-        return FramesAt(places, shape)
+    def at(self, places: np.ndarray) -> Sequence[torch.Tensor]:
+        """The frames at `places` (B,)."""
+        return FramesAt(places, self._shape)
 
-    def kept(self, places: np.ndarray, shape: tuple[int, ...]) -> list[torch.Tensor]:
+    def kept(self, places: np.ndarray) -> list[torch.Tensor]:
         """The frames at `places` (B,) of this memory, which stays as long as any of them."""
         frames = {frame.data_ptr(): frame for slab in self._slabs for frame in slab}
         return [frames[place] for place in places.tolist()]
 
-    def _take(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
+    def _take(self, count: int) -> np.ndarray:
         """Places of memory for `count` frames."""
         lacking = count - len(self._free)
         if lacking > 0:
-            self._free = np.concatenate([self._free, self._more(lacking, shape)])
+            self._give_back(self._more(lacking))
         taken, self._free = np.split(self._free, [count])
         return taken
 
-    def _more(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
+    def _give_back(self, places: np.ndarray) -> None:
+        self._free = np.concatenate([self._free, places[places > 0]])
+
+    def _more(self, count: int) -> np.ndarray:
         """Places of new memory for `count` frames or more."""
-        spare = min(_SLAB, self._most_bytes // 4) // math.prod(shape)
-        slab = torch.empty(max(count, spare), *shape)
+        spare = min(_SLAB, self._most_bytes // 4) // math.prod(self._shape)
+        slab = torch.empty(max(count, spare), *self._shape)
         self._slabs.append(slab)
         return (slab.data_ptr() + np.arange(len(slab)) * slab[0].nbytes).astype(np.uintp)
 
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
-        indices = np.unique(indices)
-        self._release_levels(indices)
-        held = np.concatenate([self._lens[indices].ravel(), self._moved[indices]])
-        self._free = np.concatenate([self._free, held[held > 0]])
-        self._lens[indices] = self._moved[indices] = 0
-
-    def _release_levels(self, indices: np.ndarray) -> None:
-        held = self._levels[indices].ravel()
-        self._free = np.concatenate([self._free, held[held > 0]])
-        self._levels[indices] = 0
+        self._give_back(self._held[np.unique(indices)])
+        self._held[indices] = 0
 
     def _free_others(self, indices: np.ndarray, slots: np.ndarray) -> None:
-        """Frees all of the scenes `indices` but the light at the apertures `slots`."""
-        self._release_levels(indices)
-        others = self._lens[indices]
-        others[np.arange(len(indices)), slots] = 0
-        self._lens[indices] -= others
-        self._free = np.concatenate([self._free, others[others > 0]])
+        """Frees all of the scenes `indices` but the light at the apertures `slots`, and in motion.
+
+        Their layouts stay, too.
+        """
+        others = self._held[indices]
+        others[np.arange(len(indices)), slots] = others[:, -2:] = 0
+        self._held[indices] -= others
+        self._give_back(others)
 
     def make(
-        self,
-        indices: np.ndarray,
-        slots: np.ndarray,
-        blurs: np.ndarray,
-        source: np.ndarray,
-        shape: tuple[int, ...],
+        self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
     ) -> np.ndarray:
         """(K,) places of the light of scenes `indices` behind their blurs.
 
@@ -163,100 +273,80 @@ class BlurredFrames:
         behind_lens = blurs["defocus_px"] > 0.0
         known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
         known &= self._diameter[indices, slots] == blurs["defocus_px"]
-        new = np.flatnonzero(behind_lens & ~known)
-        if len(new):
-            self._focus(indices[new], slots[new], blurs[new], source[new], shape)
+        new = behind_lens & ~known
+        if new.any():
+            self._focus(indices[new], slots[new], blurs[new], source[new])
         light = np.where(behind_lens, self._lens[indices, slots], source)
-        moves = np.flatnonzero(blurs["motion_px"] > 0.0)
-        if len(moves):
-            some, blurs, source = indices[moves], blurs[moves], light[moves]
+        moves = blurs["motion_px"] > 0.0
+        if moves.any():
+            some, source = indices[moves], light[moves]
             lacking = some[self._moved[some] == 0]
-            self._moved[lacking] = self._take(len(lacking), shape)
+            self._moved[lacking] = self._take(len(lacking))
             light[moves] = self._moved[some]
-            self._move(some, blurs, source, self._moved[some], shape)
+            self._move(some, blurs[moves], source, light[moves])
         return light
 
     def _focus(
-        self,
-        indices: np.ndarray,
-        slots: np.ndarray,
-        blurs: np.ndarray,
-        source: np.ndarray,
-        shape: tuple[int, ...],
+        self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
     ) -> None:
         """Makes the light behind the lens, of scenes that are out of focus; see `make`."""
         lacking = self._lens[indices, slots] == 0
-        memory = self._take(int(lacking.sum()), shape)
-        self._lens[indices[lacking], slots[lacking]] = memory
+        self._lens[indices[lacking], slots[lacking]] = self._take(int(lacking.sum()))
         self._source[indices, slots] = source
         self._diameter[indices, slots] = blurs["defocus_px"]
         to, blends = self._lens[indices, slots], blurs["diameter"] > 0
         if blends.any():
-            levels = np.zeros((len(indices), len(DIAMETERS)), np.uintp)
-            made = indices[blends], blurs[blends], source[blends]
-            levels[blends] = self._made_levels(*made, shape)
-            self._blend(indices, blends, blurs, levels, to, shape)
+            own = indices[blends], blurs[blends]
+            self._blend(*own, self._made_levels(*own, source[blends]), to[blends])
         one = ~blends  # disc everywhere
-        self._blur(blurs["defocus_px"][one], source[one], to[one], shape)
+        self._blur(blurs["defocus_px"][one], source[one], to[one])
 
     def _made_levels(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, shape: tuple[int, ...]
+        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray
     ) -> np.ndarray:
         """(K, 13) places of the light of scenes behind the discs that their blend needs."""
-        stale = self._levels_source[indices] != source
-        self._release_levels(np.unique(indices[stale]))
+        stale = np.unique(indices[self._levels_source[indices] != source])
+        self._give_back(self._levels[stale])
+        self._levels[stale] = 0
         self._levels_source[indices] = source
         needed = np.zeros((len(indices), len(DIAMETERS)), bool)
         mark_needed(blurs, _KNOTS, needed)
         frame, level = np.nonzero(needed & (self._levels[indices] == 0))
         _, first = np.unique(indices[frame] * len(DIAMETERS) + level, return_index=True)
         frame, level = frame[first], level[first]
-        made = self._take(len(frame), shape)
+        made = self._take(len(frame))
         self._levels[indices[frame], level] = made
-        self._blur(np.array(DIAMETERS)[level], source[frame], made, shape)
+        self._blur(np.array(DIAMETERS)[level], source[frame], made)
         # Levels without a share are read too, times 0: any image does.
         levels = self._levels[indices]
         levels[:, 0] = source
         return np.where(levels == 0, source[:, None], levels)
 
-    # Each writes frames to the places `to` (K,): behind one disc, behind discs of the pixels' own
-    # (of the frames that `blends` (K,) marks), and moved.
-    def _blur(
-        self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray, shape: tuple[int, ...]
-    ) -> None:
+    # Each writes frames to the places `to` (K,): behind one disc, behind discs of the pixels' own,
+    # and moved.
+    def _blur(self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
         radii = np.zeros(len(diameters))
         for i, diameter in enumerate(diameters.tolist()):
             if diameter > WIDE_PX:
-                frames = frame_at(int(source[i]), shape), frame_at(int(to[i]), shape)
-                wide_disc(frames[0], diameter, LIGHT_LIMIT, frames[1])
+                light, out = (frame_at(int(at[i]), self._shape) for at in (source, to))
+                wide_disc(light, diameter, LIGHT_LIMIT, out)
             else:
                 radii[i] = _radius(diameter)
-        _run(blur_discs, radii, shape, source, to, radii)
+        _run(blur_discs, radii, self._shape, source, to, radii)
 
     def _blend(
-        self,
-        indices: np.ndarray,
-        blends: np.ndarray,
-        blurs: np.ndarray,
-        levels: np.ndarray,
-        to: np.ndarray,
-        shape: tuple[int, ...],
+        self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
     ) -> None:
-        _run(blend_discs, blends, shape, to, blurs, levels)
+        _run(blend_discs, np.ones(len(to)), self._shape, to, blurs, levels)
 
     def _move(
-        self,
-        indices: np.ndarray,
-        blurs: np.ndarray,
-        source: np.ndarray,
-        to: np.ndarray,
-        shape: tuple[int, ...],
+        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
         # Sums of taps take as long as these are many, twice as long with a subject.
         taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
         streaks = blurs["streaks"]
-        _run(move_along_rows, taps * streaks, shape, source, to, blurs)
-        _run(move_along_paths, taps * ~streaks, shape, source, to, blurs)
+        _run(move_along_rows, taps * streaks, self._shape, source, to, blurs)
+        _run(move_along_paths, taps * ~streaks, self._shape, source, to, blurs)
 
 
 _radius = functools.lru_cache(maxsize=4096)(disc_radius)
@@ -325,10 +415,8 @@ def blend_discs(  # type: ignore[no-untyped-def]
     samples, count = planes * height * width, max(planes // parts, 1)
     for unit in range(first, last):
         i, rows = order[unit // parts], _share(unit, parts, planes * height)
-        diameter, scale = (
-            _array_at(blurs[i].diameter, (height, width)),
-            np.float32(blurs[i].defocus_px),
-        )
+        diameter = _array_at(blurs[i].diameter, (height, width))
+        scale = np.float32(blurs[i].defocus_px)
         top, plane = rows[0] % height, rows[0] // height
         out = _array_at(to[i], (planes, height, width))[plane : plane + count]
         bottom, begin = top + (rows[1] - rows[0]) // count, plane * height * width

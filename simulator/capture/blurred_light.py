@@ -13,25 +13,21 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from simulator.capture.blurred_frames import BLUR, BlurredFrames
+from simulator.capture.blurred_frames import BLUR, BlurredFrames, Layout
 from simulator.capture.columns import blur_column
-from simulator.capture.decision import LIGHT_LIMIT, Exposure, Origin
+from simulator.capture.decision import Exposure, Origin
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
-from simulator.optics.discs import HALO, DiscBank, kernel_energy
+from simulator.optics.discs import HALO, LIGHT_LIMIT, DiscBank, kernel_energy
 from simulator.optics.motion import Path, Taps, path_blur, path_taps
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
-
-if TYPE_CHECKING:
-    from simulator.capture.prepared_scene import Layout
 
 #: Memory that the cached blurred light of one scene may take, and that its cached opened light may
 #: [byte].
@@ -279,14 +275,14 @@ class BlurredLight:
         if not len(todo):
             return result
         sources = [lights[i].float().contiguous() for i in todo]
-        shape, slots = tuple(sources[0].shape), np.arange(len(todo))
+        slots = np.arange(len(todo))
         frames = new_frames(len(todo), len(todo), 0, None if device.type == "cpu" else device)
         places = frames.places(sources)
         # One light behind several lenses shares discs; each motion has memory of its own.
         same = np.unique(places, return_inverse=True)[1]
         indices = np.where(blurs["motion_px"][todo] > 0.0, slots, same)
-        done = frames.make(indices, slots, blurs[todo], places, shape)
-        for i, light in zip(todo.tolist(), frames.kept(done, shape), strict=True):
+        done = frames.make(indices, slots, blurs[todo], places)
+        for i, light in zip(todo.tolist(), frames.kept(done), strict=True):
             result[i] = light
         return result
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.blurred_frames import BLUR, LAYOUT
+from simulator.capture.blurred_frames import BLUR, LAYOUT, Layout
 from simulator.capture.decision import (
     MAX_DISC_PX,
     RATIO_LIMIT,
@@ -33,7 +33,7 @@ from simulator.settings import CameraSettings
 from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
-    from simulator.capture.prepared_scene import Layout, PreparedScene
+    from simulator.capture.prepared_scene import PreparedScene
 
 #: All of a scene that the exposure of a capture depends on; see `PreparedScene`.
 SCENE = np.dtype(

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.statistics import DenoisedLight
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import kernel_energy
@@ -27,7 +28,7 @@ from simulator.utils.checks import check_number
 from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
-    from simulator.capture.prepared_scene import Layout, PreparedScene
+    from simulator.capture.prepared_scene import PreparedScene
 
 #: Error that a capture may have, in units of the target's noise: by default the distribution of a
 #: pixel may move by a tenth of its noise's standard deviation.
@@ -35,9 +36,6 @@ DEFAULT_TOLERANCE = 0.1
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
 SIGNAL_LIMIT = 1e6
-#: Light beyond this many times the reference's white is clipped before it is blurred: it is white
-#: at every exposure, and sums of larger numbers would no longer resolve the shadows.
-LIGHT_LIMIT = 1e9
 #: Exposure ratios are limited to this: float32 must hold them, and any two settings keep below.
 RATIO_LIMIT = 2.0**107
 #: Most negative signal that a companded 8-bit code shows; the offset under its square root.

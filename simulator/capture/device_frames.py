@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from simulator.capture.blurred_frames import BlurredFrames, frame_at
-from simulator.capture.decision import LIGHT_LIMIT
-from simulator.optics.discs import DIAMETERS, disc_blur
+from simulator.optics.discs import DIAMETERS, LIGHT_LIMIT, disc_blur
 from simulator.optics.motion import motion_blur, taps_of
 from simulator.utils.compute import kernel
 
@@ -37,9 +36,8 @@ class DeviceFrames(BlurredFrames):
         self._frames = torch.empty(0, device=device)
         # The lights of scenes by `id`, as long as they exist, and their places.
         self._known: dict[int, tuple[weakref.ref[Tensor], int]] = {}
-        # Places of each scene's layout as a frame: diameters, mask, pixels behind it; and the
-        # addresses of diameters and mask that they were copied from.
-        self._layouts, self._diameters, self._masks = np.zeros((3, num_scenes), np.uintp)
+        # Addresses of diameters and masks that the layouts were copied from.
+        self._diameters, self._masks = np.zeros((2, num_scenes), np.uintp)
 
     @property
     def is_full(self) -> bool:
@@ -48,10 +46,10 @@ class DeviceFrames(BlurredFrames):
 
     def places(self, lights: Sequence[Tensor]) -> np.ndarray:
         """(B,) places of lights (4, H, W) of scenes, which are copied when they are new."""
+        self._shape = tuple(lights[0].shape)
         new = {id(light): light for light in lights if self._place_of(light) == 0}
         if new:
-            shape = next(iter(new.values())).shape
-            made = self._take(len(new), tuple(shape))
+            made = self._take(len(new))
             self._put(made, list(new.values()))
             for (key, light), place in zip(new.items(), made.tolist(), strict=True):
                 self._known[key] = weakref.ref(light), place
@@ -61,20 +59,13 @@ class DeviceFrames(BlurredFrames):
         found = self._known.get(id(light))
         return found[1] if found is not None and found[0]() is light else 0
 
-    def at(self, places: np.ndarray, shape: tuple[int, ...]) -> Any:
+    def at(self, places: np.ndarray) -> Any:
         """The frames at `places` (B,), a copy (B, 4, H, W)."""
         return self._frames[self._numbers(places)]
 
-    def kept(self, places: np.ndarray, shape: tuple[int, ...]) -> list[Tensor]:
+    def kept(self, places: np.ndarray) -> list[Tensor]:
         """The same, one by one."""
-        return list(self.at(places, shape))
-
-    def release(self, indices: np.ndarray) -> None:
-        """Frees the memory of the scenes `indices`."""
-        super().release(indices)
-        held = self._layouts[np.unique(indices)]
-        self._free = np.concatenate([self._free, held[held > 0]])
-        self._layouts[indices] = 0
+        return list(self.at(places))
 
     def _numbers(self, places: np.ndarray) -> Tensor:
         return torch.from_numpy(places.astype(np.int64) - 1).to(self._frames.device)
@@ -82,7 +73,7 @@ class DeviceFrames(BlurredFrames):
     def _put(self, places: np.ndarray, frames: Sequence[Tensor]) -> None:
         self._frames[self._numbers(places)] = torch.stack(list(frames)).to(self._frames.device)
 
-    def _more(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
+    def _more(self, count: int) -> np.ndarray:
         # Lights of scenes that are gone come first.
         gone = {key: place for key, (light, place) in self._known.items() if light() is None}
         for key in gone:
@@ -92,8 +83,8 @@ class DeviceFrames(BlurredFrames):
         if lacking <= 0:
             return freed
         begin = len(old)
-        spare = max(begin // 2, min(_FRAMES, _SAMPLES // math.prod(shape)))
-        self._frames = old.new_empty(begin + max(lacking, spare), *shape)
+        spare = max(begin // 2, min(_FRAMES, _SAMPLES // math.prod(self._shape)))
+        self._frames = old.new_empty(begin + max(lacking, spare), *self._shape)
         if begin:
             self._frames[:begin] = old
         added = np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
@@ -101,9 +92,7 @@ class DeviceFrames(BlurredFrames):
 
     # -- passes -------------------------------------------------------------------------------
 
-    def _blur(
-        self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray, shape: tuple[int, ...]
-    ) -> None:
+    def _blur(self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
         for diameter in np.unique(diameters).tolist():
             alike = diameters == diameter
             light = self._clamped(source[alike])
@@ -113,16 +102,10 @@ class DeviceFrames(BlurredFrames):
         return self._frames[self._numbers(places)].clamp_(-LIGHT_LIMIT, LIGHT_LIMIT)
 
     def _blend(
-        self,
-        indices: np.ndarray,
-        blends: np.ndarray,
-        blurs: np.ndarray,
-        levels: np.ndarray,
-        to: np.ndarray,
-        shape: tuple[int, ...],
+        self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
     ) -> None:
-        for part in _parts(np.flatnonzero(blends), 2 * shape[0] * shape[1] * shape[2]):
-            maps = self._layout_frames(indices[part], blurs[part], shape)
+        for part in _parts(np.arange(len(to)), 2 * math.prod(self._shape)):
+            maps = self._layout_frames(indices[part], blurs[part])
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
             knots = _KNOTS.to(maps.device)
             squared = (maps[:, 0].flatten(1) * scale[:, None]).square_()
@@ -130,33 +113,31 @@ class DeviceFrames(BlurredFrames):
             below = torch.searchsorted(knots, squared, right=True).sub_(1).clamp_(0, len(knots) - 2)
             share = (squared - knots[below]) / (knots[below + 1] - knots[below])  # (K, H W)
             numbers = self._numbers(levels[part])
-            low, high = (self._pixels(numbers.gather(1, below + i), shape) for i in range(2))
+            low, high = (self._pixels(numbers.gather(1, below + i)) for i in range(2))
             blended = torch.lerp(low, high, share[:, None])
-            self._frames[self._numbers(to[part])] = blended.reshape(-1, *shape)
+            self._frames[self._numbers(to[part])] = blended.reshape(-1, *self._shape)
 
-    def _pixels(self, numbers: Tensor, shape: tuple[int, ...]) -> Tensor:
+    def _pixels(self, numbers: Tensor) -> Tensor:
         """(K, 4, H W) pixels, each of the frame at `numbers` (K, H W)."""
-        planes, size = shape[0], shape[1] * shape[2]
+        planes, size = self._shape[0], numbers.shape[1]
         first = (numbers * planes * size + torch.arange(size, device=numbers.device))[:, None]
         offsets = size * torch.arange(planes, device=numbers.device)[:, None]
         return self._frames.view(-1)[first + offsets]
 
-    def _layout_frames(
-        self, indices: np.ndarray, blurs: np.ndarray, shape: tuple[int, ...]
-    ) -> Tensor:
+    def _layout_frames(self, indices: np.ndarray, blurs: np.ndarray) -> Tensor:
         """(K, 4, H, W) diameters, masks, and pixels behind the subjects."""
         stale = (self._layouts[indices] == 0) | (self._diameters[indices] != blurs["diameter"])
         stale |= (blurs["mask"] > 0) & (self._masks[indices] != blurs["mask"])
         if stale.any():
             lacking = indices[stale & (self._layouts[indices] == 0)]
-            self._layouts[lacking] = self._take(len(lacking), shape)
-            frames = []
+            self._layouts[lacking] = self._take(len(lacking))
+            frames, plane = [], self._shape[1:]
             for blur in blurs[stale]:
-                frame = np.zeros(shape, np.float32)
-                frame[0] = frame_at(blur["diameter"].item(), shape[1:])
+                frame = np.zeros(self._shape, np.float32)
+                frame[0] = frame_at(blur["diameter"].item(), plane)
                 if blur["mask"]:
-                    frame[1] = frame_at(blur["mask"].item(), shape[1:])
-                    frame[2] = frame_at(blur["behind"].item(), shape[1:]).view(np.int32)
+                    frame[1] = frame_at(blur["mask"].item(), plane)
+                    frame[2] = frame_at(blur["behind"].item(), plane).view(np.int32)
                 frames.append(torch.from_numpy(frame))
             self._put(self._layouts[indices[stale]], frames)
             self._diameters[indices[stale]] = blurs["diameter"][stale]
@@ -164,14 +145,9 @@ class DeviceFrames(BlurredFrames):
         return self._frames[self._numbers(self._layouts[indices])]
 
     def _move(
-        self,
-        indices: np.ndarray,
-        blurs: np.ndarray,
-        source: np.ndarray,
-        to: np.ndarray,
-        shape: tuple[int, ...],
+        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
-        apart, samples = blurs["mask"] > 0, math.prod(shape)
+        apart, samples, plane = blurs["mask"] > 0, math.prod(self._shape), self._shape[1:]
         # Large frames one by one: the time of a streak's running sum is the same for all lengths.
         alone = blurs["streaks"] & (samples >= _ALONE)
         for i in np.flatnonzero(alone).tolist():
@@ -179,16 +155,16 @@ class DeviceFrames(BlurredFrames):
             self._frames[self._numbers(to[[i]])] = moved
         for part in _parts(np.flatnonzero(~apart & ~alone), _TOGETHER * samples):
             light = self._clamped(source[part])
-            moved = moved_sums(light, *tap_columns(blurs[part], False, *shape[1:]))
+            moved = moved_sums(light, *tap_columns(blurs[part], False, *plane))
             self._frames[self._numbers(to[part])] = moved
         for part in _parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
             # See `simulator.optics.motion.blur_apart`.
             light = self._clamped(source[part])
-            maps = self._layout_frames(indices[part], blurs[part], shape)
+            maps = self._layout_frames(indices[part], blurs[part])
             mask, behind = maps[:, 1:2], maps[:, 2:3].long().flatten(2)
-            back = light.flatten(2).gather(2, behind.expand(-1, shape[0], -1)).view_as(light)
-            back = moved_sums(back, *tap_columns(blurs[part], False, *shape[1:]))
-            own = tap_columns(blurs[part], True, *shape[1:])
+            back = light.flatten(2).gather(2, behind.expand(-1, light.shape[1], -1)).view_as(light)
+            back = moved_sums(back, *tap_columns(blurs[part], False, *plane))
+            own = tap_columns(blurs[part], True, *plane)
             front = moved_sums(torch.cat([light * mask, mask], dim=1), *own)
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
             self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import copy
-import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from simulator.camera import CameraProfile
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.columns import plan_sweep
 from simulator.capture.decision import DEFAULT_TOLERANCE, Exposure, check_tolerance, decide, disc_px
@@ -32,115 +30,6 @@ from simulator.utils.checks import check_number, check_type, check_word
 _TOGETHER_BYTES = 2**26
 #: Fastest image [frame heights per second]: even 1/1000 s smears it over the whole frame.
 MAX_IMAGE_SPEED = 1000.0
-#: Levels that `Layout.shares` counts defocus in.
-_LEVELS = 255
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Where a scene is out of focus, and where its subject is."""
-
-    #: (H, W) float32 in [0, 1], circle of confusion relative to that of a scene's `defocus`; 0 is
-    #: the plane of focus.
-    defocus: torch.Tensor
-    #: (H, W) bool, the subject's pixels, which may move apart from the rest, or None.
-    subject: torch.Tensor | None = None
-
-    def __post_init__(self) -> None:
-        found, mask = self.defocus, self.subject
-        check_type("defocus", found, torch.Tensor)
-        check_type("subject", mask, torch.Tensor, None)
-        if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
-            raise ValueError(f"`defocus` (shape {tuple(found.shape)}) must be (H, W) in [0, 1]")
-        object.__setattr__(self, "defocus", found.detach().float().cpu().contiguous())
-        if mask is None:
-            return
-        if mask.dtype != torch.bool or mask.shape != found.shape:
-            raise ValueError(
-                f"`subject` ({mask.dtype}, shape {tuple(mask.shape)}) must be bool of the shape of "
-                f"`defocus`, {tuple(found.shape)}"
-            )
-        count = int(mask.count_nonzero())
-        known = mask.cpu().contiguous() if 0 < count < mask.numel() else None
-        object.__setattr__(self, "subject", known)
-
-    @classmethod
-    def from_depth(cls, depth: torch.Tensor, distance: float, *, in_focus: float) -> Layout:
-        """The layout of a scene whose depth is known; the subject is what is in focus.
-
-        The circle of confusion goes with the difference of the inverse distances.
-
-        Args:
-            depth: (H, W) distance [m], above 0.
-            distance: At which the lens is focused [m].
-            in_focus: Largest relative circle of confusion of the subject.
-        """
-        if not isinstance(depth, torch.Tensor) or not bool((depth > 0.0).all()):
-            raise ValueError("`depth` must be a torch tensor with every value above 0 and not NaN")
-        if not 0.0 < distance < math.inf:
-            raise ValueError(f"`distance` (={distance}) must be above 0 and finite")
-        check_number("in_focus", in_focus, 0.0, 1.0)
-        apart = (1.0 / depth.double() - 1.0 / distance).abs()
-        relative = (apart / apart.max().clamp(min=1e-12)).float()
-        return cls(relative, relative <= in_focus)
-
-    def averaged(self, factor: int) -> Layout:
-        """Means over `factor` x `factor` pixels; the subject is where it has most of them."""
-
-        def mean(values: torch.Tensor) -> torch.Tensor:
-            return F.avg_pool2d(values[None].double(), factor)[0]
-
-        subject = None if self.subject is None else mean(self.subject) > 0.5
-        return Layout(mean(self.defocus).float().clamp(max=1.0), subject)
-
-    def cut(self, rows: slice, columns: slice) -> Layout:
-        """A window of it."""
-        subject = None if self.subject is None else self.subject[rows, columns]
-        return Layout(self.defocus[rows, columns], subject)
-
-    @cached_property
-    def shares(self) -> np.ndarray:
-        """(3, K) the pixels, counted by defocus (in steps of 1/255) and subject, in K sorts.
-
-        Their circle of confusion relative to the largest, whether they are the subject's, and
-        their share of all pixels.
-        """
-        levels = (self.defocus * _LEVELS).round().int().numpy()
-        if self.subject is not None:
-            levels = levels + (_LEVELS + 1) * self.subject.numpy()
-        sorts, counts = np.unique(levels, return_counts=True)
-        subject = sorts > _LEVELS
-        defocus = (sorts - (_LEVELS + 1) * subject) / _LEVELS
-        return np.stack([defocus, subject, counts / levels.size])
-
-    @cached_property
-    def mask(self) -> torch.Tensor:
-        """(1, H, W) float32, 1 where the subject is."""
-        assert self.subject is not None
-        return self.subject[None].float()
-
-    @cached_property
-    def behind(self) -> torch.Tensor:
-        """(H, W) int64, the pixel of the background nearest to each, counted row by row."""
-        from scipy.ndimage import distance_transform_edt  # not above: it takes long
-
-        assert self.subject is not None
-        rows, columns = distance_transform_edt(
-            self.subject.numpy(), return_distances=False, return_indices=True
-        )
-        return torch.from_numpy(rows.astype(np.int64) * self.subject.shape[1] + columns)
-
-    @cached_property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """Arrays that kernels find by their addresses: they never move, as tensors may.
-
-        (H, W) float32 `defocus`, and (K,) that of `shares`; of a subject also its (H, W) float32
-        `mask`, and int32 `behind`.
-        """
-        found = [self.defocus.numpy().copy(), self.shares[0].astype(np.float32)]
-        if self.subject is not None:
-            found += [self.mask.numpy().copy(), self.behind.numpy().astype(np.int32)]
-        return tuple(found)
 
 
 class HasPrepared(Protocol):

@@ -38,6 +38,9 @@ from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
+#: Light beyond this many times the reference's white is clipped before it is blurred: it is white
+#: at every exposure, and sums of larger numbers would no longer resolve the shadows.
+LIGHT_LIMIT = 1e9
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32
 #: Streaks longer than this [pixel] are not written out: they leave next to no noise in any case.

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from numpy.random import Generator
 
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.radiance.light import temperature_tint
 from simulator.radiance.procedural import (
     Drawing,

@@ -19,7 +19,7 @@ from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.merging import log_error, merge
 from ae_env.tasks import move_subject
 from simulator.camera import get_camera
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.radiance.light import WHITE_SIGNAL
 from tests.ae_env.environments import SMALL, assert_same, check_parity, make_env, make_envs

@@ -14,7 +14,7 @@ from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, exposure_ratio
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.networks.aperture_module import BLUR_FACTOR, DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 from simulator.radiance.light import camera_from_srgb, temperature_tint

@@ -19,7 +19,7 @@ from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.term_scores import TermScores
 from ae_env.scorers.terms import Highlights, Noise, Sharpness
 from simulator import NoiseLevelFunction
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.sensor import clip_and_quantise
 from simulator.optics.motion import Movement
 from tests.ae_env.scorer_images import CAMERA, GRID, Own, make_captures, make_scene, random_scene

@@ -27,7 +27,7 @@ from agents.evaluation.result import BRACKET_METRICS, Track, overall_ranking
 from agents.report import ae_bench, plots
 from agents.report.evaluation import code, code_block, escape, summary, to_markdown
 from agents.report.film import CHART, GAP, PICTURE, TITLE, record, write_film
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from tests.ae_env.environments import make_envs
 
 

@@ -14,16 +14,15 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_cam
 from simulator.capture import batch as batch_module
 from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
-from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import Transitions, noise_keys, record
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
 from simulator.optics.motion import Movement, motion_blur, motion_kernel, path_blur, path_taps
-from simulator.utils.compute import addresses
 from simulator.utils.tiles import make_tiles
 
 Z6 = get_camera("nikon_z6")
@@ -246,9 +245,9 @@ def test_many_images_are_scipys_correlation(threads, most_bytes, monkeypatch):
     lights[3][1, 5, 6], atol = -1e30, {1: 3000.0, 2: 300.0, 3: 300.0}
     frames = blurred_frames.BlurredFrames(9, 2, most_bytes)
     for used in (np.arange(7), np.array([5, 2]), np.arange(4)):
-        some = addresses([lights[i] for i in used])
-        made = frames.make(used + 1, np.zeros(len(used), int), blurs[used], some, shape)
-        for i, found in zip(used, blurred_frames.FramesAt(made, shape)[:], strict=True):
+        some = frames.places([lights[i] for i in used])
+        made = frames.make(used + 1, np.zeros(len(used), int), blurs[used], some)
+        for i, found in zip(used, frames.at(made), strict=True):
             rtol, clipped = 2e-4 if i == 0 else 1e-5, lights[i].double().clamp(-1e9, 1e9).numpy()
             weights = disc_kernel(blurs["defocus_px"][i])[None]
             wanted = correlate(clipped, weights, mode="nearest")

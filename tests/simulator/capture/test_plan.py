@@ -11,12 +11,12 @@ from scipy.integrate import quad
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
 from simulator.capture import statistics
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
 from simulator.capture.decision import Exposure
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
 from simulator.capture.plan import _BOUND, _LEAST_BOUND, KEPT_BLUR_ERROR, MISSED_BLUR
-from simulator.capture.prepared_scene import Layout
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.optics.motion import Movement
 

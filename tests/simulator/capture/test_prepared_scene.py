@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import prepared_scene
+from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.prepared_scene import Layout
 from simulator.capture.sensor import clip_and_quantise
 from simulator.capture.statistics import DenoisedLight
 from simulator.optics.thin_lens import Lens

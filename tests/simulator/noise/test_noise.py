@@ -19,7 +19,8 @@ from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture import sensor
-from simulator.capture.prepared_scene import Layout, PreparedScene
+from simulator.capture.blurred_frames import Layout
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import noise_keys, record
 from simulator.noise import noise_level_function as nlfs
 from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, philox
