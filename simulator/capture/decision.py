@@ -23,6 +23,7 @@ from simulator.capture.statistics import DenoisedLight
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import kernel_energy
 from simulator.optics.motion import Path
+from simulator.optics.vignetting import Vignetting
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
 from simulator.utils.compute import kernel
@@ -107,8 +108,8 @@ class Exposure:
     #: (H, W) share of the source's noise variance that the blurs leave, beyond `energy`: of all of
     #: them with a layout, else of `opened_to`; None for all.
     remaining_variance: torch.Tensor | None = None
-    #: (H, W) float32 share of the light that the lens leaves, see `PreparedScene.lens`; None for
-    #: all.
+    lens: Vignetting | None = None  # that darkens the frame, see `PreparedScene.lens`
+    #: (H, W) float32 share of the light that it leaves; None for all.
     vignetting: np.ndarray | None = field(default=None, compare=False)
     #: Whether a capture is wanted; else the light without noise, in which that of the source cannot
     #: count as part of the target's.
@@ -191,6 +192,7 @@ def decide(
         subject_path=subject_path,
         denoised=denoised,
         opened_to=f_number if aperture.runs else None,
+        lens=scene.lens,
         vignetting=vignetting,
         noise=noise,
         steps=(noise_reduction, aperture, defocus, motion_blur, _vignetting(scene, f_number)),

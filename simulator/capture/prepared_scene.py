@@ -292,7 +292,8 @@ class PreparedScene:
             order = sorted(range(len(kinds)), key=lambda i: ranks[kinds[i]])
             parts = [slice(i, i + 1) for i in order]
         for some in parts:
-            lights = self.blurred_light.lights(origins[some], blurs[some], self.layout)
+            owners = self.layout, self.lens
+            lights = self.blurred_light.lights(origins[some], blurs[some], owners)
             lights = [light.contiguous() for light in lights]
             shares = None if remaining is None else remaining[some]
             yield some, Transitions(lights, table[some], shares)
