@@ -114,7 +114,7 @@ class Exposure:
     #: Whether a capture is wanted; else the light without noise, in which that of the source cannot
     #: count as part of the target's.
     noise: bool = True
-    #: Noise reduction, aperture, defocus, motion blur and vignetting, in the order in which they run.
+    #: Noise reduction, aperture, defocus, motion blur, vignetting, in the order in which they run.
     steps: tuple[Step, ...] = field(default=(), compare=False)
 
     @cached_property
