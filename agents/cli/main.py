@@ -36,7 +36,7 @@ from simulator.utils.checks import NOTE, check_word
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
-    *("agents", "bracketing", "cluster", "colour_checker", "curves", "defects", "denoising"),
+    *("agents", "bodies", "bracketing", "cluster", "colour_checker", "curves", "defects", "denoising"),
     *("features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
     *("scorers", "simulator", "throughput", "transfer", "work_precision"),
 )
