@@ -167,7 +167,8 @@ class AutoExposure(Task):
             gain = episodes.gain(env_index, 0.0)[0]
             moment = (gain,)
         # All that a table depends on: tables of episodes that were seen before are cached.
-        key = (episode.scene, episode.speed, episode.defocus, episode.movement, moment)
+        lens = episodes.lens(env_index)
+        key = (episode.scene, episode.speed, episode.defocus, episode.movement, moment, lens)
         table = self._tables.get(key)
         if table is None:
             if lighting.within_frame:
@@ -476,6 +477,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `delay` | 0 | frames between an action and the first capture that has it; a mapping by control, such as `{"exposure_time": 2, "iso": 1}`, where some are slower |
     | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |
     | `camera` | `"nikon_z6"` | built-in camera, `"ctt:FILE"`, `"darktable:MAKER MODEL"`, `"emva:FILE"`, or a `CameraProfile` |
+    | `lens` | `None` | whose vignetting frames have: `"lensfun:NAME"` (extra `lens`), a `Vignetting`, or `"random"`: one of 64 for each episode; `None`: none |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
     | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.capture.sensor`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |

@@ -26,6 +26,7 @@ from simulator.camera import CameraProfile, get_camera
 from simulator.capture.decision import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.decision import MAX_DISC_PX, check_tolerance
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED
+from simulator.optics.vignetting import Vignetting, get_lens
 from simulator.utils.checks import (
     check_flag,
     check_integer,
@@ -46,6 +47,8 @@ Noise = Literal["bank", "exact", "sensor"]
 Reward = Literal["capture", "expected"]
 #: What is known of a scene: its light, or one photograph of it.
 Source = Literal["light", "raw"]
+#: `lens` that every episode draws.
+RANDOM_LENS = "random"
 #: Longest delay [frame], and the names of what may have its own.
 MAX_DELAY, CONTROLS = 16, ("iso", "exposure_time", "f_number")
 #: Relative tolerance of the range of settings, because nominal ones are rounded: 1/30 s for 1/32 s.
@@ -73,6 +76,7 @@ class EnvArguments(TypedDict, total=False):
     delay: int | Mapping[str, int]
     source: Source
     camera: str | CameraProfile
+    lens: str | Vignetting | None
     simulator: str | None
     noise: bool | Noise
     tolerance: float
@@ -102,6 +106,7 @@ class EnvOptions:
     delay: int | Mapping[str, int] = 0
     source: Source = "light"
     camera: str | CameraProfile = "nikon_z6"
+    lens: str | Vignetting | None = None
     simulator: str | None = DEFAULT_SIMULATOR
     noise: bool | Noise = True
     tolerance: float = DEFAULT_TOLERANCE
@@ -157,6 +162,7 @@ class EnvOptions:
                 raise ValueError(
                     "`device` (='meta') must be one that holds numbers, such as 'cuda'"
                 )
+        self.make_lens()
         if self.recorded is not None:
             self._check_recorded()
 
@@ -164,7 +170,7 @@ class EnvOptions:
         """Real captures have the light, the motion and the noise that they have."""
         defaults: dict[str, tuple[Any, ...]] = {"lighting": ("static",), "source": ("light",)}
         defaults |= {"motion": ("random", "none"), "depth": ("random", "far"), "noise": (True,)}
-        defaults["device"] = (None,)
+        defaults |= {"device": (None,), "lens": (None,)}
         for name, allowed in defaults.items():
             value = getattr(self, name)
             if not any(value is word or value == word for word in allowed):
@@ -223,6 +229,10 @@ class EnvOptions:
         if self.noise == "sensor":
             camera.read_noise(100.0)  # raises where there is no such calibration
         return camera if self.recorded is None else self.recorded.camera(camera)
+
+    def make_lens(self) -> Vignetting | None:
+        """The lens of all episodes; None for none, or one of its own for each."""
+        return None if self.lens == RANDOM_LENS else get_lens(self.lens)
 
     def make_scorer(self) -> CompositeScorer:
         """The scorer."""

@@ -36,6 +36,7 @@ from simulator.networks.noise_module import (
 )
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DISC_REACH
+from simulator.optics.vignetting import Vignetting, get_lens
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
@@ -62,6 +63,7 @@ class SceneArguments(TypedDict, total=False):
     image_speed: float | None
     defocus: float | None
     depth: Depth
+    lens: str | Vignetting | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +226,7 @@ class CameraSimulator:
         image_speed: float | None = None,
         defocus: float | None = None,
         depth: Depth = "far",
+        lens: str | Vignetting | None = None,
         tolerance: float | Literal["source"] = "source",
     ) -> PreparedScene:
         """Everything that does not depend on the target settings, done once, when first needed.
@@ -239,6 +242,9 @@ class CameraSimulator:
                 takes the scene as far or in focus throughout, where every aperture is exact.
             depth: ``"unknown"`` lets the aperture module find what is out of focus, and blur that
                 more where the aperture opens; ``"far"`` takes the scene as in focus throughout.
+            lens: Whose vignetting captures have (`simulator.optics.vignetting.get_lens`), such as
+                ``"lensfun:Canon EF 24-70mm f/2.8L II USM"``; by default the source's own. A raw
+                was taken through it: only what the f-number changes is changed.
             tolerance: Error that a capture may have, in units of the target's noise: the cheapest
                 steps that keep it are taken, or else, as at 0, those with the least error. By
                 default what the source was prepared with, `DEFAULT_TOLERANCE` for a raw or a scene.
@@ -248,7 +254,7 @@ class CameraSimulator:
             raise ValueError(
                 "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
             )
-        prepared = self._seen(source, image_speed, defocus)
+        prepared = self._seen(source, image_speed, defocus, lens)
         if tolerance != "source":
             prepared = replace(prepared, tolerance=tolerance)
         # A prepared scene may be corrected already; a scene is no recording of this body.
@@ -270,11 +276,17 @@ class CameraSimulator:
         return prepared
 
     def _seen(
-        self, source: Source, image_speed: float | None, defocus: float | None
+        self,
+        source: Source,
+        image_speed: float | None,
+        defocus: float | None,
+        lens: str | Vignetting | None,
     ) -> PreparedScene:
-        """The source's light, with its motion and blur unless they are None."""
-        given = {"image_speed": image_speed, "defocus": defocus}
+        """The source's light, with its motion, blur and lens unless they are None."""
+        given = {"image_speed": image_speed, "defocus": defocus, "lens": get_lens(lens)}
         known: Any = {name: value for name, value in given.items() if value is not None}
+        if lens is not None and isinstance(source, RawImage):
+            known["seen_through_lens"] = True
         prepared = prepared_of(source, self.device)
         return replace(prepared, **known) if known else prepared
 
@@ -433,6 +445,7 @@ class CameraSimulator:
         image_speed: float | None = None,
         defocus: float | None = None,
         depth: Depth = "unknown",
+        lens: str | Vignetting | None = None,
     ) -> Stages:
         """Runs the whole pipeline on one source, every module for this very transition.
 
@@ -441,7 +454,7 @@ class CameraSimulator:
         `ValueError` if this simulator has no networks, or an argument is out of range.
 
         Args:
-            source, image_speed, defocus, depth: See `prepare`.
+            source, image_speed, defocus, depth, lens: See `prepare`.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
@@ -449,7 +462,7 @@ class CameraSimulator:
         noise, aperture = _required("noise", self.noise), _required("aperture", self.aperture)
         check_word("depth", depth, get_args(Depth))
         keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
-        prepared = self._seen(source, image_speed, defocus)
+        prepared = self._seen(source, image_speed, defocus, lens)
         # A prepared scene may be corrected already; a scene is no recording of this body.
         module = self.exposure if isinstance(source, RawImage) else ExposureModule().to(self.device)
         # What networks found out about the scene is not used.

@@ -353,16 +353,18 @@ class EpisodeCore:
         if env_index < 0:
             return self._prepared_at_rest(light_index)
         episode, displaced = self.episodes[env_index], self.task.displaced(env_index)
+        lens = self.episodes.lens(env_index)
         if displaced is None:
-            return in_episode(self._prepared_at_rest(episode.scene), **episode.moves)
+            prepared = in_episode(self._prepared_at_rest(episode.scene), **episode.moves)
+            return prepared if lens is prepared.lens else prepared.changed(lens=lens)
         prepared = prepare_scene(displaced, self.camera, **episode.moves)
-        return prepared.changed(tolerance=self.options.tolerance)
+        return prepared.changed(tolerance=self.options.tolerance, lens=lens)
 
     def _prepared_at_rest(self, scene: int) -> PreparedScene:
         prepared = self._at_rest.get(scene)
         if prepared is None:
-            prepared = prepare_scene(self.scenes[scene], self.camera)
-            prepared = prepared.changed(tolerance=self.options.tolerance)
+            options, prepared = self.options, prepare_scene(self.scenes[scene], self.camera)
+            prepared = prepared.changed(tolerance=options.tolerance, lens=options.make_lens())
             if prepared.aperture_blur is None:  # which caches too much light to stay for long
                 self._at_rest[scene] = prepared
         return prepared

@@ -13,11 +13,13 @@ from scipy.special import ndtri
 from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, RollingShutter
-from ae_env.options import EnvOptions
+from ae_env.options import RANDOM_LENS, EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
+from simulator.capture.sensor import noise_keys
 from simulator.optics.motion import Movement
+from simulator.optics.vignetting import RANDOM_LENSES, Vignetting, random_lens
 from simulator.utils.checks import check_integer, check_key, did_you_mean
 
 #: Share of the episodes in which nothing moves.
@@ -102,6 +104,7 @@ class Episodes:
         self.grid: ExposureGrid = options.make_grid()
         self.camera: CameraProfile = options.make_camera()
         self.lighting: Lighting = options.make_lighting()
+        self._lens = options.make_lens()
         self.static = type(self.lighting) is Lighting
         self.scenes = options.scenes_on_demand() if scenes is None else SceneSet.of(scenes)
         # With one delay of all controls a state needs not be put together.
@@ -290,7 +293,8 @@ class Episodes:
             moves = self.speed[env_indices] > 0.0
             moves |= self.subject_speed[env_indices] > 0.0
             moves |= self.defocus[env_indices] > 0.0
-            own = np.where(moves | self._has_map[scenes], own, scenes)
+            apart = moves | self._has_map[scenes] | (self.options.lens == RANDOM_LENS)
+            own = np.where(apart, own, scenes)
         self.light_index[env_indices] = own
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -307,6 +311,13 @@ class Episodes:
 
     def __getitem__(self, env_index: int) -> Episode:
         return Episode(**{name: getattr(self, name).item(env_index) for name in _FIELDS})
+
+    def lens(self, env_index: int) -> Vignetting | None:
+        """Lens of an episode; a function of its seed where it is drawn."""
+        if self.options.lens != RANDOM_LENS:
+            return self._lens
+        seed = self.noise_seed[env_index : env_index + 1]
+        return random_lens(int(noise_keys(seed, 0.5)[0] % RANDOM_LENSES))
 
     def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
         """Light of an exposure [s] in an episode's current frame, relative to its scene's own.

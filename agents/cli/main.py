@@ -36,9 +36,9 @@ from simulator.utils.checks import NOTE, check_word
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
-    *("agents", "bracketing", "cluster", "colour_checker", "curves", "defects", "denoising"),
-    *("emva", "features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
-    *("scorers", "simulator", "throughput", "transfer", "work_precision"),
+    *("agents", "bodies", "bracketing", "cluster", "colour_checker", "curves", "defects"),
+    *("denoising", "emva", "features", "hdr", "onboard", "paper", "ptc", "places", "recorded"),
+    *("refocus", "scorers", "simulator", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]

@@ -28,6 +28,7 @@ from simulator.capture.columns import (
     scene_column,
     state_columns,
     statistics_column,
+    vignetting_column,
 )
 from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
@@ -38,7 +39,7 @@ from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
-_STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
+_STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "vignetting", "noise")
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
@@ -137,6 +138,7 @@ class CaptureBatch:
         self._scenes: dict[int, PreparedScene] = {}
         self._scene_columns = np.zeros(num_scenes, SCENE)
         self._statistics = np.zeros((num_scenes, 4, 4, BINS))
+        self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._in_columns, self._light = np.zeros(num_scenes, bool), np.empty(num_scenes, object)
         # Row of the blurred light that each scene has at present.
         self._blurred_row = np.full(num_scenes, -1)
@@ -250,6 +252,7 @@ class CaptureBatch:
         box = scene.box_factor
         if box not in self._targets:
             self._targets[box] = noise_columns(self.camera, self.states, box)
+        self._vignetting[index] = vignetting_column(scene, self.states)
         self._in_columns[index] = fits_columns(scene, self._columns)
         if self._in_columns[index]:
             self._scene_columns[index] = scene_column(scene, list(self._targets).index(box))
@@ -273,10 +276,13 @@ class CaptureBatch:
             targets, height = np.stack([*self._targets.values()]), self._light[indices[0]].shape[-2]
             plan_frames(*known, targets, height, indices[inside], planned, gains[inside], *columns)
             blur = self._blur[planned]
-            defocus, motion = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0
-            found = (self.noise is not None) * _BIT["noise"] + defocus * _BIT["defocus"]
-            self._modules[planned] = found + motion * _BIT["motion_blur"]
-            self._blurs[planned] = defocus | motion
+            darkened = self._vignetting[indices[inside], planned % len(self.states)]
+            self._blur["vignetting"][planned] = darkened
+            runs = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0, darkened > 0
+            bits = (_BIT[name] for name in ("defocus", "motion_blur", "vignetting"))
+            found = sum(bit * own for bit, own in zip(bits, runs, strict=True))
+            self._modules[planned] = found + (self.noise is not None) * _BIT["noise"]
+            self._blurs[planned] = np.logical_or.reduce(runs)
             self._excess_variance[planned] = 0.0
         self._any_blurs |= bool(self._blurs[rows].any())
         self._gain[rows] = gains  # last: what is interrupted stays unknown
@@ -286,7 +292,8 @@ class CaptureBatch:
         """Works out a row for a scene with noise of its own, or one whose aperture opens."""
         noisy, settings = self.noise is not None, self.states[row % len(self.states)]
         exposure = decide(scene, settings, gain=gain)
-        self._blurs[row] = exposure.defocus_px or exposure.motion_px or exposure.opened_to
+        blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to
+        self._blurs[row] = blurs or exposure.vignetting is not None
         self._exposure[row], self._any_remaining = exposure, True
         self._blur[row] = blur_column(exposure)
         remaining = exposure.remaining_variance

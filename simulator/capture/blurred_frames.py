@@ -45,6 +45,7 @@ BLUR = np.dtype(
         # The background's path, see `simulator.optics.motion.Path`; and how the subject drifts.
         *((n, "f8") for n in ("extent", "direction", "turn", "drift_x", "drift_y")),
         *LAYOUT,
+        ("vignetting", "uintp"),  # address of the (H, W) float32 share of light left; 0 for all
     ]
 )
 #: Samples of memory that are made at once, and of a frame whose planes are shared out.
@@ -273,11 +274,21 @@ class BlurredFrames:
         moves = blurs["motion_px"] > 0.0
         if moves.any():
             some, source = indices[moves], light[moves]
-            lacking = some[self._moved[some] == 0]
-            self._moved[lacking] = self._take(len(lacking))
+            self._give_memory(some)
             light[moves] = self._moved[some]
             self._move(some, blurs[moves], source, light[moves])
+        darkened = blurs["vignetting"] > 0
+        if darkened.any():
+            some, source = indices[darkened], light[darkened]
+            self._give_memory(some)
+            light[darkened] = self._moved[some]
+            self._darken(blurs["vignetting"][darkened], source, light[darkened])
         return light
+
+    def _give_memory(self, indices: np.ndarray) -> None:
+        """Gives the scenes `indices` memory for light of their own, which motion or lens change."""
+        lacking = indices[self._moved[indices] == 0]
+        self._moved[lacking] = self._take(len(lacking))
 
     def _focus(
         self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
@@ -340,6 +351,10 @@ class BlurredFrames:
         streaks = blurs["streaks"]
         _run(move_along_rows, taps * streaks, self._shape, source, to, blurs)
         _run(move_along_paths, taps * ~streaks, self._shape, source, to, blurs)
+
+    def _darken(self, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+        """Writes the light of the places `source`, times the maps at `vignetting`, to `to`."""
+        _run(darken, np.ones(len(to)), self._shape, source, to, vignetting)
 
 
 _radius = functools.lru_cache(maxsize=4096)(disc_radius)
@@ -427,6 +442,21 @@ def move_along_rows(  # type: ignore[no-untyped-def]
         n, share = streak_share(blurs[i].motion_px)
         image, out = _array_at(light[i], shape), _array_at(to[i], shape)
         move_rows(rows[0], rows[1], image, n, share, _MOST, out)
+
+
+@_jit()
+def darken(  # type: ignore[no-untyped-def]
+    first, last, order, parts, planes, height, width, light, to, vignetting
+):
+    """Light through a lens with vignetting."""
+    shape = planes * height, width
+    for unit in range(first, last):
+        i, rows = order[unit // parts], _share(unit, parts, shape[0])
+        image, out = _array_at(light[i], shape), _array_at(to[i], shape)
+        left = _array_at(vignetting[i], (height, width))
+        for y in range(rows[0], rows[1]):
+            for x in range(width):
+                out[y, x] = image[y, x] * left[y % height, x]
 
 
 @_jit()

@@ -26,6 +26,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
 from simulator.optics.discs import HALO, LIGHT_LIMIT, DiscBank, kernel_energy
 from simulator.optics.motion import Path, Taps, path_blur, path_taps
+from simulator.optics.vignetting import Vignetting
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
 
@@ -236,29 +237,32 @@ class BlurredLight:
     def blurred(self, exposure: Exposure) -> Tensor:
         """The light (4, H, W) with every blur of `exposure`; see `lights`."""
         blurs = np.array([blur_column(exposure)], BLUR)
-        return self.lights([exposure.origin], blurs, exposure.layout)[0]
+        return self.lights([exposure.origin], blurs, (exposure.layout, exposure.lens))[0]
 
     def lights(
-        self, origins: Sequence[Origin], blurs: np.ndarray, layout: Layout | None
+        self,
+        origins: Sequence[Origin],
+        blurs: np.ndarray,
+        owners: tuple[Layout | None, Vignetting | None],
     ) -> list[Tensor]:
         """Lights (4, H, W) with the `blurs` (N,) `BLUR`, not exposed yet; not to be changed.
 
-        Those that are alike are one. `layout` is the one whose addresses the `blurs` have.
+        Those that are alike are one. The `blurs` have addresses of arrays of the `owners`.
         """
-        if not (blurs["defocus_px"] + blurs["motion_px"]).any():
+        if not (blurs["defocus_px"] + blurs["motion_px"] + blurs["vignetting"]).any():
             return [self.source(origin) for origin in origins]
         lens, fields = np.zeros_like(blurs), ["defocus_px", "diameter", "sorts", "num_sorts"]
         lens[fields] = blurs[fields]
-        moves = blurs["motion_px"] > 0.0
-        blurs = np.where(moves, blurs, lens)
+        changes = _changes(blurs)
+        blurs = np.where(changes, blurs, lens)
         numbers = blurs.view(f"V{BLUR.itemsize}").tolist()
-        keys = [(*key, layout) for key in zip(origins, numbers, strict=True)]
+        keys = [(*key, owners) for key in zip(origins, numbers, strict=True)]
         found = {key: self._cache.get(key) for key in set(keys)}
         some = [*{key: row for row, key in enumerate(keys) if found[key] is None}.values()]
         if some:
             own, origins = blurs[some], [origins[row] for row in some]
-            if moves[some].any():  # it starts from the light behind the lens
-                lights, own["defocus_px"] = self.lights(origins, lens[some], layout), 0.0
+            if changes[some].any():  # it starts from what is out of focus
+                lights, own["defocus_px"] = self.lights(origins, lens[some], owners), 0.0
             else:
                 lights = [self.source(origin) for origin in origins]
             made = self._made(lights, own)
@@ -269,18 +273,18 @@ class BlurredLight:
         return [found[key] for key in keys]  # type: ignore[misc]
 
     def _made(self, lights: list[Tensor], blurs: np.ndarray) -> list[Tensor]:
-        """Lights (4, H, W) behind lenses or in motion; those without blur as they are."""
+        """Lights (4, H, W) out of focus, or in motion and darkened; the others as they are."""
         result, device = [*lights], self.light.device
-        todo = np.flatnonzero((blurs["defocus_px"] > 0.0) | (blurs["motion_px"] > 0.0))
+        todo = np.flatnonzero((blurs["defocus_px"] > 0.0) | _changes(blurs))
         if not len(todo):
             return result
         sources = [lights[i].float().contiguous() for i in todo]
         slots = np.arange(len(todo))
         frames = new_frames(len(todo), len(todo), 0, None if device.type == "cpu" else device)
         places = frames.places(sources)
-        # One light behind several lenses shares discs; each motion has memory of its own.
+        # One light out of focus shares discs; each motion or vignetting has memory of its own.
         same = np.unique(places, return_inverse=True)[1]
-        indices = np.where(blurs["motion_px"][todo] > 0.0, slots, same)
+        indices = np.where(_changes(blurs[todo]), slots, same)
         done = frames.make(indices, slots, blurs[todo], places)
         for i, light in zip(todo.tolist(), frames.kept(done), strict=True):
             result[i] = light
@@ -293,7 +297,7 @@ class BlurredLight:
         left: Tensor | None = None
         path, layout, defocus_px = exposure.path, exposure.layout, exposure.defocus_px
         blurs = exposure.motion_px or defocus_px or exposure.subject_path
-        if not blurs and exposure.opened_to is None:
+        if not blurs and exposure.opened_to is None and exposure.vignetting is None:
             return exposure  # nothing averages it
         if path is None and exposure.motion_px:
             path = Path(exposure.motion_px)
@@ -311,7 +315,17 @@ class BlurredLight:
                 # averages it further. Both together leave about what the larger leaves alone.
                 opened = (share / energy).clamp(max=1.0)
                 left = opened if left is None else torch.minimum(left, opened)
+        if exposure.vignetting is not None:
+            # The variance goes with the square of the share r, its top-up with r: exact for shot
+            # noise, and off by r (1 - r) of the source's read noise (`Transitions.in_bands`).
+            share = torch.from_numpy(exposure.vignetting).to(self.light.device)
+            left = share if left is None else left * share
         return replace(exposure, energy=energy, remaining_variance=left)
+
+
+def _changes(blurs: np.ndarray) -> np.ndarray:
+    """(N,) which of the blurs change what is behind the disc of defocus."""
+    return np.asarray((blurs["motion_px"] > 0.0) | (blurs["vignetting"] > 0))
 
 
 def new_frames(

@@ -94,6 +94,17 @@ def scene_column(scene: PreparedScene, targets: int) -> tuple[Any, ...]:
     )
 
 
+def vignetting_column(scene: PreparedScene, states: Sequence[CameraSettings]) -> np.ndarray:
+    """(S,) uintp addresses of the vignetting of captures, 0 for none; the lens keeps its maps."""
+    if scene.lens is None:
+        return np.zeros(len(states), np.uintp)
+    return np.array([_address(scene.vignetting(s.effective_f_number)) for s in states], np.uintp)
+
+
+def _address(array: np.ndarray | None) -> int:
+    return 0 if array is None else array.ctypes.data
+
+
 def blur_column(exposure: Exposure) -> tuple[Any, ...]:
     """The `BLUR` of an exposure."""
     path, own = exposure.path, exposure.subject_path
@@ -101,7 +112,8 @@ def blur_column(exposure: Exposure) -> tuple[Any, ...]:
         path = Path(exposure.motion_px)
     drift = (0.0, 0.0) if own is None else own[3:]
     numbers = exposure.defocus_px, exposure.motion_px, exposure.path is None
-    return (*numbers, *path[:3], *drift, *_addresses(exposure.layout, own is not None))
+    layout = _addresses(exposure.layout, own is not None)
+    return (*numbers, *path[:3], *drift, *layout, _address(exposure.vignetting))
 
 
 def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
@@ -175,9 +187,10 @@ def plan_sweep(
         pairs = zip(states, gains.tolist(), strict=True)
         exposures = [decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
         # Of one scene, how far it moves tells its path.
-        kinds = {(exposure.defocus_px, exposure.motion_px): exposure for exposure in exposures}
+        keys = [(e.defocus_px, e.motion_px, _address(e.vignetting)) for e in exposures]
+        kinds = dict(zip(keys, exposures, strict=True))
         numbers = {kind: number for number, kind in enumerate(kinds)}
-        which = [numbers[exposure.defocus_px, exposure.motion_px] for exposure in exposures]
+        which = [numbers[key] for key in keys]
         blurs = np.array([*map(blur_column, kinds.values())], BLUR)[which]
         left = (exposure.remaining_variance for exposure in exposures)
         shares = [None if share is None else share.float().contiguous() for share in left]
@@ -187,4 +200,5 @@ def plan_sweep(
     targets = noise_columns(scene.camera, states, scene.box_factor)[None]
     own = np.array([scene_column(scene, 0)], SCENE), statistics_column(scene)[None]
     plan_frames(*own, columns, targets, height, 0 * rows, rows, gains.astype(float), *made)
+    made[0]["vignetting"] = vignetting_column(scene, states)
     return [(None, None)] * count, made[0], made[1], None

@@ -22,6 +22,7 @@ from simulator.capture.blurred_frames import Layout
 from simulator.capture.statistics import DenoisedLight
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.motion import Path
+from simulator.optics.vignetting import Vignetting
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
 from simulator.utils.compute import kernel
@@ -105,10 +106,13 @@ class Exposure:
     #: (H, W) share of the source's noise variance that the blurs leave, beyond `energy`: of all of
     #: them with a layout, else of `opened_to`; None for all.
     remaining_variance: torch.Tensor | None = None
+    lens: Vignetting | None = None  # that darkens the frame, see `PreparedScene.lens`
+    #: (H, W) float32 share of the light that it leaves; None for all.
+    vignetting: np.ndarray | None = field(default=None, compare=False)
     #: Whether a capture is wanted; else the light without noise, in which that of the source cannot
     #: count as part of the target's.
     noise: bool = True
-    #: Noise reduction, aperture, defocus and motion blur, in the order in which they run.
+    #: Noise reduction, aperture, defocus, motion blur, vignetting, in the order in which they run.
     steps: tuple[Step, ...] = field(default=(), compare=False)
 
     @cached_property
@@ -171,7 +175,7 @@ def decide(
     denoised = noise_reduction.network
     aperture, defocus, motion_blur = _decide_blurs(wanted, noise_reduction)
     defocus_px = defocus.extent if defocus.runs else 0.0
-    moves = motion_blur.runs
+    moves, vignetting = motion_blur.runs, scene.vignetting(f_number)
     subject_path = subject_path if moves else None
     exposure = Exposure(
         ratio=ratio,
@@ -184,8 +188,10 @@ def decide(
         subject_path=subject_path,
         denoised=denoised,
         opened_to=f_number if aperture.runs else None,
+        lens=scene.lens,
+        vignetting=vignetting,
         noise=noise,
-        steps=(noise_reduction, aperture, defocus, motion_blur),
+        steps=(noise_reduction, aperture, defocus, motion_blur, _vignetting(scene, f_number)),
     )
     if exposure.source.is_zero:
         return exposure
@@ -338,6 +344,16 @@ def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, f
     disc, row = light.curvature(wanted.ratio, wanted.target)
     # No second difference exceeds the Laplacian, in the root mean square: (k u)^4 <= |k|^4.
     return disc, row if wanted.along_rows else STREAK_TO_DISC * disc
+
+
+def _vignetting(scene: PreparedScene, f_number: float) -> Step:
+    """The shading by the lens, whose error is not weighed: a product is cheap."""
+    if scene.lens is None:
+        return Step("vignetting", False, "no lens is given")
+    if scene.vignetting(f_number) is None:
+        return Step("vignetting", False, "the source was taken through the same aperture")
+    loss = scene.lens.corner_loss(f_number)
+    return Step("vignetting", True, f"the lens takes {loss:.2g} EV of the corners' light")
 
 
 @functools.cache

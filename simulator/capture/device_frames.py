@@ -167,6 +167,12 @@ class DeviceFrames(BlurredFrames):
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
             self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
 
+    def _darken(self, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+        for address in np.unique(vignetting).tolist():
+            same = vignetting == address
+            left = torch.from_numpy(frame_at(address, self._shape[1:])).to(self._frames)
+            self._frames[self._numbers(to[same])] = self._frames[self._numbers(source[same])] * left
+
 
 def _parts(chosen: np.ndarray, samples: int) -> list[np.ndarray]:
     """`chosen` in parts of frames that need so many `samples` each at once."""

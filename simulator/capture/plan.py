@@ -38,7 +38,14 @@ _BOUND = {
 #: rounded in the source.
 _LEAST_BOUND = 0.05
 #: Arithmetic operations per sample of the steps whose cost does not depend on anything.
-_OPERATIONS = {"exposure": 2, "aperture": 4, "motion_blur": 6, "noise": 14, "clip_and_quantise": 6}
+_OPERATIONS = {
+    "exposure": 2,
+    "aperture": 4,
+    "motion_blur": 6,
+    "vignetting": 1,
+    "noise": 14,
+    "clip_and_quantise": 6,
+}
 #: Rounding error of float32 in a transition, as a share of the light.
 ROUNDING = 2.0**-20
 #: Points between white in the source and in a darker capture at which its light is integrated.

@@ -21,6 +21,7 @@ from simulator.capture.sensor import Noise, Transitions, exposed_light, record, 
 from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.optics.motion import ALONG_ROWS, Movement
+from simulator.optics.vignetting import Vignetting
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number, check_type, check_word
@@ -72,6 +73,10 @@ class PreparedScene:
     movement: Movement = ALONG_ROWS
     #: What is out of focus, and what is the subject; None for one disc everywhere.
     layout: Layout | None = None
+    #: The lens whose vignetting captures have; None for one without.
+    lens: Vignetting | None = None
+    #: Whether `light` was taken through that lens, at the reference's f-number, as that of a raw.
+    seen_through_lens: bool = False
     #: Error that a capture may have, in units of the target's noise: the cheapest steps that keep
     #: it are taken, or else, as at 0, those with the least error.
     tolerance: float = DEFAULT_TOLERANCE
@@ -101,6 +106,7 @@ class PreparedScene:
         check_number("defocus", self.defocus, 0.0, sys.float_info.max)
         disc_px(self, 4.0)
         check_number("gain", self.gain, 0.0, sys.float_info.max)
+        check_type("lens", self.lens, Vignetting, None)
         if self.layout is not None and self.layout.defocus.shape != self.light.shape[-2:]:
             raise ValueError(
                 f"`layout` (shape {tuple(self.layout.defocus.shape)}) must have the height and "
@@ -118,6 +124,14 @@ class PreparedScene:
         copied = copy.copy(self)
         vars(copied).update(values)
         return copied
+
+    def vignetting(self, f_number: float) -> np.ndarray | None:
+        """(H, W) share of the light that the lens leaves at an f-number; None for all."""
+        source = self.reference.effective_f_number if self.seen_through_lens else None
+        if self.lens is None or f_number == source:
+            return None
+        height, width = self.light.shape[-2:]
+        return self.lens.illumination(f_number, (height, width), source)
 
     def __repr__(self) -> str:
         _, height, width = self.light.shape
@@ -278,7 +292,8 @@ class PreparedScene:
             order = sorted(range(len(kinds)), key=lambda i: ranks[kinds[i]])
             parts = [slice(i, i + 1) for i in order]
         for some in parts:
-            lights = self.blurred_light.lights(origins[some], blurs[some], self.layout)
+            owners = self.layout, self.lens
+            lights = self.blurred_light.lights(origins[some], blurs[some], owners)
             lights = [light.contiguous() for light in lights]
             shares = None if remaining is None else remaining[some]
             yield some, Transitions(lights, table[some], shares)

@@ -26,6 +26,7 @@ from simulator.noise.noise_level_function import plane_tensor
 from simulator.optics.flicker_integral import Lamp
 from simulator.optics.motion import motion_blur
 from simulator.optics.thin_lens import Lens, defocus
+from simulator.optics.vignetting import Vignetting
 from simulator.raw.image import check_packed
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.checks import check_integer
@@ -205,7 +206,8 @@ class ReferenceCamera:
     Its sensor has a noise calibration and, for scenes with depth, a pixel pitch; `box_factor` are
     the samples k that are averaged per side and plane after they were recorded, each with noise of
     its own: captures then have H // k x W // k pixels. With `sensor_noise` the read noise has the
-    camera's rows and tails (`CameraProfile.read_noise`); else it is normal and independent.
+    camera's rows and tails (`CameraProfile.read_noise`); else it is normal and independent. A lens
+    with `vignetting` darkens what is on the sensor.
     """
 
     def __init__(
@@ -215,12 +217,13 @@ class ReferenceCamera:
         body: BodyError | None = None,
         box_factor: int = 1,
         sensor_noise: bool = False,
+        vignetting: Vignetting | None = None,
     ) -> None:
         camera.nlf(100.0)  # raises where there is no noise calibration
         self.camera = camera
         self.body = BodyError() if body is None else body
         self.box_factor = check_integer("box_factor", box_factor, 1)
-        self.sensor_noise = sensor_noise
+        self.sensor_noise, self.vignetting = sensor_noise, vignetting
         if sensor_noise:
             camera.read_noise(min(camera.nlf_by_iso))  # raises where there is none
 
@@ -282,6 +285,9 @@ class ReferenceCamera:
         if lamp is not None:
             bands = lamp.row_light(start, time, light.shape[-2], self.camera.row_time, 2)
             moved = moved * torch.from_numpy(bands).to(moved)[:, None]
+        if self.vignetting is not None:
+            shape, f_number = (light.shape[-2], light.shape[-1]), settings.effective_f_number
+            moved = moved * torch.from_numpy(self.vignetting.illumination(f_number, shape))
         return moved * ratio + self._black_offset(light)
 
     def _black_offset(self, signal: Tensor) -> Tensor:
