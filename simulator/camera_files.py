@@ -26,7 +26,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
-from zipfile import BadZipFile
+from zipfile import is_zipfile
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
         what["emva"] = "npz of flat fields"
         fault = f"lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"`camera` (={name!r}) must name a {what[kind]}: it {fault}") from None
-    except (ValueError, OSError, EOFError, BadZipFile) as error:
+    except (ValueError, OSError) as error:
         raise ValueError(f"`camera` (={name!r}) cannot be used: {error}") from None
 
 
@@ -259,9 +259,16 @@ def read_flat_fields(path: str | os.PathLike[str]) -> FlatFields:
 
     Exposures after those whose times rise are of other measurements, and are left out.
     """
-    with np.load(Path(path).expanduser()) as file:
-        bright, dark, times = (file[name] for name in ("bright", "dark", "bright_exposure_ns"))
-        photons = file["bright_photons"] if "bright_photons" in file.files else 0.0 * times
+    path = Path(path).expanduser()
+    if path.is_file() and not is_zipfile(path):
+        raise ValueError(f"{path.name} is no .npz")
+    with np.load(path) as file:
+        found = dict(file)
+    bright, dark, times = (found[name] for name in ("bright", "dark", "bright_exposure_ns"))
+    photons = found.get("bright_photons", 0.0 * times)
+    pairs = bright.ndim == 4 and bright.shape[1] == 2 and len(times) == len(photons) == len(bright)
+    if not pairs or bright.shape != dark.shape:
+        raise ValueError("`bright` and `dark` must be (exposures, 2, H, W), with as many times")
     count = int(np.argmax(np.append(np.diff(times) <= 0, True))) + 1
     return FlatFields(*(values[:count] for values in (bright, dark, photons, times)))
 

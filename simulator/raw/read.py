@@ -126,7 +126,7 @@ def read_raw(
             1/64) if the maker's cameras mark stops; a DNG of `write_dng`, a phone, a computer or an
             industrial camera says exact values.
         camera: A `CameraProfile`, taken as it is (its CFA order must be the file's), or the name of
-            a built-in camera, whose noise calibration is used with the file's own CFA order and
+            one (`get_camera`), whose noise calibration is used with the file's own CFA order and
             levels. By default a built-in camera of the file's make and model is used in that way,
             and for any other one a profile is made from the file.
         nlf: Noise level function of this raw. By default the file's own (DNG NoiseProfile), else

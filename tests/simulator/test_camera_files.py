@@ -125,10 +125,10 @@ def test_bodies_of_darktable(tmp_path, monkeypatch):
     [
         *[("ctt:none.json", "none.json"), ("ctt:b.json", "it lacks 'rpi.noise'")],
         *[("ctt:c.json", "must name a tuning file"), ("ctt:d.json", "cannot be used")],
-        *[("emva:none.npz", "none.npz"), ("emva:d.json", "cannot be used")],
+        *[("emva:none.npz", "none.npz"), ("emva:d.json", "d.json is no .npz")],
+        *[("emva:e.npz", "it lacks 'dark'"), ("emva:f.npz", r"must be \(exposures, 2, H, W\)")],
         ("ctt:a.json?bits=7", r"`bits` \(=7\) must be an integer in \[8, 16\]"),
         ("ctt:a.json?bit=12", "did you mean 'bits'"),
-        ("ctt:a.json?cfa=RGB", "`cfa`"),
         ("darktable:Canon EOS 70", "1 bodies, not 'Canon EOS 70'; did you mean 'Canon EOS 70D'"),
         ("darktable:Canon EOS 70D?white=high", "`white`"),
         ("darktable:Canon EOS 70D?file=b.json", "it lacks 'noiseprofiles'"),
@@ -140,6 +140,9 @@ def test_errors_name_the_camera(tmp_path, monkeypatch, name, message):
     tuning(tmp_path / "a.json", 3.0)
     for file, text in (("b.json", "{}"), ("c.json", "[1]"), ("d.json", "{")):
         (tmp_path / file).write_text(text)
+    arrays = {"dark": np.zeros((3, 8, 8), np.uint8), "bright_exposure_ns": np.arange(3)}
+    np.savez(tmp_path / "e.npz", bright=arrays["dark"])
+    np.savez(tmp_path / "f.npz", bright=arrays["dark"], **arrays)
     monkeypatch.setenv(DARKTABLE_VARIABLE, str(noise_profiles(tmp_path / "n.json")))
     with pytest.raises(ValueError, match=message):
         get_camera(name)
