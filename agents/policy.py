@@ -51,11 +51,6 @@ class PolicyContext:
         return cls(base.grid, base.camera, space, delays=base.delays, bracket=limits)
 
     @property
-    def frame_size(self) -> tuple[int, ...]:
-        """Height and width of a frame [packed pixel]."""
-        return (self.observation_space["raw"].shape or ())[1:]
-
-    @property
     def has_sensors(self) -> bool:
         """Whether the observation has image speed and defocus spread."""
         return "sensors" in self.observation_space.spaces

@@ -37,14 +37,7 @@ from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import marks_stops, read_raw, read_settings
 from simulator.settings import CameraSettings, exposure_ratio, snap_exposure_time
-from simulator.utils.checks import (
-    UNITS,
-    check_key,
-    check_number,
-    check_word,
-    import_extra,
-    parse_number,
-)
+from simulator.utils.checks import UNITS, check_key, check_number, import_extra, parse_number
 from simulator.utils.files import (
     PICTURE_SUFFIXES,
     RAW_SUFFIXES,
@@ -91,19 +84,17 @@ _TRUTH = re.compile(r"(?<![a-z])(gt|ground[_\-. ]?truth)(?![a-z])", re.I)
 
 @dataclass(frozen=True)
 class RecordedOptions:
-    """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs.
-
-    `numbers`, one of `FOLDERS`, is what its folders state that are bare numbers.
-    """
+    """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs."""
 
     folder: Path
     iso: float | None = None
     exposure_time: float | None = None
     f_number: float | None = None
-    numbers: str | None = None
+    numbers: str | None = None  # what folders are that are bare numbers, of `FOLDERS`
 
     def __post_init__(self) -> None:
-        check_word("scenes['folder']", self.numbers, tuple(FOLDERS), None)
+        if self.numbers not in (None, *FOLDERS):
+            raise ValueError(f"`folder` (={self.numbers!r}) must be one of {list(FOLDERS)}")
         for name, value in self.known.items():
             check_number(name, value, 1e-9, 1e8)
 
@@ -193,8 +184,7 @@ def recorded_scenes(
         said = f"{len(single)} of {len(scenes) + len(single)} recorded scenes have fewer than two "
         said += f"states of the grid and are left out, such as {str(single[0].path)!r}"
         if not scenes:
-            rule = "settings that files share are one state, the rest of a name is the scene's"
-            raise ValueError(f"`scenes` (='recorded:{options.folder}'): {said}: {rule}")
+            raise ValueError(f"{said}: what a name has beside settings is the scene's")
         logger.warning(said)
     holes = {s.scene_id: ~s.allowed for s in scenes if s.allowed is not None}
     lacking = {name: missing for name, missing in holes.items() if missing.any()}

@@ -99,7 +99,7 @@ class MeteringPolicy(Policy):
         given = {name: value for name, value in by_hand.items() if value is not None}
         self.options = ProgramOptions(compensation, damping, shutter_cap, iso_cap=iso_cap, **given)
         self.meter = make_meter(meter, context.camera)
-        self.region = Region(roi, mask, context.frame_size)
+        self.region = Region(roi, mask, context.observation_space["raw"].shape)
         self.needs_subject = self.region.of_subject
         self._meter_name = meter
         self.name = f"{meter}:{program}"

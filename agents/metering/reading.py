@@ -108,17 +108,17 @@ SUBJECT = "subject"
 
 
 class Region:
-    """The pixels of frames of `shape` (h, w) that a meter reads: all of them by default.
+    """The pixels of frames of `shape` (4, h, w) that a meter reads: all of them by default.
 
     Give one of `roi`: left, top, width and height in [0, 1] of the frame, in a sequence or a text
     with commas; and `mask`: (h, w) bool, or ``"subject"``.
     """
 
-    def __init__(self, roi: Any, mask: Any, shape: tuple[int, ...]) -> None:
+    def __init__(self, roi: Any, mask: Any, shape: tuple[int, ...] | None) -> None:
         if roi is not None and mask is not None:
             raise ValueError("give `roi` or `mask`, not both")
-        self.of_subject, self._shape = isinstance(mask, str) and mask == SUBJECT, shape
-        mask = mask if roi is None else _rectangle(roi, shape)
+        self.of_subject, self._shape = isinstance(mask, str) and mask == SUBJECT, (shape or ())[1:]
+        mask = mask if roi is None else _rectangle(roi, self._shape)
         #: (1, h, w) bool, the same for all cameras; None for all pixels, and of a subject.
         self._fixed = None if mask is None or self.of_subject else self._checked(mask)[None]
         self.key = mask if self._fixed is None else self._fixed.tobytes()  # for caches

@@ -367,9 +367,10 @@ class RpiAgc(Policy):
         metering = _chosen("metering", metering, found.metering_modes)
         mode = _chosen("mode", mode, found.exposure_modes)
         constraint = _chosen("constraint", constraint, found.constraint_modes)
-        speed = check_number("speed", found.speed if speed is None else speed, 1e-3, 1.0)
-        frames = found.startup_frames if startup_frames is None else startup_frames
-        own = {"speed": speed, "startup_frames": check_integer("startup_frames", frames, 0)}
+        own = {"speed": speed, "startup_frames": startup_frames}
+        found = found.model_copy(update={n: v for n, v in own.items() if v is not None})
+        check_number("speed", found.speed, 1e-3, 1.0)
+        check_integer("startup_frames", found.startup_frames, 0)
         time = PRIORITY_TIME if exposure_time is None else exposure_time
         lens = context.grid.f_numbers[0] if f_number is None else f_number
         self.options = ProgramOptions(compensation, damping, shutter_cap, lens, time, iso, iso_cap)
@@ -379,12 +380,12 @@ class RpiAgc(Policy):
         if flicker_period is not None:
             check_number("flicker_period", flicker_period, 1e-6, 10.0)
         self.name = f"rpi_agc:{program}"
-        self.region = Region(roi, mask, context.frame_size)
+        self.region = Region(roi, mask, context.observation_space["raw"].shape)
         self.needs_subject = self.region.of_subject
         gains = tuple(min(g, most) for g in (*gains[:-1], most))
         self.agc = LibcameraAgc(
             0,
-            tuning=found.model_copy(update=own),
+            tuning=found,
             metering=metering,
             constraint=constraint,
             ladder=Ladder(found.exposure_modes[mode].shutter, gains),

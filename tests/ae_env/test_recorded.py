@@ -275,7 +275,7 @@ def test_grids_of_other_people(tmp_path: Path, caplog) -> None:
         f"recorded:{tmp_path}?folder=exposure_us&iso=1&f_number=4"
     )
     assert options.grid.exposure_times == (1e-6, 8e-6)
-    with pytest.raises(ValueError, match=r"`scenes\['folder'\]` \(='ms'\) must be"):
+    with pytest.raises(ValueError, match=r"`folder` \(='ms'\) must be"):
         load(f"recorded:{tmp_path}?folder=ms")
     names = ["GT_SRGB_010", "0001_gt", "ground truth", "GroundTruth", "room-gt"]
     assert all(map(recorded._TRUTH.search, names))

@@ -254,7 +254,7 @@ def test_other_pixels_count_for_nothing(context, photograph, name):
     frame, estimate = photograph(light, 9.0, state), np.array([9.5])
 
     def read(frame, **part):
-        masks = readings.Region(part.get("roi"), part.get("mask"), (64, 64)).masks(frame)
+        masks = readings.Region(part.get("roi"), part.get("mask"), (4, 64, 64)).masks(frame)
         return readings.read_part(meter, frame, estimate, masks).ev100[0]
 
     whole = meter(frame, estimate).ev100[0]
@@ -307,6 +307,6 @@ def test_what_a_part_may_be(context):
     with pytest.raises(ValueError, match="not both"):
         make_policy("average?roi=0,0,1,1&mask=subject", context)
     # Pixels that are touched: 6.4 to 12.8 across, 32 to 33 down.
-    (found,) = readings.Region((0.1, 0.5, 0.1, 1 / 64), None, (64, 64)).masks({})
+    (found,) = readings.Region((0.1, 0.5, 0.1, 1 / 64), None, (4, 64, 64)).masks({})
     assert np.argwhere(found)[[0, -1]].tolist() == [[32, 6], [32, 12]]
     assert found.sum() == 7
