@@ -232,7 +232,9 @@ class EnvOptions:
 
     def make_lens(self) -> Vignetting | None:
         """The lens of all episodes; None for none, or one of its own for each."""
-        return None if self.lens == RANDOM_LENS else get_lens(self.lens)
+        if isinstance(self.lens, str) and self.lens == RANDOM_LENS:
+            return None
+        return get_lens(self.lens)
 
     def make_scorer(self) -> CompositeScorer:
         """The scorer."""

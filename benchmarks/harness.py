@@ -8,7 +8,6 @@ disk until the whole run is done, so that a run that was stopped continues.
 from __future__ import annotations
 
 import inspect
-import io
 import json
 import math
 import os
@@ -32,7 +31,7 @@ from torch import Tensor
 from agents.cli.console import print_files, progress_bars
 from agents.report.evaluation import Cell, to_markdown
 from agents.report.evaluation import cell as markdown_cell
-from agents.report.plots import write_palette_png
+from agents.report.plots import write_figure
 from benchmarks.isolated import CORES, ROOT
 from simulator import CameraProfile
 from simulator.reference.reference_camera import ReferenceScene
@@ -132,7 +131,7 @@ def benchmark(
         command = f"ae-env bench {name}{''.join(words)}{' --quick' * quick}"
         given = {"seed": seed, "quick": quick}
         meta = result_meta(command, seed) | {"quick": quick}
-        data = [v for k, v in options.items() if k != "against" and isinstance(v, Path)]
+        data = [v for v in options.values() if isinstance(v, Path)]
         store, state = Store(RUNS / name), [command, seed, *_state(data)]
         chosen, results = parts(seed, quick, **options), {}
         with progress_bars() as progress, progress(name) as task:
@@ -169,7 +168,7 @@ def write_report(report: Report, out: Path, stem: str, meta: Mapping[str, Any]) 
     files = {"numbers": write_results(out / f"{stem}.json", rows, {**meta, **more})}
     for name, figure in report.figures.items():
         path = name if isinstance(name, Path) else out / name
-        files[f"picture {path.stem}"] = write_picture(path, figure)
+        files[f"picture {path.stem}"] = write_figure(path, figure)
     if report.tables:
         tables = {"origin": origin(meta), **report.tables}
         page = filled_page(stem, tables, report.figures)
@@ -225,19 +224,6 @@ def rounded(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     return value
-
-
-def write_picture(path: Path, figure: Figure) -> Path:
-    """Writes a figure: photographs as WebP, plots as PNG with a palette, a third of the bytes."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".webp":
-        Image.open(stream).convert("RGB").save(path, quality=80, method=6)
-        return path
-    return write_palette_png(path, Image.open(stream))
 
 
 def side_by_side(*lines: Mapping[str, Tensor]) -> Figure:

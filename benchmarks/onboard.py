@@ -110,10 +110,8 @@ def guide(quick: bool) -> list[Row]:
         for command in GUIDE[1:] if quick else GUIDE:
             before = os.times()
             program = [sys.executable, "-m", "agents.cli", *command.split()]
-            paths = {"PYTHONPATH": str(ROOT)}
-            subprocess.run(
-                program, cwd=folder, env=os.environ | paths, check=True, capture_output=True
-            )
+            variables = os.environ | {"PYTHONPATH": str(ROOT)}
+            subprocess.run(program, cwd=folder, env=variables, check=True, capture_output=True)
             after = os.times()
             seconds = sum(after[2:4]) - sum(before[2:4])  # of processes that have ended
             rows.append({"command": f"ae-env {command}", "cpu_seconds": seconds})

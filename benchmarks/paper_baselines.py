@@ -33,10 +33,6 @@ PARAMETER_UNIT = 8.0
 
 def scaled_parameters(parameters: Tensor, image: Tensor) -> Tensor:
     """Parameters (B, 6) as the networks get them, on the device and in the dtype of `image`."""
-    batch = image.shape[0]
-    if parameters.shape != (batch, NUM_PARAMETERS):
-        shape = tuple(parameters.shape)
-        raise ValueError(f"`parameters` (of shape {shape}) must have shape ({batch}, 6)")
     return (parameters.to(image) + image.new_tensor(PARAMETER_OFFSET)) / PARAMETER_UNIT
 
 

@@ -18,6 +18,7 @@ from ae_env.scenes.load import simulate_source_raw
 from ae_env.scorers.score_table import ScoreTable
 from agents.cli.main import BENCHMARKS
 from agents.learning import training as learning
+from agents.report.plots import pareto_front
 from benchmarks import emva, features, harness, paper, recorded, transfer
 from benchmarks import paper_baselines as baselines
 from benchmarks.denoising import anscombe, inverse_anscombe
@@ -25,7 +26,6 @@ from benchmarks.features import training
 from benchmarks.harness import Part, Report, benchmark, pivot, rounded, table
 from benchmarks.transfer import agents, tables
 from benchmarks.transfer.agents import TableSet, TransferPlan, World
-from benchmarks.work_precision import undominated
 from benchmarks.work_precision.plans import distance
 from simulator import NoiseLevelFunction, exposure_ratio
 from simulator.networks.weights import build_modules
@@ -115,7 +115,6 @@ def test_every_benchmark_of_the_command_is_there() -> None:
         (("paper", "data", "--weights", "none.safetensors"), "there is no none.json"),
         (("ptc", "data"), "`folder` (='data')"),
         (("ptc", "--weights", "a"), "`--weights` (='a')"),
-        (("throughput", "--against", "none"), "`--against` (='none')"),
         (("emva", "runs"), "`folder` (="),
         (("recorded", "none"), "`scenes` (='recorded:"),
         (("recorded", "runs"), "`scenes` (='recorded:runs')"),
@@ -159,8 +158,8 @@ def test_a_camera_of_counted_photons(benchmarks_here):
 
 
 def test_the_front_of_time_and_error() -> None:
-    points = [(1.0, 30.0), (2.0, 35.0), (3.0, 34.0), (4.0, 35.004)]
-    assert undominated(points) == [True, True, False, False]
+    ms, db = (dict(zip("abcd", v, strict=True)) for v in ((1, 2, 3, 4), (30, 35, 34, 35.004)))
+    assert pareto_front(ms, db, 0.01) == ["a", "b"]
 
 
 @pytest.mark.parametrize(("shift", "spread"), [(0.5, 1.5), (0.0, 0.8), (2.0, 1.0)])
@@ -355,16 +354,6 @@ def test_batch_of_different_parameters_equals_single_runs(make):
     images = normal(3, 4, 9, 7).double()
     alone = [net(images[i : i + 1], PARAMETERS[i : i + 1]) for i in range(3)]
     torch.testing.assert_close(net(images, PARAMETERS), torch.cat(alone))
-    with pytest.raises(ValueError, match="`parameters`"):
-        net(images, PARAMETERS[:1])
-
-
-def test_scaled_parameters() -> None:
-    """ISO 100, 1/8000 s is the origin; the paper's whole range is positive and of order one."""
-    extremes = torch.tensor([[0.0, -12.97, 2.0, 7.33, 2.0, 4.46]])
-    expected = [[0.0, 0.00375, 0.25, 0.91625, 1.875, 0.5575]]
-    found = baselines.scaled_parameters(extremes, normal(1, 1))
-    torch.testing.assert_close(found, torch.tensor(expected))
 
 
 def test_baselines_have_as_many_parameters_as_published():

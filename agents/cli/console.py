@@ -11,7 +11,7 @@ import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -125,6 +125,23 @@ def print_files(files: Mapping[str, Path]) -> None:
     """Prints the files that were written."""
     for name, path in files.items():
         print_line(f"wrote {name}: {path}")
+
+
+def print_table(
+    title: str, rows: Iterable[Sequence[str]], *columns: str, numbers: bool = False
+) -> None:
+    """Prints a table of texts; with `numbers` all columns but those of names are to the right."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, box=box.SIMPLE_HEAD)
+    for column in columns:  # names in it are no markup, and those of policies not cut off
+        side: Any = "right" if numbers and column not in ("policy", "kind") else "left"
+        table.add_column(Text(column), justify=side, no_wrap=column == "name", overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    terminal.print(table)
 
 
 def command_line() -> str:

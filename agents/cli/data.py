@@ -197,21 +197,15 @@ def cache(clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = 
 
     Example: `ae-env cache --clear`; the folder is another one where AE_ENV_CACHE names it.
     """
-    from rich.table import Table
-
     from simulator.utils.cache import DISK_BYTES, disk_cache
 
     disk = disk_cache()
     usage = disk.usage()
     if clear:
         disk.clear()
-    table = Table(title="removed" if clear else f"cached, at most {DISK_BYTES >> 30} GiB")
-    table.add_column("kind")
-    table.add_column("files", justify="right")
-    table.add_column("bytes", justify="right")
-    for kind, (files, size) in usage.items():
-        table.add_row(kind.replace("_", " "), f"{files:,}", f"{size:,}")
-    console.terminal.print(table)
+    rows = [(kind.replace("_", " "), *(f"{n:,}" for n in own)) for kind, own in usage.items()]
+    title = "removed" if clear else f"cached, at most {DISK_BYTES >> 30} GiB"
+    console.print_table(title, rows, "kind", "files", "bytes", numbers=True)
     print_line(f"folder: {disk.folder}")
 
 

@@ -269,16 +269,7 @@ def print_scores(
     results: EvaluationResult | Mapping[str, EvaluationResult], ranking: pd.DataFrame | None = None
 ) -> None:
     """Prints the scores of an evaluation, and every source group's where there are few."""
-    from rich.table import Table
-    from rich.text import Text
-
     from agents.report.evaluation import summary
 
     for title, frame in summary(results, ranking):
-        table = Table(title=title)
-        for name in frame.columns:  # names in it are no markup, and those of policies not cut off
-            side: Any = "left" if name == "policy" else "right"
-            table.add_column(Text(name), justify=side, overflow="fold")
-        for line in frame.to_numpy().tolist():
-            table.add_row(*map(Text, line))
-        console.terminal.print(table)
+        console.print_table(title, frame.to_numpy().tolist(), *frame.columns, numbers=True)

@@ -62,10 +62,6 @@ def bench(
     ] = None,
     seed: console.Seed = 0,
     quick: Annotated[bool, Option(help="A short version, to try it out.")] = False,
-    against: Annotated[
-        Path | None,
-        Option(help="Of throughput: another checkout, timed in turns with this."),
-    ] = None,
     weights: Annotated[
         Path | None, Option(help="Of paper: measure these weights, and train nothing.")
     ] = None,
@@ -77,7 +73,7 @@ def bench(
     """
     name = name.replace("-", "_")
     check_word("name", name, BENCHMARKS)
-    given = {"against": against, "folder": folder, "weights": weights, "part": part}
+    given = {"folder": folder, "weights": weights, "part": part}
     options: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     _check_options(name, **options)
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
@@ -96,7 +92,6 @@ def bench(
 #: Parts that can be run alone, and benchmarks that take an option.
 _PARTS = {"places": ("posterior", "receptors", "curve"), "transfer": ("agents", "tables")}
 _TAKES = {
-    "against": ("throughput",),
     "folder": ("emva", "paper", "recorded"),
     "part": tuple(_PARTS),
     "weights": ("paper",),

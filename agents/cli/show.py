@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from agents.cli import console
-from agents.cli.console import print_files, print_line, progress_bars
+from agents.cli.console import print_files, print_line, print_table, progress_bars
 from agents.cli.simulate import make_simulator
 from simulator.utils.checks import import_extra
 
@@ -186,7 +185,7 @@ def scorers() -> None:
         what += f" From {row.package}." if row.package != "ae-env" else ""
         rows.append((row.name, row.domain, row.depends_on, what))
     title = "scorers: all in [0, 1], higher is better"
-    _print_table(title, rows, "name", "sees", "depends on", "what it is")
+    print_table(title, rows, "name", "sees", "depends on", "what it is")
     print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")
 
 
@@ -199,7 +198,7 @@ def policies() -> None:
 
     rows = [(name,) for name in names.list_policies() if not names.is_metering(name)]
     rows += [(f"{meter}:PROGRAM",) for meter in (*names.METERS, "rpi_agc")]
-    _print_table("policies", rows, "name")
+    print_table("policies", rows, "name")
     print_line(f"programs: {', '.join(names.PROGRAMS)} (of rpi_agc the first four); P by default")
 
 
@@ -216,7 +215,7 @@ def cameras() -> None:
         calibrated = f"ISO {isos[0]:g} to {isos[-1]:g}" if isos else "-"
         by = camera.source.partition(";")[0]
         rows.append((camera.name, f"{camera.make} {camera.model}", calibrated, by))
-    _print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
+    print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
     print_line("others by a file: ctt:FILE, darktable:MAKER MODEL, emva:FILE (docs/cameras.md)")
 
 
@@ -234,17 +233,4 @@ def lightings() -> None:
     for name, kind in KINDS.items():
         options = ", ".join(f"{option.name}={option.default}" for option in fields(kind))
         rows.append((name, options, str(kind.__doc__).partition("\n")[0]))
-    _print_table("lightings", rows, "name", "options", "what it is")
-
-
-def _print_table(title: str, rows: Iterable[Sequence[str]], *columns: str) -> None:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title, box=box.SIMPLE_HEAD)
-    for column in columns:
-        table.add_column(column, no_wrap=column == "name", overflow="fold")
-    for row in rows:
-        table.add_row(*map(Text, row))
-    console.terminal.print(table)
+    print_table("lightings", rows, "name", "options", "what it is")

@@ -419,18 +419,10 @@ def difference_rows(
         for policy in (name for name in result.tracks if name != minus):
             gains = result.group_gains(policy, part)[0]
             interval = difference_interval(gains, other, span, resamples=resamples)
-            rows.append(
-                {
-                    "policy": policy,
-                    "minus": minus,
-                    "condition": part,
-                    "difference": interval.value,
-                    "ci95": interval.pair,
-                    "num_groups": interval.num_groups,
-                    "num_training_seeds": interval.num_seeds,
-                }
-            )
-    return pd.DataFrame(rows)
+            counts = interval.num_groups, interval.num_seeds
+            rows.append((policy, minus, part, interval.value, interval.pair, *counts))
+    columns = ["policy", "minus", "condition", "difference", "ci95"]
+    return pd.DataFrame(rows, columns=[*columns, "num_groups", "num_training_seeds"])
 
 
 def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataFrame:

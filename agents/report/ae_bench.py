@@ -29,7 +29,7 @@ from agents.policy_names import (
     training_seeds,
 )
 from agents.report.evaluation import Cell, cell, fill
-from simulator.utils.files import machine, sibling, versions, write_atomically
+from simulator.utils.files import machine, read_table, sibling, versions, write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -225,7 +225,7 @@ def append_rows(
     text = found.reindex(columns=COLUMNS).to_csv(index=False, float_format="%.4f")
     table = _followed(table)
     table.parent.mkdir(parents=True, exist_ok=True)
-    new, page = _parse(text), page_of(table)
+    new, page = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False), page_of(table)
     with FileLock(table.with_name(f".{table.name}.lock")):
         known = _read_own(table, plan)
         for name in new.policy:  # whoever began at the same time may have added it meanwhile
@@ -245,7 +245,7 @@ def append_rows(
 
 def _read_own(table: Path, plan: EvaluationPlan) -> pd.DataFrame:
     """Rows of a table; an error where one has another hash."""
-    rows = read_table(table)
+    rows = read_rows(table)
     if others := set(rows.hash) - {plan.hash}:
         raise ValueError(
             f"{table} has rows that were measured under the hash {', '.join(others)}, this run "
@@ -254,19 +254,11 @@ def _read_own(table: Path, plan: EvaluationPlan) -> pd.DataFrame:
     return rows
 
 
-def _parse(text: str) -> pd.DataFrame:
-    """Cells of a table as the texts that they are: those of other rows stay to the last digit."""
-    return pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False)
-
-
-def read_table(table: Path) -> pd.DataFrame:
+def read_rows(table: Path) -> pd.DataFrame:
     """Rows of a benchmark's table, checked, all cells as texts; none where there is no file."""
     if not table.is_file():
         return pd.DataFrame(columns=COLUMNS, dtype=str)
-    try:
-        rows = _parse(table.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:  # pandas' errors of parsing are ValueErrors
-        raise ValueError(f"{table} cannot be read as a table: {error}") from error
+    rows = read_table(table)
     if version := next((own for name, own in _OLDER.items() if name in rows), None):
         rule = f"is a table of AE-Bench {version}, which takes no rows: give docs/ae-bench/v3.csv"
         raise _refusal(table, f"{rule}, or a new file")

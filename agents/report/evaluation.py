@@ -547,10 +547,6 @@ def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _named(fault: str) -> str:
-    return "no fault" if fault == "none" else f"the fault {fault}"
-
-
 def verdict(faults: Sequence[Mapping[str, Any]]) -> str:
     """What a controller does in a sentence or two, from each fault's row; the first has none."""
     sound = faults[0]
@@ -566,7 +562,8 @@ def verdict(faults: Sequence[Mapping[str, Any]]) -> str:
     if sound["error"] > THIRD_EV:
         text += f" Where it does, it may rest {sound['error']:.2f} EV off."
     pulsing = [
-        f"{row['pulses']:.1%} by up to {row['pulse']:.2f} EV with {_named(row['fault'])}"
+        f"{row['pulses']:.1%} by up to {row['pulse']:.2f} EV with "
+        + ("no fault" if row["fault"] == "none" else f"the fault {row['fault']}")
         for row in sorted(faults, key=lambda row: -row["pulse"])
         if row["pulse"]
     ]

@@ -69,7 +69,7 @@ def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str
     axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
     if title:
         figure.suptitle(_text(title), fontsize=11)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def plot_convergence(
@@ -105,7 +105,7 @@ def plot_convergence(
     figure.supylabel("mean EV error [EV]", fontsize=9)
     labels = [_text(policy) for policy in order]
     figure.legend(lines, labels, loc="outside lower center", ncols=wide, fontsize=8)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
@@ -127,7 +127,7 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
     if len(curves) > 1:
         lines = panels[0].get_lines()
         figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
@@ -167,7 +167,7 @@ def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
     for panel in (margins, traces):
         _tidy(panel, labelsize=8)
     figure.suptitle(_text(found.name), fontsize=11)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def line_style(index: int) -> dict[str, str]:
@@ -176,16 +176,21 @@ def line_style(index: int) -> dict[str, str]:
     return {"color": PATH_COLOURS[colour], "linestyle": _DASHES[round_ % len(_DASHES)]}
 
 
-def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> list[str]:
+def pareto_front(
+    costs: Mapping[str, float], scores: Mapping[str, float], same: float = 0.0
+) -> list[str]:
     """Names that no other beats in both cost and score, the cheapest first.
+
+    Scores that differ by `same` or less are the same.
 
     >>> pareto_front({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 0.5, "b": 0.4, "c": 0.9})
     ['a', 'c']
     """
-    front: list[str] = []
+    front, best = list[str](), -np.inf
     for name in sorted(scores, key=lambda n: (costs[n], -scores[n])):
-        if not front or scores[name] > scores[front[-1]]:
+        if scores[name] > best + same:
             front.append(name)
+        best = max(best, scores[name])
     return front
 
 
@@ -212,7 +217,7 @@ def plot_cost(
     _tidy(axes)
     figure.legend(frameon=False, fontsize=8, loc="outside lower center")
     _label(axes, points, colours)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Sequence[str]) -> None:
@@ -299,13 +304,11 @@ def _text(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def _write(path: Path, figure: Figure) -> Path:
+def write_figure(path: Path, figure: Figure) -> Path:
+    """Write a figure: photographs as WebP, plots as PNG of 256 colours, a third of the bytes."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
-    return write_palette_png(path, Image.open(stream))
-
-
-def write_palette_png(path: Path, picture: Image.Image) -> Path:
-    """Write a picture as PNG of 256 colours: a third of the bytes, no visible loss."""
-    indexed = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    return write_picture(path, indexed, optimize=True)
+    picture = Image.open(stream).convert("RGB")
+    if path.suffix == ".webp":
+        return write_picture(path, picture, quality=80, method=6)
+    return write_picture(path, picture.quantize(256, dither=Image.Dither.NONE), optimize=True)

@@ -11,8 +11,9 @@ from typing import Any
 
 from torch import Tensor
 
+from agents.report.plots import write_figure
 from benchmarks.fidelity.models import equal_exposure, load_models
-from benchmarks.harness import Row, clipped, psnr, side_by_side, table, write_picture
+from benchmarks.harness import Row, clipped, psnr, side_by_side, table
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
@@ -44,7 +45,7 @@ def measure(seed: int, quick: bool) -> list[Row]:
         rows.append({"part": "pictures", "case": case, **row})
         lines.append(_titled(rows[-1], pictures, crops[name]))
     if not quick:
-        write_picture(IMAGE, side_by_side(*lines))
+        write_figure(IMAGE, side_by_side(*lines))
     return rows
 
 

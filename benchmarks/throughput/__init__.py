@@ -1,17 +1,15 @@
 """Steps per second against what the machine could do, and how cost grows.
 
     ae-env bench throughput
-    ae-env bench throughput --against ANOTHER_CHECKOUT
 
 Parts: environment steps beside a fused kernel, copies of the environment; resets
 beside steps; the first episode after installation; growth of time and memory with pixels; a
-24-megapixel raw through the simulator beside LibRaw. With another checkout, both are timed in turns
-(`benchmarks.throughput.paired`). The real files that ``AE_ENV_DATA`` names are used where they are.
+24-megapixel raw through the simulator beside LibRaw. The real files that ``AE_ENV_DATA`` names are
+used where they are.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -20,20 +18,14 @@ from matplotlib.figure import Figure
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, sections, table
 from benchmarks.isolated import CORES
 from benchmarks.throughput import frames
-from benchmarks.throughput.paired import COLUMNS, checkout, measure_paired
 from benchmarks.throughput.steps import measure_cold_start, measure_resets, measure_steps
 
 #: Threads and frame sizes of the steps; the first is drawn.
 STEPS = ((CORES, 64), (CORES, 128), (1, 64), (1, 128))
 
 
-def parts(seed: int, quick: bool, against: Path | None = None) -> list[Part]:
+def parts(seed: int, quick: bool) -> list[Part]:
     found = []
-    if against is not None:
-        other = str(checkout(against))
-        for n in dict.fromkeys((1,) if quick else (1, CORES)):
-            arguments = {"against": other, "threads": n}
-            found.append(Part(f"paired {n}", measure_paired, arguments, threads=n))
     for n, size in list(dict.fromkeys(STEPS))[: 1 if quick else None]:
         arguments = {"threads": n, "size": size}
         found.append(Part(f"steps {n} {size}", measure_steps, arguments, threads=n))
@@ -64,7 +56,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         found = (own for name, own in results.items() if name.partition("|")[0].startswith(kind))
         return [row for own in found for row in (own if isinstance(own, list) else [own])]
 
-    steps, paired, growth = of("steps"), of("paired"), of("growth")
+    steps, growth = of("steps"), of("growth")
     more = {"resets": of("resets"), "cold_start": of("cold"), "growth": frames.curves(growth)}
     libraw = {row["file"]: row for row in of("libraw")}
     more["full_frame"] = [row | {"libraw": libraw[row["file"]]} for row in of("frame")]
@@ -74,14 +66,13 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     contents = "time [ms] = {ms:.2f} | memory [MiB] = {mib:.1f}"
     by_x = pivot(growth, "pixels = {x:,.0f}", "{curve}", contents)
     tables = {
-        "before": table(paired, COLUMNS),
         "steps": sections(steps, "{title}", lambda own: table(own, _STEPS)),
         "resets": table(more["resets"], _RESETS),
         "first-episode": table(more["cold_start"], _COLD),
         "growth": f"{table(more['growth'], _CURVES)}\n\n{by_x}",
         "frames": table(more["full_frame"], _FRAMES),
     }
-    return Report([*steps, *paired], tables, meta=more, figures={"throughput.png": _drawn(steps)})
+    return Report(steps, tables, meta=more, figures={"throughput.png": _drawn(steps)})
 
 
 def _drawn(steps: list[Row]) -> Figure:

@@ -26,9 +26,11 @@ from agents.learning.ppo import PPOTraining, train_ppo
 from benchmarks.harness import Row, quartiles
 from benchmarks.isolated import CORES, timed
 from benchmarks.throughput.kernel_limit import KernelLimit
-from benchmarks.throughput.worker import CACHED, ID, warm_environments
 from simulator.utils.cache import CACHE_VARIABLE
 
+ID = "ae_env/AutoExposure-v0"
+#: Neither motion nor defocus: every frame is exposed from the scene's own light.
+CACHED: dict[str, Any] = {"motion": "none", "depth": "far"}
 SCENES = "bundled:small"
 #: Rounds, and seconds that a case takes in each.
 QUICK, FULL = (3, 0.08), (9, 0.3)
@@ -46,6 +48,17 @@ class LiveScore:
     def __call__(self, images: torch.Tensor, captures: Captures | None) -> torch.Tensor:
         """Scores (B,) of `images` (B, 4, H, W)."""
         return ((images.sqrt() - 0.5) ** 2 / (-2 * 0.2**2)).exp().mean(dim=(1, 2, 3))
+
+
+def warm_environments(num_envs: int, make: dict[str, Any], seed: int = 0) -> Any:
+    """One environment, or a batch of them, after all that is computed once for a scene."""
+    many = num_envs > 1
+    envs: Any = gym.make_vec(ID, num_envs=num_envs, **make) if many else gym.make(ID, **make)
+    scenes = len(envs.unwrapped.scenes)
+    for first in range(0, scenes, num_envs):
+        chosen = [(first + i) % scenes for i in range(num_envs)]
+        envs.reset(seed=seed, options={"scene": chosen if many else first})
+    return envs
 
 
 @dataclass

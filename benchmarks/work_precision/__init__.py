@@ -18,6 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from agents.report.plots import pareto_front
 from benchmarks import harness
 from benchmarks.fidelity.models import train_missing
 from benchmarks.harness import Part, Report, Row, benchmark, clipped, psnr, sections, table
@@ -70,10 +71,14 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         row |= {"relative_rmse": float(np.mean(own["rmse"])), "noise_variance_floor": floor}
         row |= {"noise_variance_error": float(np.median(own["noise"] or np.nan))}
         rows.append(row | {"scenes": len(chosen), "states_per_scene": count})
-    points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
-    for row, best in zip(rows, undominated(points), strict=True):
-        row["pareto"] = best
-    return rows
+    front = _front(rows)
+    return [row | {"pareto": row in front} for row in rows]
+
+
+def _front(rows: Sequence[Row]) -> list[Row]:
+    """Rows that no other beats, the fastest first: faster and, to a hundredth of a dB, as good."""
+    ms, db = ({str(i): r[k] for i, r in enumerate(rows)} for k in ("ms_per_state", "psnr_db"))
+    return [rows[int(i)] for i in pareto_front(ms, db, _SAME_DB)]
 
 
 def _one_trial(
@@ -153,17 +158,6 @@ def noise_ratios(
     wanted = wanted[clear].double()
     levels = wanted.argsort().tensor_split(_LEVELS)
     return [float(found[at].mean() / wanted[at].mean()) for at in levels if len(at) >= _FEWEST]
-
-
-def undominated(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which of (milliseconds, PSNR [dB]) no other beats in both.
-
-    One that is faster and, to a hundredth of a decibel, as good beats another.
-    """
-    ms, db = (np.array(values)[:, None] for values in zip(*points, strict=True))
-    earlier = np.tri(len(points), k=-1, dtype=bool).T
-    beats = (ms <= ms.T) & (db >= db.T - _SAME_DB) & ((ms < ms.T) | (db > db.T) | earlier)
-    return [not beaten for beaten in beats.any(axis=0)]
 
 
 # -- report ---------------------------------------------------------------------------------------
@@ -277,8 +271,7 @@ def _headline(rows: list[Row]) -> Figure:
     figure = Figure(figsize=(8.0, 5.0), dpi=100, layout="constrained")
     axes = figure.add_subplot(xscale="log")
     own = [row for row in rows if row["height"] == 128 and row["dtype"] == "float32"]
-    points = [(row["ms_per_state"], row["psnr_db"]) for row in own]
-    front = sorted(point for point, best in zip(points, undominated(points), strict=True) if best)
+    front = [(row["ms_per_state"], row["psnr_db"]) for row in _front(own)]
     axes.plot(*zip(*front, strict=True), color="0.75", lw=5, zorder=0)
     best = max(row["psnr_db"] for row in own)
     low = min(row["psnr_db"] for row in own if row["psnr_db"] > best - _REACH) - 0.5
@@ -296,7 +289,12 @@ def _headline(rows: list[Row]) -> Figure:
     axes.grid(color="0.92")
     time = "time per state, 4 x 128 x 128 raw, 64-state sweep [ms]"
     error = "PSNR against the noise-free truth [dB]  (better: up)"
-    axes.set(ylim=(low, best + 0.6), xlim=(None, 4 * max(points)[0]), xlabel=time, ylabel=error)
+    axes.set(
+        ylim=(low, best + 0.6),
+        xlim=(None, 4 * max(row["ms_per_state"] for row in own)),
+        xlabel=time,
+        ylabel=error,
+    )
     axes.set_title(f"Error against run time ({CORES} CPU threads, float32)", loc="left")
     marks = [axes.plot([], [], mark, color="0.4")[0] for mark in "os"]
     axes.legend(marks, ["shared by the 64 states", "per transition"], frameon=False)

@@ -283,7 +283,7 @@ TAKES = {
     **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
     **{key: [True] for key in ("sensors", "noise", "with_oracle", "with_subject")},
     **{key: [1.5] for key in ("motion", "depth")},
-    **{key: [None] for key in ("grid", "simulator", "render_mode", "device")},
+    **{key: [None] for key in ("grid", "simulator", "render_mode", "device", "lens")},
     "blur_memory": [1.5],
     "costs": [None, {}],
     "tolerance": [1.5, HUGE],

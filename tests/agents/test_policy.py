@@ -190,10 +190,9 @@ def test_masks_that_do_not_fit_or_allow_nothing_are_refused(name):
     with closing(make_envs({"scenes": "bundled:small"}, num_envs=2, frames=1)) as envs:
         policy = make_policy(training_seeds(name)[0], PolicyContext.from_envs(envs))
         (seen, _), masks = envs.reset(seed=0), np.ones((2, len(policy.context.grid)), bool)
-    rules = {"shape": (masks[:1], masks[:, 1:], masks[0]), "allow a state": (masks & [[1], [0]],)}
-    for rule, wrong in ((rule, one) for rule, own in rules.items() for one in own):
-        policy.reset(2)
-        with pytest.raises(ValueError, match=f"`action_masks` .*{rule}"):
+    policy.reset(2)
+    for wrong in (masks[:1], masks[:, 1:], masks[0], masks & [[1], [0]]):
+        with pytest.raises(ValueError, match="`action_masks`"):
             policy.act(seen, wrong)
 
 

@@ -174,9 +174,14 @@ def test_brackets_by_hand(tmp_path):
     assert content["meta"]["plan"]["budgets"] == [0.1, 0.2]
     shown = {(r["budget"], r["policy"]): r["quality"] for r in content["rows"]}
     assert (shown[0.1, "low"], shown[0.2, "low"]) == pytest.approx((0.65, 0.75))
-    few = made_brackets(low=quality[:, :2], high=quality[:, :2] + 0.05)
-    files = write_report({"0.1 s": few, "0.2 s": few}, tmp_path, command="x")
+    few = dict.fromkeys(results, made_brackets(low=quality[:, :2], high=quality[:, :2] + 0.05))
+    files, ranking = write_report(few, tmp_path, command="x"), made.overall_ranking(few)
     assert files["report.md"].read_text().count(" -0.050 |") == 2  # too few for an interval
+    own = ae_bench.bench_rows(few, ranking)
+    ae_bench.append_rows(tmp_path / "mine.csv", few["0.1 s"].plan, own, author="me")
+    page = (tmp_path / "mine.md").read_text().replace(" ", "")
+    assert "|low|uint8|0.5100|-|" in page
+    assert page.count("|500.00|") == 2  # milliseconds of 0.5 s
 
 
 def test_files_of_a_report(tmp_path):
@@ -369,7 +374,7 @@ def test_plans_of_a_suite_have_one_hash_whatever_a_policy_sees(scenes, tmp_path)
     assert {plan.task for plan in plans} == set(ae_bench._TASKS)
     assert len({(plan.suite, plan.max_scenes, plan.hash) for plan in plans}) == 1
     table = Path("docs/ae-bench/v3.csv")
-    rows = ae_bench.read_table(table)
+    rows = ae_bench.read_rows(table)
     assert set(rows.hash) == {plans[0].hash}
     assert rows.to_csv(index=False) == table.read_text()
     assert rows[rows.policy == "ppo"].frames_seen.tolist() == 2 * ["500000"]
@@ -405,31 +410,15 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     add = lambda author: ae_bench.append_rows(table, plan, again, author=author)  # noqa: E731
     with ThreadPoolExecutor(6) as pool:  # each reads, adds and renames
         list(pool.map(add, authors))
-    assert set(authors) < set(ae_bench.read_table(table).author)
+    assert set(authors) < set(ae_bench.read_rows(table).author)
     add("")
     with pytest.raises(ValueError, match="`author`"):  # of who began before that was there
         add("")
 
 
-def test_rows_of_brackets_by_hand(tmp_path):
-    """Two groups; two budgets; one seed."""
-    groups = ["place", "zz"]
-    quality = {"0.1 s": [[0.9, 0.7]], "0.2 s": [[1.0, 0.8]]}
-    results = {name: made_brackets(groups, p=np.array(own)) for name, own in quality.items()}
-    rows = ae_bench.bench_rows(results, overall_ranking(results))
-    row = rows.iloc[0]
-    assert row.score == pytest.approx(0.85)
-    assert row.ms_alone == pytest.approx(500.0)
-    plan = results["0.1 s"].plan
-    ae_bench.append_rows(tmp_path / "mine.csv", plan, rows, author="me")
-    page = (tmp_path / "mine.md").read_text().replace(" ", "")
-    assert "|p|uint8|0.8500|-|" in page
-
-
 def test_columns_have_the_interval_of_their_mean_over_places():
     results = {"static": (result := made_result())}
-    rows = ae_bench.bench_rows(results, overall_ranking(results))
-    row = rows.set_index("policy").loc["spot:P"]
+    row = ae_bench.bench_rows(results, overall_ranking(results)).set_index("policy").loc["spot:P"]
     own = np.take_along_axis(result.scores, result.tracks["spot:P"].states[0][..., None], -1)
     places = (result.scores.max(-1) - own[..., 0]).mean(-1).reshape(20, 2).mean(-1)
     ends = bootstrap((places,), np.mean, method="percentile", rng=1).confidence_interval
