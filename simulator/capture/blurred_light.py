@@ -210,7 +210,7 @@ class BlurredLight:
         self.light, self.aperture_blur = light, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
-        self._cache_bytes = cache_bytes
+        self._cache: LruCache[Tensor] = LruCache(cache_bytes)
 
     @property
     def known(self) -> tuple[NoiseLevelFunction, ApertureBlur | None]:
@@ -222,10 +222,6 @@ class BlurredLight:
         copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes)
         copied.residuals = self.residuals
         return copied
-
-    @functools.cached_property
-    def _cache(self) -> LruCache[Tensor]:
-        return LruCache(self._cache_bytes)  # of a sweep: a batch takes none of it
 
     def source(self, origin: Origin) -> Tensor:
         """The light (4, H, W) as recorded, denoised or opened."""

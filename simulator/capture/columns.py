@@ -6,7 +6,6 @@ a time.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -47,7 +46,6 @@ SCENE = np.dtype(
 )
 #: All of a state that the exposure of a capture depends on.
 STATE = np.dtype([(name, "f8") for name in ("log2_exposure", "time", "f_number")])
-_jit = functools.partial(kernel, fastmath={"contract"})
 
 
 def state_columns(states: Sequence[CameraSettings]) -> np.ndarray:
@@ -123,7 +121,7 @@ def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
     return (*found[:2], arrays[1].size if arrays else 0, *found[2:])
 
 
-@_jit()
+@kernel(fastmath={"contract"})
 def plan_frames(  # type: ignore[no-untyped-def]
     scenes, statistics, states, targets, height, indices, rows, gains, blurs, table, error
 ):

@@ -49,7 +49,6 @@ from simulator.utils.compute import addresses, as_pointer, kernel, parallel_rang
 Noise = Literal["exact", "bank", "sensor"]
 #: Blocks of a plane that one thread works on at a time, and samples that are worth a thread.
 _UNIT_BLOCKS, _WORTH_A_THREAD = 256, 4 * 64 * 64 * 4
-_FAST = {"nnan", "nsz", "contract"}
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
 #: Bit from which samples clipped high are counted: no unit has as many that are clipped low.
 _HIGH_BITS = 16
@@ -59,7 +58,7 @@ _OFF, _BANK, _DRAWN = 0, 1, 2
 _NO_BANK = np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
 _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
-_jit = functools.partial(kernel, fastmath=_FAST, boundscheck=False)
+_jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundscheck=False)
 
 
 # -- keys: 64 bits from a seed and from the numbers that frames differ by ----------------------

@@ -261,20 +261,14 @@ class LightStatistics:
         return picked, np.arange(1, picked.shape[1], 3)
 
     @functools.cached_property
-    def _sorted(self) -> np.ndarray:
-        """(4, S) light of some pixels of each plane, ascending; every column counts alike."""
-        light, rows = self._rows
-        seen = light[:, rows].reshape(4, -1)
-        step = max(1, seen.shape[1] // _SORTED)
-        while math.gcd(step, light.shape[-1]) > 1:
-            step += 1
-        return np.sort(seen[:, ::step], axis=1)
-
-    @functools.cached_property
     def _bins(self) -> _Bins:
         light, rows = self._rows
         samples = len(rows) * light.shape[-1]
-        edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
+        step = max(1, samples // _SORTED)
+        while math.gcd(step, light.shape[-1]) > 1:  # every column counts alike
+            step += 1
+        some = np.sort(light[:, rows].reshape(4, -1)[:, ::step], axis=1)
+        edges = some[:, np.arange(1, BINS) * some.shape[1] // BINS]
         bins = np.zeros((4, BINS, 6))
         bins[..., 4] = np.inf
         least = 1 + _WORTH_A_THREAD // samples

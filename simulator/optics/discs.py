@@ -194,42 +194,6 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
 
 
 @_jit()
-def _disc(first, last, height, rows, weights, reach, limit, out):  # type: ignore[no-untyped-def]
-    width, radius = rows.shape[1], len(weights) - 1
-    pitch = width + 2 * radius
-    many = max(1, min(height, GROUP // pitch))
-    padded = np.empty((many + 2 * radius, pitch), np.float32)
-    flat = padded.reshape(-1)
-    size = many * pitch
-    total, both = np.zeros((many, pitch), np.float32), np.zeros(size, np.float32)
-    inner = total.reshape(-1)[radius : size - radius]
-    y = first
-    while y < last:
-        top = y // height * height
-        count = min(many, last - y, top + height - y)
-        pad_rows(rows, y - radius, top, top + height, radius, limit, padded)
-        for i in range(radius + 1):
-            above, below = (radius - i) * pitch, (radius + i) * pitch
-            if i:
-                add_rows(flat[above : above + size], flat[below:], both)
-            else:
-                copy_row(flat[above:], both)
-                inner[:] = np.float32(0)
-            weight, middle = weights[i, 0], both[radius:]
-            for x in range(len(inner)):
-                inner[x] += weight * middle[x]
-            for j in range(1, reach[i] + 1):
-                weight, left, right = weights[i, j], both[radius - j :], both[radius + j :]
-                for x in range(len(inner)):
-                    inner[x] += weight * (left[x] + right[x])
-        for i in range(count):
-            row = np.uint64(y + i)
-            for x in range(width):
-                out[row, x] = total[i, np.uint64(radius + x)]
-        y += count
-
-
-@_jit()
 def _quadrant(radius):  # type: ignore[no-untyped-def]
     """Weights (r + 1, r + 1) of a disc's quadrant, and the last non-zero one of each row."""
     weights = coverage(radius).astype(np.float32)
@@ -242,10 +206,41 @@ def _quadrant(radius):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def disc_image(first, last, image, height, radius, limit, out):  # type: ignore[no-untyped-def]
+def disc_image(first, last, rows, height, radius, limit, out):  # type: ignore[no-untyped-def]
     """Rows from `first` to `last` of planes (P * H, W) behind a disc of `radius`."""
     weights, reach = _quadrant(radius)
-    _disc(first, last, height, image, weights, reach, limit, out)
+    width, border = rows.shape[1], len(weights) - 1
+    pitch = width + 2 * border
+    many = max(1, min(height, GROUP // pitch))
+    padded = np.empty((many + 2 * border, pitch), np.float32)
+    flat = padded.reshape(-1)
+    size = many * pitch
+    total, both = np.zeros((many, pitch), np.float32), np.zeros(size, np.float32)
+    inner = total.reshape(-1)[border : size - border]
+    y = first
+    while y < last:
+        top = y // height * height
+        count = min(many, last - y, top + height - y)
+        pad_rows(rows, y - border, top, top + height, border, limit, padded)
+        for i in range(border + 1):
+            above, below = (border - i) * pitch, (border + i) * pitch
+            if i:
+                add_rows(flat[above : above + size], flat[below:], both)
+            else:
+                copy_row(flat[above:], both)
+                inner[:] = np.float32(0)
+            weight, middle = weights[i, 0], both[border:]
+            for x in range(len(inner)):
+                inner[x] += weight * middle[x]
+            for j in range(1, reach[i] + 1):
+                weight, left, right = weights[i, j], both[border - j :], both[border + j :]
+                for x in range(len(inner)):
+                    inner[x] += weight * (left[x] + right[x])
+        for i in range(count):
+            row = np.uint64(y + i)
+            for x in range(width):
+                out[row, x] = total[i, np.uint64(border + x)]
+        y += count
 
 
 # -- a bank of discs --------------------------------------------------------------------------
