@@ -35,8 +35,8 @@ def tables(camera: str, lens: Any, seed: int, quick: bool) -> list[list[float]]:
     """(views, states) expected scores."""
     if isinstance(lens, int):
         lens = random_lens(lens)
-    scenes = {"scenes": "polyhaven", "split": "test", "resolution": RESOLUTION}
-    env = gym.make(TASK, **scenes, camera=camera, lens=lens).unwrapped
+    scenes: dict[str, Any] = {"scenes": "polyhaven", "split": "test", "resolution": RESOLUTION}
+    env: Any = gym.make(TASK, **scenes, camera=camera, lens=lens).unwrapped
     count, found = len(env.scene_ids), []
     for scene in range(0, count, 8 if quick else 1):
         env.reset(seed=1000 * seed + scene, options={"scene": scene})
