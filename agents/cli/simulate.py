@@ -40,6 +40,10 @@ def simulate(
     seed: console.Seed = 0,
     weights: console.Weights = "compact",
     depth: console.Depth = "far",
+    lens: Annotated[
+        str | None,
+        Option(help="The raw's, lensfun:NAME?focal=50: its vignetting at the new f-number."),
+    ] = None,
     tolerance: console.Tolerance = console.TOLERANCE,
     noise: console.Noise = "exact",
     device: console.Device = "auto",
@@ -57,10 +61,12 @@ def simulate(
     from simulator import read_raw
     from simulator.capture.decision import check_tolerance
     from simulator.capture.sensor import Noise
+    from simulator.optics.vignetting import get_lens
     from simulator.raw.read import check_settings
 
     check_word("noise", noise, get_args(Noise))
     check_tolerance(tolerance)
+    through = get_lens(lens)
     if ev is not None and shutter is not None:
         raise ValueError(f"`ev` (={ev:g}) changes the exposure time: leave out --shutter")
     texts = {"iso": iso, "exposure_time": shutter, "f_number": aperture}
@@ -74,7 +80,8 @@ def simulate(
     settings = replace(source.settings, **given)
     if noise == "sensor":
         source.camera.read_noise(settings.iso)  # refuses a camera without its calibration
-    prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
+    options: Any = {"depth": depth, "tolerance": tolerance, "lens": through}
+    prepared = simulator.prepare(source, **options)
     print_line(f"source {source.settings} ({source.camera.name})")
     plan = prepared.plan(settings)
     for text in (plan.explain(), *([plan.details()] if details else [])):
