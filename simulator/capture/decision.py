@@ -352,8 +352,11 @@ def _vignetting(scene: PreparedScene, f_number: float) -> Step:
         return Step("vignetting", False, "no lens is given")
     if scene.vignetting(f_number) is None:
         return Step("vignetting", False, "the source was taken through the same aperture")
-    loss = scene.lens.corner_loss(f_number)
-    return Step("vignetting", True, f"the lens takes {loss:.2g} EV of the corners' light")
+    reason = f"the lens takes {scene.lens.corner_loss(f_number):.2g} EV of the corners' light"
+    if scene.seen_through_lens:
+        source = scene.lens.corner_loss(scene.reference.effective_f_number)
+        reason += f", {source:.2g} in the source"
+    return Step("vignetting", True, reason)
 
 
 @functools.cache
