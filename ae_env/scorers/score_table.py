@@ -12,17 +12,20 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import prepare_scene
+from ae_env.scorers.registry import scorer_fingerprint
 from ae_env.scorers.term_scores import CHUNK, TermScores, slices
 from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
 from simulator.capture.decision import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.optics.motion import ALONG_ROWS, Movement
+from simulator.utils.cache import cache_key, content_digest, disk_cache
 from simulator.utils.checks import check_integer
 
 #: Memory for the blurred light of one table [byte].
@@ -109,6 +112,53 @@ class ScoreTables:
                 scene, self.camera, speed=speed, defocus=defocus, movement=movement
             )
             prepared = prepared.changed(tolerance=self.tolerance)
+        key = self._stored_key(scene, prepared, gain, row_gain)
+        stored = None if key is None else disk_cache().get(key)
+        if stored is not None:
+            mean, error = stored.pop("mean"), stored.pop("standard_error")
+            return ScoreTable(mean, error, stored, scene.allowed)
+        table = self._made(scene, prepared, gain, row_gain)
+        if key is not None:
+            found = {"mean": table.mean, "standard_error": table.standard_error}
+            disk_cache().put(key, found | table.parts)
+        return table
+
+    def _stored_key(
+        self,
+        scene: Scene,
+        prepared: PreparedScene,
+        gain: float | np.ndarray,
+        row_gain: np.ndarray | None,
+    ) -> str | None:
+        """Key of a table on the disk; None where it is not stored.
+
+        Stored are those of scorers with ``stored = True``, which take long, of light without noise.
+        """
+        parts = self.scorer.parts.values()
+        if scene.ladder is None or not any(getattr(part, "stored", False) for part in parts):
+            return None
+        if self._fingerprint is None or not scene.noise_free:
+            return None
+        rows = None if row_gain is None else content_digest({"rows": torch.from_numpy(row_gain)})
+        known = scene.content, scene.ladder.facts, scene.ev100, scene.white_balance
+        light = *known, scene.box_factor, repr((scene.reference, scene.camera))
+        blur = prepared.image_speed, prepared.defocus, repr(prepared.movement)
+        scored = self._fingerprint, self.scorer.weights, repr((self.camera, self.states))
+        own = *scored, self.noise, self.noise_seeds, self.tolerance
+        return cache_key("score_tables", [light, blur, np.asarray(gain).tolist(), rows, own])
+
+    @cached_property
+    def _fingerprint(self) -> str | None:
+        return scorer_fingerprint(self.scorer)
+
+    def _made(
+        self,
+        scene: Scene,
+        prepared: PreparedScene,
+        gain: float | np.ndarray,
+        row_gain: np.ndarray | None,
+    ) -> ScoreTable:
+        """`table`, worked out."""
         terms, count = self.term_scores, len(self.states)
         light: dict[str, Any] = {"gain": gain, "row_gain": row_gain}
         parts = terms.closed_form_terms(scene, prepared, "light", "blur", **light)
