@@ -52,10 +52,8 @@ _BOARDS = (("sun",), ("sun",), ("shade",), ("shade",), ("sun", "shade"))
 _GREY = 0.35
 #: Largest turn of a board [rad], and what its far side lacks at most of the near one's length.
 _TURN, _FAR = math.radians(5.0), 0.15
-#: Sets of places of which the one with the light that fits best is taken; samples per pixel's side.
-_TRIES, _SAMPLES = 8, 4
-#: Raised when the drawing changes.
-_VERSION = 1
+#: Sets of places that are tried; samples per pixel's side; raised when the drawing changes.
+_TRIES, _SAMPLES, _VERSION = 8, 4, 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,10 +191,9 @@ def _view(rng: Generator, height: int) -> Array:
     quad = _rectangle(*_board_size(height))
     quad, side = quad - quad.mean(axis=0), int(rng.integers(4))
     quad[[side, (side + 1) % 4]] *= rng.uniform(1.0 - _FAR, 1.0)
-    angle = rng.uniform(-_TURN, _TURN)
-    across = math.cos(angle), math.sin(angle)
-    turned = quad @ np.array([across, (-across[1], across[0])])
-    return np.asarray(turned - turned.min(axis=0))
+    turn = rng.uniform(-_TURN, _TURN)
+    quad = quad @ np.array([(math.cos(turn), math.sin(turn)), (-math.sin(turn), math.cos(turn))])
+    return np.asarray(quad - quad.min(axis=0))
 
 
 def _matrix(source: Array, target: Array) -> Array:

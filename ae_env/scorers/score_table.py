@@ -115,49 +115,29 @@ class ScoreTables:
         key = self._stored_key(scene, prepared, gain, row_gain)
         stored = None if key is None else disk_cache().get(key)
         if stored is not None:
-            mean, error = stored.pop("mean"), stored.pop("standard_error")
-            return ScoreTable(mean, error, stored, scene.allowed)
+            return ScoreTable(stored.pop("mean"), stored.pop("error"), stored, scene.allowed)
         table = self._made(scene, prepared, gain, row_gain)
         if key is not None:
-            found = {"mean": table.mean, "standard_error": table.standard_error}
-            disk_cache().put(key, found | table.parts)
+            disk_cache().put(key, {"mean": table.mean, "error": table.standard_error} | table.parts)
         return table
 
     def _stored_key(
-        self,
-        scene: Scene,
-        prepared: PreparedScene,
-        gain: float | np.ndarray,
-        row_gain: np.ndarray | None,
+        self, scene: Scene, prepared: PreparedScene, gain: Any, rows: Any
     ) -> str | None:
-        """Key of a table on the disk; None where it is not stored.
-
-        Stored are those of scorers with ``stored = True``, which take long, of light without noise.
-        """
-        parts = self.scorer.parts.values()
-        if scene.ladder is None or not any(getattr(part, "stored", False) for part in parts):
+        """Key on the disk of the table of a scorer with ``stored = True``; None for any other."""
+        slow = any(getattr(part, "stored", False) for part in self.scorer.parts.values())
+        scorer = scorer_fingerprint(self.scorer) if slow and scene.noise_free else None
+        if scorer is None or scene.ladder is None:
             return None
-        if self._fingerprint is None or not scene.noise_free:
-            return None
-        rows = None if row_gain is None else content_digest({"rows": torch.from_numpy(row_gain)})
         known = scene.content, scene.ladder.facts, scene.ev100, scene.white_balance
         light = *known, scene.box_factor, repr((scene.reference, scene.camera))
-        blur = prepared.image_speed, prepared.defocus, repr(prepared.movement)
-        scored = self._fingerprint, self.scorer.weights, repr((self.camera, self.states))
-        own = *scored, self.noise, self.noise_seeds, self.tolerance
-        return cache_key("score_tables", [light, blur, np.asarray(gain).tolist(), rows, own])
+        rows = None if rows is None else content_digest({"rows": torch.from_numpy(rows)})
+        episode = prepared.image_speed, prepared.defocus, repr(prepared.movement), rows
+        own = scorer, self.scorer.weights, repr((self.camera, self.states)), self.tolerance
+        noise = self.noise, self.noise_seeds
+        return cache_key("score_tables", [light, episode, np.asarray(gain).tolist(), own, noise])
 
-    @cached_property
-    def _fingerprint(self) -> str | None:
-        return scorer_fingerprint(self.scorer)
-
-    def _made(
-        self,
-        scene: Scene,
-        prepared: PreparedScene,
-        gain: float | np.ndarray,
-        row_gain: np.ndarray | None,
-    ) -> ScoreTable:
+    def _made(self, scene: Scene, prepared: PreparedScene, gain: Any, row_gain: Any) -> ScoreTable:
         """`table`, worked out."""
         terms, count = self.term_scores, len(self.states)
         light: dict[str, Any] = {"gain": gain, "row_gain": row_gain}
