@@ -38,7 +38,7 @@ from simulator.utils.checks import NOTE, check_word
 BENCHMARKS = (
     *("agents", "bracketing", "cluster", "colour_checker", "curves", "defects", "denoising"),
     *("features", "hdr", "onboard", "paper", "ptc", "places", "recorded", "refocus"),
-    *("scorers", "simulator", "throughput", "transfer", "work_precision"),
+    *("scorers", "simulator", "tasks", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
