@@ -17,6 +17,7 @@ from PIL import Image
 from ae_env.scenes.ladder import tag_dictionary, zxing
 from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.scorers.measures import luma_of
+from simulator.utils.checks import import_extra
 
 #: Pixels of the picture that a reader is given for each of the frame's, per side: both readers want
 #: two or three for a module. The rim around a code's cell [pixel of the frame].
@@ -109,12 +110,11 @@ class Tags(_Ladder):
     needs, kind = "extra cv", "tags"
 
     def _made(self) -> tuple[Reader, str]:
-        import cv2
-
+        cv2 = import_extra("cv2", "cv", "the scorer tags")
         detector = cv2.aruco.ArucoDetector(tag_dictionary())
 
         def read(crop: np.ndarray) -> list[str]:
             numbers = detector.detectMarkers(crop)[1]
             return [] if numbers is None else [str(n) for n in numbers.ravel().tolist()]
 
-        return read, cv2.__version__
+        return read, str(cv2.__version__)

@@ -29,6 +29,7 @@ from ae_env.utils.user_files import UserCodeError, load_from_file, split_file_na
 from simulator import CameraProfile
 from simulator.raw.develop import develop_inverse
 from simulator.settings import CameraSettings
+from simulator.utils.checks import import_extra
 from simulator.utils.files import open_picture
 
 #: From a picture (H, W, 3) uint8 sRGB to what is in it: a truth value, a label, or a list of them.
@@ -120,9 +121,8 @@ def load_detector(name: str) -> Detector:
         module = zxing()
         return lambda picture: [code.text for code in module.read_barcodes(picture)]
     if name == "tags":
-        import cv2
-
-        search = cv2.aruco.ArucoDetector(tag_dictionary()).detectMarkers
+        aruco = import_extra("cv2", "cv", "the detector tags").aruco
+        search = aruco.ArucoDetector(tag_dictionary()).detectMarkers
         return lambda picture: () if (ids := search(picture)[1]) is None else ids.ravel().tolist()
     if name.lower().endswith(".onnx"):
         classifier = Classifier(name)
