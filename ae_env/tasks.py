@@ -339,7 +339,8 @@ def move_subject(scene: Scene, rows: int, columns: int) -> Scene:
 
     new = Layout(moved(layout.defocus[None])[0].clamp(0.0, 1.0), subject)
     denoised = None if scene.denoised is None else moved(scene.denoised)
-    return replace(scene, light=moved(scene.light), denoised=denoised, layout=new)
+    # Codes are no longer where a ladder says.
+    return replace(scene, light=moved(scene.light), denoised=denoised, layout=new, ladder=None)
 
 
 class _Bracket(AutoExposureBase):

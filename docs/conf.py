@@ -56,7 +56,7 @@ CONTENTS = {
     ],
     "The simulator": [
         *("simulator", "cameras", "networks", "dataset", "colour", "performance", "stability"),
-        *("refocus", "hdr", "augmentation"),
+        *("refocus", "hdr", "augmentation", "latitude"),
     ],
     "More": [
         "architecture",

@@ -9,6 +9,8 @@ What `scenes=` may be:
   ``"polyhaven:unknown"``: the same as if nobody had metered their light; ``"mixed"``:
   such views and the procedural scenes of ``"bundled:large"``, as many of each; ``"mixed:10"``:
   views of 10 of the places only;
+- any of these, or a file of light without noise, with ``"?codes"`` or ``"?tags"`` behind it:
+  codes are drawn into every scene (`ae_env.scenes.ladder`); ``"?codes=7"`` draws others;
 - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
 - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
   given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
@@ -41,6 +43,8 @@ import torch
 from ae_env.grid import ExposureGrid
 from ae_env.scenes.bundled import HARD, KINDS, Size, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
+from ae_env.scenes.ladder import KINDS as LADDERS
+from ae_env.scenes.ladder import with_ladder
 from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest, SceneSet, Split
@@ -72,6 +76,7 @@ REAL = ("polyhaven", VIEWS_OF_UNKNOWN_LIGHT, "mixed")
 NAMED = (*BUNDLED, *BUNDLED_PARTS, *REAL)
 #: Ways to name scenes, see `load_scenes`.
 SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any] | RecordedOptions
+_LADDER = re.compile(rf"(.+)\?({'|'.join(LADDERS)})(?:=(\d{{1,18}}))?", re.DOTALL)
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 #: The weights that come with the package.
 DEFAULT_SIMULATOR = "compact"
@@ -113,6 +118,10 @@ def load_scenes(
         resize: Called with each scene at its finest resolution, `resolution` and `crop`.
         grid: States of recorded grids; by default all that their captures have.
     """
+    if isinstance(spec, str) and (drawn := _LADDER.fullmatch(spec)):
+        size: dict[str, Any] = {"resolution": resolution, "crop": crop, "resize": resize}
+        plain = load_scenes(drawn[1], split, camera=camera, grid=grid, **size)
+        return [with_ladder(scene, drawn[2], int(drawn[3] or 0)) for scene in plain]
     check_word("split", split, get_args(Split))
     named = isinstance(spec, str | Path | Mapping)
     if split == "validation" and named and spec not in REAL[:2]:
@@ -246,7 +255,7 @@ def environment_scenes(
     elif recorded is not None:
         times = tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files)
         key = (*facts, *known_by, grid, times)
-    elif isinstance(spec, str) and spec in NAMED:
+    elif isinstance(spec, str) and _LADDER.sub(r"\1", spec) in NAMED:
         key = (*facts, *known_by, spec)
     known = None if key is None else _LOADED.get(key)
     if known is not None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 
 import numpy as np
 import torch
@@ -24,6 +24,9 @@ from simulator.raw.image import RawImage, check_packed
 from simulator.settings import CameraSettings
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_integer, check_number, check_type, check_word
+
+if TYPE_CHECKING:
+    from ae_env.scenes.ladder import Ladder
 
 #: Median image speed of a moving episode [frame heights / s].
 DEFAULT_SPEED = 0.125
@@ -94,6 +97,7 @@ class Scene:
     #: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has them; None
     #: for every state of any grid.
     allowed: np.ndarray | None = None
+    ladder: Ladder | None = None  # codes drawn into it (`ae_env.scenes.ladder`), and where they are
 
     @property
     def noise_free(self) -> bool:
@@ -306,6 +310,7 @@ class Scene:
             residual=None,  # of the whole frame
             defocus_map=part(self.defocus_map),
             layout=None if self.layout is None else self.layout.cut(rows, columns),
+            ladder=self.ladder and self.ladder.within(rows.start or 0, columns.start or 0, 1),
         )
 
     def averaged(self, k: int) -> Scene:
@@ -340,6 +345,7 @@ class Scene:
             residual=None,  # of the finer pixels
             defocus_map=None if found is None else mean(found.square()).sqrt().float() / k,
             layout=layout,
+            ladder=self.ladder and self.ladder.within(0, 0, k),
         )
 
     def __repr__(self) -> str:

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from ae_env.scenes.ladder import Ladder
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.capture.decision import MAX_DISC_PX
@@ -108,6 +109,11 @@ class Captures:
     def scene_ids(self) -> Sequence[str]:
         """The scene of each capture, B long."""
         return [scene.scene_id for scene in self._scenes]
+
+    @property
+    def ladders(self) -> Sequence[Ladder | None]:
+        """The codes that are drawn into the scene of each capture, B long."""
+        return [scene.ladder for scene in self._scenes]
 
     @cached_property
     def white_balance(self) -> torch.Tensor:

@@ -291,14 +291,21 @@ class Classifier:
 
         A `UserCodeError` if the network raises, or returns anything but numbers (B, classes).
         """
+        return self._classified(images).amax(dim=1).clamp(max=1.0)
+
+    def labels(self, images: Tensor) -> list[int]:
+        """The most likely class of each picture."""
+        return [int(label) for label in self._classified(images).argmax(dim=1)]
+
+    def _classified(self, images: Tensor) -> Tensor:
+        """Probabilities (B, classes) float64."""
         mean, std = (torch.tensor(v)[:, None, None] for v in (self.mean, self.std))
-        scores = []
+        found = []
         with torch.no_grad():
             for part in images.split(self.batch or _CLASSIFIED_AT_ONCE):  # type: ignore[no-untyped-call]
                 part = _of_size(part, self.size).float().clamp(0.0, 1.0)
-                outputs = self._outputs((part - mean) / std)
-                scores.append(_confidence(outputs, len(part)))
-        return torch.cat(scores)
+                found.append(_probabilities(self._outputs((part - mean) / std), len(part)))
+        return torch.cat(found)
 
     def _outputs(self, pictures: Tensor) -> Any:
         try:
@@ -315,8 +322,8 @@ class Classifier:
             raise UserCodeError(text) from error
 
 
-def _confidence(outputs: Any, count: int) -> Tensor:
-    """Largest probability (B,) float64 of logits or probabilities (B, classes)."""
+def _probabilities(outputs: Any, count: int) -> Tensor:
+    """Probabilities (B, classes) float64 of logits, or of probabilities."""
     try:
         values = torch.as_tensor(outputs)
         found = "complex numbers" if values.is_complex() else str(tuple(values.shape))
@@ -330,8 +337,8 @@ def _confidence(outputs: Any, count: int) -> Tensor:
     values = values.double()
     sums = values.sum(dim=1)
     if bool((values >= 0.0).all()) and bool(((sums - 1.0).abs() < _SUM_ERROR).all()):
-        return values.amax(dim=1).clamp(max=1.0)
-    return values.softmax(dim=1).amax(dim=1)
+        return values
+    return values.softmax(dim=1)
 
 
 @lru_cache(maxsize=4)

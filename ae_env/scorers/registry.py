@@ -8,6 +8,7 @@
 | | `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
 | `fidelity.py` | `fidelity`, `keypoints`, `matches` |
+| `detection.py` | `legibility`, `tags` |
 | `learnt.py` | `nima_aesthetic`, `nima_technical`, `classifier`, ``pyiqa:METRIC`` |
 """
 
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from ae_env.scorers import defects, fidelity, learnt, measures, terms
+from ae_env.scorers import defects, detection, fidelity, learnt, measures, terms
 from ae_env.scorers.captures import Scorer
 from ae_env.scorers.terms import CompositeScorer, check_part
 from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
@@ -42,6 +43,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "banding": terms.Banding,
     "classifier": learnt.Classifier,
     "keypoints": fidelity.Keypoints,
+    "legibility": detection.Legibility,
     "matches": fidelity.Matches,
     "nima_aesthetic": learnt.NimaAesthetic,
     "nima_technical": learnt.NimaTechnical,
@@ -57,6 +59,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "blind_noise": measures.BlindNoise,
     "defects": defects.Defects,
     "fidelity": fidelity.Fidelity,
+    "tags": detection.Tags,
     **defects.ANALYTIC,
 }
 

@@ -12,17 +12,20 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import prepare_scene
+from ae_env.scorers.registry import scorer_fingerprint
 from ae_env.scorers.term_scores import CHUNK, TermScores, slices
 from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
 from simulator.capture.decision import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.optics.motion import ALONG_ROWS, Movement
+from simulator.utils.cache import cache_key, content_digest, disk_cache
 from simulator.utils.checks import check_integer
 
 #: Memory for the blurred light of one table [byte].
@@ -109,6 +112,33 @@ class ScoreTables:
                 scene, self.camera, speed=speed, defocus=defocus, movement=movement
             )
             prepared = prepared.changed(tolerance=self.tolerance)
+        key = self._stored_key(scene, prepared, gain, row_gain)
+        stored = None if key is None else disk_cache().get(key)
+        if stored is not None:
+            return ScoreTable(stored.pop("mean"), stored.pop("error"), stored, scene.allowed)
+        table = self._made(scene, prepared, gain, row_gain)
+        if key is not None:
+            disk_cache().put(key, {"mean": table.mean, "error": table.standard_error} | table.parts)
+        return table
+
+    def _stored_key(
+        self, scene: Scene, prepared: PreparedScene, gain: Any, rows: Any
+    ) -> str | None:
+        """Key on the disk of the table of a scorer with ``stored = True``; None for any other."""
+        slow = any(getattr(part, "stored", False) for part in self.scorer.parts.values())
+        scorer = scorer_fingerprint(self.scorer) if slow and scene.noise_free else None
+        if scorer is None or scene.ladder is None:
+            return None
+        known = scene.content, scene.ladder.facts, scene.ev100, scene.white_balance
+        light = *known, scene.box_factor, repr((scene.reference, scene.camera))
+        rows = None if rows is None else content_digest({"rows": torch.from_numpy(rows)})
+        episode = prepared.image_speed, prepared.defocus, repr(prepared.movement), rows
+        own = scorer, self.scorer.weights, repr((self.camera, self.states)), self.tolerance
+        noise = self.noise, self.noise_seeds
+        return cache_key("score_tables", [light, episode, np.asarray(gain).tolist(), own, noise])
+
+    def _made(self, scene: Scene, prepared: PreparedScene, gain: Any, row_gain: Any) -> ScoreTable:
+        """`table`, worked out."""
         terms, count = self.term_scores, len(self.states)
         light: dict[str, Any] = {"gain": gain, "row_gain": row_gain}
         parts = terms.closed_form_terms(scene, prepared, "light", "blur", **light)

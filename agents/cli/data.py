@@ -192,6 +192,35 @@ def score_tables(
     print_files({"score tables": out / "tables-*.parquet"})
 
 
+def latitude(
+    detector: Annotated[str, Argument(help="codes, tags, model.onnx or my_file.py:Name.")],
+    pictures: Annotated[str, Argument(help="A picture, raw or radiance map, a folder, or a glob.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for results.")] = Path("latitude"),
+    size: Annotated[int, Option(help="Longer side of pictures [pixel].", min=36, max=4096)] = 512,
+    camera: Annotated[str, Option(help="Camera whose noise counts.")] = "nikon_z6",
+) -> None:
+    """Measure over which exposures, ISO speeds and blurs a detector works; a plot and a CSV.
+
+    It is called with (H, W, 3) uint8 and returns a truth value, a label, or a list of them.
+
+    Example: `ae-env latitude my_file.py:MyDetector path/to/pictures`
+    """
+    from agents.applications.latitude import load_detector, measure_latitude, picture_scenes
+    from simulator import get_camera
+    from simulator.utils.files import write_atomically
+
+    found, scenes = load_detector(detector), picture_scenes(pictures, get_camera(camera), size)
+    console.make_folder(out)
+    with progress_bars() as progress, progress("pictures") as task:
+        result = measure_latitude(found, scenes, task)
+    files = {"shares": out / "latitude.csv", "plot": out / "latitude.png"}
+    write_atomically(files["shares"], result.rows.to_csv(index=False, float_format="%.6g"))
+    result.plot(files["plot"])
+    for line in result.lines():
+        print_line(line)
+    print_files(files)
+
+
 def cache(clear: Annotated[bool, Option("--clear", help="Remove all of it.")] = False) -> None:
     """Show what is cached between runs (scenes, networks' outputs), or clear it.
 

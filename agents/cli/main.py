@@ -25,7 +25,7 @@ from typer import Argument, Option
 from typer.core import TyperGroup
 
 from agents.cli import console
-from agents.cli.data import cache, record, scenes, score_tables, warm_up
+from agents.cli.data import cache, latitude, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate, stability
 from agents.cli.quickstart import quickstart
 from agents.cli.show import cameras, film, judge, lightings, policies, scorers, view
@@ -38,7 +38,7 @@ from simulator.utils.checks import NOTE, check_word
 BENCHMARKS = (
     *("agents", "bodies", "bracketing", "cluster", "colour_checker", "curves", "defects"),
     *("denoising", "emva", "features", "hdr", "onboard", "paper", "ptc", "places", "recorded"),
-    *("refocus", "scorers", "simulator", "throughput", "transfer", "work_precision"),
+    *("refocus", "scorers", "simulator", "tasks", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -135,7 +135,7 @@ app = typer.Typer(
 _HEADINGS: dict[str, tuple[Callable[..., None], ...]] = {
     "Start": (quickstart, view),
     "Policies": (evaluate, stability, train, policies, scorers, film, judge, record, export),
-    "Raw files": (simulate, sweep, refocus, hdr),
+    "Raw files": (simulate, sweep, refocus, hdr, latitude),
     "Scenes": (cameras, lightings, score_tables),
     "Maintenance": (cache, warm_up, train_simulator),
 }

@@ -37,13 +37,13 @@ from simulator.training.crops import ReferencePairs
 from simulator.utils.files import sibling
 
 COMMANDS = (
-    *("bench", "cache", "cameras", "evaluate", "export", "film", "hdr", "judge", "lightings"),
-    *("policies", "quickstart", "record", "refocus", "scenes", "score-tables", "scorers"),
-    *("simulate", "stability", "sweep", "train", "train-simulator", "view", "warm-up"),
+    *("bench", "cache", "cameras", "evaluate", "export", "film", "hdr", "judge", "latitude"),
+    *("lightings", "policies", "quickstart", "record", "refocus", "scenes", "score-tables"),
+    *("scorers", "simulate", "stability", "sweep", "train", "train-simulator", "view", "warm-up"),
 )
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "cameras", "lightings", "policies", "scenes", "scorers", "view", "warm-up")
-NO_SEED = (*NO_OUT, "export", "hdr")
+NO_SEED = (*NO_OUT, "export", "hdr", "latitude")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
 from agents import Policy

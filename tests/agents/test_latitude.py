@@ -1,0 +1,87 @@
+"""`ae-env latitude` on detectors whose thresholds are known."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ae_env.utils.user_files import UserCodeError
+from agents.applications.latitude import load_detector, measure_latitude, picture_scenes
+from simulator import get_camera
+
+CAMERA = get_camera("nikon_z6")
+
+
+def decoded(code):
+    """Linear light of an sRGB code (IEC 61966-2-1)."""
+    return ((code / 255.0 + 0.055) / 1.055) ** 2.4
+
+
+def latitude(picture, detector, tmp_path):
+    Image.fromarray(picture).save(tmp_path / "picture.png")
+    scenes = picture_scenes(str(tmp_path / "picture.png"), CAMERA, 128)
+    return measure_latitude(detector, scenes)
+
+
+def test_exposures_end_where_a_threshold_of_the_code_is_crossed(tmp_path):
+    grey = np.full((64, 64, 3), 100, np.uint8)
+    found = latitude(grey, lambda p: bool(60.0 < p.mean() < 150.0), tmp_path)
+    ends = found.ends("EV")
+    for name, code in (("low", 60.0), ("high", 150.0)):
+        crossing = np.log2(decoded(code) / decoded(100.0))
+        assert ends[name][0] == pytest.approx(crossing, abs=1.0)  # the step of the axis
+        assert ends[name][1] == "clipping"  # it is so without noise, too
+    assert found.ends("ISO")["high"][1] == ""
+
+
+def test_gain_ends_where_the_noise_reaches_a_threshold(tmp_path):
+    """Of green, the mean of two planes; an 18 % card has 0.119 of white and is shown as 18 %."""
+    grey = np.full((96, 96, 3), 118, np.uint8)
+    slope = 255.0 * 1.055 / 2.4 * 0.18 ** (1.0 / 2.4 - 1.0) * 0.18 / 0.119  # code by signal
+    found = latitude(grey, lambda p: bool(p[..., 1].std() < 6.0), tmp_path)
+    value, cause = found.ends("ISO")["high"]
+    stds = {}
+    for iso in found.curve("ISO").value:
+        noise = CAMERA.nlf(iso)
+        stds[iso] = slope * np.sqrt((noise.shot[1] * 0.119 + noise.read[1]) / 2.0)
+    last = max(iso for iso, std in stds.items() if std < 6.0)
+    assert cause == "noise"
+    assert last <= value <= 2.0 * last
+
+
+def test_blur_ends_where_an_edge_is_too_wide(tmp_path):
+    """A motion of L pixels makes a ramp of L pixels."""
+    picture = np.zeros((128, 128, 3), np.uint8)
+    picture[:, 64:] = 200
+
+    def is_sharp(shown):
+        row = shown[64].mean(axis=1)
+        return bool(((row > 20.0) & (row < 190.0)).sum() <= 2)
+
+    value, cause = latitude(picture, is_sharp, tmp_path).ends("blur")["high"]
+    assert cause == "blur"
+    assert 0.8 <= value <= 3.2  # two pixels of 128 are 1.6 %, among steps of 2
+
+
+def test_things_that_are_not_found_to_begin_with_do_not_count(tmp_path):
+    picture = np.full((64, 64, 3), 128, np.uint8)
+    counted = latitude(picture, lambda p: ["a", "b"] if p.mean() > 90.0 else ["a"], tmp_path)
+    assert set(counted.rows.trials) == {2}
+    dark = counted.curve("EV").iloc[0]
+    assert (dark.share, round(dark.low, 4), round(dark.high, 4)) == (0.5, 0.0945, 0.9055)  # Wilson
+    with pytest.raises(ValueError, match="at least one"):
+        latitude(picture, lambda p: [], tmp_path)
+    with pytest.raises(UserCodeError, match="ZeroDivisionError"):
+        latitude(picture, lambda p: 1 / 0, tmp_path)
+    with pytest.raises(ValueError, match=r"`detector` \(='nothing'\)"):
+        load_detector("nothing")
+
+
+def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path):
+    (tmp_path / "own.py").write_text("def is_bright(picture):\n    return picture.mean() > 60\n")
+    Image.fromarray(np.full((48, 64, 3), 128, np.uint8)).save(tmp_path / "grey.png")
+    options = f"{tmp_path}/own.py:is_bright", f"{tmp_path}/grey.png", "-o", str(tmp_path)
+    code, out, *_ = ae_env("latitude", *options)
+    assert (code, "over " in out) == (0, True)
+    assert (tmp_path / "latitude.csv").read_text().startswith("axis,value,noise,share,low,high")
+    with Image.open(tmp_path / "latitude.png") as plot:
+        assert plot.width > 300
