@@ -260,7 +260,7 @@ def panels(curves: Iterable[Row], width: float = 3.6, **axes: Any) -> Figure:
         axis.set(**{"title": title, **axes})
         axis.grid(alpha=0.3)
         labels = [curve["label"] for curve in own]
-        if labels not in explained:
+        if labels not in explained and set(labels) != {"_"}:
             explained.append(labels)
             axis.legend(fontsize=6)
     for axis in axes_of:
