@@ -49,28 +49,20 @@ class LightTracker(Protocol):
 class TrendTracker:
     """An alpha-beta filter of the metered EV of each camera: its level and its rate.
 
-    A frame's reading corrects the level by `alpha` of the surprise and the rate by `beta` of it
-    (constant-velocity model). The rate is expected to die away: after each frame a share of
-    `damping` of it is left (Gardner and McKenzie 1985). A mostly saturated frame only says that the
-    light is not below a bound, a black one that it is not above: what was expected stays if it
-    agrees. `ev_range` is that of the exposure states [EV100].
+    A surprise corrects the level by a share of `ALPHA` and the rate by one of `BETA`; of the rate a
+    share of `DAMPING` is left after each frame (Gardner and McKenzie 1985). A mostly saturated
+    frame only says that the light is not below a bound, a black one that it is not above: what was
+    expected stays if it agrees. `ev_range` is that of the exposure states [EV100].
     """
 
-    def __init__(
-        self,
-        num_envs: int,
-        ev_range: tuple[float, float],
-        alpha: float = ALPHA,
-        beta: float = BETA,
-        damping: float = DAMPING,
-    ) -> None:
-        self.ev_range, self.alpha, self.beta, self.damping = ev_range, alpha, beta, damping
+    def __init__(self, num_envs: int, ev_range: tuple[float, float]) -> None:
+        self.ev_range = ev_range
         self.ev100, self.rate = np.full(num_envs, np.nan), np.zeros(num_envs)
 
     def update(self, reading: Reading, exposed_at: Floats) -> None:
         """See `LightTracker.update`."""
         low, high = self.ev_range
-        expected = self.ev100 + self.damping * self.rate
+        expected = self.ev100 + DAMPING * self.rate
         bound = reading.ev100 - SATURATED_STEP_EV * reading.saturated
         agrees = (reading.saturated > 0.5) & (expected >= bound)
         agrees |= reading.black & (expected <= reading.ev100)
@@ -78,8 +70,8 @@ class TrendTracker:
         metered = np.where(reading.black, np.minimum(reading.ev100, low), reading.ev100)
         surprise = np.where(agrees, 0.0, metered - expected)
         jumped = np.abs(surprise) > JUMP_EV
-        rate = self.damping * self.rate + self.beta * surprise
-        level = expected + np.where(jumped, 1.0, self.alpha) * surprise
+        rate = DAMPING * self.rate + BETA * surprise
+        level = expected + np.where(jumped, 1.0, ALPHA) * surprise
         first = np.isnan(expected)
         self.ev100 = np.clip(np.where(first, metered, level), low - 4.0, high + 4.0)
         rate = np.where(first | jumped, 0.0, rate)
@@ -87,7 +79,7 @@ class TrendTracker:
 
     def ahead(self, frames: int) -> tuple[Floats, Floats]:
         """See `LightTracker.ahead`; how far off it may be is not known."""
-        weight = sum(self.damping**k for k in range(1, frames + 1))
+        weight = sum(DAMPING**k for k in range(1, frames + 1))
         return self.ev100 + weight * self.rate, np.zeros_like(self.rate)
 
 

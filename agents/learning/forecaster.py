@@ -1,8 +1,9 @@
 """A forecaster of light with a memory: a recurrent network over what a light meter reads.
 
 It learns from light that is drawn (`ae_env.lighting.moving`, the training kinds, mixed and bent),
-as a meter reads it on frames that are exposed for the light of some frames before: clipped where
-they are too bright, noisy where they are dark. No picture is needed, so it trains in minutes.
+as a meter reads it on frames exposed for the light of some frames before: clipped where they are
+too bright, noisy where they are dark. It needs no picture, so it trains in minutes. Beside it,
+light that repeats itself is foreseen from what came after light like it (`analogues`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from pydantic import Field
 from torch import nn
@@ -37,6 +39,13 @@ HORIZON = 4
 KINDS = tuple(kind for kind in KIND_SETS["train"] if kind != "lamps")
 #: Frames of a sample, and numbers that describe one.
 _LENGTH, _INPUTS = 128, 4
+#: Frames that past light is compared in, and those that are remembered for it. How alike it must be
+#: to count [EV]: so much, and a share of how unlike the most alike is. Like those below, chosen on
+#: the training kinds and on stretches of them that repeat themselves or go to and fro.
+_COMPARED, _REMEMBERED, _ALIKE, _OF_BEST = 5, 128, 0.05, 0.2
+#: The newest error's share in the mean of a forecast's errors, that mean at first, what is added to
+#: it [EV], and the power of it that divides the forecast's weight.
+_NEWEST, _FIRST_ERROR, _LEAST_ERROR, _POWER = 0.15, 0.3, 0.05, 4
 #: Changes beyond this are not learnt from, and the least spread of a forecast [EV].
 _LARGEST, _LEAST_SPREAD = 8.0, 0.02
 
@@ -88,25 +97,57 @@ def network_inputs(reading: Reading, before: Floats, exposed_at: Floats) -> NDAr
     `before` is the metered EV100 of the frame before, `exposed_at` that of the settings.
     """
     change, exposure = (reading.ev100 - before) / 2.0, (reading.ev100 - exposed_at) / 4.0
-    parts = [change, exposure, reading.saturated, reading.black]
-    return np.stack(parts, axis=-1).astype(np.float32)
+    return np.stack([change, exposure, reading.saturated, reading.black], -1).astype(np.float32)
+
+
+def analogues(light: Floats) -> tuple[Floats, Floats]:
+    """What came after light like the latest, as it was and in reverse (Lorenz 1969).
+
+    Every five frames of `light` (N, T) [EV] are compared with the last five. The changes after
+    them, or in reverse those before them, are averaged, most of all those of the most alike.
+    Returns the changes, (N, 2, HORIZON), and how unlike the most alike are, (N, 2) [EV].
+    """
+    before = np.repeat(light[:, :1], _COMPARED + HORIZON - 1, axis=1)
+    known = np.concatenate([before, light], axis=1)
+    stretches = sliding_window_view(known, _COMPARED, axis=1)
+    ahead = sliding_window_view(known, HORIZON + 1, axis=1)
+    found = []
+    for others, after in (
+        (stretches[:, :-HORIZON], ahead[:, _COMPARED - 1 :]),
+        (stretches[:, HORIZON:, ::-1], ahead[:, : 1 - _COMPARED, ::-1]),
+    ):
+        apart = np.sqrt(np.square(others - stretches[:, -1:]).mean(axis=2))
+        least = apart.min(axis=1, keepdims=True)
+        weights = np.exp((least - apart) / (_ALIKE + _OF_BEST * least))
+        change = np.einsum("nt,nth->nh", weights, after[..., 1:] - after[..., :1])
+        found.append((change / weights.sum(axis=1, keepdims=True), least[:, 0]))
+    changes, unlike = zip(*found, strict=True)
+    return np.stack(changes, axis=1), np.stack(unlike, axis=1)
 
 
 class LearntTracker:
-    """The forecast of trained networks, as a `LightTracker`.
+    """The forecasts of trained networks and of `analogues`, as a `LightTracker`.
 
-    Those of several trainings are averaged; where they differ, the forecast is less sure.
+    Networks are averaged; where they differ, they are less sure. They and the two analogues weigh
+    by how far off each was so far, and by the error it expects or how unlike the light is.
     """
 
     def __init__(self, num_envs: int, networks: Sequence[LightForecaster]) -> None:
         self.networks = networks
-        self._before: Floats | None = None
+        self._light = np.empty((num_envs, 0))
         self._states: list[torch.Tensor | None] = [None] * len(networks)
         self._expected, self._spread = np.full((2, num_envs, HORIZON + 1), np.nan)
+        self._forecasts: list[Floats] = []  # of the last frames, (N, 3, HORIZON) each
+        self._errors = np.full((num_envs, 3, HORIZON), _FIRST_ERROR)
 
     def update(self, reading: Reading, exposed_at: Floats) -> None:
         """Take in one frame's reading."""
-        before = reading.ev100 if self._before is None else self._before
+        light = reading.ev100[:, None]
+        for i, forecast in enumerate(reversed(self._forecasts)):
+            error = np.abs(forecast[:, :, i] - light)
+            self._errors[:, :, i] += _NEWEST * (error - self._errors[:, :, i])
+        self._light = np.concatenate([self._light, light], axis=1)[:, -_REMEMBERED:]
+        before = self._light[:, -2:][:, 0]  # in the first frame itself
         inputs = torch.from_numpy(network_inputs(reading, before, exposed_at))[:, None]
         inputs = inputs.to(next(self.networks[0].parameters()).device)
         found = []
@@ -115,9 +156,17 @@ class LearntTracker:
                 changes, spreads, self._states[i] = network(inputs, self._states[i])
                 found.append(torch.stack([changes[:, 0], spreads[:, 0]]).double().cpu().numpy())
         changes, spreads = np.stack(found, axis=1)  # (networks, N, HORIZON + 1) each
-        self._before = reading.ev100.copy()
-        self._expected = reading.ev100[:, None] + changes.mean(axis=0)
-        self._spread = np.sqrt((spreads**2).mean(axis=0) + changes.var(axis=0))
+        expected = light + changes.mean(axis=0)
+        spread = np.sqrt((spreads**2).mean(axis=0) + changes.var(axis=0))
+        changes, unlike = analogues(self._light)
+        forecasts = np.concatenate([expected[:, None, 1:], light[:, None] + changes], axis=1)
+        off = self._errors + _LEAST_ERROR
+        off[:, 0] = np.sqrt(off[:, 0] * (spread[:, 1:] + _LEAST_ERROR))
+        off[:, 1:] += unlike[:, :, None]
+        weights = off**-_POWER / (off**-_POWER).sum(axis=1, keepdims=True)
+        self._forecasts = [*self._forecasts, forecasts][-HORIZON:]
+        self._expected = np.column_stack([expected[:, 0], (weights * forecasts).sum(axis=1)])
+        self._spread = np.column_stack([spread[:, 0], (weights * off).sum(axis=1)])
 
     def ahead(self, frames: int) -> tuple[Floats, Floats]:
         """See `LightTracker.ahead`; at most `HORIZON` frames."""

@@ -63,12 +63,11 @@ class ExposureFeatures(nn.Module):
     """A small CNN over the raw and its absolute luminance, and the numbers beside it.
 
     The raw alone does not tell a bright scene from a long exposure. A plane of absolute log
-    luminance, log2 of the decoded green plus the EV100 of the frame's settings, does; it is the one
-    input that made the difference in trials. The planes are first averaged to about 16 x 16, with
-    the maximum of the luminance as another plane: exposure is decided on coarse structure. The
-    CNN's output is averaged over the quarters of the frame, with its maxima over the whole frame: a
-    network that sees where everything is memorises the training places. Readings of a light meter,
-    mean luminance and clipped share of 4 x 4 zones, are added.
+    luminance, log2 of the decoded green plus the EV100 of the frame's settings, does. The planes
+    are averaged to about 16 x 16, with the maximum of the luminance as another: exposure is decided
+    on coarse structure. The CNN's output is averaged over quarters of the frame, with its maxima: a
+    network that sees where everything is memorises the training places. Mean luminance and clipped
+    share of 4 x 4 zones, as of a light meter, are added.
 
     Args:
         observation_space: Observation of a single environment, with a uint8 ``raw``.
@@ -137,8 +136,7 @@ class ExposureFeatures(nn.Module):
     ) -> torch.Tensor:
         """Histograms of the frame's luminance, ``(B, LIGHT_NUMBERS)``, for a `StateHead`.
 
-        Where statistics are observed, `histogram` (B, 128) has the shares of all samples by code;
-        the brightest of each pixel is then that of each zone.
+        Observed statistics have a `histogram` (B, 128), shares of all samples by code.
         """
         step = max(1, min(codes.shape[2:]) // _COUNTED)
         counted = (codes[:, :, ::step, ::step] * 255.0).round().long()
@@ -196,9 +194,8 @@ class StateHead(nn.Module):
     A state enters as its EV100, Av, Tv and Sv, the blur that the sensors predict for it, and the
     histogram of the frame as the state would expose it: which share of the light it puts above
     white and above so many stops below. So what is learnt about one state serves its neighbours,
-    and any grid within the same ranges; and what a capture's own light decides need not be learnt
-    place by place. Beside it stands what the features tell of the right exposure: how bright the
-    state's frame is expected to look, and by how much it is too dark or too bright.
+    and any grid within the same ranges. Beside it stands what the features tell of the right
+    exposure: how bright the state's frame would look, and how much too dark or too bright.
 
     Args:
         grid: The states.
@@ -291,8 +288,7 @@ class StateHead(nn.Module):
 def exposure_loss(ev100: torch.Tensor, spread: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     """Loss of what a `StateHead` says of the right exposure, whose EV100 is `right`; all (B,).
 
-    The mean learns from the squared error, the spread from the likelihood with that error held
-    fixed.
+    The mean learns from the squared error, the spread from the likelihood at that error.
     """
     off = (ev100 - right).square()
     return (off + 0.5 * off.detach() / spread.square() + spread.log()).mean()
@@ -302,10 +298,7 @@ def exposure_loss(ev100: torch.Tensor, spread: torch.Tensor, right: torch.Tensor
 
 
 class MeterHistory:
-    """Readings of a light meter in the last `frames` frames of each camera, and the actions then.
-
-    The frame in hand is among them.
-    """
+    """Readings of a meter in the last `frames` frames, that in hand included, and the actions."""
 
     def __init__(self, context: PolicyContext, num_envs: int, frames: int) -> None:
         self._meter = make_meter("average", context.camera)
@@ -350,8 +343,7 @@ def with_history(space: gym.spaces.Dict, frames: int) -> gym.spaces.Dict:
 def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Frames (N, 4, H, W) shifted by up to an eighth, all alike, and mirrored half of the time.
 
-    Their light, and so the scores of all states, stay nearly what they were: shifted frames
-    continue their border.
+    Shifted frames continue their border: the scores of all states stay nearly what they were.
     """
     for axis in (2, 3):
         size = raw.shape[axis]
@@ -368,8 +360,8 @@ def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
 class Session:
     """Where a training runs, what it reports to, and where its state is kept.
 
-    A second run resumes from the file `checkpoint`, with new episodes, unless that is of a training
-    with another `identity`, a JSON value; by default the hyperparameters.
+    A second run resumes from the file `checkpoint`, with new episodes, if that has the same
+    `identity`, a JSON value; by default the hyperparameters.
     """
 
     checkpoint: Path | None = None

@@ -150,8 +150,7 @@ class NetworkPolicy(Policy, ABC):
     """Base of the policies that a trained network decides.
 
     Give `weights`, a file that a training wrote, for the torch `device`; or `network`, in memory. A
-    `ValueError` unless the network was trained for such an observation, and for a grid whose ranges
-    hold that of the context.
+    `ValueError` unless it was trained for such an observation, and a grid with the context's range.
     """
 
     #: The name of this kind of agent in its files.

@@ -85,10 +85,7 @@ class _StateLogits(nn.Module):
 
 
 class _WithLoss(torch.autograd.Function):
-    """A tensor as it is; in the backward pass the gradient of a `loss` (scalar) joins its own.
-
-    Stable-Baselines3's PPO has no place for a loss of another kind.
-    """
+    """A tensor as it is; backwards the gradient of a scalar `loss`, which SB3's PPO cannot take."""
 
     @staticmethod
     def forward(ctx: Any, tensor: torch.Tensor, loss: torch.Tensor) -> torch.Tensor:
@@ -102,10 +99,7 @@ class _WithLoss(torch.autograd.Function):
 
 
 class ExposureActorCritic(MultiInputActorCriticPolicy):
-    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits.
-
-    `ev_coef` is the weight of the loss of the right exposure.
-    """
+    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits."""
 
     action_net: _StateLogits
 
@@ -163,19 +157,15 @@ _OF_OURS = {"total_timesteps", "learning_rate", "ev_coef", "width", "history", "
 class PPOTraining(Configuration):
     """Hyperparameters of PPO, named as in Stable-Baselines3."""
 
-    #: Frames in all environments together.
-    total_timesteps: int = Field(default=200_000, ge=1, le=10**12)
+    total_timesteps: int = Field(default=200_000, ge=1, le=10**12)  # of all environments together
     n_steps: int = Field(default=16, ge=1, le=10**6)  # frames per environment and update
     batch_size: int = Field(default=256, ge=2, le=10**9)  # frames of a gradient step
     n_epochs: int = Field(default=4, ge=1, le=10**4)  # passes over each rollout
-    #: At the start; falls linearly to a tenth.
-    learning_rate: float = Field(default=1e-3, ge=1e-9, le=1.0)
-    #: Discount; 0 because a static scene is a contextual bandit.
-    gamma: float = Field(default=0.0, ge=0.0, le=1.0)
+    learning_rate: float = Field(default=1e-3, ge=1e-9, le=1.0)  # falls linearly to a tenth
+    gamma: float = Field(default=0.0, ge=0.0, le=1.0)  # 0: a still scene is a contextual bandit
     gae_lambda: float = Field(default=1.0, ge=0.0, le=1.0)  # of the advantage estimate
     clip_range: float = Field(default=0.2, ge=1e-6, le=1e6)  # of the probability ratio
-    #: Weight of the entropy at the start; falls linearly to a tenth.
-    ent_coef: float = Field(default=0.02, ge=0.0, le=1e6)
+    ent_coef: float = Field(default=0.02, ge=0.0, le=1e6)  # of the entropy; falls to a tenth
     vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)  # weight of the value loss
     max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)  # gradient clipping
     #: Weight of the loss of the right exposure's EV100, see `StateHead`.

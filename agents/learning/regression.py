@@ -35,7 +35,6 @@ from agents.learning.networks import (
 from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.metering_policy import HYSTERESIS_SCORE
 from agents.metering.meters import make_meter
-from agents.metering.reading import Reading
 from agents.policy import Bools, Floats, Ints, Observations, PolicyContext, masked_argmax
 from agents.policy_names import FORECASTERS, LEARNT, weight_files
 from simulator.utils.config_file import Configuration
@@ -44,15 +43,11 @@ from simulator.utils.config_file import Configuration
 _OF_CHANNELS = 0.4
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
-#: Frames that foresight shows to the network in the light to come, and the share of white samples
-#: from which a frame's reading is only a bound of the light.
-RECENT, WHITE_SHARE = 4, 0.5
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
-#: What a state must promise beyond that of the last decision to replace it, with foresight [score];
-#: without, as in tuned meters. Chosen among 0, 0.01, 0.03 and 0.06 on training scenes and kinds of
-#: light.
+#: What a state must promise beyond that of the last decision to replace it, with foresight [score].
+#: Chosen among 0, 0.01, 0.03 and 0.06 on training scenes and kinds of light.
 HYSTERESIS = 0.01
 #: Past frames come in so many parts, each from another step.
 _CHUNKS = 4
@@ -125,11 +120,11 @@ class RegressionPolicy(NetworkPolicy):
 
     Args:
         context, weights, network, device: See `NetworkPolicy`.
-        foresight: ``"none"``: frames of the same light count together; else the latest frames are
+        foresight: ``"none"``: frames of the same light count together; else the frame in hand is
             shown to the network as if taken in the light that is expected, and the state is taken
             that promises most in the frames that its controls are in effect in. ``"trend"``: an
             alpha-beta filter expects it; ``"learnt"``: the forecasters that come with the package
-            (`LightForecaster`); or the file of another one, or a pattern of several.
+            (`LearntTracker`); or the file of another one, or a pattern of several.
     """
 
     kind, hysteresis = "regression", HYSTERESIS_SCORE
@@ -183,9 +178,6 @@ class RegressionPolicy(NetworkPolicy):
             if self._forecasters:
                 tracker = LearntTracker(num_envs, self._forecasters)
             self._foresight = Foresight(self.context, tracker)
-        # The network's inputs of the latest frames, but for the settings, which are beside them,
-        # and the meter's reading.
-        self._recent: list[tuple[torch.Tensor, Any, torch.Tensor | None, Reading]] = []
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Best state (N,) after this frame and those before it in the same light."""
@@ -196,9 +188,14 @@ class RegressionPolicy(NetworkPolicy):
         foresight = self._foresight
         if foresight is not None:
             reading = foresight.observe(reading, observations)
-            frame = codes, np.array(observations["settings"]), sensors, reading
-            self._recent = [*self._recent, frame][-RECENT:]
-            utility = foresight.utility(self._scores_in)
+
+            def scores_in(ev100: Floats) -> Floats:
+                # What a mostly white frame reads is only a bound: it is shown as it is.
+                stops = np.where(reading.saturated < 0.5, ev100 - reading.ev100, 0.0)
+                shifted = torch.from_numpy(shift_ev(observations["settings"], stops))
+                return self._predict(codes, shifted.to(device), sensors)[0]
+
+            utility = foresight.utility(scores_in)
             utility[np.arange(len(utility)), foresight.pending_action] += HYSTERESIS
             chosen = masked_argmax(utility, action_masks)
             foresight.record_action(chosen)
@@ -219,22 +216,6 @@ class RegressionPolicy(NetworkPolicy):
         precision = torch.exp(-log_variance)
         return scores.double().cpu().numpy(), precision.double().cpu().numpy()
 
-    def _scores_in(self, ev100: Floats) -> Floats:
-        """Scores (N, S) in light that is metered at `ev100` (N,), from all recent frames."""
-        weighted, precisions = np.zeros((2, len(ev100), len(self.context.grid)))
-        # What a white frame reads is only a bound: in hand, it counts alone and as it is.
-        newest = self._recent[-1][3]
-        white = newest.saturated >= WHITE_SHARE
-        ev100 = np.where(white, newest.ev100, ev100)
-        for codes, settings, sensors, reading in self._recent:
-            shifted = torch.from_numpy(shift_ev(settings, ev100 - reading.ev100))
-            scores, precision = self._predict(codes, shifted.to(codes.device), sensors)
-            if reading is not newest:
-                precision[white | (reading.saturated >= WHITE_SHARE)] = 0.0
-            weighted += precision * scores
-            precisions += precision
-        return weighted / precisions
-
     def forget(self, done: Bools) -> None:
         """Forgets the frames of the environments that `done` marks; without foresight."""
         for sums in (self._weighted, self._precision, self._light, self._frames):
@@ -249,14 +230,12 @@ class RegressionTraining(Configuration):
     """Hyperparameters of the regression agent."""
 
     frames: int = Field(default=100_000, ge=1, le=10**12)  # to take
-    #: Peak of the one-cycle schedule of AdamW.
-    learning_rate: float = Field(default=5e-3, ge=1e-9, le=1.0)
+    learning_rate: float = Field(default=5e-3, ge=1e-9, le=1.0)  # peak of AdamW's one cycle
     weight_decay: float = Field(default=1e-3, ge=0.0, le=1.0)  # of AdamW
     #: Frames of the recent past that each optimiser step sees again, per new frame.
     replay: int = Field(default=2, ge=0, le=64)
     memory: int = Field(default=8192, ge=1, le=10**9)  # frames that are remembered for it
-    #: Share of random actions; the others are the agent's own, so that it learns from the frames it
-    #: will meet.
+    #: Share of random actions; the others are its own, so that it learns from frames it will meet.
     explore: float = Field(default=0.5, ge=0.0, le=1.0)
     width: int = Field(default=256, ge=1, le=MAX_WIDTH)  # hidden features of the network
     #: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
@@ -341,8 +320,7 @@ def _loss(
 ) -> tuple[torch.Tensor, dict[str, float]]:
     """Loss to minimise; the mean squared error, and what the states that seem best lose [score].
 
-    The mean learns from the plain squared error, the confidence from the likelihood with that
-    error held fixed: a large predicted variance cannot excuse a poor mean.
+    As in `exposure_loss`: a large predicted variance cannot excuse a poor mean.
     """
     device = next(network.parameters()).device
     observations, *targets = batch

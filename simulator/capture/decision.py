@@ -191,7 +191,7 @@ def decide(
         lens=scene.lens,
         vignetting=vignetting,
         noise=noise,
-        steps=(noise_reduction, aperture, defocus, motion_blur, _vignetting(scene, f_number)),
+        steps=(noise_reduction, aperture, defocus, motion_blur, *_vignetting(scene, f_number)),
     )
     if exposure.source.is_zero:
         return exposure
@@ -346,17 +346,18 @@ def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, f
     return disc, row if wanted.along_rows else STREAK_TO_DISC * disc
 
 
-def _vignetting(scene: PreparedScene, f_number: float) -> Step:
-    """The shading by the lens, whose error is not weighed: a product is cheap."""
-    if scene.lens is None:
-        return Step("vignetting", False, "no lens is given")
+def _vignetting(scene: PreparedScene, f_number: float) -> list[Step]:
+    """The shading by a lens, if there is one; its error is not weighed, as a product is cheap."""
+    name, lens = "vignetting", scene.lens
+    if lens is None:
+        return []
     if scene.vignetting(f_number) is None:
-        return Step("vignetting", False, "the source was taken through the same aperture")
-    reason = f"the lens takes {scene.lens.corner_loss(f_number):.2g} EV of the corners' light"
+        return [Step(name, False, "the source was taken through the same aperture")]
+    reason = f"the lens takes {lens.corner_loss(f_number):.2g} EV of the corners' light"
     if scene.seen_through_lens:
-        source = scene.lens.corner_loss(scene.reference.effective_f_number)
+        source = lens.corner_loss(scene.reference.effective_f_number)
         reason += f", {source:.2g} in the source"
-    return Step("vignetting", True, reason)
+    return [Step(name, True, reason)]
 
 
 @functools.cache

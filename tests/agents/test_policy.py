@@ -286,8 +286,10 @@ def test_scores_are_averaged_over_what_the_light_may_be(context, photograph):
     np.testing.assert_allclose(found, 25.0 + 4.0 * np.pi / 2, rtol=1e-4)
 
 
-def test_a_trend_foresees_ramps_and_rests_and_follows_jumps_at_once():
-    tracker = TrendTracker(1, (-2.0, 18.0), alpha=0.5, beta=0.3, damping=1.0)
+def test_a_trend_foresees_ramps_and_rests_and_follows_jumps_at_once(monkeypatch):
+    for name, value in ("ALPHA", 0.5), ("BETA", 0.3), ("DAMPING", 1.0):
+        monkeypatch.setattr(f"agents.foresight.{name}", value)
+    tracker = TrendTracker(1, (-2.0, 18.0))
     light = np.concatenate([np.arange(40) * 0.25, np.full(40, 9.75)])
     for ev in light[:40]:
         tracker.update(_reading(ev), np.zeros(1))

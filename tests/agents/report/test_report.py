@@ -208,8 +208,7 @@ def test_files_of_a_report(tmp_path):
 
 def test_labels_are_nearest_to_their_own_points_and_legends_are_whole(monkeypatch):
     figures = []
-    # Private: how a figure becomes a file.
-    monkeypatch.setattr(plots, "_write", lambda _, figure: figures.append(figure))
+    monkeypatch.setattr(plots, "write_figure", lambda _, figure: figures.append(figure))
     rng, names = np.random.default_rng(0), [f"centre_weighted:tuned_{i}" for i in range(9)]
     costs = dict(zip(names, 10 ** rng.uniform(-0.5, 0.5, 9), strict=True))
     plots.plot_cost("", costs, dict(zip(names, rng.uniform(0.8, 0.95, 9), strict=True)), names)
