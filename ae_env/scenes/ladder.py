@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.random import Generator
 
-from simulator.capture.prepared_scene import Layout
+from simulator.capture.blurred_frames import Layout
 from simulator.radiance.light import WHITE_SIGNAL
 from simulator.utils.checks import check_integer, import_extra
 

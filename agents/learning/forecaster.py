@@ -29,7 +29,8 @@ from agents.metering.reading import (
     ZoneMatcher,
     mean_reading,
 )
-from agents.policy import Floats
+from agents.policy import Floats, PolicyContext
+from agents.policy_names import FORECASTERS, LEARNT, weight_files
 from simulator.networks.weights import load_into
 from simulator.utils.config_file import Configuration
 
@@ -180,6 +181,28 @@ def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
         network = LightForecaster(card["width"])
     load_into(network, tensors, f"`weights` (={str(path)!r})")
     return network.to(device, torch.float32).eval()
+
+
+def load_forecasters(
+    foresight: str, context: PolicyContext, device: str = "cpu"
+) -> list[LightForecaster]:
+    """The forecasters that an option ``foresight`` of a policy names.
+
+    A `ValueError` if there are none, or they look less far ahead than the camera's delays.
+    """
+    pattern = FORECASTERS if foresight == LEARNT else foresight
+    files = weight_files(pattern) if isinstance(pattern, str) else []
+    if not files:
+        raise ValueError(
+            f"`foresight` (={foresight!r}) must be 'none', 'trend', {LEARNT!r} or the name of a "
+            "forecaster's files, as `ae-env train` writes them"
+        )
+    if 1 + max(context.delays) > HORIZON:
+        raise ValueError(
+            f"`foresight` (={foresight!r}) forecasts {HORIZON} frames, and a delay of "
+            f"{max(context.delays)} asks for {1 + max(context.delays)}: use 'trend'"
+        )
+    return [load_forecaster(file, device) for file in files]
 
 
 # -- training -------------------------------------------------------------------------------------

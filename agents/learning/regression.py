@@ -22,7 +22,7 @@ from torch import nn
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
 from agents.foresight import Foresight, LightTracker, TrendTracker
-from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
+from agents.learning.forecaster import LearntTracker, LightForecaster, load_forecasters
 from agents.learning.networks import (
     UNWATCHED,
     ExposureFeatures,
@@ -36,7 +36,6 @@ from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.metering_policy import HYSTERESIS_SCORE
 from agents.metering.meters import make_meter
 from agents.policy import Bools, Floats, Ints, Observations, PolicyContext, masked_argmax
-from agents.policy_names import FORECASTERS, LEARNT, weight_files
 from simulator.utils.config_file import Configuration
 
 #: Dropout of the CNN's channels, relative to that of the features.
@@ -140,19 +139,7 @@ class RegressionPolicy(NetworkPolicy):
         self.foresight = foresight
         self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):
-            pattern = FORECASTERS if foresight == LEARNT else foresight
-            files = weight_files(pattern) if isinstance(pattern, str) else []
-            if not files:
-                raise ValueError(
-                    f"`foresight` (={foresight!r}) must be 'none', 'trend', {LEARNT!r} or the name "
-                    "of a forecaster's files, as `ae-env train` writes them"
-                )
-            if 1 + max(context.delays) > HORIZON:
-                raise ValueError(
-                    f"`foresight` (={foresight!r}) forecasts {HORIZON} frames, and a delay of "
-                    f"{max(context.delays)} asks for {1 + max(context.delays)}: use 'trend'"
-                )
-            self._forecasters = [load_forecaster(file, device) for file in files]
+            self._forecasters = load_forecasters(foresight, context, device)
         #: Shows that the light has changed.
         self._meter = make_meter("average", context.camera)
         super().__init__(context, weights, network, device)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
-from agents.foresight import Foresight, TrendTracker
+from agents.foresight import Foresight, LightTracker, TrendTracker
 from agents.metering.meters import make_meter
 from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
 from agents.metering.reading import EVTracker, ReferenceFrames, Region, read_part
@@ -40,7 +40,7 @@ FIT_EPISODES, FIT_PER_SCENE, FIT_FRAMES = 1600, 4, 4
 #: Distance of the second pass's seeds from the first's: other episodes of the same scenes.
 SECOND_PASS = 1_000_000
 #: What a meter may foresee.
-FORESIGHTS = ("none", "trend", "model")
+FORESIGHTS = ("none", "trend", "model", "learnt")
 #: Fits of this process by key, see `MeteringPolicy.fit_once`: no folder need be writable.
 _FITS: dict[str, ScoreRegression] = {}
 
@@ -64,7 +64,8 @@ class MeteringPolicy(Policy):
         foresight: ``"none"``; ``"trend"``: the program works on the EV that is expected in the
             first frame that has all of the decision (an alpha-beta filter); ``"model"``, of a tuned
             program: the trend is rolled through the delay of each control, and the state is taken
-            that promises most (`Foresight`).
+            that promises most (`Foresight`); ``"learnt"``: the same with the forecasters that come
+            with the package in place of the trend.
     """
 
     def __init__(
@@ -89,11 +90,16 @@ class MeteringPolicy(Policy):
         check_word("program", program, PROGRAMS)
         self.program = program
         check_word("foresight", foresight, FORESIGHTS)
-        if foresight == "model" and not program.startswith("tuned"):
-            raise ValueError(f"`foresight` (='model') needs a tuned program, not {program}")
+        if foresight in FORESIGHTS[2:] and not program.startswith("tuned"):
+            raise ValueError(f"`foresight` (={foresight!r}) needs a tuned program, not {program}")
         if foresight != "none" and damping:
             raise ValueError(f"`damping` (={damping!r}) must be 0 with `foresight`")
         self.foresight = foresight
+        self._forecasters: list[Any] = []
+        if foresight == "learnt":
+            from agents.learning.forecaster import load_forecasters  # imports torch's networks
+
+            self._forecasters = load_forecasters(foresight, context)
         by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
         check_used(program, weights=weights, **by_hand)
         given = {name: value for name, value in by_hand.items() if value is not None}
@@ -119,7 +125,12 @@ class MeteringPolicy(Policy):
         self._tracker = EVTracker(num_envs, ev_range, options.damping, options.compensation)
         self._foresight: Foresight | None = None
         if self.foresight != "none":
-            self._foresight = Foresight(self.context, TrendTracker(num_envs, ev_range))
+            tracker: LightTracker = TrendTracker(num_envs, ev_range)
+            if self._forecasters:
+                from agents.learning.forecaster import LearntTracker
+
+                tracker = LearntTracker(num_envs, self._forecasters)
+            self._foresight = Foresight(self.context, tracker)
         searches = self._meter_name in SEARCH_METERS
         self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))
@@ -130,7 +141,7 @@ class MeteringPolicy(Policy):
         """Meter the frames, then choose by the program."""
         readings = self.observe(observations)
         foresight = self._foresight
-        if foresight is not None and self.foresight == "model":
+        if foresight is not None and self.foresight in FORESIGHTS[2:]:
             utility = foresight.utility(
                 lambda ev: self._tuned_utility(np.column_stack([ev, readings[:, 1:]]))
             )
