@@ -51,7 +51,8 @@ CONTENTS = {
     ],
     "The environment": [
         *("tasks", "environment", "scenes", "recorded-grids", "changing-light"),
-        *("incident_light", "scorers", "policies", "agents", "evaluation"),
+        *("incident_light", "scorers", "task-rewards", "policies", "rpi-agc"),
+        *("agents", "evaluation"),
         *("ae-bench", "clients", "offline", "scale"),
     ],
     "The simulator": [
