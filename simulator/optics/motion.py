@@ -427,28 +427,26 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
     pad_rows(plane, first - down, _TOP, height, reach, limit, padded)
     flat, offsets = padded.reshape(-1), (rows + down) * pitch + columns + reach
     # Rows behind one another are one long vector, but where most of it would be their borders.
-    many = max(1, min(last - first, GROUP // pitch)) if 2 * reach <= width else 1
-    total = np.empty(many * pitch, np.float32)
+    many = max(1, min(last - first, GROUP // pitch)) if 8 * reach <= width else 1
+    several = np.empty(many * pitch, np.float32)
     for y in range(first, last, many):
         count = min(many, last - y)
         at, size = (y - first) * pitch, (count - 1) * pitch + width
-        total[:size] = np.float32(0)
+        total = out[y] if many == 1 else several[:size]
         for k in range(0, len(weights), 8):
-            _add_taps(flat, at + offsets[k : k + 8], weights[k : k + 8], total[:size])
-        for i in range(count):
-            for x in range(width):
-                out[y + i, x] = total[i * pitch + x]
-
-
-@_jit()
-def _add_taps(flat, starts, w, total):  # type: ignore[no-untyped-def]
-    """Adds the weighted sum of eight pieces of `flat`, which begin at `starts`."""
-    a, b, c, d = flat[starts[0] :], flat[starts[1] :], flat[starts[2] :], flat[starts[3] :]
-    e, f, g, h = flat[starts[4] :], flat[starts[5] :], flat[starts[6] :], flat[starts[7] :]
-    for x in range(len(total)):
-        low = (w[0] * a[x] + w[1] * b[x]) + (w[2] * c[x] + w[3] * d[x])
-        high = (w[4] * e[x] + w[5] * f[x]) + (w[6] * g[x] + w[7] * h[x])
-        total[x] += low + high
+            a, b = flat[at + offsets[k] :], flat[at + offsets[k + 1] :]
+            c, d = flat[at + offsets[k + 2] :], flat[at + offsets[k + 3] :]
+            e, f = flat[at + offsets[k + 4] :], flat[at + offsets[k + 5] :]
+            g, h = flat[at + offsets[k + 6] :], flat[at + offsets[k + 7] :]
+            w = weights[k : k + 8]
+            if k == 0:
+                total[:] = np.float32(0)
+            for x in range(size):
+                low = (w[0] * a[x] + w[1] * b[x]) + (w[2] * c[x] + w[3] * d[x])
+                high = (w[4] * e[x] + w[5] * f[x]) + (w[6] * g[x] + w[7] * h[x])
+                total[x] += low + high
+        for i in range(count if many > 1 else 0):
+            copy_row(several[i * pitch : i * pitch + width], out[y + i])
 
 
 @_jit()
