@@ -288,7 +288,8 @@ def _use_rest() -> None:
     numbers = raw.to_mosaic().astype(np.float64)  # files hold integers
     light = RawImage.from_mosaic(numbers, raw.settings, raw.camera).data
     disc_blur(motion_blur(light, 2.5), 2.5)
-    blurs = np.array([(0.0, 2.5, True, *[0] * 11)], BLUR)
+    vignetting = np.ones(light.shape[1:], np.float32)
+    blurs = np.array([(0.0, 2.5, True, *[0] * 10, vignetting.ctypes.data)], BLUR)
     first = np.zeros(1, np.int64)
     frames = BlurredFrames(1, 1, 0)
     frames.make(first, first, blurs, frames.places([light]))
