@@ -31,7 +31,7 @@ from zipfile import is_zipfile
 import numpy as np
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.utils.checks import check_integer, check_key, did_you_mean
+from simulator.utils.checks import check_integer, check_key, check_number, did_you_mean
 
 #: Share of the variance of a photosite in HH of the green that PPG makes of a flat field; LibRaw's
 #: PPG has 0.076 to 0.080 for greens that are 1 to 2.5 times as bright as red and blue.
@@ -93,10 +93,10 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
         for key in options:
             check_key("options", key, known)
         return reader(stem, options)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, IndexError, np.linalg.LinAlgError) as error:
         what = {"ctt": "tuning file of libcamera", "darktable": "noiseprofiles.json of darktable"}
         what["emva"] = "npz of flat fields"
-        fault = f"lacks {error}" if isinstance(error, KeyError) else error
+        fault = f"lacks {error}" if isinstance(error, KeyError) else f"has a wrong entry: {error}"
         raise ValueError(f"`camera` (={name!r}) must name a {what[kind]}: it {fault}") from None
     except (ValueError, OSError) as error:
         raise ValueError(f"`camera` (={name!r}) cannot be used: {error}") from None
@@ -127,6 +127,10 @@ def _from_ctt(path: str, options: Mapping[str, str]) -> dict[str, Any]:
     common = own.get("black_level", 4096)
     red, green, blue = (own.get(f"black_level_{c}", common) / unit for c in "rgb")
     white, noise = 2**bits - 1, blocks["rpi.noise"]
+    for level in (red, green, blue):
+        check_number("rpi.black_level", level * unit, 0.0, 2.0**_TUNED_BITS - 2.0 * unit)
+    for key in ("reference_constant", "reference_slope"):
+        check_number(f"rpi.noise.{key}", noise[key], 0.0, 2.0**_TUNED_BITS)
     constant, slope = noise["reference_constant"] / unit, noise["reference_slope"] / unit**0.5
     shot, read = zip(
         *(_straight(constant, slope, white - b) for b in (red, green, green, blue)), strict=True
@@ -206,6 +210,8 @@ def _from_darktable(body: str, options: Mapping[str, str]) -> dict[str, Any]:
         for text in [options.get(key)]
         if text is not None
     }
+    if not table:
+        raise ValueError(f"{path} has no profile of {found[0]} that darktable uses")
     return {
         **given,
         "name": f"darktable_{_letters(body)}",
@@ -269,6 +275,13 @@ def read_flat_fields(path: str | os.PathLike[str]) -> FlatFields:
     pairs = bright.ndim == 4 and bright.shape[1] == 2 and len(times) == len(photons) == len(bright)
     if not pairs or bright.shape != dark.shape:
         raise ValueError("`bright` and `dark` must be (exposures, 2, H, W), with as many times")
+    whole = all(np.array_equal(frames, np.rint(np.abs(frames))) for frames in (bright, dark))
+    if not whole or len(times) < 3 or not np.diff(times[:3]).min() > 0:
+        raise ValueError(
+            "`bright` and `dark` must be whole numbers >= 0 at three exposures or more, and "
+            "`bright_exposure_ns` must rise"
+        )
+    bright, dark = bright.astype(np.int64), dark.astype(np.int64)
     count = int(np.argmax(np.append(np.diff(times) <= 0, True))) + 1
     return FlatFields(*(values[:count] for values in (bright, dark, photons, times)))
 

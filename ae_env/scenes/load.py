@@ -76,7 +76,7 @@ REAL = ("polyhaven", VIEWS_OF_UNKNOWN_LIGHT, "mixed")
 NAMED = (*BUNDLED, *BUNDLED_PARTS, *REAL)
 #: Ways to name scenes, see `load_scenes`.
 SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any] | RecordedOptions
-_LADDER = re.compile(rf"(.+)\?({'|'.join(LADDERS)})(?:=(\d{{1,18}}))?", re.DOTALL)
+_LADDER = re.compile(rf"(.+)\?({'|'.join(LADDERS)})(?:=(.*))?", re.DOTALL)
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 #: The weights that come with the package.
 DEFAULT_SIMULATOR = "compact"
@@ -119,6 +119,8 @@ def load_scenes(
         grid: States of recorded grids; by default all that their captures have.
     """
     if isinstance(spec, str) and (drawn := _LADDER.fullmatch(spec)):
+        if not re.fullmatch(r"\d{1,18}", drawn[3] or "0"):
+            raise ValueError(f"`scenes?{drawn[2]}` (={drawn[3]!r}) must be a whole number >= 0")
         size: dict[str, Any] = {"resolution": resolution, "crop": crop, "resize": resize}
         plain = load_scenes(drawn[1], split, camera=camera, grid=grid, **size)
         return [with_ladder(scene, drawn[2], int(drawn[3] or 0)) for scene in plain]

@@ -92,7 +92,9 @@ class Latitude:
         said = [f"{LEVEL:.0%} of successes over {high - low:.1f} stops"]
         if "EVlow" in found:
             said[0] += f": {found.pop('EVlow')} to {found.pop('EVhigh')}"
-        return [*said, *found.values(), f"{self.left_out} pictures left out: nothing is found"]
+        if self.left_out:
+            said.append(f"{self.left_out} pictures left out: the detector finds nothing in them")
+        return [*said, *found.values()]
 
     def plot(self, path: Path) -> None:
         """Draws the shares with their intervals, and dotted without noise."""

@@ -58,8 +58,9 @@ def _check_pairs(numbers: list[float]) -> list[float]:
 
 def _in_seconds(ladder: Ladder) -> Ladder:
     """`ladder` with times in seconds, from microseconds."""
-    if len(ladder.shutter) != len(ladder.gain) or len(ladder.gain) < 2 or 0.0 in ladder.gain:
-        raise ValueError("must have as many times as gains, two or more, all above 0")
+    alike = len(ladder.shutter) == len(ladder.gain) >= 2 and 0.0 not in ladder.gain
+    if not alike or list(ladder.shutter) != sorted(ladder.shutter):
+        raise ValueError("must have as many times as gains, two or more, above 0, the times sorted")
     return Ladder(tuple(time / 1e6 for time in ladder.shutter), ladder.gain)
 
 

@@ -14,7 +14,13 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from simulator.utils.checks import check_type, did_you_mean, import_extra, parse_number
+from simulator.utils.checks import (
+    check_key,
+    check_type,
+    did_you_mean,
+    import_extra,
+    parse_number,
+)
 
 #: Lenses that `random_lens` chooses from.
 RANDOM_LENSES = 64
@@ -107,12 +113,15 @@ def get_lens(lens: str | Vignetting | None) -> Vignetting | None:
         check_type("lens", lens, Vignetting, None)
         return lens
     if not lens.startswith(_PREFIX):
-        raise ValueError(f"`lens` (={lens!r}) must be '{_PREFIX}NAME', a `Vignetting` or None")
+        rule = f"'{_PREFIX}NAME', a `Vignetting` or None; environments also take 'random'"
+        raise ValueError(f"`lens` (={lens!r}) must be {rule}")
     name, _, query = lens.removeprefix(_PREFIX).partition("?")
-    numbers = dict(parse_qsl(query, keep_blank_values=True))
+    pairs = parse_qsl(query, keep_blank_values=True)
+    numbers = dict(pairs)
+    if len(numbers) < len(pairs):
+        raise ValueError(f"`lens` (={lens!r}) must have each option once")
     for key, value in numbers.items():
-        if key not in _KEYS:
-            raise ValueError(f"`lens` (={lens!r}) takes {_KEYS}, not {key!r}")
+        check_key("lens", key, _KEYS)
         if not 0.0 < parse_number(value, f"lens?{key}") < math.inf:
             raise ValueError(f"`lens?{key}` (={value}) must be above 0 and finite")
     return _from_lensfun(name, *(float(numbers.get(key, 0.0)) for key in _KEYS))
