@@ -27,7 +27,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
-from ae_env.scorers.captures import Captures, describe_captures
+from ae_env.scorers.captures import Captures
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
@@ -262,17 +262,15 @@ class AutoExposure(Task):
         if source_noise[part].any():
             pairs = source_noise[part].tolist()
             noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
-        return describe_captures(
+        return self._terms.captures.of(
             scenes,
-            [episodes.grid[state] for state in episodes.state[env_indices].tolist()],
-            episodes.camera,
+            episodes.state[env_indices],
             speed=episodes.speed[env_indices],
             defocus=episodes.defocus[env_indices],
             movements=movements,
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],
             source_noise=noises,
-            noisy=self.tables.noise,
         )
 
 

@@ -26,12 +26,13 @@ from ae_env.observation import (
     encode_settings,
     frame_statistics,
 )
-from ae_env.options import EnvOptions
+from ae_env.options import RANDOM_LENS, EnvOptions
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import in_episode, prepare_scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
+from simulator.capture.columns import MOVES
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, single_normals
 
@@ -183,6 +184,7 @@ class EpisodeCore:
                 noise=noise,
                 light_bytes=int(options.blur_memory * 2**20),
                 device=options.torch_device,
+                moved=self._moved,
             )
             transitions = batch.transitions if options.reward == "expected" else None
         self.task = make_task(episodes, self._captures, scorer, transitions)
@@ -346,6 +348,21 @@ class EpisodeCore:
         if self.options.observation == "linear":
             torch.as_tensor(raw).clamp_(-PEDESTAL, 1.0)
         return columns
+
+    def _moved(self, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of lights (K,) those of the scenes that they show in motion, else -1, and `MOVES`."""
+        own, moves = lights >= len(self.scenes), np.zeros(len(lights), MOVES)
+        env_indices = np.where(own, lights - len(self.scenes), 0)
+        rest = np.where(own, self.episodes.scene[env_indices], -1)
+        for name in MOVES.names or ():
+            moves[name] = getattr(self.episodes, name)[env_indices]
+        moves["defocus"] *= self.options.resolution / 64.0
+        for i in np.flatnonzero(rest >= 0).tolist():
+            if self.task.displaced(env_indices.item(i)) is not None:
+                rest[i] = -1
+        if self.options.lens == RANDOM_LENS:
+            rest[:] = -1
+        return rest, moves
 
     def _prepared(self, light_index: int) -> PreparedScene:
         """The scene of a `Episodes.light_index` as the camera sees it, in its own light."""

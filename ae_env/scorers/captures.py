@@ -228,53 +228,16 @@ def describe_captures(
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
         source_noise, noisy: See `Captures`.
     """
-    height = scenes[0].light.shape[-2]
-    times = np.array([s.exposure_time for s in settings])
-    f_numbers = np.array([s.effective_f_number for s in settings])
-    discs = defocus * (4.0 / f_numbers) * height / 64.0
-    own = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
-    moves = np.zeros((len(scenes), 4)) if movements is None else movements
-    blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, np.array(own))
-    nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
-    noise = [nlfs[s.iso] for s in settings], source_noise, noisy
-    return _captures(scenes, settings, noise, gain, row_gain, torch.from_numpy(blur), pixel_blur)
-
-
-def _captures(
-    scenes: Sequence[Scene],
-    settings: Sequence[CameraSettings],
-    noise: tuple[Sequence[NoiseLevelFunction], Sequence[NoiseLevelFunction] | None, bool],
-    gain: np.ndarray,
-    row_gain: np.ndarray | None,
-    blur_px: torch.Tensor,
-    pixel_blur: PixelBlur | None,
-) -> Captures:
-    """`noise` are `nlf`, `source_noise` and `noisy`; the others are those of `Captures`."""
-    pairs, (nlf, source_noise, noisy) = zip(scenes, settings, strict=True), noise
-    ratios = [2.0 ** (s.log2_exposure - c.reference.log2_exposure) for c, s in pairs]
-    return Captures(
-        settings=settings,
-        _scenes=scenes,
-        ratio=torch.from_numpy(np.array(ratios) * gain),
-        nlf=nlf,
-        proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
-        blur_px=blur_px,
-        row_gain=None if row_gain is None else torch.from_numpy(row_gain),
+    return SceneCaptures(camera, settings, noisy=noisy).of(
+        scenes,
+        np.arange(len(settings)),
+        speed=speed,
+        defocus=defocus,
+        movements=movements,
+        gain=gain,
+        row_gain=row_gain,
         source_noise=source_noise,
-        noisy=noisy,
-        pixel_blur=pixel_blur,
-        likely_ev=_likely_ev(scenes, gain),
     )
-
-
-def _likely_ev(scenes: Sequence[Scene], gain: np.ndarray) -> torch.Tensor | None:
-    """See `Captures`; `gain` (B,) is the light relative to each scene's own."""
-    right = [scene.incident_light.right_ev100 for scene in scenes]
-    most = max(map(len, right), default=1)
-    if most == 1:
-        return None
-    each = np.stack([np.broadcast_to(own, most) for own in right])
-    return torch.from_numpy(each + np.log2(gain)[:, None])
 
 
 def all_blur(
@@ -342,13 +305,73 @@ class SceneCaptures:
     def __init__(
         self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool
     ) -> None:
-        self.camera, self.states, self.noisy = camera, states, noisy
+        self.camera, self.states, self.noisy = camera, list(states), noisy
         nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in states}}
         self._nlf = [nlfs[s.iso] for s in states]
+        numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
+        self._times, self._f_numbers, self._log2_exposures = np.array(numbers).T
         # (K, 2) times and f-numbers of states that differ in them, and (S,) which each state has.
-        blurs = np.array([(s.exposure_time, s.effective_f_number) for s in states])
+        blurs = np.array(numbers)[:, :2]
         self._blurs, which = np.unique(blurs, axis=0, return_inverse=True)
         self._which = which.reshape(-1)
+
+    def of(
+        self,
+        scenes: Sequence[Scene],
+        states: np.ndarray,
+        *,
+        speed: np.ndarray,
+        defocus: np.ndarray,
+        movements: np.ndarray | None,
+        gain: np.ndarray,
+        row_gain: np.ndarray | None,
+        source_noise: Sequence[NoiseLevelFunction] | None,
+    ) -> Captures:
+        """Captures at `states` (B,) of a scene each; see `describe_captures`."""
+        height = scenes[0].light.shape[-2]
+        times, f_numbers = self._times[states], self._f_numbers[states]
+        discs = defocus * (4.0 / f_numbers) * height / 64.0
+        own = np.zeros(len(scenes))
+        if any(scene.defocus_map is not None for scene in scenes):
+            own[:] = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
+        moves = np.zeros((len(scenes), 4)) if movements is None else movements
+        blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, own)
+        lights = gain, row_gain, source_noise
+        return self._captures(scenes, states, *lights, torch.from_numpy(blur), pixel_blur)
+
+    def _captures(
+        self,
+        scenes: Sequence[Scene],
+        states: np.ndarray,
+        gain: np.ndarray,
+        row_gain: np.ndarray | None,
+        source_noise: Sequence[NoiseLevelFunction] | None,
+        blur_px: torch.Tensor,
+        pixel_blur: PixelBlur | None,
+    ) -> Captures:
+        """The last four are those of `Captures`."""
+        few = {id(scene): scene for scene in scenes}  # an environment shows some of them often
+        facts = {key: (c.reference.log2_exposure, c.ev100) for key, c in few.items()}
+        references, ev100s = np.array([facts[id(scene)] for scene in scenes]).T
+        ratios = [2.0**stops for stops in (self._log2_exposures[states] - references).tolist()]
+        indices, right = states.tolist(), {k: c.incident_light.right_ev100 for k, c in few.items()}
+        most, likely = max(map(len, right.values()), default=1), None
+        if most > 1:
+            each = np.stack([np.broadcast_to(right[id(scene)], most) for scene in scenes])
+            likely = torch.from_numpy(each + np.log2(gain)[:, None])
+        return Captures(
+            settings=[self.states[state] for state in indices],
+            _scenes=scenes,
+            ratio=torch.from_numpy(np.array(ratios) * gain),
+            nlf=[self._nlf[state] for state in indices],
+            proper_ev=torch.from_numpy(ev100s + np.log2(gain)),
+            blur_px=blur_px,
+            row_gain=None if row_gain is None else torch.from_numpy(row_gain),
+            source_noise=source_noise,
+            noisy=self.noisy,
+            pixel_blur=pixel_blur,
+            likely_ev=likely,
+        )
 
     def describe(
         self,
@@ -362,14 +385,15 @@ class SceneCaptures:
 
         For `gain` and `row_gain` see `ScoreTables.table`.
         """
-        states, count = self.states[part], len(self.states[part])
+        states = np.arange(len(self.states))[part]
         blur, pixel_blur, alike = self.blur(scene, prepared, part)
         if pixel_blur is not None:
             pixel_blur = PixelBlur(*(values[alike] for values in pixel_blur))
         gains = np.broadcast_to(gain, len(self.states))[part]
-        noise = self._nlf[part], source_noises(prepared, states, gains), self.noisy
+        noise = source_noises(prepared, self.states[part], gains)
         rows = None if row_gain is None else row_gain[part]
-        return _captures([scene] * count, states, noise, gains, rows, blur[alike], pixel_blur)
+        scenes = [scene] * len(states)
+        return self._captures(scenes, states, gains, rows, noise, blur[alike], pixel_blur)
 
     def blur(
         self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)

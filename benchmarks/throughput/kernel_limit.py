@@ -40,23 +40,27 @@ def _codes(x, ratio, shot, read, z, y):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _loop(light, ratio, shot, read, bank, exact, state, out):  # type: ignore[no-untyped-def]
-    """A frame (4, N), `_RUN` samples at a time."""
-    planes, samples = light.shape
+def _loop(  # type: ignore[no-untyped-def]
+    begin, end, lights, chosen, ratios, shot, read, bank, exact, state, out
+):
+    """Frames (4, N) from `begin` to before `end`, `_RUN` samples at a time."""
+    planes, samples = lights.shape[1:]
     starts = np.uint64(bank.size - _RUN - 1)
     words, drawn = np.empty((4, _RUN // 4), np.uint32), np.empty(_RUN, np.float32)
-    for p in range(planes):
-        for first in range(0, samples, _RUN):
-            size = min(_RUN, samples - first)
-            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            normals = drawn[:size]
-            if exact:
-                draw_block(state, 0, words, drawn)
-            else:  # anywhere in the bank
-                start = np.int64(((state >> np.uint64(20)) % starts) & ~np.uint64(_GRAIN - 1))
-                normals = bank[start : start + size]
-            x, y = light[p, first : first + size], out[p, first : first + size]
-            _codes(x, ratio, shot[p], read[p], normals, y)
+    for frame in range(begin, end):
+        light, ratio = lights[chosen[frame]], ratios[frame]
+        for p in range(planes):
+            for first in range(0, samples, _RUN):
+                size = min(_RUN, samples - first)
+                state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+                normals = drawn[:size]
+                if exact:
+                    draw_block(state, 0, words, drawn)
+                else:  # anywhere in the bank
+                    start = np.int64(((state >> np.uint64(20)) % starts) & ~np.uint64(_GRAIN - 1))
+                    normals = bank[start : start + size]
+                x, y = light[p, first : first + size], out[frame, p, first : first + size]
+                _codes(x, ratio, shot[p], read[p], normals, y)
     return state
 
 
@@ -90,8 +94,8 @@ class KernelLimit:
         return self._out
 
     def _share(self, thread: int) -> None:
-        state = self._states[thread]
-        for i in range(thread, len(self._flat), len(self._states)):
-            args = (self._lights[self._chosen[i]], self._ratios[i], self._shot, self._read)
-            state = np.uint64(_loop(*args, self._bank, self._exact, state, self._flat[i]))
-        self._states[thread] = state
+        count, threads, state = len(self._flat), len(self._states), self._states[thread]
+        part = count * thread // threads, count * (thread + 1) // threads
+        noise = self._shot, self._read, self._bank, self._exact
+        args = (*part, self._lights, self._chosen, self._ratios, *noise, state, self._flat)
+        self._states[thread] = np.uint64(_loop(*args))

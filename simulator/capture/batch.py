@@ -23,12 +23,15 @@ from simulator.capture.columns import (
     SCENE,
     blur_column,
     fits_columns,
+    moved_columns,
     noise_columns,
     plan_frames,
     scene_column,
     state_columns,
     statistics_column,
+    subject_column,
     vignetting_column,
+    widest_defocus,
 )
 from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
@@ -108,11 +111,12 @@ class FrameSource(Protocol):
 class CaptureBatch:
     """`FrameSource` that simulates the frames.
 
-    `prepared` returns the scene of an index, in its own light, when it is first photographed. The
-    light behind the lens at every f-number is cached until a scene is forgotten, as long as all
-    takes no more than `light_bytes`. Everything is planned on the CPU; light is blurred and frames
-    are recorded there by compiled loops or, with a `device`, by torch operations on it. A pickled
-    copy works everything out again.
+    `prepared` returns the scene of an index, in its own light, when it is first photographed. Of
+    indices (K,), `moved` returns the scenes that they show in motion, -1 for none, and how these
+    move, `MOVES` (K,). The light behind the lens at every f-number is cached until a scene is
+    forgotten, as long as all takes no more than `light_bytes`. Everything is planned on the CPU;
+    light is blurred and frames are recorded there by compiled loops or, with a `device`, by torch
+    operations on it. A pickled copy works everything out again.
     """
 
     def __init__(
@@ -125,8 +129,10 @@ class CaptureBatch:
         noise: Noise | None,
         light_bytes: int,
         device: torch.device | None = None,
+        moved: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
+        self._moved = moved
         self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
         self._device = device
         self._columns = state_columns(states)
@@ -136,7 +142,9 @@ class CaptureBatch:
         # Scenes as columns; whether their captures are planned in columns, too: where the light has
         # no noise of its own, and no aperture is opened.
         self._scenes: dict[int, PreparedScene] = {}
-        self._scene_columns = np.zeros(num_scenes, SCENE)
+        self._known = np.zeros(num_scenes, bool)
+        self._scene_columns, self._widest = np.zeros(num_scenes, SCENE), np.zeros(num_scenes)
+        self._subjects = np.zeros((num_scenes, 2), np.uintp)
         self._statistics = np.zeros((num_scenes, 4, 4, BINS))
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._in_columns, self._light = np.zeros(num_scenes, bool), np.empty(num_scenes, object)
@@ -161,7 +169,7 @@ class CaptureBatch:
 
     def __reduce__(self) -> tuple[Any, ...]:
         options: dict[str, Any] = {"noise": self.noise, "light_bytes": self._light_bytes}
-        made = partial(CaptureBatch, device=self._device, **options)
+        made = partial(CaptureBatch, device=self._device, moved=self._moved, **options)
         return made, (self._prepared, self.num_scenes, self.states, self.camera)
 
     def forget(self, indices: np.ndarray) -> None:
@@ -173,6 +181,7 @@ class CaptureBatch:
             for column in objects[: 3 if self._any_remaining else 1]:
                 column[rows] = None
             self._scenes.pop(index, None)
+        self._known[indices] = False
         self._frames.release(indices)
         self._blurred_row[indices] = -1
 
@@ -239,15 +248,36 @@ class CaptureBatch:
     def prepared_scene(self, index: int) -> PreparedScene:
         """See `FrameSource`."""
         scene = self._scenes.get(index)
-        return self._added(index) if scene is None else scene
+        if scene is None:
+            scene = self._prepared(index)
+            # Scenes that are shown several times share their light, but not what is blurred of it.
+            scene = scene.changed(blurred_light=scene.blurred_light.copy())
+            self._scenes[index] = scene
+        return scene
 
     # -- planning -----------------------------------------------------------------------------
 
-    def _added(self, index: int) -> PreparedScene:
-        """The scene `index`, which is new, and its columns."""
-        scene = self._prepared(index)
-        # Scenes that are shown several times share their light, but not what is blurred of it.
-        scene = scene.changed(blurred_light=scene.blurred_light.copy())
+    def _add(self, indices: np.ndarray) -> None:
+        """Makes the columns of scenes `indices`, which are new."""
+        if self._moved is not None:
+            rest, moves = self._moved(indices)
+            for index in np.unique(rest[(rest >= 0) & ~self._known[rest]]).tolist():
+                self._add_alone(index)
+            inside = (rest >= 0) & self._in_columns[rest]
+            inside &= moves["defocus"] <= self._widest[rest]
+            new, rest = indices[inside], rest[inside]
+            own = self._scene_columns[rest], moves[inside], self._subjects[rest]
+            self._scene_columns[new] = moved_columns(*own)
+            self._light[new], self._vignetting[new] = self._light[rest], self._vignetting[rest]
+            for index, scene in zip(new.tolist(), rest.tolist(), strict=True):
+                self._statistics[index] = self._scenes[scene].statistics.columns
+            self._in_columns[new] = self._known[new] = True
+            indices = indices[~inside]
+        for index in indices.tolist():
+            self._add_alone(index)
+
+    def _add_alone(self, index: int) -> None:
+        scene = self.prepared_scene(index)
         self._light[index] = scene.light.contiguous()
         box = scene.box_factor
         if box not in self._targets:
@@ -257,13 +287,15 @@ class CaptureBatch:
         if self._in_columns[index]:
             self._scene_columns[index] = scene_column(scene, list(self._targets).index(box))
             self._statistics[index] = statistics_column(scene)
-        self._scenes[index] = scene
-        return scene
+            self._widest[index] = widest_defocus(scene, self._columns)
+            self._subjects[index] = subject_column(scene)
+        self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
         """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
-        for index in indices.tolist():
-            self.prepared_scene(index)
+        unknown = ~self._known[indices]
+        if unknown.any():
+            self._add(np.unique(indices[unknown]))
         inside = self._in_columns[indices]
         others = np.flatnonzero(~inside).tolist()
         for i in others:

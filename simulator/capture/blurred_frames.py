@@ -336,7 +336,8 @@ class BlurredFrames:
                 wide_disc(light, diameter, LIGHT_LIMIT, out)
             else:
                 radii[i] = _radius(diameter)
-        _run(blur_discs, radii, self._shape, source, to, radii)
+        cost = np.where(radii > 0.0, 6.0 + radii**2, 0.0)
+        _run(blur_discs, cost, self._shape, source, to, radii)
 
     def _blend(
         self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
@@ -346,8 +347,9 @@ class BlurredFrames:
     def _move(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
-        # Sums of taps take as long as these are many, twice as long with a subject.
-        taps = (8.0 + 2.0 * blurs["motion_px"]) * np.where(blurs["mask"] > 0, 2.0, 1.0)
+        # Sums of taps take as long as these are many; with a subject there are three.
+        taps = 12.0 + np.minimum(blurs["motion_px"], sum(self._shape[1:]))
+        taps *= np.where(blurs["mask"] > 0, 2.5, 1.0)
         streaks = blurs["streaks"]
         _run(move_along_rows, taps * streaks, self._shape, source, to, blurs)
         _run(move_along_paths, taps * ~streaks, self._shape, source, to, blurs)
@@ -361,7 +363,7 @@ _radius = functools.lru_cache(maxsize=4096)(disc_radius)
 
 
 def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]
-    """Calls a pass for units of each frame on all threads, the costliest first."""
+    """Calls a pass for units of each frame on all threads, which share the cost (K,)."""
     todo = np.flatnonzero(cost)
     if not len(todo):
         return
@@ -371,11 +373,18 @@ def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -
     parts = 1
     if len(todo) < 2 * threads and math.prod(shape) >= _LARGE:
         parts = shape[0] * min(1 + (threads - 1) // (len(todo) * shape[0]), shape[1])
-    ranked = todo[np.argsort(cost[todo], kind="stable")[::-1]]
-    # Dealt out in turn: every thread gets about as much to do.
-    order = np.concatenate([ranked[share::threads] for share in range(threads)])
-    fixed = order, parts, *shape
-    parallel_ranges(lambda a, b: task(a, b, *fixed, *columns), len(order) * parts)
+    order = todo[np.argsort(-cost[todo], kind="stable")]
+    costs = np.repeat(cost[order], parts)
+    # A unit belongs to the thread in whose share of the cost its middle is.
+    share = (costs.cumsum() - 0.5 * costs) * (threads / costs.sum())
+    ends = np.searchsorted(share, np.arange(threads + 1)).tolist()
+    fixed = order, parts, *shape, *columns
+
+    def do(first: int, last: int) -> None:
+        for thread in range(first, last):
+            task(ends[thread], ends[thread + 1], *fixed)
+
+    parallel_ranges(do, threads)
 
 
 @_jit()

@@ -34,16 +34,18 @@ from simulator.utils.compute import kernel
 if TYPE_CHECKING:
     from simulator.capture.prepared_scene import PreparedScene
 
+_MOVES = ("defocus", "speed", "direction", "turn", "subject_speed", "subject_direction")
 #: All of a scene that the exposure of a capture depends on; see `PreparedScene`.
 SCENE = np.dtype(
     [
-        *((n, "f8") for n in ("log2_reference", "gain", "tolerance", "speed", "defocus")),
-        *((n, "f8") for n in ("direction", "turn", "subject_speed", "subject_direction")),
+        *((n, "f8") for n in ("log2_reference", "gain", "tolerance", *_MOVES)),
         ("targets", "i8"),  # which noise of the camera its captures have
         ("streaks", "?"),  # whether the whole frame moves along the rows
         *LAYOUT,
     ]
 )
+#: How a scene is out of focus and moves: `PreparedScene.defocus`, `image_speed` and `movement`.
+MOVES = np.dtype([(name, "f8") for name in _MOVES])
 #: All of a state that the exposure of a capture depends on.
 STATE = np.dtype([(name, "f8") for name in ("log2_exposure", "time", "f_number")])
 
@@ -66,9 +68,13 @@ def fits_columns(scene: PreparedScene, states: np.ndarray) -> bool:
 
     Discs that are too wide do not fit: `decide` raises an error for these.
     """
-    widest = scene.defocus * 4.0 / states["f_number"].min()
-    largest = max(*scene.light.shape[-2:], MAX_DISC_PX)
-    return scene.nlf.is_zero and scene.aperture_blur is None and bool(widest <= largest)
+    widest = widest_defocus(scene, states)
+    return scene.nlf.is_zero and scene.aperture_blur is None and scene.defocus <= widest
+
+
+def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
+    """The largest `PreparedScene.defocus` whose disc is not too wide at `STATE` (S,)."""
+    return float(max(*scene.light.shape[-2:], MAX_DISC_PX) * states["f_number"].min() / 4.0)
 
 
 def statistics_column(scene: PreparedScene) -> np.ndarray:
@@ -85,11 +91,34 @@ def scene_column(scene: PreparedScene, targets: int) -> tuple[Any, ...]:
     own = movement.subject_speed if apart else 0.0
     return (
         *(scene.reference.log2_exposure, scene.gain, scene.tolerance),
-        *(scene.image_speed, scene.defocus),
-        *(movement.direction, movement.turn, own, movement.subject_direction),
+        *(scene.defocus, scene.image_speed, movement.direction, movement.turn),
+        *(own, movement.subject_direction),
         *(targets, movement.along_rows and not apart),
         *_addresses(layout, apart),
     )
+
+
+def moved_columns(rest: np.ndarray, moves: np.ndarray, subjects: np.ndarray) -> np.ndarray:
+    """`SCENE` (K,) of scenes in motion, from those at rest.
+
+    `moves` (K,) are `MOVES`, `subjects` (K, 2) the addresses of `LAYOUT` that a subject which moves
+    has, 0 without one.
+    """
+    columns, apart = rest.copy(), (moves["subject_speed"] > 0.0) & (subjects[:, 0] > 0)
+    for name in MOVES.names or ():
+        columns[name] = moves[name]
+    columns["subject_speed"] *= apart
+    columns["streaks"] = (moves["turn"] == 0.0) & (moves["direction"] == 0.0) & ~apart
+    columns["mask"], columns["behind"] = np.where(apart, subjects.T, np.uintp(0))
+    return columns
+
+
+def subject_column(scene: PreparedScene) -> tuple[int, ...]:
+    """Addresses of the mask of a scene's subject and of the pixels behind it; 0 without one."""
+    layout = scene.layout
+    if layout is None or layout.subject is None:
+        return 0, 0
+    return _addresses(layout, subject=True)[3:]
 
 
 def vignetting_column(scene: PreparedScene, states: Sequence[CameraSettings]) -> np.ndarray:

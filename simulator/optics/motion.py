@@ -32,7 +32,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from simulator.utils.checks import check_number
-from simulator.utils.compute import kernel, parallel_ranges
+from simulator.utils.compute import LANES, add_shifts, kernel, parallel_ranges
 
 #: Samples from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
@@ -44,6 +44,8 @@ _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 _LENGTH_POINTS = 32
 #: The first row: a literal 0 would compile what takes it twice.
 _TOP = np.int64(0)
+#: Taps that are added to all rows together.
+_TAPS = 128
 #: Shares below this are left out.
 _LEAST_WEIGHT = 1e-9
 _jit = functools.partial(kernel, fastmath={"contract"})
@@ -417,36 +419,29 @@ def _rasterised(  # type: ignore[no-untyped-def]
 
 @_jit()
 def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
-    """Rows from `first` to `last` of a plane (H, W) as sums of its shifts, eight at a time."""
+    """Rows from `first` to `last` of a plane (H, W) as sums of its shifts."""
     height, width = plane.shape
     reach = down = 0
     for k in range(len(weights)):
         reach, down = max(reach, abs(columns[k])), max(down, abs(rows[k]))
-    pitch = width + 2 * reach
-    padded = np.empty((last - first + 2 * down, pitch), np.float32)
+    pitch, count = width + 2 * reach, last - first
+    wide = (width + LANES - 1) // LANES * LANES  # what a sum reads behind its row does not count
+    memory = np.empty((count + 2 * down) * pitch + wide - width, np.float32)
+    padded = memory[: (count + 2 * down) * pitch].reshape(count + 2 * down, pitch)
     pad_rows(plane, first - down, _TOP, height, reach, limit, padded)
-    flat, offsets = padded.reshape(-1), (rows + down) * pitch + columns + reach
-    # Rows behind one another are one long vector, but where most of it would be their borders.
-    many = max(1, min(last - first, GROUP // pitch)) if 8 * reach <= width else 1
-    several = np.empty(many * pitch, np.float32)
-    for y in range(first, last, many):
-        count = min(many, last - y)
-        at, size = (y - first) * pitch, (count - 1) * pitch + width
-        total = out[y] if many == 1 else several[:size]
-        for k in range(0, len(weights), 8):
-            a, b = flat[at + offsets[k] :], flat[at + offsets[k + 1] :]
-            c, d = flat[at + offsets[k + 2] :], flat[at + offsets[k + 3] :]
-            e, f = flat[at + offsets[k + 4] :], flat[at + offsets[k + 5] :]
-            g, h = flat[at + offsets[k + 6] :], flat[at + offsets[k + 7] :]
-            w = weights[k : k + 8]
-            if k == 0:
-                total[:] = np.float32(0)
-            for x in range(size):
-                low = (w[0] * a[x] + w[1] * b[x]) + (w[2] * c[x] + w[3] * d[x])
-                high = (w[4] * e[x] + w[5] * f[x]) + (w[6] * g[x] + w[7] * h[x])
-                total[x] += low + high
-        for i in range(count if many > 1 else 0):
-            copy_row(several[i * pitch : i * pitch + width], out[y + i])
+    memory[padded.size :] = np.float32(0)
+    offsets = (rows + down) * pitch + columns + reach
+    sums = out[first:last] if wide == width else np.empty((count, wide), np.float32)
+    sums[:] = np.float32(0)
+    # Some taps for all rows, then the next: rows have most of what they look at in common.
+    for k in range(0, len(weights), _TAPS):
+        some, shares = offsets[k : k + _TAPS], weights[k : k + _TAPS]
+        for y in range(count):
+            for x in range(0, wide, LANES):
+                add_shifts(memory[y * pitch + x :], some, shares, sums[y, x:])  # type: ignore[call-arg]
+    if wide > width:
+        for y in range(count):
+            copy_row(sums[y, :width], out[first + y])
 
 
 @_jit()
@@ -484,11 +479,14 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
         flat = source.reshape(-1)
         copy_row(flat, back.reshape(-1))
         for y in range(top, bottom):
-            for x in range(left, right):
-                value = source[y, x]
+            own, at = back[y, left:right], behind[y, left:right]
+            for x in range(right - left):
+                own[x] = flat[np.uint64(at[x])]
+            shown, marks, only = source[y, left:right], mask[y, left:right], apart[y]
+            for x in range(right - left):
+                value = shown[x]
                 value = value if value < limit else limit
-                apart[y, x - left] = mask[y, x] * (value if value > -limit else -limit)
-                back[y, x] = flat[np.uint64(behind[y, x])]
+                only[x] = marks[x] * (value if value > -limit else -limit)
         blur_rows(_TOP, height, back, taps[0], taps[1], taps[2], limit, result)
         blur_rows(top, bottom, apart, rows, columns, weights, limit, front)
         for y in range(top, bottom):

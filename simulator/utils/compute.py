@@ -31,8 +31,9 @@ from typing import Any
 import numba
 import numpy as np
 import torch
+from llvmlite import ir
 from numba import types
-from numba.core import event
+from numba.core import cgutils, event
 
 from simulator.utils.checks import NOTE
 
@@ -163,6 +164,53 @@ def as_pointer(typing, address):  # type: ignore[no-untyped-def]
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
 
     return types.CPointer(types.float32)(types.uintp), generate  # type: ignore[no-untyped-call]
+
+
+#: Samples that `add_shifts` adds to.
+LANES = 64
+
+
+@numba.extending.intrinsic
+def add_shifts(typing, light, shifts, weights, sums):  # type: ignore[no-untyped-def]
+    """Adds weighted shifts of `light`, all 1-dimensional, to the first `LANES` of `sums`.
+
+    ``sums[i] += weights[k] * light[shifts[k] + i]`` for all k, eight of them at a time, with the
+    sums in registers: loops over slices take two to three times as long.
+    """
+    lanes = ir.VectorType(ir.FloatType(), LANES)
+    unset, first = ir.Constant(lanes, ir.Undefined), ir.Constant(ir.IntType(32), 0)
+    all_first = ir.Constant(ir.VectorType(first.type, LANES), [0] * LANES)
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        arrays = [context.make_array(t)(context, builder, args[i]) for i, t in enumerate(given)]
+        of, at, by, to = (array.data for array in arrays)
+        contract = ("contract",)
+
+        def at_lanes(pointer: Any) -> Any:
+            return builder.bitcast(pointer, lanes.as_pointer())
+
+        def term(k: Any) -> Any:
+            weight = builder.load(builder.gep(by, [k]))
+            weight = builder.insert_element(unset, weight, first)
+            light = at_lanes(builder.gep(of, [builder.load(builder.gep(at, [k]))]))
+            weights = builder.shuffle_vector(weight, unset, all_first)
+            return builder.fmul(weights, builder.load(light, align=4), flags=contract)
+
+        found = builder.load(at_lanes(to), align=4)
+        total = cgutils.alloca_once_value(builder, found)  # type: ignore[no-untyped-call]
+        count = builder.extract_value(arrays[2].shape, 0)
+        begin, step = ir.Constant(count.type, 0), ir.Constant(count.type, 8)
+        with cgutils.for_range_slice(builder, begin, count, step, count.type) as (k, _):
+            terms = [term(builder.add(k, ir.Constant(k.type, j))) for j in range(8)]
+            while len(terms) > 1:  # in pairs
+                pairs = zip(terms[::2], terms[1::2], strict=True)
+                terms = [builder.fadd(a, b, flags=contract) for a, b in pairs]
+            builder.store(builder.fadd(builder.load(total), *terms, flags=contract), total)
+        builder.store(builder.load(total), at_lanes(to), align=4)
+        return context.get_dummy_value()
+
+    given = light, shifts, weights, sums
+    return types.void(*given), generate
 
 
 # -- threads --------------------------------------------------------------------------------------
