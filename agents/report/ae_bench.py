@@ -6,7 +6,7 @@ import datetime
 import io
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from agents.policy_names import (
     split_options,
     training_seeds,
 )
-from agents.report.evaluation import Cell, cell, fill
+from agents.report.evaluation import fill
 from simulator.utils.files import machine, read_table, sibling, versions, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -315,16 +315,6 @@ def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _measured(name: str, form: str) -> Cell:
-    """Cells with a value and half the width of its interval, if it has one: "0.841 ± 0.030"."""
-
-    def shown(row: Mapping[str, Any]) -> str:
-        half = {"half": (row[f"{name}_high"] - row[f"{name}_low"]) / 2.0}
-        return cell(row, f"{{{name}:{form}}}") + cell(half, f" ± {{half:{form}}}", "")
-
-    return shown
-
-
 def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     """The page of a benchmark's table as Markdown."""
 
@@ -336,4 +326,4 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     )
     by_task = {str(task): own for task, own in numbers.groupby("task")}
     names = {"table": shown(table), "page": shown(page_of(table))}
-    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, measured=_measured, **names)
+    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, **names)
