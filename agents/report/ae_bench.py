@@ -6,7 +6,7 @@ import datetime
 import io
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from agents.policy_names import (
     split_options,
     training_seeds,
 )
-from agents.report.evaluation import fill
+from agents.report.evaluation import escape, fill
 from simulator.utils.files import machine, read_table, sibling, versions, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -326,4 +326,10 @@ def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     )
     by_task = {str(task): own for task, own in numbers.groupby("task")}
     names = {"table": shown(table), "page": shown(page_of(table))}
-    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, **names)
+    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, named=_named, **names)
+
+
+def _named(row: Mapping[str, Any]) -> str:
+    """A policy's name, and its observation unless that is the default."""
+    seen = "" if row["observation"] == "uint8" else f" ({row['observation']})"
+    return escape(row["policy"]) + escape(seen)
