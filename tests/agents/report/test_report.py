@@ -180,7 +180,7 @@ def test_brackets_by_hand(tmp_path):
     own = ae_bench.bench_rows(few, ranking)
     ae_bench.append_rows(tmp_path / "mine.csv", few["0.1 s"].plan, own, author="me")
     page = (tmp_path / "mine.md").read_text().replace(" ", "")
-    assert "|low|uint8|0.5100|-|" in page
+    assert "|low|0.5100|-|" in page
     assert page.count("|500.00|") == 2  # milliseconds of 0.5 s
 
 
