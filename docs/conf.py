@@ -63,7 +63,7 @@ CONTENTS = {
         "architecture",
         "gallery",
         "results/README",
-        *("ae-bench/v1", "ae-bench/v2"),
+        *("ae-bench/v3", "ae-bench/v2", "ae-bench/v1"),
         "api/simulator",
         "api/ae_env",
         "api/agents",

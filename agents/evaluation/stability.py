@@ -347,7 +347,7 @@ def _batches(cases: Cases, controller: Controller) -> Iterator[tuple[Ints, int]]
 
 
 def gain_limit(law: Proportional, delay: int) -> float:
-    """Loop gain at which a proportional law begins to oscillate; derived in docs/stability.md."""
+    """Loop gain where a proportional law starts to oscillate: docs/results/controllers.md."""
     return 2.0 if law.anchored else float(2.0 * np.sin(np.pi / (4 * delay + 2)))
 
 

@@ -28,7 +28,7 @@ from agents.policy_names import (
     split_options,
     training_seeds,
 )
-from agents.report.evaluation import Cell, cell, fill
+from agents.report.evaluation import escape, fill
 from simulator.utils.files import machine, read_table, sibling, versions, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -239,7 +239,7 @@ def append_rows(
         content = both.to_csv(index=False, lineterminator="\n")
         return {
             table.name: write_atomically(table, content),
-            page.name: write_atomically(page, table_page(plan, both, table)),
+            page.name: write_atomically(page, table_page(plan, both)),
         }
 
 
@@ -280,13 +280,8 @@ def read_rows(table: Path) -> pd.DataFrame:
 
 
 def page_of(table: Path) -> Path:
-    """The page of a table: ``docs/ae-bench/v3.csv`` has ``docs/ae-bench.md``.
-
-    >>> page_of(Path("docs/ae-bench/v3.csv")).as_posix(), page_of(Path("mine.csv")).as_posix()
-    ('docs/ae-bench.md', 'mine.md')
-    """
-    folder = table.parent
-    return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
+    """The page of a table, beside it."""
+    return table.with_suffix(".md")
 
 
 def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
@@ -315,25 +310,16 @@ def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _measured(name: str, form: str) -> Cell:
-    """Cells with a value and half the width of its interval, if it has one: "0.841 ± 0.030"."""
-
-    def shown(row: Mapping[str, Any]) -> str:
-        half = {"half": (row[f"{name}_high"] - row[f"{name}_low"]) / 2.0}
-        return cell(row, f"{{{name}:{form}}}") + cell(half, f" ± {{half:{form}}}", "")
-
-    return shown
-
-
-def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
+def table_page(plan: EvaluationPlan, rows: pd.DataFrame) -> str:
     """The page of a benchmark's table as Markdown."""
-
-    def shown(path: Path) -> str:  # a full path is of one machine only
-        return path.name if path.is_absolute() else path.as_posix()
-
     numbers = rows.assign(
         **{name: pd.to_numeric(rows[name]) for name in COLUMNS if name not in _TEXT}
     )
     by_task = {str(task): own for task, own in numbers.groupby("task")}
-    names = {"table": shown(table), "page": shown(page_of(table))}
-    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, measured=_measured, **names)
+    return fill("ae_bench.md", hash=plan.hash, tasks=by_task, named=_named)
+
+
+def _named(row: Mapping[str, Any]) -> str:
+    """A policy's name, and its observation unless that is the default."""
+    seen = "" if row["observation"] == "uint8" else f" ({row['observation']})"
+    return escape(row["policy"]) + escape(seen)
