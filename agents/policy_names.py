@@ -186,6 +186,7 @@ def make_policy(
             ``"bracket:planned"``, ``"bracket:fixed"`` or ``"bracket:hasinoff"`` for
             `ExposureBracket-v0`; ``"package.module:Class"`` or ``"path/to/file.py:Class"``. Options
             may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
+        context: The camera that it drives, see `PolicyContext.from_envs`.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
     """

@@ -187,7 +187,7 @@ def test_the_scorer_computes_what_it_says_and_is_used_as_printed(ae_env, tmp_pat
 
 
 #: Pages of the site that are written out.
-WRITTEN = {"index", "tasks", "viewer", "api/simulator", "tutorials/explore_a_raw"}
+WRITTEN = {"index", "tasks", "viewer", "api/simulator.CameraSettings", "tutorials/explore_a_raw"}
 
 
 def _build(folder: Path) -> tuple[str, set[str]]:
@@ -196,7 +196,8 @@ def _build(folder: Path) -> tuple[str, set[str]]:
     from sphinx.application import Sphinx
 
     # But for `viewcode`: 40 pages of the packages' own text, of which nothing is tested here.
-    used = {"extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]}
+    parts = [f"sphinx.ext.{name}" for name in ("autodoc", "autosummary", "napoleon")]
+    used = {"extensions": ["myst_parser", *parts]}
     warnings, folders = io.StringIO(), (ROOT / "docs", ROOT / "docs", folder, folder / "doctrees")
     more = {"confoverrides": {**used, "smartquotes": False}, "status": None}
     site = Sphinx(*folders, "html", **more, warning=warnings)
@@ -226,6 +227,10 @@ def test_the_site(tmp_path, forkserver):
         assert f"<h2>{title}" in text
     assert text.count("<h3>Action Space") == 3
     assert "{docstring}" not in text
+    # Each public class has a page, where each of its fields is described.
+    text = (tmp_path / "api" / "simulator.CameraSettings.html").read_text(encoding="utf-8")
+    for field in ("iso", "exposure_time", "f_number", "ev100"):
+        assert f'id="simulator.CameraSettings.{field}"' in text
     # Tutorials are pages of text and code.
     text = (tmp_path / "tutorials" / "explore_a_raw.html").read_text(encoding="utf-8")
     assert ("<h1>Explore a raw" in text, "# %%" in text) == (True, False)
