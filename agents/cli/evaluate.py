@@ -192,7 +192,10 @@ def make_plan(
     """The plan that the options describe; `given` are those about episodes, by name."""
     from pydantic import ValidationError
 
+    from ae_env import ExposureGrid, make_lighting, make_scorer
+    from ae_env.options import EnvOptions
     from agents.evaluation.evaluation_plan import EvaluationPlan, light_name, load_plan
+    from agents.policy_names import check_policy
     from simulator.utils.config_file import one_line
 
     if preset is not None:
@@ -208,6 +211,13 @@ def make_plan(
     environment |= {k: given[k] for k in _ENVIRONMENT if k in given}
     condition |= {k: given[k] for k in _CONDITION if k in given}
     entries: dict[str, Any] = {"environment": environment}
+    with console.all_mistakes() as check:
+        for policy in policies:
+            check(check_policy, policy)
+        named = {"scorer": make_scorer, "grid": ExposureGrid.from_spec, "lighting": make_lighting}
+        for key in (key for key in (*_ENVIRONMENT, *_CONDITION) if key in given):
+            check(EnvOptions.from_kwargs, {key: given[key]})
+            check(named.get(key, str), given[key])
     if preset is None:
         scenes = environment["scenes"]
         name = scenes.get("path", scenes) if isinstance(scenes, Mapping) else scenes

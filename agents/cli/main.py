@@ -111,16 +111,39 @@ def _check_options(name: str, **options: Any) -> None:
 
 
 class _Commands(TyperGroup):
-    """The commands; errors of options say the value."""
+    """The commands; errors of options say the value, and all of them are shown at once."""
 
     def invoke(self, ctx: Any) -> Any:
+        words = [*ctx._protected_args, *ctx.args]
         try:
             return super().invoke(ctx)
-        except typer.BadParameter as error:
-            found: Any = error.__cause__  # pydantic's, of a Typer that names no value itself
-            if hasattr(found, "errors"):
-                error.message = f"{found.errors()[0]['input']!r}: {error.message}"
+        except typer.BadParameter as first:
+            error: typer.BadParameter | None = _with_value(first)
+            command: Any = self.resolve_command(ctx, words)[1]
+            while error and _left_out(error, words):
+                try:
+                    error = command.make_context(None, words[1:], parent=ctx) and None
+                except typer.BadParameter as other:
+                    error = _with_value(other)
+                    first.message += f"\n{error.format_message()}"
             raise
+
+
+def _with_value(error: typer.BadParameter) -> typer.BadParameter:
+    """The error of an option, with the value that was given for it."""
+    cause: Any = error.__cause__  # pydantic's, of a Typer that names no value itself
+    if hasattr(cause, "errors"):
+        error.message = f"{cause.errors()[0]['input']!r}: {error.message}"
+    return error
+
+
+def _left_out(error: typer.BadParameter, words: list[str]) -> bool:
+    """Takes the option that an error is about, and its value, off the `words` of a command."""
+    names = getattr(error.param, "opts", ())
+    at = next((i for i, word in enumerate(words) if word.partition("=")[0] in names), None)
+    if at is not None:
+        del words[at : at + 1 + ("=" not in words[at])]
+    return at is not None
 
 
 app = typer.Typer(
@@ -172,9 +195,11 @@ def main() -> None:
             raise
         from ae_env.utils.user_files import UserCodeError
 
-        text = escape(_as_typed(_one_line(error)))
-        Console(stderr=True).print(f"[bold red]error[/] {text}", soft_wrap=True)
-        usage = isinstance(error, _USAGE) and not isinstance(error, UserCodeError)
+        errors = error.exceptions if isinstance(error, ExceptionGroup) else (error,)
+        for one in errors:
+            text = escape(_as_typed(_one_line(one)))
+            Console(stderr=True).print(f"[bold red]error[/] {text}", soft_wrap=True)
+        usage = all(isinstance(e, _USAGE) and not isinstance(e, UserCodeError) for e in errors)
         raise SystemExit(2 if usage else 1) from None
     except SystemExit as stop:
         if stop.code in (_INTERRUPTED, _TERMINATED):  # the first is what Typer makes of Ctrl-C
