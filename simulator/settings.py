@@ -121,7 +121,9 @@ def incident_ev100(illuminance: float) -> float:
 def sensor_signal(luminance: float, settings: CameraSettings) -> float:
     """Signal of a surface of `luminance` [cd/m^2] at `settings`; 1.0 is sensor white.
 
-    Saturation-based speed of ISO 12232 (H = 0.65 L t / N^2, H_sat = 78 / ISO).
+    Saturation-based speed of ISO 12232 (H = 0.65 L t / N^2, H_sat = 78 / ISO). It is the exposure
+    scale of OpenUSD's `UsdGeomCamera`, the imaging ratio t (ISO / 100) / N^2 times a responsivity,
+    which is 5 / 6 here; our N is the exact stop that a marked f-number stands for.
 
     >>> sensor_signal(1.2, CameraSettings(100, 1.0, 1.0))  # 0.65 * 1.2 = 78 / 100
     1.0

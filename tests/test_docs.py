@@ -1,6 +1,8 @@
 """README, docs and site: links lead somewhere, code runs as printed, commands parse, it builds."""
 
+import contextlib
 import io
+import json
 import os
 import pkgutil
 import re
@@ -132,6 +134,23 @@ def test_code_runs_as_printed(page, tmp_path, forkserver):
         code = re.sub(printed, short, code)
     with ProcessPoolExecutor(1, mp_context=forkserver) as pool:
         pool.submit(_run, code, tmp_path).result()
+
+
+def _printed(code: str) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(code, "first_look.ipynb", "exec"), {})
+    return printed.getvalue()
+
+
+def test_the_notebook_prints_what_it_shows(forkserver) -> None:
+    cells = json.loads((ROOT / "examples" / "first_look.ipynb").read_text())["cells"]
+    code = "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
+    assert code.startswith("%pip install -q ae-env\n")
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    with ProcessPoolExecutor(1, mp_context=forkserver) as pool:
+        printed = pool.submit(_printed, code.partition("\n")[2]).result()
+    assert printed == "".join(line for output in outputs for line in output.get("text", []))
 
 
 def _commands(page, pattern):
