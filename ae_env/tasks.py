@@ -466,8 +466,7 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
 class ExposureBracketVectorEnv(_Bracket, AutoExposureVectorEnv):
     """`num_envs` episodes of `ExposureBracketEnv`, photographed in batches.
 
-    `budget` and `max_frames` are those of `ExposureBracketEnv`, all others, such as
-    `autoreset_mode`, those of `AutoExposureVectorEnv` that the task has.
+    `budget` and `max_frames`: see `ExposureBracketEnv`; `autoreset_mode`: `AutoExposureVectorEnv`.
     """
 
     @takes_env_arguments(WITHOUT, **BRACKET)

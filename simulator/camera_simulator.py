@@ -431,8 +431,7 @@ class CameraSimulator:
     ) -> SimulationPlan:
         """Steps from `source` to `settings`, why others are left out, error and cost.
 
-        Without `noise`, of the light on the sensor alone. `tolerance` and the arguments of a
-        `scene` are those of `prepare`.
+        Without `noise`, of the light alone. `tolerance` and the others of `scene`: see `prepare`.
         """
         return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 

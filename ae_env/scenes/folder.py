@@ -178,7 +178,7 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     files = visible_files(base, found, (*RAW_SUFFIXES, *RADIANCE_SUFFIXES))
     if not files:
         if len(found) == 1 and found[0].suffix.lower() in PICTURE_SUFFIXES:
-            kind = found[0].suffix[1:].upper().replace("JPG", "JPEG")
+            kind = found[0].suffix[1:].upper()
             raise ValueError(f"`path` (={str(spec)!r}) is a {kind}, not a raw or a radiance map")
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):

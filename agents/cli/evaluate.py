@@ -159,12 +159,9 @@ def _run(
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.jobs import Jobs
     from agents.evaluation.result import overall_ranking
-    from agents.policy_names import check_policy
     from agents.report.ae_bench import append_rows, bench_rows, check_append, check_hash
     from agents.report.evaluation import write_report
 
-    for name in plan.policies:
-        check_policy(name)  # before scenes are read, which may take minutes
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
     with Jobs(plan, out / "parts", scenes, device=device) as run:
@@ -212,7 +209,7 @@ def make_plan(
     condition |= {k: given[k] for k in _CONDITION if k in given}
     entries: dict[str, Any] = {"environment": environment}
     with console.all_mistakes() as check:
-        for policy in policies:
+        for policy in policies or base.policies:  # before scenes are read, which may take minutes
             check(check_policy, policy)
         named = {"scorer": make_scorer, "grid": ExposureGrid.from_spec, "lighting": make_lighting}
         for key in (key for key in (*_ENVIRONMENT, *_CONDITION) if key in given):

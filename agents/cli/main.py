@@ -12,8 +12,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,11 +90,7 @@ def bench(
 
 #: Parts that can be run alone, and benchmarks that take an option.
 _PARTS = {"places": ("posterior", "receptors", "curve"), "transfer": ("agents", "tables")}
-_TAKES = {
-    "folder": ("emva", "paper", "recorded"),
-    "part": tuple(_PARTS),
-    "weights": ("paper",),
-}
+_TAKES = {"folder": ("emva", "paper", "recorded"), "part": tuple(_PARTS), "weights": ("paper",)}
 
 
 def _check_options(name: str, **options: Any) -> None:
@@ -117,33 +112,26 @@ class _Commands(TyperGroup):
         words = [*ctx._protected_args, *ctx.args]
         try:
             return super().invoke(ctx)
-        except typer.BadParameter as first:
-            error: typer.BadParameter | None = _with_value(first)
+        except typer.BadParameter as error:
             command: Any = self.resolve_command(ctx, words)[1]
-            while error and _left_out(error, words):
-                try:
-                    error = command.make_context(None, words[1:], parent=ctx) and None
-                except typer.BadParameter as other:
-                    error = _with_value(other)
-                    first.message += f"\n{error.format_message()}"
+            error.message = "\n".join(_messages(error, command, words[1:], ctx))
             raise
 
 
-def _with_value(error: typer.BadParameter) -> typer.BadParameter:
-    """The error of an option, with the value that was given for it."""
+def _messages(error: typer.BadParameter, command: Any, words: list[str], ctx: Any) -> Iterator[str]:
+    """Messages of an error of an option and, without that option, of the next ones."""
     cause: Any = error.__cause__  # pydantic's, of a Typer that names no value itself
-    if hasattr(cause, "errors"):
-        error.message = f"{cause.errors()[0]['input']!r}: {error.message}"
-    return error
-
-
-def _left_out(error: typer.BadParameter, words: list[str]) -> bool:
-    """Takes the option that an error is about, and its value, off the `words` of a command."""
+    given = f"{cause.errors()[0]['input']!r}: " if hasattr(cause, "errors") else ""
+    yield given + error.message
     names = getattr(error.param, "opts", ())
-    at = next((i for i, word in enumerate(words) if word.partition("=")[0] in names), None)
-    if at is not None:
-        del words[at : at + 1 + ("=" not in words[at])]
-    return at is not None
+    at = next((i for i, word in enumerate(words) if word.partition("=")[0] in names), len(words))
+    rest = words[:at] + words[at + 1 + ("=" not in "".join(words[at : at + 1])) :]
+    if rest != words:
+        try:
+            command.make_context(None, list(rest), parent=ctx)
+        except typer.BadParameter as other:
+            other.message = "\n".join(_messages(other, command, rest, ctx))
+            yield other.format_message()
 
 
 app = typer.Typer(
@@ -184,7 +172,8 @@ def main() -> None:
     files), 1 where something failed while running; Ctrl-C gives 130, SIGTERM 143.
     """
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
-    handler.addFilter(_first_time())
+    seen: Any = set()  # scenes that are loaded again have the same to say
+    handler.addFilter(lambda r: not (r.getMessage() in seen or seen.add(r.getMessage())))
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(level=NOTE, format="%(message)s", handlers=[handler])
     signal.signal(signal.SIGTERM, _terminate)
@@ -208,28 +197,13 @@ def main() -> None:
             Console(stderr=True).print(f"\nstopped{more}")
             # What is kept is written: a second Ctrl-C need not wait for the workers' end.
             for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, partial(_quit, stop.code))
+                signal.signal(number, lambda *_, status=stop.code: os._exit(status))
         raise
-
-
-def _first_time() -> Callable[[logging.LogRecord], bool]:
-    """A filter of log lines: scenes that are loaded again have the same to say."""
-    seen = set[str]()
-
-    def is_new(record: logging.LogRecord) -> bool:
-        text = record.getMessage()
-        return not (text in seen or seen.add(text))  # type: ignore[func-returns-value]
-
-    return is_new
 
 
 def _terminate(*_: Any) -> None:
     """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
     raise SystemExit(_TERMINATED)
-
-
-def _quit(status: int, *_: Any) -> None:
-    os._exit(status)
 
 
 def _one_line(error: Exception) -> str:

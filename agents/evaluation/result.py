@@ -222,9 +222,8 @@ class EvaluationResult:
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
     def mean(self, policy: str, key: str, episodes: Bools | None = None) -> float:
-        """Mean of the metric `key` of `policy`, over each group's episodes, then groups and seeds.
-
-        Of the `episodes` that are True, ``(E,)``, or of all.
+        """Mean of the metric `key` of `policy` over a group's episodes, then over groups and seeds;
+        of the `episodes` that are True, ``(E,)``, or of all.
         """
         members = self.part("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]

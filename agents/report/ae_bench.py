@@ -21,13 +21,7 @@ from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan,
 from agents.evaluation.intervals import score_interval
 from agents.evaluation.metrics import group_means
 from agents.evaluation.result import Results, overall_gains, static_condition
-from agents.policy_names import (
-    LEARNT_AGENTS,
-    WITH_FILE,
-    split_class,
-    split_options,
-    training_seeds,
-)
+from agents.policy_names import LEARNT_AGENTS, WITH_FILE, split_class, split_options, training_seeds
 from agents.report.evaluation import Cell, cell, fill
 from simulator.utils.files import machine, read_table, sibling, versions, write_atomically
 
