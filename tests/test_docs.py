@@ -244,7 +244,6 @@ def test_the_site(tmp_path, forkserver):
         assert f"<h2>{title}" in text
     assert text.count("<h3>Action Space") == 3
     assert "{docstring}" not in text
-    # Each public class has a page, each field a description.
     text = (tmp_path / "api" / "simulator.CameraSettings.html").read_text("utf-8")
     assert 'id="simulator.CameraSettings.f_number"' in text
     # Tutorials are pages of text and code.
