@@ -72,4 +72,4 @@ $(STAMP): $(BASE)
 	touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) quickstart build dist *.egg-info
+	rm -rf $(VENV) quickstart build dist docs/api *.egg-info

@@ -515,7 +515,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode; see the class for `options`."""
+        """Begins an episode; `seed` restarts the random numbers, see the class for `options`."""
         chosen = check_options(options)
         super().reset(seed=check_seed(seed))
         self.core.begin(_FIRST, [self.np_random], [chosen])

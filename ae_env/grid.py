@@ -47,9 +47,9 @@ class ExposureGrid:
     (64, 'ISO 100, 1/1000 s, f/4', 'ISO 6400, 1/2 s, f/11')
     """
 
-    isos: tuple[float, ...]  # ISO speeds, ascending
-    exposure_times: tuple[float, ...]  # exposure times [s], ascending (shortest first)
-    f_numbers: tuple[float, ...]  # F-numbers, ascending
+    isos: tuple[float, ...]  #: ISO speeds, ascending
+    exposure_times: tuple[float, ...]  #: exposure times [s], ascending (shortest first)
+    f_numbers: tuple[float, ...]  #: F-numbers, ascending
 
     def __post_init__(self) -> None:
         for name in ("isos", "exposure_times", "f_numbers"):
@@ -90,7 +90,7 @@ class ExposureGrid:
 
     @classmethod
     def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Iterable[float]]) -> ExposureGrid:
-        """A grid from a name, such as ``"default"`` or ``"video"``, or a mapping of its lists."""
+        """A grid from `spec`: a name such as ``"default"`` or ``"video"``, or lists by name."""
         if isinstance(spec, ExposureGrid):
             return spec
         named = ("bracket", "default", "third_stop", "video")
@@ -133,7 +133,7 @@ class ExposureGrid:
         return np.array([[s.aperture_value, s.time_value, s.speed_value] for s in self.states])
 
     def index(self, iso_index: int, time_index: int, aperture_index: int) -> int:
-        """Index of the state with these positions in the three lists."""
+        """State at the positions `iso_index`, `time_index` and `aperture_index` of the lists."""
         return int(np.ravel_multi_index((iso_index, time_index, aperture_index), self.shape))
 
     def controls(self, states: np.ndarray | int) -> np.ndarray:
@@ -141,7 +141,7 @@ class ExposureGrid:
         return np.stack(np.unravel_index(np.asarray(states), self.shape), axis=-1).astype(np.int64)
 
     def mixed(self, iso: np.ndarray, time: np.ndarray, aperture: np.ndarray) -> np.ndarray:
-        """(...) int64: states with the ISO of the states `iso`, the exposure time of `time`, ..."""
+        """(...) int64: states with the ISO of `iso`, exposure time of `time`, f/ of `aperture`."""
         sources = np.broadcast_arrays(iso, time, aperture)
         controls = [self.controls(states)[..., i] for i, states in enumerate(sources)]
         return np.ravel_multi_index(tuple(controls), self.shape).astype(np.int64)

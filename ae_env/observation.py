@@ -73,7 +73,7 @@ def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def decode_observation(raw: np.ndarray) -> np.ndarray:
-    """Signal of 8-bit codes, float32 in [-1/1024, 1]: the inverse of `encode_observation`.
+    """Signal of the codes `raw`, float32 in [-1/1024, 1]: the inverse of `encode_observation`.
 
     >>> decode_observation(np.array([0, 255], np.uint8)).tolist()
     [-0.0009765625, 1.0]

@@ -98,7 +98,7 @@ class AutoExposureVideoEnv(AutoExposureEnv):
 class AutoExposureVideoVectorEnv(AutoExposureVectorEnv):
     """`num_envs` episodes of `AutoExposureVideoEnv`, photographed in batches.
 
-    All arguments are those of `AutoExposureVectorEnv`, with the defaults of the task.
+    All arguments, such as `autoreset_mode`, are those of `AutoExposureVectorEnv`.
     """
 
     __init__ = takes_env_arguments(max_episode_steps=96, **VIDEO)(AutoExposureVectorEnv.__init__)
@@ -466,7 +466,7 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
 class ExposureBracketVectorEnv(_Bracket, AutoExposureVectorEnv):
     """`num_envs` episodes of `ExposureBracketEnv`, photographed in batches.
 
-    All other arguments are those of `AutoExposureVectorEnv` that the task has.
+    `budget` and `max_frames`: see `ExposureBracketEnv`; `autoreset_mode`: `AutoExposureVectorEnv`.
     """
 
     @takes_env_arguments(WITHOUT, **BRACKET)

@@ -164,7 +164,7 @@ class _Apex(_GridActions):
 
 
 class ControlActions(_Controls, _One):
-    """Actions `MultiDiscrete([I, T, N])`: positions of ISO, exposure time and f-number.
+    """Actions of `env` as `MultiDiscrete([I, T, N])`: positions of ISO, exposure time, f-number.
 
     >>> import ae_env
     >>> env = ControlActions(gym.make("ae_env/AutoExposure-v0", scenes="bundled:small"))
@@ -174,7 +174,7 @@ class ControlActions(_Controls, _One):
 
 
 class RelativeActions(_Steps, _One):
-    """Actions `MultiDiscrete([3, 3, 3])`: 0 one step down, 1 stay, 2 one step up.
+    """Actions of `env` as `MultiDiscrete([3, 3, 3])`: 0 one step down, 1 stay, 2 one step up.
 
     For ISO, exposure time and f-number at once, because a single control cannot trade shutter for
     ISO without leaving the right exposure on the way. Steps count from the state of the latest
@@ -183,7 +183,7 @@ class RelativeActions(_Steps, _One):
 
 
 class ContinuousActions(_Apex, _One):
-    """Actions `Box(-1, 1, (3,))`: Av, Tv and Sv from the grid's least to its greatest.
+    """Actions of `env` as `Box(-1, 1, (3,))`: Av, Tv and Sv from the grid's least to greatest.
 
     The allowed state at the least distance in stops is taken; ties go to the lower ISO. Values
     beyond the box are clipped.
@@ -191,12 +191,12 @@ class ContinuousActions(_Apex, _One):
 
 
 class VectorControlActions(_Controls, _Many):
-    """`ControlActions` for a vector environment from `gymnasium.make_vec`; actions (N, 3)."""
+    """`ControlActions` for a vector `env` of `gymnasium.make_vec`; actions (N, 3)."""
 
 
 class VectorRelativeActions(_Steps, _Many):
-    """`RelativeActions` for a vector environment from `gymnasium.make_vec`; actions (N, 3)."""
+    """`RelativeActions` for a vector `env` of `gymnasium.make_vec`; actions (N, 3)."""
 
 
 class VectorContinuousActions(_Apex, _Many):
-    """`ContinuousActions` for a vector environment from `gymnasium.make_vec`; actions (N, 3)."""
+    """`ContinuousActions` for a vector `env` of `gymnasium.make_vec`; actions (N, 3)."""

@@ -31,14 +31,14 @@ class BracketLimits(NamedTuple):
 class PolicyContext:
     """The camera that a policy drives; an action is an index into its `grid`."""
 
-    grid: ExposureGrid
-    camera: CameraProfile
+    grid: ExposureGrid  #: states that actions choose from
+    camera: CameraProfile  #: body that takes the frames
     #: Observation of a single environment (a `Dict` with ``raw``, ``settings`` and, where the
     #: camera has them, ``sensors``).
     observation_space: gym.spaces.Dict
     #: Frames after the next until a decision's ISO, exposure time and aperture are in effect.
     delays: tuple[int, int, int] = (0, 0, 0)
-    bracket: BracketLimits | None = None  # None for tasks without a bracket
+    bracket: BracketLimits | None = None  #: None for tasks without a bracket
 
     @classmethod
     def from_envs(cls, envs: gym.vector.VectorEnv[Any, Any, Any]) -> PolicyContext:
@@ -57,7 +57,7 @@ class PolicyContext:
 
 
 class Policy:
-    """Base class of everything that chooses exposures, for a batch of cameras at once.
+    """Base class of everything that chooses exposures, for a batch of cameras of a `context`.
 
     A policy is causal: `act` sees the frames so far and nothing else. Override `reset` (call it
     through `super`) and `act`; override `fit` where the policy has something to learn from the
@@ -77,11 +77,11 @@ class Policy:
         self.name = type(self).__name__
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Forget the past: the next observations begin new episodes of `num_envs` cameras."""
+        """Begin new episodes of `num_envs` cameras; random choices follow `seed`."""
         self.num_envs = num_envs
 
     def check_reset(self, observations: Observations) -> None:
-        """Raises a `ValueError` unless `reset` was called for as many cameras as are observed."""
+        """Raises a `ValueError` unless `reset` was called for as many cameras as `observations`."""
         count = len(observations["raw"])
         if count != self.num_envs:
             raise ValueError(
@@ -99,7 +99,7 @@ class Policy:
         raise NotImplementedError(f"{type(self).__name__} must implement `act`")
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
-        """Learn from the training scenes of `envs`; called once, before evaluation."""
+        """Learn from the scenes of `envs`, in episodes of `seed`; once, before evaluation."""
 
 
 def masked_argmax(utility: NDArray[np.floating], action_masks: Bools | None) -> Ints:

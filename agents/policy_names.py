@@ -186,6 +186,7 @@ def make_policy(
             ``"bracket:planned"``, ``"bracket:fixed"`` or ``"bracket:hasinoff"`` for
             `ExposureBracket-v0`; ``"package.module:Class"`` or ``"path/to/file.py:Class"``. Options
             may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
+        context: The camera that it drives, see `PolicyContext.from_envs`.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
     """
@@ -281,8 +282,8 @@ def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str
 def _known(base: str, head: str) -> str:
     """What a name may be, for an error about the unknown `base`, which begins with `head`."""
     if head in (*METERS, "rpi_agc"):
-        programs = PROGRAMS if head in METERS else MANUAL_PROGRAMS
-        return f": its program must be one of {', '.join(f'{head}:{p}' for p in programs)}"
+        known = [f"{head}:{p}" for p in (PROGRAMS if head in METERS else MANUAL_PROGRAMS)]
+        return f" must be one of {', '.join(known)}{did_you_mean(base, known)}"
     files = [f"{head}:{argument.upper()}" for head, (_, argument) in WITH_FILE.items()]
     names = [*_POLICIES, *files, *_BRACKETS]
     single = [name for name in names if name.partition(":")[0] not in METERS]

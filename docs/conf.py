@@ -6,11 +6,14 @@ import importlib
 import inspect
 import re
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 from docutils import nodes
 from myst_parser.parsers.sphinx_ import MystParser
 from sphinx.application import Sphinx
+from sphinx.util.inspect import stringify_signature
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -22,8 +25,12 @@ project = "ae-env"
 author = copyright = "The ae-env developers"
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = [
+    *("myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"),
+    "sphinx.ext.viewcode",
+]
 exclude_patterns = ["conf.py"]
+templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"ae-env {release}"
 html_copy_source = False
@@ -35,9 +42,13 @@ myst_enable_extensions = ["html_image"]
 # Parts of reports begin below the level of a title.
 suppress_warnings = ["myst.header"]
 
-autodoc_member_order = "bysource"
-autodoc_typehints = "description"
-autodoc_default_options = {"members": True, "show-inheritance": False}
+# Pages of the API are made in `api/`, one per class, from the templates.
+autosummary_generate = ["api.md"]
+autosummary_ignore_module_all = False
+autosummary_imported_members = True
+autodoc_typehints = "both"
+autodoc_typehints_description_target = "documented"
+python_maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
@@ -64,9 +75,7 @@ CONTENTS = {
         "gallery",
         "results/README",
         *("ae-bench/v3", "ae-bench/v2", "ae-bench/v1"),
-        "api/simulator",
-        "api/ae_env",
-        "api/agents",
+        "api",
     ],
 }
 
@@ -125,8 +134,37 @@ def _link(app: Sphinx, name: str, found: re.Match[str]) -> str:
     return found[0] if path.is_relative_to(HERE) or (path.is_file() and not page) else text
 
 
+#: Descriptions of attributes by name, before Napoleon takes what ends in a colon for a type.
+DESCRIPTIONS: dict[str, list[str]] = {}
+
+
+def on_docstring(app: Sphinx, what: str, name: str, found: object, *rest: Any) -> None:
+    """Keeps the first line of an environment's docstring: all of it is the page of its task."""
+    lines = rest[-1]
+    if what == "class" and "## Description" in lines:
+        lines[1:] = ["", "Spaces, reward and arguments: :doc:`the page of the tasks </tasks>`.", ""]
+    elif what in ("attribute", "property"):
+        DESCRIPTIONS[name] = lines[:]
+
+
+def after_napoleon(app: Sphinx, what: str, name: str, found: object, *rest: Any) -> None:
+    """Gives attributes their descriptions back."""
+    if what in ("attribute", "property"):
+        rest[-1][:] = DESCRIPTIONS[name]
+
+
+def on_signature(app: Sphinx, what: str, name: str, found: Any, *rest: Any) -> Any:
+    """Of a class whose fields are described one by one, with their types, leaves the names."""
+    if what == "class" and (is_dataclass(found) or hasattr(found, "model_fields")):
+        return stringify_signature(inspect.signature(found), show_annotation=False), None
+    return None
+
+
 def setup(app: Sphinx) -> None:
     """Registers scripts as pages, and what is done to every page."""
     app.add_source_suffix(".py", "script")
     app.add_source_parser(ScriptParser)
     app.connect("source-read", on_source_read)
+    app.connect("autodoc-process-docstring", on_docstring, priority=400)
+    app.connect("autodoc-process-docstring", after_napoleon, priority=600)
+    app.connect("autodoc-process-signature", on_signature)

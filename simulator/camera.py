@@ -53,17 +53,17 @@ class BayerPattern(StrEnum):
 class CameraProfile:
     """A camera body."""
 
-    name: str  # unique lower-case name, such as ``"nikon_z6"``
-    cfa: BayerPattern  # order of the colour filter array
+    name: str  #: unique lower-case name, such as ``"nikon_z6"``
+    cfa: BayerPattern  #: order of the colour filter array
     #: Digital number of no light, per plane R, G1, G2, B.
     black_level: tuple[float, float, float, float]
-    white_level: float  # digital number at which the sensor saturates, whole
-    bit_depth: int  # bits per sample of its raw files
+    white_level: float  #: digital number at which the sensor saturates, whole
+    bit_depth: int  #: bits per sample of its raw files
     #: Share of white from which a photosite is full where another one of its pixel is at white:
     #: photosites of some compact cameras differ by some percent.
     full_level: float = field(default=1.0, kw_only=True)
-    make: str = "unknown"  # maker as EXIF spells it
-    model: str = "unknown"  # model as EXIF spells it
+    make: str = "unknown"  #: maker as EXIF spells it
+    model: str = "unknown"  #: model as EXIF spells it
     #: Calibrated noise level function by ISO; empty if unknown.
     nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict, hash=False)
     #: Rows and tails of the read noise by ISO, for ``noise="sensor"``; empty if unknown.
@@ -72,11 +72,11 @@ class CameraProfile:
     segments: tuple[float, ...] = field(default=(), hash=False)
     #: XYZ (D65) to camera RGB, row by row (3 x 3); None if unknown.
     colour_matrix: tuple[tuple[float, float, float], ...] | None = field(default=None, hash=False)
-    colour_matrix_source: str = ""  # where the matrix comes from
+    colour_matrix_source: str = ""  #: where the matrix comes from
     #: Distance between sensor pixels [micrometre]; None if unknown.
     pixel_pitch_um: float | None = None
-    row_time: float = 0.0  # read-out time of one sensor row [s]
-    source: str = ""  # where the noise calibration comes from
+    row_time: float = 0.0  #: read-out time of one sensor row [s]
+    source: str = ""  #: where the noise calibration comes from
 
     def __post_init__(self) -> None:
         check_word("cfa", self.cfa, tuple(p.value for p in BayerPattern))
@@ -176,10 +176,10 @@ class CameraProfile:
     def with_levels(
         self, black_level: Sequence[float], white_level: float, bit_depth: int
     ) -> CameraProfile:
-        """This camera with the levels of a file, and its noise on the scale that they make.
+        """This camera with a file's `black_level` (4,) and `white_level` [DN] of `bit_depth` bits.
 
-        The same digital numbers, as shares of the converter's range, are more or less of the way to
-        white; the noise of a plane goes with them.
+        The noise is scaled to them: the same digital numbers, as shares of the converter's range,
+        are more or less of the way to white.
         """
         levels: dict[str, Any] = {"black_level": black_level, "white_level": white_level}
         other = replace(self, **levels, bit_depth=bit_depth)
@@ -192,7 +192,7 @@ class CameraProfile:
         return replace(other, nlf_by_iso=table)
 
     def with_nlf(self, iso: float, nlf: NoiseLevelFunction) -> CameraProfile:
-        """This camera with its noise calibrated by one measurement at `iso`."""
+        """This camera with `nlf`, measured at `iso`, as its only noise calibration."""
         return replace(self, nlf_by_iso={float(iso): nlf}, segments=(), source=nlf.source)
 
 

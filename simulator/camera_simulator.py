@@ -292,7 +292,7 @@ class CameraSimulator:
 
     @torch.no_grad()
     def denoise(self, prepared: PreparedScene, noise: NoiseModule | None = None) -> torch.Tensor:
-        """The prepared scene's light (4, H, W) with little noise, by `noise` or the best module.
+        """Light (4, H, W) of `prepared` with little noise, by the module `noise` or the best one.
 
         The result serves every exposure: the family commutes with exposure. Those of the paper
         and of its authors' code do not; they are run at the exposure of the source. A `ValueError`
@@ -323,7 +323,7 @@ class CameraSimulator:
 
     @torch.no_grad()
     def estimate_defocus(self, prepared: PreparedScene) -> torch.Tensor:
-        """Circle of confusion of each pixel (H, W), at the prepared scene's own aperture [pixel].
+        """Circle of confusion (H, W) of each pixel of `prepared`, at its own aperture [pixel].
 
         A `ValueError` if the aperture module has no such map.
         """
@@ -429,9 +429,9 @@ class CameraSimulator:
         tolerance: float | Literal["source"] = "source",
         **scene: Unpack[SceneArguments],
     ) -> SimulationPlan:
-        """Which steps the change to `settings` takes, why others are left out, error and cost.
+        """Steps from `source` to `settings`, why others are left out, error and cost.
 
-        Without `noise`, of the light on the sensor alone; see `prepare` for the other arguments.
+        Without `noise`, of the light alone. `tolerance` and the others of `scene`: see `prepare`.
         """
         return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 

@@ -37,9 +37,9 @@ class CameraSettings:
     14.965784284662087
     """
 
-    iso: float  # ISO speed, in [0.001, 1e8]
-    exposure_time: float  # time the shutter is open, in seconds, in [1e-9, 1e5]
-    f_number: float  # aperture f-number as marked on the lens, in [0.5, 1024]
+    iso: float  #: ISO speed, in [0.001, 1e8]
+    exposure_time: float  #: time the shutter is open, in seconds, in [1e-9, 1e5]
+    f_number: float  #: aperture f-number as marked on the lens, in [0.5, 1024]
     #: Aperture in sixths of the f-number's octave (thirds of a stop): ``round(6 log2 N)``.
     aperture_stop: int = field(init=False, repr=False, compare=False)
     #: The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper, section 3.1).
@@ -62,7 +62,7 @@ class CameraSettings:
 
     @classmethod
     def from_exif(cls, iso: float, exposure_time: float, f_number: float) -> CameraSettings:
-        """Settings as a camera recorded them: a rounded shutter speed becomes the exact stop.
+        """Settings of a file: `iso`, `f_number` and, of a rounded `exposure_time`, the exact stop.
 
         >>> CameraSettings.from_exif(100, 1 / 60, 2.8).exposure_time == 1 / 64
         True
@@ -119,9 +119,11 @@ def incident_ev100(illuminance: float) -> float:
 
 
 def sensor_signal(luminance: float, settings: CameraSettings) -> float:
-    """Signal, 1.0 at sensor white, of a surface of `luminance` [cd/m^2].
+    """Signal of a surface of `luminance` [cd/m^2] at `settings`; 1.0 is sensor white.
 
-    Saturation-based speed of ISO 12232 (H = 0.65 L t / N^2, H_sat = 78 / ISO).
+    Saturation-based speed of ISO 12232 (H = 0.65 L t / N^2, H_sat = 78 / ISO). It is the exposure
+    scale of OpenUSD's `UsdGeomCamera`, the imaging ratio t (ISO / 100) / N^2 times a responsivity,
+    which is 5 / 6 here; our N is the exact stop that a marked f-number stands for.
 
     >>> sensor_signal(1.2, CameraSettings(100, 1.0, 1.0))  # 0.65 * 1.2 = 78 / 100
     1.0

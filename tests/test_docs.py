@@ -1,6 +1,8 @@
 """README, docs and site: links lead somewhere, code runs as printed, commands parse, it builds."""
 
+import contextlib
 import io
+import json
 import os
 import pkgutil
 import re
@@ -134,6 +136,21 @@ def test_code_runs_as_printed(page, tmp_path, forkserver):
         pool.submit(_run, code, tmp_path).result()
 
 
+def _printed(code: str) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(code, {})
+    return printed.getvalue()
+
+
+def test_the_notebook_prints_what_it_shows(forkserver) -> None:
+    cells = json.loads((ROOT / "examples" / "first_look.ipynb").read_text())["cells"]
+    code = "\n".join("".join(c["source"]) for c in cells if "outputs" in c)
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    with ProcessPoolExecutor(1, mp_context=forkserver) as pool:
+        printed = pool.submit(_printed, code.partition("\n")[2]).result()
+    assert printed == "".join(line for output in outputs for line in output.get("text", []))
+
+
 def _commands(page, pattern):
     """The words after `ae-env` of every command that the pattern finds, without comments."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
@@ -187,7 +204,7 @@ def test_the_scorer_computes_what_it_says_and_is_used_as_printed(ae_env, tmp_pat
 
 
 #: Pages of the site that are written out.
-WRITTEN = {"index", "tasks", "viewer", "api/simulator", "tutorials/explore_a_raw"}
+WRITTEN = {"index", "tasks", "viewer", "api/simulator.CameraSettings", "tutorials/explore_a_raw"}
 
 
 def _build(folder: Path) -> tuple[str, set[str]]:
@@ -196,7 +213,8 @@ def _build(folder: Path) -> tuple[str, set[str]]:
     from sphinx.application import Sphinx
 
     # But for `viewcode`: 40 pages of the packages' own text, of which nothing is tested here.
-    used = {"extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]}
+    parts = [f"sphinx.ext.{name}" for name in ("autodoc", "autosummary", "napoleon")]
+    used = {"extensions": ["myst_parser", *parts]}
     warnings, folders = io.StringIO(), (ROOT / "docs", ROOT / "docs", folder, folder / "doctrees")
     more = {"confoverrides": {**used, "smartquotes": False}, "status": None}
     site = Sphinx(*folders, "html", **more, warning=warnings)
@@ -226,6 +244,8 @@ def test_the_site(tmp_path, forkserver):
         assert f"<h2>{title}" in text
     assert text.count("<h3>Action Space") == 3
     assert "{docstring}" not in text
+    text = (tmp_path / "api" / "simulator.CameraSettings.html").read_text("utf-8")
+    assert 'id="simulator.CameraSettings.f_number"' in text
     # Tutorials are pages of text and code.
     text = (tmp_path / "tutorials" / "explore_a_raw.html").read_text(encoding="utf-8")
     assert ("<h1>Explore a raw" in text, "# %%" in text) == (True, False)

@@ -69,7 +69,7 @@ class Lighting:
     A subclass gives `name`, by which `make_lighting` knows it, and `gain`.
     """
 
-    name: ClassVar[str] = "static"
+    name: ClassVar[str] = "static"  #: by which `make_lighting` knows it
     #: Whether light also changes within a frame, so that it depends on the exposure time.
     within_frame: ClassVar[bool] = False
     #: Options that are frames, the second not before the first.
@@ -95,9 +95,9 @@ class Lighting:
                 )
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """Mean relative light of an exposure [s]; frame 0 is the one that `reset` returns.
+        """Mean relative light of an exposure of `exposure_time` [s] in `frame`.
 
-        `phase` is the episode's own, in [0, 1).
+        Frame 0 is the one that `reset` returns; `phase` is the episode's own, in [0, 1).
         """
         return float(2.0 ** self._stops(frame, phase))
 
@@ -108,7 +108,7 @@ class Lighting:
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure as of `gain`, row by row of a frame that `shutter` reads.
+        """Light of a `frame` row by row, as `shutter` reads; `exposure_time`, `phase` as of `gain`.
 
         The mean of the frame, and (rows,) float64 that of each row relative to this mean; None
         where all rows have the same.
@@ -120,7 +120,7 @@ KINDS[Lighting.name] = Lighting
 
 
 def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
-    """A lighting from a name or from a mapping such as ``{"kind": "step", "stops": 3}``.
+    """A lighting from `spec`: its name, or a mapping such as ``{"kind": "step", "stops": 3}``.
 
     A `ValueError` if the kind or an option is unknown, or an option out of range.
 
@@ -149,9 +149,9 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
 class StepLighting(Lighting):
     """The light changes by `stops` at frame `at` and stays."""
 
-    name: ClassVar[str] = "step"
-    stops: float = -4.0
-    at: int = 4
+    name: ClassVar[str] = "step"  #: by which `make_lighting` knows it
+    stops: float = -4.0  #: change of the light [EV], in [-64, 64]
+    at: int = 4  #: frame from which the light has changed
 
     def _stops(self, frame: int, phase: float) -> float:
         return self.stops if frame >= self.at else 0.0
@@ -161,9 +161,9 @@ class StepLighting(Lighting):
 class RampLighting(Lighting):
     """The light changes by `stops_per_frame` (>= 0) each frame, up to `stops` (of either sign)."""
 
-    name: ClassVar[str] = "ramp"
-    stops: float = -4.0
-    stops_per_frame: float = 0.5
+    name: ClassVar[str] = "ramp"  #: by which `make_lighting` knows it
+    stops: float = -4.0  #: change of the light [EV], in [-64, 64]
+    stops_per_frame: float = 0.5  #: change per frame [EV], in [0, 64]
 
     def _stops(self, frame: int, phase: float) -> float:
         return math.copysign(min(abs(self.stops), self.stops_per_frame * frame), self.stops)
@@ -173,9 +173,9 @@ class RampLighting(Lighting):
 class SineLighting(Lighting):
     """The light swings by +- `stops` with a period of `period` frames, at the episode's phase."""
 
-    name: ClassVar[str] = "sine"
-    stops: float = 2.0
-    period: float = 16.0
+    name: ClassVar[str] = "sine"  #: by which `make_lighting` knows it
+    stops: float = 2.0  #: change of the light [EV], in [-64, 64]
+    period: float = 16.0  #: length of a swing [frame], at least 0.001
 
     def _stops(self, frame: int, phase: float) -> float:
         return self.stops * math.sin(2.0 * math.pi * (frame / self.period + phase))
@@ -189,12 +189,12 @@ class TunnelLighting(Lighting):
     the change. With `edge` 0 frame ``enter`` has all of it. `leave` works likewise.
     """
 
-    name: ClassVar[str] = "tunnel"
-    ordered: ClassVar[tuple[str, str] | None] = ("enter", "leave")
-    stops: float = -6.0
-    enter: int = 3
-    leave: int = 10
-    edge: int = 2
+    name: ClassVar[str] = "tunnel"  #: by which `make_lighting` knows it
+    ordered: ClassVar[tuple[str, str] | None] = ("enter", "leave")  #: see `Lighting`
+    stops: float = -6.0  #: change of the light [EV], in [-64, 64]
+    enter: int = 3  #: last frame with the light outside, an integer
+    leave: int = 10  #: last frame inside, not before `enter`
+    edge: int = 2  #: frames that each change takes, >= 0
 
     def _stops(self, frame: int, phase: float) -> float:
         inside, outside = self._share(frame - self.enter), self._share(frame - self.leave)
@@ -211,11 +211,11 @@ class TunnelLighting(Lighting):
 class LensCapLighting(Lighting):
     """The lens is covered (`stops` darker) from frame `on` to before frame `off`."""
 
-    name: ClassVar[str] = "lens_cap"
-    ordered: ClassVar[tuple[str, str] | None] = ("on", "off")
-    stops: float = -20.0
-    on: int = 2
-    off: int = 5
+    name: ClassVar[str] = "lens_cap"  #: by which `make_lighting` knows it
+    ordered: ClassVar[tuple[str, str] | None] = ("on", "off")  #: see `Lighting`
+    stops: float = -20.0  #: change of the light [EV], in [-64, 64]
+    on: int = 2  #: first dark frame
+    off: int = 5  #: first frame with light again, not before `on`
 
     def _stops(self, frame: int, phase: float) -> float:
         return self.stops if self.on <= frame < self.off else 0.0
@@ -229,7 +229,7 @@ class ScheduleLighting(Lighting):
     4.0
     """
 
-    name: ClassVar[str] = "schedule"
+    name: ClassVar[str] = "schedule"  #: by which `make_lighting` knows it
     #: One number per frame, within +- `MAX_STOPS`: a list, tuple or one-dimensional array.
     ev: Sequence[float] | np.ndarray | None = None
     #: In place of `ev`, a text file with one number per line, or a CSV with a column ``ev``.
@@ -302,8 +302,8 @@ class FlickerLighting(Lighting):
     1.0
     """
 
-    name: ClassVar[str] = "flicker"
-    within_frame: ClassVar[bool] = True
+    name: ClassVar[str] = "flicker"  #: by which `make_lighting` knows it
+    within_frame: ClassVar[bool] = True  #: see `Lighting`
     #: Of the light [Hz]: twice that of the mains, or of the pulses. 0.001 to 1e6.
     frequency: float = 100.0
     #: Share of the light that flickers, 0 to 1; the rest is steady. `MAINS_DEPTH` by default, 1
@@ -323,14 +323,14 @@ class FlickerLighting(Lighting):
         return PulsedLamp(frequency=self.frequency, duty=self.duty, phase=phase)
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """Mean relative light of an exposure that begins with the frame; see `Lighting.gain`."""
+        """See `Lighting.gain`: `exposure_time` begins with `frame`; `phase` shifts the lamp."""
         light = self.lamp(phase).mean_light(self._start(frame), exposure_time)
         return float(self._with_steady_light(light))
 
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
-        """See `Lighting.rows`."""
+        """See `Lighting.rows`: `frame`, `exposure_time`, `phase`, `shutter`."""
         light = self.lamp(phase).row_light(
             self._start(frame), exposure_time, shutter.rows, shutter.row_time, shutter.sensor_rows
         )

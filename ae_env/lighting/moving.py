@@ -144,11 +144,11 @@ class MovingLighting(Lighting):
     True
     """
 
-    name: ClassVar[str] = "moving"
-    within_frame: ClassVar[bool] = True
+    name: ClassVar[str] = "moving"  #: by which `make_lighting` knows it
+    within_frame: ClassVar[bool] = True  #: see `Lighting`
     #: ``"train"`` or ``"test"`` (`KIND_SETS`), ``"all"``, or names of `MOVES`.
     kinds: str | Sequence[str] = "train"
-    frame_rate: float = 29.97  # frames per second, for lamps
+    frame_rate: float = 29.97  #: frames per second, for lamps
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -167,15 +167,15 @@ class MovingLighting(Lighting):
         return tuple(dict.fromkeys(names))
 
     def kind(self, phase: float) -> str:
-        """Which kind of `MOVES` the episode with this phase has."""
+        """Which kind of `MOVES` the episode with this `phase` in [0, 1) has."""
         return _drawn(self.drawn_from, phase)[0]
 
     def stops(self, phase: float) -> np.ndarray:
-        """(FRAMES,) light of each frame relative to the scene's [EV]; lamps left out."""
+        """(FRAMES,) light of each frame at `phase`, relative to the scene's [EV]; without lamps."""
         return _drawn(self.drawn_from, phase)[1]
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
-        """See `Lighting.gain`."""
+        """See `Lighting.gain`: `frame`, `exposure_time`, `phase`."""
         kind, stops, lamp = _drawn(self.drawn_from, phase)
         gain = float(2.0 ** stops[min(frame, FRAMES - 1)])
         if kind == "lamps":
@@ -185,7 +185,7 @@ class MovingLighting(Lighting):
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
-        """See `Lighting.rows`."""
+        """See `Lighting.rows`: `frame`, `exposure_time`, `phase`, `shutter`."""
         kind, stops, lamp = _drawn(self.drawn_from, phase)
         if kind == "lamps":
             return self._lamp(lamp).rows(frame, exposure_time, phase, shutter)

@@ -177,6 +177,9 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
     files = visible_files(base, found, (*RAW_SUFFIXES, *RADIANCE_SUFFIXES))
     if not files:
+        if len(found) == 1 and found[0].suffix.lower() in PICTURE_SUFFIXES:
+            kind = found[0].suffix[1:].upper()
+            raise ValueError(f"`path` (={str(spec)!r}) is a {kind}, not a raw or a radiance map")
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):
             endings += "; developed pictures of every state are 'recorded:FOLDER'"

@@ -45,7 +45,7 @@ class Scene:
     itself trusts its caller.
     """
 
-    scene_id: str  # unique and stable, such as ``"snow-012"``
+    scene_id: str  #: unique and stable, such as ``"snow-012"``
     #: Source group: the photograph, panorama or physical subject. All scenes of a group stay in one
     #: split and are resampled together.
     group: str
@@ -55,21 +55,21 @@ class Scene:
     #: Settings at which `light` is. With `illuminance` known, an 18 % grey card under it has 0.119
     #: of white in green there.
     reference: CameraSettings
-    camera: CameraProfile  # camera in whose colour space `light` is
+    camera: CameraProfile  #: camera in whose colour space `light` is
     #: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
     nlf: NoiseLevelFunction
     #: Light on the subject as an incident-light meter with a dome reads it there, in the lux of a
     #: flat receptor that asks for the same (`simulator.radiance.incident_light`); None where
     #: unknown.
     illuminance: float | None
-    white_balance: tuple[float, float, float]  # gains of R, G, B that make a grey card grey
-    kind: str  # sort of scene, such as ``"snow"``
+    white_balance: tuple[float, float, float]  #: gains of R, G, B that make a grey card grey
+    kind: str  #: sort of scene, such as ``"snow"``
     #: Whether it belongs to the hard part (back light, snow, night, spot light, motion).
     hard: bool = False
     #: Median image speed of a moving episode [frame heights / s].
     median_speed: float = DEFAULT_SPEED
-    box_factor: int = 1  # sensor pixels averaged per side into one pixel of `light`
-    source: str = ""  # provenance and licence in one line
+    box_factor: int = 1  #: sensor pixels averaged per side into one pixel of `light`
+    source: str = ""  #: provenance and licence in one line
     #: (H, W) bool, pixels whose light is a guess because the source raw was saturated there
     #: (`simulator.raw.develop`); None if there are none.
     saturated: torch.Tensor | None = None
@@ -93,11 +93,11 @@ class Scene:
     #: white is 1. With it nothing is simulated: environments show these frames, and `light` is what
     #: they tell together. None where captures are simulated.
     recorded: torch.Tensor | None = None
-    sequence: str = ""  # video that it is a frame of; empty for a still scene
+    sequence: str = ""  #: video that it is a frame of; empty for a still scene
     #: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has them; None
     #: for every state of any grid.
     allowed: np.ndarray | None = None
-    ladder: Ladder | None = None  # codes drawn into it (`ae_env.scenes.ladder`), and where they are
+    ladder: Ladder | None = None  #: codes drawn into it, and where (`ae_env.scenes.ladder`)
 
     @property
     def noise_free(self) -> bool:
@@ -154,7 +154,7 @@ class Scene:
         return LightStatistics(self.light)  # computes each value when it is first asked for
 
     def own_blur(self, f_number: float) -> float:
-        """Root mean square of the scene's own circle of confusion at an effective f-number [px].
+        """Root mean square of the scene's own circle of confusion at an effective `f_number` [px].
 
         It grows as the aperture opens; a smaller aperture than the reference's leaves its blur. 0
         without a `defocus_map`.
@@ -207,7 +207,8 @@ class Scene:
         """A scene from a packed raw in an array.
 
         `packed` is (4, H, W) float, planes R, G1, G2, B, 1.0 at sensor white, which it may exceed;
-        `group` is `scene_id` by default, `nlf` no noise. The others are the fields of `Scene`.
+        `group` is `scene_id` by default, `nlf` no noise. `reference`, `camera`, `illuminance`,
+        `white_balance`, `kind` and further `fields` are those of `Scene`.
         """
         scene = cls(
             scene_id=scene_id,
@@ -225,10 +226,10 @@ class Scene:
 
     @classmethod
     def from_raw(cls, raw: RawImage, *, scene_id: str, kind: str = "raw", **fields: Any) -> Scene:
-        """A scene from a raw photograph: its light, its noise, its saturated pixels (neutral).
+        """A scene, called `scene_id` of `kind`, from `raw`: light, noise, neutral highlights.
 
-        Its settings become the reference; `fields` are further arguments of `from_array`, such as
-        a measured `illuminance`. A `ValueError` if neither the raw nor its camera knows the noise.
+        Its settings become the reference; the other `fields`, such as a measured `illuminance`,
+        are those of `from_array`. A `ValueError` if neither the raw nor its camera knows the noise.
         """
         saturated = raw.saturated
         fields |= {"scene_id": scene_id, "kind": kind, "saturated": saturated, "sampled": True}
@@ -257,8 +258,9 @@ class Scene:
     ) -> Scene:
         """A noise-free scene from linear light, taken into the camera's colours.
 
-        See `camera_light` for the first six arguments; `fields`, at least `scene_id`, are further
-        ones of `from_array`, as `kind` is.
+        `rgb` (3, H, W) has sRGB primaries; with `sampled`, its pixels are photosites (3, 2H, 2W).
+        1.0 is white under `illuminance` [lux], or else the mean is set for `ev100`; `illuminant` is
+        the light's colour. `camera`, `kind` and `fields` as of `from_array`.
         """
         light, reference, white_balance = camera_light(
             rgb, camera, illuminance, ev100, illuminant, sampled=sampled
@@ -314,7 +316,7 @@ class Scene:
         )
 
     def averaged(self, k: int) -> Scene:
-        """This scene with k x k pixels per plane averaged into one, as `resized` states them.
+        """This scene with `k` x `k` pixels per plane averaged into one, as `resized` states them.
 
         Rows and columns at the end that fill no such square are left out.
         """

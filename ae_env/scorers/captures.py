@@ -48,7 +48,7 @@ class Scorer(Protocol):
     ``"blur"`` it reads the captures only and is called with ``images=None``.
     """
 
-    domain: Domain
+    domain: Domain  #: kind of image that it is called with, ``"raw"`` or ``"srgb"``
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of the images."""

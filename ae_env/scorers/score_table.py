@@ -38,10 +38,10 @@ TIE = 1e-7
 class ScoreTable:
     """Expected scores of S states."""
 
-    mean: np.ndarray  # (S,) float64, q of each state
-    standard_error: np.ndarray  # (S,) float64, 0 where the closed form was used
-    parts: dict[str, np.ndarray]  # (S,) float64 of each part of the scorer
-    allowed: np.ndarray | None = None  # (S,) bool, states that the scene allows; None for all
+    mean: np.ndarray  #: (S,) float64, q of each state
+    standard_error: np.ndarray  #: (S,) float64, 0 where the closed form was used
+    parts: dict[str, np.ndarray]  #: (S,) float64 of each part of the scorer
+    allowed: np.ndarray | None = None  #: (S,) bool, states that the scene allows; None for all
 
     @property
     def nbytes(self) -> int:

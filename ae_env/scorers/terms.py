@@ -39,7 +39,7 @@ def depends_on(scorer: Scorer) -> DependsOn:
 
 
 class CompositeScorer:
-    """Weighted mean of several scorers by name, equally weighted by default.
+    """Weighted mean of scorers, the `parts` by name, with `weights`, equal by default.
 
     The weights are divided by their sum. A `ValueError` if a part is no scorer, or a weight is
     missing or not positive.
@@ -90,7 +90,7 @@ class CompositeScorer:
     ) -> dict[str, torch.Tensor]:
         """Score (B,) float64 of each part that depends on one of `kinds`.
 
-        The images are developed to sRGB only if a part asks for it.
+        `images` and `captures` as of `Scorer`; developed to sRGB only if a part asks for it.
         """
         views: dict[str, torch.Tensor | None] = {"raw": images}
         scores = {}
@@ -110,13 +110,13 @@ class CompositeScorer:
         return scores
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
-        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
+        """Total of the parts' `scores`: tensors, arrays of any one shape, or numbers."""
         total: Any = sum(weight * scores[name] for name, weight in self.weights.items())
         # Rounding may leave [0, 1].
         return total.clip(0.0, 1.0) if torch.is_tensor(total) else np.clip(total, 0.0, 1.0)
 
     def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
-        """`combine` of arrays of any one shape; a `UserCodeError` if a total is not in [0, 1].
+        """`combine` of arrays `scores` of one shape; a `UserCodeError` if one is not in [0, 1].
 
         It is checked because a user's class may override it.
         """
@@ -376,7 +376,7 @@ class Balanced(CompositeScorer):
         super().__init__(parts, dict(zip(parts, (0.30, 0.15, 0.10, 0.20, 0.25), strict=True)))
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
-        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
+        """Total of the parts' `scores`: tensors, arrays of any one shape, or numbers."""
         # The logarithm of arrays by NumPy: torch's threads do not survive a fork.
         log: Any = torch.log if torch.is_tensor(scores["highlights"]) else np.log
         parts: Mapping[str, Any] = self.parts

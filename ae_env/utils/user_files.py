@@ -200,7 +200,7 @@ def find_config(path: Path) -> Path:
 
 
 def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
-    """Keyword arguments of ``gymnasium.make`` from a preset of ``configs/env`` or a ``.yaml`` file.
+    """Arguments of ``gymnasium.make`` from the preset or ``.yaml`` file `name`; see `list_presets`.
 
     A `ValueError` if there is no such preset, or it cannot be read, is too large or no mapping.
     """

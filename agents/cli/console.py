@@ -5,6 +5,7 @@ Help must come at once: no module of a command imports anything heavy, see `main
 
 from __future__ import annotations
 
+import collections
 import functools
 import inspect
 import os
@@ -165,18 +166,10 @@ def takes_source(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
-        iso, shutter, f_number = (given.pop(name) for name in _SOURCE)
-        source = {} if iso is None else {"iso": iso}
-        if shutter is not None:
-            source["exposure_time"] = parse_number(shutter, "source-shutter")
-        if f_number is not None:
-            source["f_number"] = parse_number(f_number, "source-aperture")
-        if source:
-            from simulator.raw.read import check_settings
-
-            with option_names(**SOURCE):
-                check_settings(source)
-        command(**given, source=source)
+        texts = {key: given.pop(option.replace("-", "_")) for key, option in SOURCE.items()}
+        with all_mistakes() as check:
+            found = [check(setting, key, text, SOURCE[key]) for key, text in texts.items()]
+        command(**given, source=dict(collections.ChainMap(*found)))
 
     signature = inspect.signature(command, eval_str=True)
     own = [p for p in signature.parameters.values() if p.name != "source"]
@@ -184,6 +177,33 @@ def takes_source(command: Callable[..., None]) -> Callable[..., None]:
     own += [inspect.Parameter(k, kind, default=None, annotation=a) for k, a in _SOURCE.items()]
     run.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
     return run
+
+
+@contextmanager
+def all_mistakes() -> Iterator[Callable[..., Any]]:
+    """Yields a function that calls a check; the errors of all checks are raised together."""
+    errors: list[Exception] = []
+
+    def check(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        try:
+            return function(*arguments, **options)
+        except (ValueError, OSError) as error:
+            return errors.append(error)
+
+    yield check
+    if errors:
+        raise errors[0] if len(errors) == 1 else ExceptionGroup("mistakes", errors)
+
+
+def setting(key: str, text: float | str | None, option: str) -> dict[str, float]:
+    """The camera setting `key` of an option, checked; none if it is not given."""
+    if text is None:
+        return {}
+    from simulator.raw.read import check_settings
+
+    with option_names(**{key: option}):
+        check_settings(found := {key: parse_number(str(text), key)})
+    return found
 
 
 @contextmanager

@@ -15,7 +15,8 @@ from typer import Argument, Option
 from agents.cli import console
 from agents.cli.console import print_files, print_line, progress_bars
 
-scenes = typer.Typer(no_args_is_help=True)
+_EXAMPLE = "Sets of real scenes.\n\nExample: `ae-env scenes download`"
+scenes = typer.Typer(no_args_is_help=True, callback=lambda: None, help=_EXAMPLE)
 
 #: Environments whose first frames need the compiled code of all environments between them.
 _CASES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -29,14 +30,6 @@ _CASES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("AutoExposureVideo-v0", {}),
     ("ExposureBracket-v0", {}),
 )
-
-
-@scenes.callback()
-def _scenes() -> None:
-    """Sets of real scenes.
-
-    Example: `ae-env scenes download`
-    """
 
 
 @scenes.command()

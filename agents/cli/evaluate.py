@@ -159,12 +159,9 @@ def _run(
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.jobs import Jobs
     from agents.evaluation.result import overall_ranking
-    from agents.policy_names import check_policy
     from agents.report.ae_bench import append_rows, bench_rows, check_append, check_hash
     from agents.report.evaluation import write_report
 
-    for name in plan.policies:
-        check_policy(name)  # before scenes are read, which may take minutes
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
     with Jobs(plan, out / "parts", scenes, device=device) as run:
@@ -192,7 +189,10 @@ def make_plan(
     """The plan that the options describe; `given` are those about episodes, by name."""
     from pydantic import ValidationError
 
+    from ae_env import ExposureGrid, make_lighting, make_scorer
+    from ae_env.options import EnvOptions
     from agents.evaluation.evaluation_plan import EvaluationPlan, light_name, load_plan
+    from agents.policy_names import check_policy
     from simulator.utils.config_file import one_line
 
     if preset is not None:
@@ -208,6 +208,13 @@ def make_plan(
     environment |= {k: given[k] for k in _ENVIRONMENT if k in given}
     condition |= {k: given[k] for k in _CONDITION if k in given}
     entries: dict[str, Any] = {"environment": environment}
+    with console.all_mistakes() as check:
+        for policy in policies or base.policies:  # before scenes are read, which may take minutes
+            check(check_policy, policy)
+        named = {"scorer": make_scorer, "grid": ExposureGrid.from_spec, "lighting": make_lighting}
+        for key in (key for key in (*_ENVIRONMENT, *_CONDITION) if key in given):
+            check(EnvOptions.from_kwargs, {key: given[key]})
+            check(named.get(key, str), given[key])
     if preset is None:
         scenes = environment["scenes"]
         name = scenes.get("path", scenes) if isinstance(scenes, Mapping) else scenes

@@ -12,8 +12,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,11 +90,7 @@ def bench(
 
 #: Parts that can be run alone, and benchmarks that take an option.
 _PARTS = {"places": ("posterior", "receptors", "curve"), "transfer": ("agents", "tables")}
-_TAKES = {
-    "folder": ("emva", "paper", "recorded"),
-    "part": tuple(_PARTS),
-    "weights": ("paper",),
-}
+_TAKES = {"folder": ("emva", "paper", "recorded"), "part": tuple(_PARTS), "weights": ("paper",)}
 
 
 def _check_options(name: str, **options: Any) -> None:
@@ -111,16 +106,32 @@ def _check_options(name: str, **options: Any) -> None:
 
 
 class _Commands(TyperGroup):
-    """The commands; errors of options say the value."""
+    """The commands; errors of options say the value, and all of them are shown at once."""
 
     def invoke(self, ctx: Any) -> Any:
+        words = [*ctx._protected_args, *ctx.args]
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            found: Any = error.__cause__  # pydantic's, of a Typer that names no value itself
-            if hasattr(found, "errors"):
-                error.message = f"{found.errors()[0]['input']!r}: {error.message}"
+            command: Any = self.resolve_command(ctx, words)[1]
+            error.message = "\n".join(_messages(error, command, words[1:], ctx))
             raise
+
+
+def _messages(error: typer.BadParameter, command: Any, words: list[str], ctx: Any) -> Iterator[str]:
+    """Messages of an error of an option and, without that option, of the next ones."""
+    cause: Any = error.__cause__  # pydantic's, of a Typer that names no value itself
+    given = f"{cause.errors()[0]['input']!r}: " if hasattr(cause, "errors") else ""
+    yield given + error.message
+    names = getattr(error.param, "opts", ())
+    at = next((i for i, word in enumerate(words) if word.partition("=")[0] in names), len(words))
+    rest = words[:at] + words[at + 1 + ("=" not in "".join(words[at : at + 1])) :]
+    if rest != words:
+        try:
+            command.make_context(None, list(rest), parent=ctx)
+        except typer.BadParameter as other:
+            other.message = "\n".join(_messages(other, command, rest, ctx))
+            yield other.format_message()
 
 
 app = typer.Typer(
@@ -161,7 +172,8 @@ def main() -> None:
     files), 1 where something failed while running; Ctrl-C gives 130, SIGTERM 143.
     """
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
-    handler.addFilter(_first_time())
+    seen: Any = set()  # scenes that are loaded again have the same to say
+    handler.addFilter(lambda r: not (r.getMessage() in seen or seen.add(r.getMessage())))
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(level=NOTE, format="%(message)s", handlers=[handler])
     signal.signal(signal.SIGTERM, _terminate)
@@ -172,9 +184,11 @@ def main() -> None:
             raise
         from ae_env.utils.user_files import UserCodeError
 
-        text = escape(_as_typed(_one_line(error)))
-        Console(stderr=True).print(f"[bold red]error[/] {text}", soft_wrap=True)
-        usage = isinstance(error, _USAGE) and not isinstance(error, UserCodeError)
+        errors = error.exceptions if isinstance(error, ExceptionGroup) else (error,)
+        for one in errors:
+            text = escape(_as_typed(_one_line(one)))
+            Console(stderr=True).print(f"[bold red]error[/] {text}", soft_wrap=True)
+        usage = all(isinstance(e, _USAGE) and not isinstance(e, UserCodeError) for e in errors)
         raise SystemExit(2 if usage else 1) from None
     except SystemExit as stop:
         if stop.code in (_INTERRUPTED, _TERMINATED):  # the first is what Typer makes of Ctrl-C
@@ -183,28 +197,13 @@ def main() -> None:
             Console(stderr=True).print(f"\nstopped{more}")
             # What is kept is written: a second Ctrl-C need not wait for the workers' end.
             for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, partial(_quit, stop.code))
+                signal.signal(number, lambda *_, status=stop.code: os._exit(status))
         raise
-
-
-def _first_time() -> Callable[[logging.LogRecord], bool]:
-    """A filter of log lines: scenes that are loaded again have the same to say."""
-    seen = set[str]()
-
-    def is_new(record: logging.LogRecord) -> bool:
-        text = record.getMessage()
-        return not (text in seen or seen.add(text))  # type: ignore[func-returns-value]
-
-    return is_new
 
 
 def _terminate(*_: Any) -> None:
     """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
     raise SystemExit(_TERMINATED)
-
-
-def _quit(status: int, *_: Any) -> None:
-    os._exit(status)
 
 
 def _one_line(error: Exception) -> str:

@@ -214,7 +214,8 @@ def cameras() -> None:
         isos = sorted(camera.nlf_by_iso)
         calibrated = f"ISO {isos[0]:g} to {isos[-1]:g}" if isos else "-"
         by = camera.source.partition(";")[0]
-        rows.append((camera.name, f"{camera.make} {camera.model}", calibrated, by))
+        model = f"{camera.make} {camera.model.removeprefix(camera.make).strip()}"
+        rows.append((camera.name, model, calibrated, by))
     print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
     print_line("others by a file: ctt:FILE, darktable:MAKER MODEL, emva:FILE (docs/cameras.md)")
 

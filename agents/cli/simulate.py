@@ -62,22 +62,23 @@ def simulate(
     from simulator.capture.decision import check_tolerance
     from simulator.capture.sensor import Noise
     from simulator.optics.vignetting import get_lens
-    from simulator.raw.read import check_settings
 
-    check_word("noise", noise, get_args(Noise))
-    check_tolerance(tolerance)
-    through = get_lens(lens)
     if ev is not None and shutter is not None:
         raise ValueError(f"`ev` (={ev:g}) changes the exposure time: leave out --shutter")
-    texts = {"iso": iso, "exposure_time": shutter, "f_number": aperture}
-    with console.option_names(exposure_time="shutter", f_number="aperture"):
-        given = {k: parse_number(str(v), k) for k, v in texts.items() if v is not None}
-        check_settings(given)
-    check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
-    simulator = make_simulator(weights, device, cache, depth)
-    source = read_raw(raw, settings=source)
-    given = {"exposure_time": source.settings.exposure_time * 2.0 ** (ev or 0.0), **given}
-    settings = replace(source.settings, **given)
+    with console.all_mistakes() as check:
+        given = [
+            check(console.setting, "iso", iso, "iso"),
+            check(console.setting, "exposure_time", shutter, "shutter"),
+            check(console.setting, "f_number", aperture, "aperture"),
+        ]
+        check(check_word, "noise", noise, get_args(Noise))
+        check(check_tolerance, tolerance)
+        through = check(get_lens, lens)
+        check(check_outputs, raw, out=(out, ".dng"), png=(png, ".png"))
+        simulator = check(make_simulator, weights, device, cache, depth)
+        source = check(read_raw, raw, settings=source)
+    changed = {"exposure_time": source.settings.exposure_time * 2.0 ** (ev or 0.0)}
+    settings = replace(source.settings, **changed | given[0] | given[1] | given[2])
     if noise == "sensor":
         source.camera.read_noise(settings.iso)  # refuses a camera without its calibration
     options: Any = {"depth": depth, "tolerance": tolerance, "lens": through}
@@ -86,7 +87,7 @@ def simulate(
     plan = prepared.plan(settings)
     for text in (plan.explain(), *([plan.details()] if details else [])):
         console.terminal.print(text, highlight=False, soft_wrap=True)
-    result = simulator.simulate(prepared, settings, seed=seed, noise=noise)  # type: ignore[arg-type]
+    result = simulator.simulate(prepared, settings, seed=seed, noise=noise)
     result = replace(result, metadata={**source.metadata, **result.metadata})
     for line in _remarks(source, result, details=details):
         print_line(line)

@@ -393,7 +393,7 @@ def fit_policies(
     watch: Callable[[str], None] | None = None,
     keep: bool = False,
 ) -> None:
-    """Call `fit` of every policy that has one, on the training split of an environment.
+    """Call `fit` of all `policies` that have one, on the training split of an environment.
 
     `env_options` are its arguments, `seed` decides the episodes, of which `batch` run at a time;
     `progress` is called before and after each fit, `watch` with the policy's name before each step

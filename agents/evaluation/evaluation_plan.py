@@ -67,36 +67,36 @@ class EvaluationPlan(Configuration):
     merged picture, its conditions are the budgets, and it has no entries about frames.
     """
 
-    name: str = "evaluation"  # shown in the report
+    name: str = "evaluation"  #: shown in the report
     #: Arguments of the environment that all conditions share; `lighting` and `delay` are those of
     #: the conditions.
     environment: dict[str, Any] = Field(default_factory=dict)
-    scene_ids: tuple[str, ...] = ()  # scenes to use, in this order; empty for all of the split
+    scene_ids: tuple[str, ...] = ()  #: scenes to use, in this order; empty for all of the split
     #: Use at most so many scenes, source groups in turn; None for all.
     max_scenes: int | None = Field(default=None, ge=1, le=MAX_SCENES)
     conditions: dict[str, Condition] = Field(
         default_factory=lambda: {"static": Condition()}, min_length=1
-    )
+    )  #: light and delay of each condition, by name
     #: Each condition is run with each of these delays; except for the first, it is called
     #: ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
     delays: tuple[int, ...] = Field(default=(0,), min_length=1)
     #: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
     starts: tuple[str, ...] = Field(default=("dark", "middle", "bright"), min_length=1)
-    frames: int = Field(default=24, ge=1, le=10_000)  # actions per episode
+    frames: int = Field(default=24, ge=1, le=10_000)  #: actions per episode
     #: Of brackets: times that all frames of an episode may take together [s].
     budgets: tuple[Annotated[float, Field(ge=1e-5, le=3600.0)], ...] | None = Field(
         default=None, min_length=1
     )
-    max_frames: int = Field(default=3, ge=1, le=4)  # of brackets: frames of an episode at most
+    max_frames: int = Field(default=3, ge=1, le=4)  #: of brackets: frames of an episode at most
     #: Each gives every scene another motion, defocus, phase of the light and noise.
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
-    policies: tuple[str, ...] = ()  # names, as `agents.make_policy` takes them
+    policies: tuple[str, ...] = ()  #: names, as `agents.make_policy` takes them
     #: Names of scorers that no policy was trained on; chosen states are also rated by these.
     other_scorers: tuple[str, ...] = ()
     #: Scenes that they rate, source groups in turn.
     other_scorer_scenes: int = Field(default=8, ge=1, le=MAX_SCENES)
-    task: str = ""  # of a plan that is a part of a benchmark: which of its tables has the results
-    suite: tuple[str, ...] = ()  # presets of all plans of that benchmark, which have one hash
+    task: str = ""  #: of a plan that is a part of a benchmark: which of its tables has the results
+    suite: tuple[str, ...] = ()  #: presets of all plans of that benchmark, which have one hash
     #: Of a benchmark: sha256 of the plan, or of all of its suite, and of the scenes' light, which
     #: is checked.
     hash: str | None = None
@@ -218,13 +218,13 @@ class EvaluationPlan(Configuration):
         return found
 
     def changed(self, **entries: Any) -> EvaluationPlan:
-        """The same plan with other entries, checked."""
+        """The same plan with other `entries`, checked."""
         given = {name: getattr(self, name) for name in self.model_fields_set}
         return EvaluationPlan.model_validate(given | entries)
 
 
 def load_plan(name: str | Path) -> EvaluationPlan:
-    """The plan of a preset of ``configs/evaluation``, or of a YAML file of one's own.
+    """The plan `name`: a preset of ``configs/evaluation``, or the path of a YAML file.
 
     A `ValueError` if there is none, or an entry is unknown, out of range or no JSON value.
     """

@@ -234,7 +234,7 @@ def run_plan(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> dict[str, EvaluationResult]:
-    """Runs a plan, or the part of it that `folder` does not hold yet; the results by condition.
+    """Runs `plan`, or the part of it that `folder` does not hold yet; the results by condition.
 
     Args:
         scenes: Those of the plan where they are loaded already.

@@ -103,20 +103,20 @@ class EvaluationResult:
     Scene, source group and kind of each episode are ``(E,)``; tracks are by policy.
     """
 
-    grid: ExposureGrid
-    scene_ids: NDArray[Any]
-    groups: NDArray[Any]
-    kinds: NDArray[Any]
-    hard: Bools  # whether the episode's scene is in the hard part, ``(E,)``
-    start_states: Ints  # state of the reset frame; empty for brackets, as `scores` and `allowed`
-    scores: Floats  # q of every state, ``(E, T, S)``
-    allowed: Bools  # action masks of every frame, ``(E, T, S)``
-    tracks: dict[str, Track]
-    plan: EvaluationPlan  # the plan that the condition belongs to
+    grid: ExposureGrid  #: its S states
+    scene_ids: NDArray[Any]  #: scene of each episode, ``(E,)`` texts
+    groups: NDArray[Any]  #: source group of each episode's scene, ``(E,)`` texts
+    kinds: NDArray[Any]  #: kind of each episode's scene, ``(E,)`` texts
+    hard: Bools  #: whether the episode's scene is in the hard part, ``(E,)``
+    start_states: Ints  #: state of the reset frame; empty for brackets, as `scores` and `allowed`
+    scores: Floats  #: q of every state, ``(E, T, S)``
+    allowed: Bools  #: action masks of every frame, ``(E, T, S)``
+    tracks: dict[str, Track]  #: states and measurements by policy
+    plan: EvaluationPlan  #: the plan that the condition belongs to
     #: Frames between a decision and the frame that has its ISO, its exposure time and its aperture.
     delays: tuple[int, int, int] = (0, 0, 0)
-    scenes: Sequence[Scene] = ()
-    speed: Floats | None = None  # image speed of each episode [frame heights per second], ``(E,)``
+    scenes: Sequence[Scene] = ()  #: scenes that episodes drew from
+    speed: Floats | None = None  #: image speed of each episode [frame heights per second], ``(E,)``
     #: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
     defocus: Floats | None = None
     #: Fields of each episode's `simulator.optics.motion.Movement`, ``(E, 4)``.
@@ -131,7 +131,7 @@ class EvaluationResult:
         return self.plan.measure
 
     def moves(self, episode: int) -> dict[str, Any]:
-        """Arguments of `ae_env.scorers.captures.prepare_scene` that blur depends on."""
+        """What the blur of an `episode` depends on, for `ae_env.scorers.captures.prepare_scene`."""
         drawn = () if self.movement is None else self.movement[episode].tolist()
         return {
             "speed": 0.0 if self.speed is None else float(self.speed[episode]),
@@ -217,13 +217,13 @@ class EvaluationResult:
         return PARTS if self.hard.any() and not self.hard.all() else PARTS[:1]
 
     def part(self, name: str) -> Bools:
-        """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
+        """Which episodes belong to the part `name`: all, hard or rest, ``(E,)`` bool."""
         check_word("part", name, PARTS)
         return {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}[name]
 
     def mean(self, policy: str, key: str, episodes: Bools | None = None) -> float:
-        """Mean of a metric over a source group's episodes, then over groups and seeds; of the
-        `episodes` that are True, ``(E,)``, or of all.
+        """Mean of the metric `key` of `policy` over a group's episodes, then over groups and seeds;
+        of the `episodes` that are True, ``(E,)``, or of all.
         """
         members = self.part("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]
@@ -232,7 +232,7 @@ class EvaluationResult:
     def group_gains(self, policy: str, part: str | Bools = "all") -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
-        Of the episodes of `part`, a name or a mask ``(E,)``.
+        Of `policy` in the episodes of `part`, a name or a mask ``(E,)``.
         """
         members = self.part(part) if isinstance(part, str) else part
         gains = (self.episode_metrics(policy)[self.measure] - self.random)[:, members]
@@ -241,7 +241,7 @@ class EvaluationResult:
         return metrics.group_means(gains, groups), metrics.group_means(span, groups)
 
     def normalised(self, policy: str, part: str | Bools = "all") -> float:
-        """Normalised score of a policy over its training seeds; arguments as of `group_gains`."""
+        """Normalised score of `policy` over its training seeds; `part` as of `group_gains`."""
         gains, span = self.group_gains(policy, part)
         return float(gains.mean(axis=0).sum() / span.sum())
 
@@ -268,12 +268,12 @@ def result_rows(
     split: str | None = None,
     resamples: int = RESAMPLES,
 ) -> pd.DataFrame:
-    """A row per policy and condition: `ROW_COLUMNS` and `MORE_COLUMNS`.
+    """A row per policy and condition of `results`: `ROW_COLUMNS` and `MORE_COLUMNS`.
 
     The static condition gives rows ``"all"``, ``"hard"`` and ``"rest"`` (see
     `EvaluationResult.parts`), every other one a row with its own name. `source` and `split` are
-    those of the plan by default. `ci95` is the 95 % bootstrap interval of `normalised_score`, None
-    below 15 source groups; `ms_per_decision` is amortised over a batch of cameras.
+    those of the plan by default. `ci95` is the 95 % bootstrap interval (`resamples`) of
+    `normalised_score`, None below 15 source groups; `ms_per_decision` is the mean over a batch.
     """
     results = as_results(results)
     static, rows = static_condition(results), []

@@ -49,6 +49,7 @@ class MeteringPolicy(Policy):
     """A light meter and a program that splits its EV between ISO, shutter and aperture.
 
     Args:
+        context: The camera, see `Policy`.
         meter: One of `agents.policy_names.METERS`, such as ``"average"``.
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
@@ -117,7 +118,7 @@ class MeteringPolicy(Policy):
         self.reset(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Forget the past of `num_envs` cameras."""
+        """Forget the past of `num_envs` cameras; nothing here is random, so `seed` is unused."""
         super().reset(num_envs, seed)
         ev100 = self.context.grid.ev100
         ev_range = (float(ev100.min()), float(ev100.max()))
@@ -138,7 +139,7 @@ class MeteringPolicy(Policy):
         self._previous: Ints | None = None
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
-        """Meter the frames, then choose by the program."""
+        """Meter `observations`, then choose by the program; `action_masks` as of `Policy.act`."""
         readings = self.observe(observations)
         foresight = self._foresight
         if foresight is not None and self.foresight in FORESIGHTS[2:]:
@@ -156,7 +157,7 @@ class MeteringPolicy(Policy):
         return self._previous.copy()
 
     def observe(self, observations: Observations) -> Floats:
-        """Take in one frame; returns metered EV100, log2 speed, log2 defocus, ``(N, 1 or 3)``.
+        """Take in `observations`; returns EV100, log2 speed, log2 defocus, ``(N, 1 or 3)``.
 
         The sensors are averaged, in stops, over the frames of the episode.
         """
@@ -206,7 +207,7 @@ class MeteringPolicy(Policy):
         return scores
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
-        """Tune on the scenes of `envs`; only a tuned program without `weights` learns.
+        """Tune on the scenes of `envs`, in episodes of `seed`: tuned programs without `weights`.
 
         Episodes, which must not end within 4 frames, run twice: led by program P, then by what was
         learnt from those, so that the readings are those of the frames that the tuned program
@@ -229,7 +230,7 @@ class MeteringPolicy(Policy):
     def fit_once(
         self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int, env_options: Mapping[str, Any]
     ) -> None:
-        """`fit`, or what it found before, in this run or an earlier one.
+        """`fit` with `seed`, or what it found before, in this run or an earlier one.
 
         `env_options` are the arguments that `envs` were made with, JSON values.
         """
@@ -245,7 +246,7 @@ class MeteringPolicy(Policy):
         self.regression = _FITS[key]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a tuned program, a `ValueError` if there is none yet; ``weights=path`` loads it."""
+        """Write a tuned program to `path` (`ValueError` without one); ``weights=path`` loads it."""
         if self.regression is None:
             raise ValueError(f"policy {self.name!r} has nothing to save before fit(envs)")
         self.regression.save(path)

@@ -414,11 +414,8 @@ def _difference(value: float, pair: Sequence[float] | None) -> str:
 
 
 def _histogram_rows(histogram: Mapping[str, Mapping[str, float]]) -> list[dict[str, str]]:
-    labels: dict[str, Callable[[float], str]] = {
-        "iso": "ISO {:g}".format,
-        "exposure_time": format_exposure_time,
-        "f_number": "f/{:g}".format,
-    }
+    labels: dict[str, Any] = {"iso": "ISO {:g}".format, "f_number": "f/{:g}".format}
+    labels["exposure_time"] = format_exposure_time
     rows = []
     for name, own in histogram.items():
         shares = (f"{labels[name](float(value))}: {share:.0%}" for value, share in own.items())
@@ -457,17 +454,11 @@ def summary(
     result = results[static]
     ranking = overall_ranking(results) if ranking is None else ranking
     if result.measure == "quality":
-        lines = [
-            {
-                "policy": one["policy"],
-                "all": f"{one['normalised_score']:.4f}",
-                "95 % interval": _interval(one["ci95"], ".4f"),
-                **{name: f"{r.normalised(one['policy']):.4f}" for name, r in results.items()},
-            }
-            for one in ranking.to_dict("records")
-        ]
-        title = "quality of the merged picture, by time of all frames"
-        return [(title, pd.DataFrame(lines))]
+        table = ranking[["policy"]].assign(all=ranking.normalised_score.map("{:.4f}".format))
+        table["95 % interval"] = [_interval(pair, ".4f") for pair in ranking.ci95]
+        for name, one in results.items():
+            table[name] = [f"{one.normalised(policy):.4f}" for policy in ranking.policy]
+        return [("quality of the merged picture, by time of all frames", table)]
     if len(results) == 1:
         rows = result_rows(result, resamples=2000)
         table = rows.pivot(index="policy", columns="condition", values="normalised_score")
@@ -519,7 +510,7 @@ def write_stability(
         picture += f"-{len(pictures)}" * (f"{picture}.png" in pictures) + ".png"
         pictures[picture] = plot_stability(out / picture, one, rows)
         faults = [_fault_row(own) for _, own in rows.groupby("fault", sort=False)]
-        own = {"faults": faults, "verdict": verdict(faults), "picture": picture}
+        own = {"faults": faults, "third": THIRD_EV, "picture": picture}
         shown.append({"name": one.name, **own})
         meta["frames_per_second"][one.name] = one.speed
         tables.append(rows.astype(object).where(rows.notna(), None))
@@ -545,26 +536,3 @@ def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
         **{name: own[name].max() for name in ("error", "pulse")},
         **{name: own[name].mean() for name in ("cycles", "pulses")},
     }
-
-
-def verdict(faults: Sequence[Mapping[str, Any]]) -> str:
-    """What a controller does in a sentence or two, from each fault's row; the first has none."""
-    sound = faults[0]
-    text = "It does not settle after every step, even without delay or fault"
-    if sound["reach"]:
-        delay = f"up to {sound['delays']} frame{'s' * (sound['delays'] > 1)} of"
-        text = f"It settles after every step with {delay if sound['delays'] else 'no'} delay"
-        less = [row["fault"] for row in faults if row["reach"] < sound["reach"]]
-        text += f", with fewer if the fault is {' or '.join(less)}" * bool(less)
-    text += "."
-    if sound["amplitude"]:
-        text += f" Where it does not, it swings by up to {sound['amplitude']:.2f} EV."
-    if sound["error"] > THIRD_EV:
-        text += f" Where it does, it may rest {sound['error']:.2f} EV off."
-    pulsing = [
-        f"{row['pulses']:.1%} by up to {row['pulse']:.2f} EV with "
-        + ("no fault" if row["fault"] == "none" else f"the fault {row['fault']}")
-        for row in sorted(faults, key=lambda row: -row["pulse"])
-        if row["pulse"]
-    ]
-    return f"{text} Cases that settle and pulse: {', '.join(pulsing) or 'none'}."

@@ -31,7 +31,7 @@ _COLUMNS = 4
 _PATHS, _PATH_FRAMES = 5, 8
 #: Most sheets, and the quality of their compression.
 _SHEETS, _QUALITY = 2, 75
-#: The kinds of scene whose contact sheet is shown, the first that there is: pictures, not drawings.
+#: The kinds of scene whose contact sheet is shown where there are any: pictures, not drawings.
 _KINDS = ("photograph", "backlit")
 
 
@@ -228,12 +228,15 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Seque
     figure.draw_without_rendering()  # settles where the points lie
     spots = axes.transData.transform(list(points.values()))
     boxes = [*np.hstack([spots - 5, spots + 5])]  # of the marks: left, bottom, right, top
+    for line in axes.get_lines():  # whose path is steps
+        ends = axes.transData.transform(line.get_path().vertices)
+        boxes += [*np.hstack([np.minimum(ends[1:], ends[:-1]), np.maximum(ends[1:], ends[:-1])])]
     frame = axes.get_window_extent().extents
     angles = np.arange(16) * np.pi / 8
     around = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     for name, spot, colour in zip(points, spots, colours, strict=True):
-        line = {"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 0, "shrinkB": 3}
-        how: Any = {"textcoords": "offset pixels", "arrowprops": line, "in_layout": False}
+        arrow = {"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 0, "shrinkB": 3}
+        how: Any = {"textcoords": "offset points", "arrowprops": arrow, "in_layout": False}
         how |= {"fontsize": 7, "color": colour, "va": "bottom"}
         text = axes.annotate(_text(name), points[name], (0, 0), **how)
         size = np.array(Text.get_window_extent(text).size)  # without the line
@@ -241,7 +244,7 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Seque
         tried = [np.concatenate([spot + step, spot + step + size]) for step in steps]
         best = min(tried, key=lambda box: _label_cost(box, spot, spots, boxes, frame))
         boxes.append(best)
-        text.xyann = tuple(best[:2] - spot)
+        text.xyann = tuple((best[:2] - spot) * 72.0 / figure.dpi)
 
 
 def _label_cost(box: Any, spot: Any, spots: Any, boxes: Sequence[Any], frame: Any) -> Any:
@@ -263,8 +266,9 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
 
     if not result.scenes or len(result.grid) > MAX_SHEET_STATES:
         return {}
-    kinds = result.kinds.tolist()
-    episode = next((kinds.index(kind) for kind in _KINDS if kind in kinds), 0)
+    every, best = np.arange(len(result.kinds)), [result.tracks[name].states for name in order[:3]]
+    ends = [result.scores[every, -1, states[0, :, -1]] for states in best]
+    episode = int(np.argmax(np.std(ends, axis=0) + np.isin(result.kinds, _KINDS)))
     options, start = result.plan.options(), int(result.start_states[episode])
     files = {}
     for k, first in enumerate(range(0, min(len(order), _SHEETS * _PATHS), _PATHS)):
@@ -305,9 +309,9 @@ def _text(name: str) -> str:
 
 
 def write_figure(path: Path, figure: Figure) -> Path:
-    """Write a figure: photographs as WebP, plots as PNG of 256 colours, a third of the bytes."""
+    """Write a figure: photographs as WebP, plots as PNG of 256 colours at 200 dots per inch."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png")
+    figure.savefig(stream, format="png", dpi=100 if path.suffix == ".webp" else 200)
     picture = Image.open(stream).convert("RGB")
     if path.suffix == ".webp":
         return write_picture(path, picture, quality=80, method=6)

@@ -75,20 +75,20 @@ class SimulationPlan:
     the standard deviation that the target's noise should have.
     """
 
-    settings: CameraSettings  # to simulate
-    exposure: Exposure  # the exposure that was decided for them
+    settings: CameraSettings  #: to simulate
+    exposure: Exposure  #: the exposure that was decided for them
     #: The parts of the error by what they come from; ``"left out"``, ``"network"``, ``"clipped
     #: highlights"``, ``"unknown depth"``, ``"ISO"``, ``"rounding"``.
     errors: Mapping[str, float]
     #: Variance of the source's noise beyond the target's, relative to the target's: mean over the
     #: pixels. 0 means that the noise is exact.
     excess_noise: float
-    lacks_noise: bool  # whether any pixel has less noise than the target
+    lacks_noise: bool  #: whether any pixel has less noise than the target
     #: Share of the pixels that are saturated in the source: what they would show at a darker
     #: exposure is unknown.
     clipped_source: float
-    tolerance: float  # error that the capture may have
-    samples: int  # of the raw
+    tolerance: float  #: error that the capture may have
+    samples: int  #: of the raw
 
     @functools.cached_property
     def steps(self) -> tuple[Step, ...]:

@@ -46,15 +46,15 @@ class PreparedScene:
 
     #: (4, H, W) float32, linear, not clipped: above 1 where highlights are known.
     light: torch.Tensor
-    reference: CameraSettings  # settings at which `light` is on the scale where sensor white is 1
-    camera: CameraProfile  # the body that takes the captures
-    nlf: NoiseLevelFunction  # noise left in `light`, at the reference settings
+    reference: CameraSettings  #: settings at which `light` is on the scale where sensor white is 1
+    camera: CameraProfile  #: the body that takes the captures
+    nlf: NoiseLevelFunction  #: noise left in `light`, at the reference settings
     #: (H, W) bool, pixels that were white in the source: their light is a guess; None if there are
     #: none.
     saturated: torch.Tensor | None = None
     #: Gains of R, G, B of the scene's light.
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_factor: int = 1  # sensor pixels averaged per side into one pixel of `light`
+    box_factor: int = 1  #: sensor pixels averaged per side into one pixel of `light`
     #: Speed of the image [frame heights per second], at most 1000; along the rows, unless
     #: `movement` says otherwise.
     image_speed: float = 0.0
@@ -62,7 +62,7 @@ class PreparedScene:
     #: 0 for a scene that is far or in focus throughout. No disc may be wider than both the frame
     #: and 512 pixel; with a `layout`, it stays at 32.
     defocus: float = 0.0
-    gain: float = 1.0  # light relative to `light`, where it changes over time
+    gain: float = 1.0  #: light relative to `light`, where it changes over time
     #: `light` with its noise removed by each noise module, the cheapest first, for targets that are
     #: cleaner than the source; none where there is no module or no noise.
     denoised_lights: tuple[DenoisedLight, ...] = ()
@@ -115,7 +115,7 @@ class PreparedScene:
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
 
     def changed(self, **values: Any) -> PreparedScene:
-        """A copy with other values that are known to be right: not checked.
+        """A copy with the fields `values`, which are known to be right: not checked.
 
         An environment makes one an episode. `light`, `nlf` and `aperture_blur` stay: what blurs the
         light has them.
@@ -126,7 +126,7 @@ class PreparedScene:
         return copied
 
     def vignetting(self, f_number: float) -> np.ndarray | None:
-        """(H, W) share of the light that the lens leaves at an f-number; None for all."""
+        """(H, W) share of the light that the lens leaves at `f_number`; None for all."""
         source = self.reference.effective_f_number if self.seen_through_lens else None
         if self.lens is None or f_number == source:
             return None
@@ -175,7 +175,7 @@ class PreparedScene:
         return decide(self, settings, noise=noise, gain=gain)
 
     def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
-        """Steps, reasons, error and cost of a capture, or of `expected`; see `exposure`."""
+        """Steps, reasons, error and cost of a capture at `settings`, or without `noise`."""
         exposure = self.exposure(settings, noise=noise)
         # A clean source lacks all of the noise: its light need not be made to see that.
         origin = (None, None) if exposure.source.is_zero else exposure.origin
@@ -193,7 +193,7 @@ class PreparedScene:
         )
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
-        """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
+        """Noise of a native pixel at `settings`: the camera's, or the source's where that is more.
 
         Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
@@ -204,7 +204,7 @@ class PreparedScene:
     # -- captures -----------------------------------------------------------------------------
 
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
-        """Noise-free light on the sensor, (4, H, W), blurred and not clipped; see `exposure`."""
+        """Light on the sensor at `settings`, (4, H, W), without noise or clipping, times `gain`."""
         exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
 
@@ -281,7 +281,7 @@ class PreparedScene:
         """All that captures at `states` depend on, except for their noise: parts of them.
 
         States that share their blur follow each other, so that none is computed twice; they are one
-        part where the light of all may be held at once. Arguments of `expose` and `exposure`.
+        part where the light of all may be held at once. `noise` and `gain` as of `exposure`.
         """
         gains = np.ones(len(states)) if gain is None else gain
         origins, blurs, table, remaining = plan_sweep(self, states, gains, noise=noise)
@@ -316,9 +316,10 @@ class PreparedScene:
     def stream(
         self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
     ) -> Iterator[torch.Tensor]:
-        """`expose` one capture (4, H, W) at a time, for frames too large to hold all at once.
+        """`expose` `states`, `seed` and `noise` alike, one capture (4, H, W) at a time.
 
-        Each state is taken when its frame is: the next one may depend on the last frame.
+        For frames too large to hold all at once. Each state is taken from `states` when its frame
+        is: the next one may depend on the last frame.
         """
         for settings in states:
             yield self.expose([settings], seed=seed, noise=noise)[0]

@@ -33,11 +33,11 @@ class NoiseLevelFunction:
 
     #: Slope per plane R, G1, G2, B, on the scale where sensor white is 1, >= 0.
     shot: tuple[float, float, float, float]
-    read: tuple[float, float, float, float]  # variance at zero signal per plane, >= 0
+    read: tuple[float, float, float, float]  #: variance at zero signal per plane, >= 0
     #: Stops by which the ISO lies above the calibrated table, negative where it lies below; 0
     #: inside.
     extrapolation: float = 0.0
-    source: str = ""  # where the numbers come from
+    source: str = ""  #: where the numbers come from
 
     def __post_init__(self) -> None:
         for name in ("shot", "read"):
@@ -68,7 +68,7 @@ class NoiseLevelFunction:
         return self._with([v * factor for v in self.shot], [v * factor for v in self.read])
 
     def at_least(self, other: NoiseLevelFunction) -> NoiseLevelFunction:
-        """The larger shot and the larger read noise of both, plane by plane."""
+        """The larger shot and the larger read noise of this and `other`, plane by plane."""
         return self._with(map(max, self.shot, other.shot), map(max, self.read, other.read))
 
     def exposed(self, ratio: float) -> NoiseLevelFunction:

@@ -36,7 +36,7 @@ _STEP, _STEP_SHARE = 0.5, 0.25
 class Lens:
     """A thin lens, focused at one distance."""
 
-    focal_length: float = 0.05  # [m], > 0
+    focal_length: float = 0.05  #: [m], > 0
     #: Distance of the plane in focus [m], above the focal length; inf allowed.
     focus_distance: float = math.inf
 
@@ -49,10 +49,10 @@ class Lens:
             )
 
     def circle_of_confusion(self, depth: _Length, f_number: float) -> _Length:
-        """Diameter on the sensor of the image of a point [m]; < 0 in front of the plane in focus.
+        """Diameter [m] of the image of a point at `depth`; < 0 in front of the plane in focus.
 
-        ``f^2 / N * (1 / s - 1 / z) / (1 - f / s)``, focal length f, exact f-number N, focus
-        distance s, depth z > 0 (inf allowed) from the lens [m]: the aperture f / N seen from the
+        ``f^2 / N * (1 / s - 1 / z) / (1 - f / s)``, focal length f, exact `f_number` N, focus
+        distance s, `depth` z > 0 (inf allowed) from the lens [m]: the aperture f / N seen from the
         point, at the magnification of the focus plane.
 
         >>> lens = Lens(focal_length=0.05, focus_distance=2.0)
@@ -92,7 +92,7 @@ def _cut(diameter: np.ndarray) -> _Layers:
 
 
 def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
-    """Light on the sensor behind a lens, of linear light (C, H, W) as a pinhole at its centre sees.
+    """Light on the sensor behind a lens, of the linear `light` (C, H, W) that a pinhole sees.
 
     `diameter` is the circle of confusion (H, W) [px], smaller if nearer
     (`Lens.circle_of_confusion`). Borders are replicated. A pixel in focus (up to 0.1 px) with

@@ -33,14 +33,14 @@ class RawImage:
     #: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative values
     #: are real.
     data: torch.Tensor
-    settings: CameraSettings  # ISO, exposure time and f-number of the exposure
-    camera: CameraProfile  # the body that recorded it
+    settings: CameraSettings  #: ISO, exposure time and f-number of the exposure
+    camera: CameraProfile  #: the body that recorded it
     #: Noise of this very raw, where the file states it (DNG NoiseProfile) or it was estimated; by
     #: default the camera's at this ISO.
     nlf: NoiseLevelFunction | None = None
     #: Gains of R, G, B that make a grey card grey, green 1.
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_factor: int = 1  # sensor pixels averaged per side into one pixel of `data`
+    box_factor: int = 1  #: sensor pixels averaged per side into one pixel of `data`
     #: Whatever else is known: file name, how the NLF was found, excess noise.
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -59,12 +59,12 @@ class RawImage:
     def from_mosaic(
         cls, mosaic: np.ndarray, settings: CameraSettings, camera: CameraProfile, **fields: Any
     ) -> RawImage:
-        """A raw from a (2H, 2W) mosaic of digital numbers in the camera's CFA order."""
+        """A raw from `mosaic` (2H, 2W) [DN], the CFA of `camera`, `settings` and other `fields`."""
         return cls(pack_mosaic(np.asarray(mosaic), camera), settings, camera, **fields)
 
     @classmethod
     def from_finite(cls, data: torch.Tensor, *fields: Any, **more: Any) -> RawImage:
-        """A raw whose `data` (4, H, W) float32 is known to be finite: no pass over it is made."""
+        """A raw of finite `data` (4, H, W) float32, not checked; `fields` and `more` too."""
         raw = cls(data[:, :1, :1], *fields, **more)
         object.__setattr__(raw, "data", data)
         return raw

@@ -8,13 +8,11 @@ from __future__ import annotations
 import datetime
 import errno
 import functools
-import importlib.metadata
 import io
 import json
 import operator
 import os
 import platform
-import secrets
 import subprocess
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -198,7 +196,7 @@ def write_atomically(
     content = printable(content).encode() if isinstance(content, str) else content
     pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
     start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
-    temporary = path.parent / f".{start}.{secrets.token_hex(4)}.tmp"
+    temporary = path.parent / f".{start}.{os.urandom(4).hex()}.tmp"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as stream:
@@ -292,10 +290,12 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Version of Python, of this package and of the installed libraries that numbers depend on."""
+    from importlib.metadata import PackageNotFoundError, version  # imports much: help does not
+
     found = {"python": platform.python_version(), "ae-env": __version__}
     for name in _LIBRARIES:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
     return found
 
 

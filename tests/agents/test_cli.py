@@ -183,6 +183,17 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
+def test_all_mistakes_are_shown_at_once(ae_env, dng: Path) -> None:
+    many = "--iso -3 --shutter x --noise bnak --weights bar -o out.jpg"
+    code, _, error = ae_env("simulate", "IMG_1.dng", *many.split())
+    assert (code, error.count("error `-"), error.count("\n")) == (2, 4, 5)
+    assert "error Unknown noise 'bnak'. Did you mean 'bank'?" in error
+    code, _, error = ae_env("evaluate", *UNKNOWN, "--lighting", "stpe", "--grid", "vdeo")
+    assert (code, error.count("error "), error.count("Did you mean")) == (2, 3, 3)
+    code, _, error = ae_env("evaluate", "--delay", -1, "--frames=0", "--seed", "x")
+    assert (code, error.count("Invalid value")) == (2, 3)
+
+
 def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN)
     small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]

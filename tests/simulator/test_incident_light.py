@@ -8,6 +8,7 @@ import scipy.integrate
 import scipy.stats
 import torch
 
+from simulator import CameraSettings, sensor_signal
 from simulator.radiance.incident_light import (
     IncidentLight,
     IncidentPosterior,
@@ -15,6 +16,12 @@ from simulator.radiance.incident_light import (
     features,
     picture_illuminance,
 )
+
+
+def test_the_signal_is_openusds_exposure_scale_at_a_responsivity_of_5_6():
+    # UsdGeomCamera: responsivity * time * (iso / 100) * 2**exposure / fStop**2, in 1 / nit
+    scale = 5.0 / 6.0 * (1 / 64) * (400 / 100.0) / 16.0**2
+    assert sensor_signal(30.0, CameraSettings(400, 1 / 64, 16.0)) == pytest.approx(30.0 * scale)
 
 
 def test_known_light_is_moved_to_within_1_5_ev_of_the_average_meter():

@@ -195,6 +195,8 @@ def test_files_of_a_report(tmp_path):
     assert (meta["command"], meta["best_meter"]) == (names["command"], "spot:P")
     assert [row["policy"] for row in meta["ranking"]] == ["spot:P", "matrix:P", "ppo"]
     assert following[0] in files["report.md"].read_text()
+    assert "**spot:P scores best: " in files["report.md"].read_text()
+    assert re.search('<a href="#s1">Ranking.*<details open', files["report.html"].read_text(), re.S)
     for name in ("scores.png", "ev_error.png"):
         data = base64.b64encode(files[name].read_bytes()).decode()
         assert data in files["report.html"].read_text()
