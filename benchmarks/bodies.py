@@ -1,4 +1,4 @@
-"""What a lens and a wrong camera profile change of decisions, on real places.
+"""What a lens, pixels that differ and a wrong profile change of decisions, on real places.
 
 One episode of each view of the unseen places of ``polyhaven`` is drawn with its motion and defocus;
 every body and every lens sees the same. The best state of one of them is then judged in the score
@@ -27,8 +27,13 @@ LENSES = (
 )
 #: Numbers of the lenses of ``lens="random"`` that are looked at.
 RANDOM = range(0, RANDOM_LENSES, 8)
-_LENS = """{lens} | corners at f/2 [EV] = {wide:.2f} | at f/8 = {closed:.2f} |
-best state changes = {changed:.1%} | score lost = {mean:.4f} | worst view = {worst:.3f}"""
+#: PRNU and dark currents [e-/s] that are looked at; the reference sets of EMVA have 0.3 to 0.7 %
+#: and up to 28.
+PIXELS = [f"prnu={x}" for x in (0.005, 0.01, 0.02)]
+PIXELS += [f"dark_current={x}" for x in (30, 300, 3000)]
+BODIES = sorted(list_cameras())
+_LOST = "best state changes = {changed:.1%} | score lost = {mean:.4f} | worst view = {worst:.3f}"
+_LENS = "{lens} | corners at f/2 [EV] = {wide:.2f} | at f/8 = {closed:.2f} | " + _LOST
 
 
 def tables(camera: str, lens: Any, seed: int, quick: bool) -> list[list[float]]:
@@ -46,13 +51,9 @@ def tables(camera: str, lens: Any, seed: int, quick: bool) -> list[list[float]]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    bodies = [Part(f"body|{name}", tables, {"camera": name, "lens": None}) for name in _bodies()]
-    lenses = [*LENSES, *RANDOM]
+    names, lenses = [*BODIES, *(f"{CAMERA}?{pixels}" for pixels in PIXELS)], [*LENSES, *RANDOM]
+    bodies = [Part(f"body|{name}", tables, {"camera": name, "lens": None}) for name in names]
     return bodies + [Part(f"lens|{n}", tables, {"camera": CAMERA, "lens": n}) for n in lenses]
-
-
-def _bodies() -> list[str]:
-    return sorted(list_cameras())
 
 
 def lost(true: np.ndarray, assumed: np.ndarray) -> Row:
@@ -76,17 +77,21 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         drawn.append({"panel": kind, "x": row["wide"], "y": row["changed"], "label": "_"})
     wrong = [
         {"true": true, "assumed": assumed, **lost(found[f"body|{true}"], found[f"body|{assumed}"])}
-        for true, assumed in product(_bodies(), repeat=2)
+        for true, assumed in product(BODIES, repeat=2)
         if true != assumed
     ]
     for row in wrong:
         row["text"] = f"{row['mean']:.4f} ({row['worst']:.3f})"
+    pixels = [{"pixels": n, **lost(found[f"body|{CAMERA}?{n}"], plain)} for n in PIXELS]
     shown = {
+        "pixels": table(pixels, "{pixels} | " + _LOST),
         "lenses": table([{**row, "lens": _named(row["lens"])} for row in rows], _LENS),
         "profiles": pivot(wrong, "{true}", "{assumed}", "{text}"),
     }
     about = {"views": len(plain), "resolution": RESOLUTION}
-    return Report([*rows, *wrong], shown, meta=about, figures={"bodies.png": _drawn(drawn)})
+    return Report(
+        [*rows, *pixels, *wrong], shown, meta=about, figures={"bodies.png": _drawn(drawn)}
+    )
 
 
 def _named(lens: str) -> str:

@@ -88,6 +88,7 @@ class Captures:
     #: from light without noise.
     source_noise: Sequence[NoiseLevelFunction] | None = None
     noisy: bool = True  #: whether the captures have noise
+    prnu: float = 0.0  #: `CameraProfile.prnu`, of native pixels
     #: How many pixels have which extent of blur; None where all have `blur_px`.
     pixel_blur: PixelBlur | None = None
     #: (B, K) float64, EV100s that are equally likely the right one; None where the incident light
@@ -136,8 +137,8 @@ class Captures:
     def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
         """Variance of a native pixel's noise in the captures, at the recorded `signal`.
 
-        The camera's own at the settings, or the source's where it has more. `signal` is
-        (B, 4, ...), at least 0, white is 1.
+        The camera's own at the settings, or the source's where it has more; and what pixels differ
+        by. `signal` is (B, 4, ...), at least 0, white is 1.
         """
         variance = torch.zeros_like(signal)
         if not self.noisy:
@@ -148,7 +149,7 @@ class Captures:
                 shot = torch.tensor([n.shot for n in noises]).reshape(shape).to(signal)
                 read = torch.tensor([n.read for n in noises]).reshape(shape).to(signal)
                 variance = variance.maximum(signal * shot + read)
-        return variance
+        return variance + (self.prnu * signal).square() if self.prnu else variance
 
     @cached_property
     def ev100(self) -> torch.Tensor:
@@ -235,22 +236,21 @@ def describe_captures(
     own = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
     moves = np.zeros((len(scenes), 4)) if movements is None else movements
     blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, np.array(own))
-    nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
-    noise = [nlfs[s.iso] for s in settings], source_noise, noisy
+    noise = camera.nlfs(settings), source_noise, noisy, camera.prnu
     return _captures(scenes, settings, noise, gain, row_gain, torch.from_numpy(blur), pixel_blur)
 
 
 def _captures(
     scenes: Sequence[Scene],
     settings: Sequence[CameraSettings],
-    noise: tuple[Sequence[NoiseLevelFunction], Sequence[NoiseLevelFunction] | None, bool],
+    noise: tuple[Sequence[NoiseLevelFunction], Sequence[NoiseLevelFunction] | None, bool, float],
     gain: np.ndarray,
     row_gain: np.ndarray | None,
     blur_px: torch.Tensor,
     pixel_blur: PixelBlur | None,
 ) -> Captures:
-    """`noise` are `nlf`, `source_noise` and `noisy`; the others are those of `Captures`."""
-    pairs, (nlf, source_noise, noisy) = zip(scenes, settings, strict=True), noise
+    """`noise` are `nlf`, `source_noise`, `noisy` and `prnu`; the others those of `Captures`."""
+    pairs, (nlf, source_noise, noisy, prnu) = zip(scenes, settings, strict=True), noise
     ratios = [2.0 ** (s.log2_exposure - c.reference.log2_exposure) for c, s in pairs]
     return Captures(
         settings=settings,
@@ -262,6 +262,7 @@ def _captures(
         row_gain=None if row_gain is None else torch.from_numpy(row_gain),
         source_noise=source_noise,
         noisy=noisy,
+        prnu=prnu,
         pixel_blur=pixel_blur,
         likely_ev=_likely_ev(scenes, gain),
     )
@@ -343,8 +344,7 @@ class SceneCaptures:
         self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool
     ) -> None:
         self.camera, self.states, self.noisy = camera, states, noisy
-        nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in states}}
-        self._nlf = [nlfs[s.iso] for s in states]
+        self._nlf = camera.nlfs(states)
         # (K, 2) times and f-numbers of states that differ in them, and (S,) which each state has.
         blurs = np.array([(s.exposure_time, s.effective_f_number) for s in states])
         self._blurs, which = np.unique(blurs, axis=0, return_inverse=True)
@@ -367,7 +367,8 @@ class SceneCaptures:
         if pixel_blur is not None:
             pixel_blur = PixelBlur(*(values[alike] for values in pixel_blur))
         gains = np.broadcast_to(gain, len(self.states))[part]
-        noise = self._nlf[part], source_noises(prepared, states, gains), self.noisy
+        sources = source_noises(prepared, states, gains)
+        noise = self._nlf[part], sources, self.noisy, self.camera.prnu
         rows = None if row_gain is None else row_gain[part]
         return _captures([scene] * count, states, noise, gains, rows, blur[alike], pixel_blur)
 

@@ -193,6 +193,17 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
         recorded.index_recorded(tmp_path, {})
 
 
+def test_settings_that_do_not_count_are_told(tmp_path: Path, caplog) -> None:
+    touch(tmp_path, "a/iso100_1s_f4.png", "a/iso100_2s_f4.1.png", "b.png")
+    rows = "file,iso,exposure_time\nb.png,100,1\ngone.png,100,1\na/gone,100,2\n"
+    (tmp_path / "settings.csv").write_text(rows)
+    recorded.index_recorded(tmp_path, {"f_number": 4.0})  # 4.1 counts as 4
+    recorded.index_recorded(tmp_path, {"f_number": 8.0})
+    row, number, again = caplog.messages
+    assert "2 of 3 rows of tables name no file" in (row and again)
+    assert "`f_number` (=8): 2 of 3 files state another" in number
+
+
 def test_options_and_how_many_states_a_grid_may_have(tmp_path: Path) -> None:
     options = recorded.RecordedOptions
     found = options.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
