@@ -76,9 +76,8 @@ def simulated(camera: CameraProfile, stack: FlatFields, response: float, seed: i
     for light in (torch.ones(4, *size), torch.zeros(4, *size)):
         scene = simulator.prepare(PreparedScene(light, base, camera, clean))
         for signal, time in np.repeat(np.stack([*each], axis=1), 2, axis=0):
-            state = replace(base, exposure_time=time)
-            gain = np.array([signal * base.exposure_time / time])
-            frame = scene.expose([state], seed=int(rng.integers(2**31)), gain=gain)
+            state, gain = replace(base, exposure_time=time), base.exposure_time / time * signal
+            frame = scene.expose([state], seed=int(rng.integers(2**31)), gain=np.array([gain]))
             found.append(np.rint(frame.double().numpy() * camera.span[0] + camera.black_level[0]))
     frames = np.reshape(found, (2, *stack.bright.shape))
     return stack._replace(bright=frames[0], dark=frames[1])
