@@ -130,10 +130,7 @@ def test_errors_before_any_work(ae_env, benchmarks_here, arguments, named):
 
 
 def test_a_camera_of_counted_photons(benchmarks_here):
-    """12 bits, 0.2 DN an electron, 60 % of the photons, 2 DN of dark noise, as NumPy draws them.
-
-    Gains of pixels differ by 1 %, and three electrons come in the dark in each nanosecond.
-    """
+    """12 bits, 0.2 DN an electron, 60 % of photons, 2 DN of dark noise, 1 % of PRNU, 3 e-/ns."""
     rng, size, (gain, efficiency, dark, black) = np.random.default_rng(0), 64, (0.2, 0.6, 2.0, 100)
     photons = np.append(np.linspace(0.0, 40_000.0, 21), 50_000.0)
     times = np.append(np.arange(21.0), 5.0)  # the last is of another measurement
