@@ -193,17 +193,6 @@ def test_folders_that_are_no_grid(tmp_path: Path, name: str, text: str, message:
         recorded.index_recorded(tmp_path, {})
 
 
-def test_settings_that_do_not_count_are_told(tmp_path: Path, caplog) -> None:
-    touch(tmp_path, "a/iso100_1s_f4.png", "a/iso100_2s_f4.1.png", "b.png")
-    rows = "file,iso,exposure_time\nb.png,100,1\ngone.png,100,1\na/gone,100,2\n"
-    (tmp_path / "settings.csv").write_text(rows)
-    recorded.index_recorded(tmp_path, {"f_number": 4.0})  # 4.1 counts as 4
-    recorded.index_recorded(tmp_path, {"f_number": 8.0})
-    row, number, again = caplog.messages
-    assert "2 of 3 rows of tables name no file" in (row and again)
-    assert "`f_number` (=8): 2 of 3 files state another" in number
-
-
 def test_options_and_how_many_states_a_grid_may_have(tmp_path: Path) -> None:
     options = recorded.RecordedOptions
     found = options.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
@@ -270,18 +259,22 @@ def test_pictures_of_16_bits_keep_them(tmp_path: Path) -> None:
 
 
 def test_grids_of_other_people(tmp_path: Path, caplog) -> None:
-    """Folders that are bare numbers, ground truth, and shots at one setting."""
+    """Bare numbers as folders, ground truth, shots at one setting, and what does not count."""
     for time, settings in ((1, GRID[0]), (8, GRID[2])):
         write_picture(tmp_path / "desk" / f"{time}.0" / "17.png", settings)
     write_picture(tmp_path / "desk" / "gt" / "17.png", GRID[0])
     write_picture(tmp_path / "desk" / "8.0" / "17_GT.png", GRID[0])
     write_picture(tmp_path / "walk" / "4.0" / "3.png", GRID[0])
-    (scene,) = load(f"recorded:{tmp_path}?folder=exposure_ms&iso=100&f_number=4")
+    (tmp_path / "settings.csv").write_text("file,iso\ndesk/1.0,100\ngone.png,100\n")
+    known = "iso=103&f_number=4&exposure_time=7"  # 103 counts as 100
+    (scene,) = load(f"recorded:{tmp_path}?folder=exposure_ms&{known}")
     assert scene.scene_id == "desk/17"
     assert scene.recorded.shape[0] == len(scene.allowed) == 2  # 4 ms is no state
-    truth, single = caplog.messages
+    truth, time, row, single = caplog.messages
     assert "ground truth is left out, 2 of 5 files" in truth
     assert "1 of 2 recorded scenes have fewer than two states" in single
+    assert "`exposure_time` (=7): 3 of 3 files state another" in time
+    assert "1 of 2 rows of tables name no file" in row
     options = recorded.RecordedOptions.of(
         f"recorded:{tmp_path}?folder=exposure_us&iso=1&f_number=4"
     )
