@@ -117,7 +117,11 @@ def pixel_fields(query: str, known: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def _options(query: str, known: tuple[str, ...]) -> dict[str, str]:
-    options = dict(parse_qsl(query.replace("+", "%2B"), strict_parsing=bool(query)))
+    try:
+        options = dict(parse_qsl(query.replace("+", "%2B"), strict_parsing=bool(query)))
+    except ValueError:
+        rule = "must be written NAME=VALUE, with & in between"
+        raise ValueError(f"`camera?{query}`: options {rule}") from None
     for key in options:
         check_key("options", key, (*known, *_PIXEL))
     return options
