@@ -263,7 +263,8 @@ class ExposureBracket(Task):
             state = self.episodes.grid[int(self.episodes.state[env_index])]
             self._gains[env_index, k] = exposure_ratio(scene.reference, state)
             if self.episodes.options.noise:
-                nlf = self.episodes.camera.nlf(state.iso).scaled(1.0 / scene.box_factor**2)
+                own = self.episodes.camera.nlf(state.iso, state.exposure_time)
+                nlf = own.scaled(1.0 / scene.box_factor**2)
                 self._noise[env_index, k] = nlf.shot, nlf.read
         self._fresh[env_indices] = False
         light, precision = self.merged(env_indices)

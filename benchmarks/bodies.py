@@ -1,4 +1,4 @@
-"""What a lens and a wrong camera profile change of decisions, on real places.
+"""What lenses, pixels and a wrong camera profile change of decisions, on real places.
 
 One episode of each view of the unseen places of ``polyhaven`` is drawn with its motion and defocus;
 every body and every lens sees the same. The best state of one of them is then judged in the score
@@ -7,15 +7,16 @@ table of another.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from matplotlib.figure import Figure
 
+from ae_env.scenes import load_scenes
 from benchmarks.harness import Part, Report, Row, benchmark, panels, pivot, table
-from simulator import list_cameras
+from simulator import get_camera, list_cameras
 from simulator.optics.vignetting import RANDOM_LENSES, get_lens, random_lens
 
 TASK, CAMERA, RESOLUTION = "ae_env:ae_env/AutoExposure-v0", "nikon_z6", 64
@@ -27,32 +28,38 @@ LENSES = (
 )
 #: Numbers of the lenses of ``lens="random"`` that are looked at.
 RANDOM = range(0, RANDOM_LENSES, 8)
-_LENS = """{lens} | corners at f/2 [EV] = {wide:.2f} | at f/8 = {closed:.2f} |
-best state changes = {changed:.1%} | score lost = {mean:.4f} | worst view = {worst:.3f}"""
+#: PRNU, dark currents [e-/s], and shares of the mean light that a lens scatters evenly.
+EFFECTS = [f"prnu={x}" for x in (0.005, 0.01, 0.02)]
+EFFECTS += [f"dark_current={x}" for x in (30, 300, 3000)]
+EFFECTS += [f"glare={x}" for x in (0.01, 0.03)]
+BODIES = sorted(list_cameras())
+_LOST = "best state changes = {changed:.1%} | score lost = {mean:.4f} | worst view = {worst:.3f}"
+_LENS = "{lens} | corners at f/2 [EV] = {wide:.2f} | at f/8 = {closed:.2f} | " + _LOST
 
 
 def tables(camera: str, lens: Any, seed: int, quick: bool) -> list[list[float]]:
-    """(views, states) expected scores."""
+    """(views, states) expected scores; `camera` may have one of `EFFECTS` as an option."""
     if isinstance(lens, int):
         lens = random_lens(lens)
-    scenes: dict[str, Any] = {"scenes": "polyhaven", "split": "test", "resolution": RESOLUTION}
-    env: Any = gym.make(TASK, **scenes, camera=camera, lens=lens).unwrapped
-    count, found = len(env.scene_ids), []
-    for scene in range(0, count, 8 if quick else 1):
-        env.reset(seed=1000 * seed + scene, options={"scene": scene})
+    camera, _, glare = camera.partition("?glare=")
+    size: dict[str, Any] = {"camera": get_camera(camera), "resolution": RESOLUTION}
+    scenes = load_scenes("polyhaven", "test", **size)
+    for i, scene in enumerate(scenes if glare else ()):
+        veil = float(glare) * scene.light.mean(dim=(1, 2), keepdim=True)
+        scenes[i] = replace(scene, light=scene.light + veil)
+    env: Any = gym.make(TASK, scenes=scenes, lens=lens, **size).unwrapped
+    found = []
+    for index in range(0, len(scenes), 8 if quick else 1):
+        env.reset(seed=1000 * seed + index, options={"scene": index})
         found.append(env.core.score_table(0).mean.tolist())
     env.close()
     return found
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    bodies = [Part(f"body|{name}", tables, {"camera": name, "lens": None}) for name in _bodies()]
-    lenses = [*LENSES, *RANDOM]
+    names, lenses = [*BODIES, *(f"{CAMERA}?{effect}" for effect in EFFECTS)], [*LENSES, *RANDOM]
+    bodies = [Part(f"body|{name}", tables, {"camera": name, "lens": None}) for name in names]
     return bodies + [Part(f"lens|{n}", tables, {"camera": CAMERA, "lens": n}) for n in lenses]
-
-
-def _bodies() -> list[str]:
-    return sorted(list_cameras())
 
 
 def lost(true: np.ndarray, assumed: np.ndarray) -> Row:
@@ -67,36 +74,25 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     found = {name: np.array(scores) for name, scores in results.items()}
     plain, rows, drawn = found[f"body|{CAMERA}"], list[Row](), list[Row]()
     for lens in (*LENSES, *RANDOM):
-        known = random_lens(lens) if isinstance(lens, int) else get_lens(lens)
-        assert known is not None
-        row = lost(found[f"lens|{lens}"], plain)
-        row |= {"wide": known.corner_loss(2.0), "closed": known.corner_loss(8.0)}
-        rows.append({"lens": str(lens).removeprefix("lensfun:"), **row})
+        known: Any = random_lens(lens) if isinstance(lens, int) else get_lens(lens)
         kind = "drawn" if isinstance(lens, int) else "lensfun"
-        drawn.append({"panel": kind, "x": row["wide"], "y": row["changed"], "label": "_"})
+        name = f"drawn, number {lens}" if kind == "drawn" else str(lens).removeprefix("lensfun:")
+        row = {"lens": name, **lost(found[f"lens|{lens}"], plain)}
+        row |= {"wide": known.corner_loss(2.0), "closed": known.corner_loss(8.0)}
+        rows.append(row)
+        point = {"label": "_", "style": {"marker": "o", "ls": "", "c": "C0"}}
+        drawn.append({"panel": kind, "x": row["wide"], "y": row["changed"], **point})
+    effects = [{"effect": n, **lost(found[f"body|{CAMERA}?{n}"], plain)} for n in EFFECTS]
     wrong = [
         {"true": true, "assumed": assumed, **lost(found[f"body|{true}"], found[f"body|{assumed}"])}
-        for true, assumed in product(_bodies(), repeat=2)
+        for true, assumed in product(BODIES, repeat=2)
         if true != assumed
     ]
-    for row in wrong:
-        row["text"] = f"{row['mean']:.4f} ({row['worst']:.3f})"
-    shown = {
-        "lenses": table([{**row, "lens": _named(row["lens"])} for row in rows], _LENS),
-        "profiles": pivot(wrong, "{true}", "{assumed}", "{text}"),
-    }
-    about = {"views": len(plain), "resolution": RESOLUTION}
-    return Report([*rows, *wrong], shown, meta=about, figures={"bodies.png": _drawn(drawn)})
-
-
-def _named(lens: str) -> str:
-    return f"drawn, number {lens}" if lens.isdigit() else lens
-
-
-def _drawn(rows: list[Row]) -> Figure:
-    for row in rows:
-        row["style"] = {"marker": "o", "ls": "", "c": "C0"}
-    return panels(rows, xlabel="light lost in the corners at f/2 [EV]", ylabel="best state changes")
+    shown = {"lenses": table(rows, _LENS), "effects": table(effects, "{effect} | " + _LOST)}
+    shown["profiles"] = pivot(wrong, "{true}", "{assumed}", "{mean:.4f} ({worst:.3f})")
+    axes: Any = {"xlabel": "light lost in the corners at f/2 [EV]", "ylabel": "best state changes"}
+    about, figures = {"views": len(plain), "resolution": RESOLUTION}, panels(drawn, **axes)
+    return Report([*rows, *effects, *wrong], shown, meta=about, figures={"bodies.png": figures})
 
 
 run = benchmark("bodies", parts, report)

@@ -2,8 +2,8 @@
 
 A folder holds a ``.npz`` for each camera, see `simulator.camera_files.read_flat_fields`. The
 quantities are those of EMVA 1288 (release 4.0, linear model); intervals are Student's over 16 parts
-of the frames. A simulated camera is made of gain, responsivity, dark signal and dark noise. The
-package `emva1288` (LGPL) stands beside our estimates where it is installed.
+of the frames. A simulated camera is made of gain, responsivity, dark signal, dark noise, PRNU and
+dark current. The package `emva1288` (LGPL) stands beside them where it is installed.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ QUANTITIES = {
     "u_e_sat": ("saturation [e-]", "{:.0f}", 13972.6),
     "LE_min": ("least linearity error [%]", "{:.2f}", -0.6158),
     "LE_max": ("greatest linearity error [%]", "{:.2f}", 0.4804),
+    "PRNU1288": ("PRNU [%]", "{:.2f}", 0.43),
+    "u_I_mean": ("dark current [e-/s]", "{:.4g}", 28.0),
 }
 KINDS = ("real", "simulated")
 #: Half of the 95 % interval of the mean of 16 values of standard deviation 1.
@@ -61,7 +63,8 @@ def estimate(stack: FlatFields) -> Row:
     noise, most = stack.dark_variance, photons[full]
     electrons = (noise - 1 / 12) ** 0.5 / gain, most, most * response / gain
     values = gain, 100 * response / gain, noise**0.5, *electrons, errors.min(), errors.max()
-    return dict(zip(QUANTITIES, map(float, values), strict=True))
+    pixels = 100 * stack.prnu, stack.dark_current[0]
+    return dict(zip(QUANTITIES, map(float, values + pixels), strict=True))
 
 
 def simulated(camera: CameraProfile, stack: FlatFields, response: float, seed: int) -> FlatFields:
@@ -69,11 +72,12 @@ def simulated(camera: CameraProfile, stack: FlatFields, response: float, seed: i
     size, base = [n // 2 for n in stack.bright.shape[2:]], CameraSettings(100, 1 / 64, 4)
     simulator, clean = CameraSimulator(device="cpu", cache=None), NoiseLevelFunction.zero()
     found, rng = [], np.random.default_rng(seed)
+    each = response * stack.photons / camera.span[0], np.maximum(stack.times, 1) * 1e-9
     for light in (torch.ones(4, *size), torch.zeros(4, *size)):
         scene = simulator.prepare(PreparedScene(light, base, camera, clean))
-        for signal in np.repeat(response * stack.photons / camera.span[0], 2):
-            state = [replace(base, exposure_time=max(signal, 1e-6) / 64)]
-            frame = scene.expose(state, seed=int(rng.integers(2**31)), noise="exact")
+        for signal, time in np.repeat(np.stack([*each], axis=1), 2, axis=0):
+            state, gain = replace(base, exposure_time=time), base.exposure_time / time * signal
+            frame = scene.expose([state], seed=int(rng.integers(2**31)), gain=np.array([gain]))
             found.append(np.rint(frame.double().numpy() * camera.span[0] + camera.black_level[0]))
     frames = np.reshape(found, (2, *stack.bright.shape))
     return stack._replace(bright=frames[0], dark=frames[1])

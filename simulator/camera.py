@@ -6,7 +6,7 @@ import functools
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib import resources
@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from simulator.camera_files import normalised_model, read_camera_file
+from simulator.camera_files import normalised_model, pixel_fields, read_camera_file
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
+from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer, check_number, check_word
 
 #: A sample at or below this signal counts as clipped low: ten stops below white.
@@ -76,6 +77,12 @@ class CameraProfile:
     #: Distance between sensor pixels [micrometre]; None if unknown.
     pixel_pitch_um: float | None = None
     row_time: float = 0.0  #: read-out time of one sensor row [s]
+    #: Photo response non-uniformity: standard deviation of the gains of the photosites, relative to
+    #: their mean (EMVA 1288). They are a pattern that belongs to the body and stays.
+    prnu: float = field(default=0.0, kw_only=True)
+    #: Electrons that a photosite collects in the dark [1/s], at the temperature of the calibration.
+    #: Black-level subtraction removes their mean; their shot noise stays.
+    dark_current: float = field(default=0.0, kw_only=True)
     source: str = ""  #: where the noise calibration comes from
 
     def __post_init__(self) -> None:
@@ -88,6 +95,8 @@ class CameraProfile:
         object.__setattr__(self, "black_level", black)
         check_integer("bit_depth", self.bit_depth, 1, 16)
         check_number("full_level", self.full_level, 0.5, 1.0)
+        check_number("prnu", self.prnu, 0.0, 0.2)
+        check_number("dark_current", self.dark_current, 0.0, 1e12)
         white, largest = self.white_level, 2**16 - 1
         if not (all(0 <= b < white for b in black) and white <= largest and white == round(white)):
             raise ValueError(
@@ -122,8 +131,8 @@ class CameraProfile:
         table.flags.writeable = False
         return table
 
-    def nlf(self, iso: float) -> NoiseLevelFunction:
-        """Noise level function at `iso`.
+    def nlf(self, iso: float, exposure_time: float = 0.0) -> NoiseLevelFunction:
+        """Noise level function at `iso`, with the dark current's shot noise of an exposure [s].
 
         Log-log interpolation between calibrated ISOs, inside a conversion-gain segment. Outside,
         shot noise scales with ISO and read noise with its square, but for the rounding to digital
@@ -131,6 +140,21 @@ class CameraProfile:
         `NoiseLevelFunction.extrapolation` says how far. A `ValueError` if the profile has no noise
         calibration or `iso` is not positive.
         """
+        nlf = self._calibrated(iso)
+        if not self.dark_current * exposure_time:
+            return nlf
+        # So many electrons are their own variance; each is `shot` where white is 1.
+        electrons = self.dark_current * exposure_time
+        read = [r + electrons * s * s for r, s in zip(nlf.read, nlf.shot, strict=True)]
+        return replace(nlf, read=read)  # type: ignore[arg-type]
+
+    def nlfs(self, states: Iterable[CameraSettings]) -> list[NoiseLevelFunction]:
+        """`nlf` of captures; those that are alike are worked out once."""
+        keys = [(s.iso, s.exposure_time if self.dark_current else 0.0) for s in states]
+        known = {key: self.nlf(*key) for key in dict.fromkeys(keys)}
+        return [known[key] for key in keys]
+
+    def _calibrated(self, iso: float) -> NoiseLevelFunction:
         if not self.nlf_by_iso:
             raise ValueError(
                 f"camera {self.name!r} has no noise calibration; give `nlf`, or estimate one with "
@@ -242,13 +266,15 @@ def get_camera(name: str) -> CameraProfile:
 
     A file's is ``"ctt:FILE"``, a tuning of Raspberry Pi's, ``"emva:FILE"``, flat fields, or
     ``"darktable:MAKER MODEL"`` with the noise of darktable's profile: of a built-in camera all else
-    stays, another one has an RGGB array and levels of 14 bits unless options say more. A
+    stays, another one has an RGGB array and levels of 14 bits unless options say more. After each
+    name, ``"?prnu=0.005&dark_current=20"`` sets what pixels differ by and collect in the dark. A
     `ValueError` proposes the nearest name.
     """
     fields = read_camera_file(name) if isinstance(name, str) else None
     if fields is None:
-        check_word("camera", name, tuple(list_cameras()))
-        return _built_in()[name]
+        body, mark, query = name.partition("?") if isinstance(name, str) else (name, "", "")
+        check_word("camera", body, tuple(list_cameras()))
+        return replace(_built_in()[body], **pixel_fields(query)) if mark else _built_in()[body]
     known = {normalised_model(c.make, c.model): c for c in _built_in().values()}
     base = known.get(normalised_model(fields["make"], fields["model"]))
     if base is None:

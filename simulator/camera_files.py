@@ -15,6 +15,8 @@ own; the noise of flat fields is measured:
   white levels and gains have equal `shot`.
 - *Flat fields* are measured as EMVA 1288 (release 4.0, linear model) has it. The system gain is the
   slope of the variance over the mean, both less their dark values, up to 70 % of the saturation.
+  The covariance of the frames of a pair is the variance of the pattern in both; there, that of PRNU
+  grows with the square of the signal. The dark current is the slope of the dark mean over time.
 """
 
 from __future__ import annotations
@@ -31,7 +33,13 @@ from zipfile import is_zipfile
 import numpy as np
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.utils.checks import check_integer, check_key, check_number, did_you_mean
+from simulator.utils.checks import (
+    check_integer,
+    check_key,
+    check_number,
+    did_you_mean,
+    parse_number,
+)
 
 #: Share of the variance of a photosite in HH of the green that PPG makes of a flat field; LibRaw's
 #: PPG has 0.076 to 0.080 for greens that are 1 to 2.5 times as bright as red and blue.
@@ -55,6 +63,8 @@ _TUNED_BITS = 16
 _ROUNDING = 1 / 12 / 2.0**28
 #: Fields of a profile by option.
 _FIELDS = {"black": "black_level", "white": "white_level", "bits": "bit_depth", "cfa": "cfa"}
+#: Options of every camera, which are fields: what photosites differ by, and collect in the dark.
+_PIXEL = ("prnu", "dark_current")
 
 
 def normalised_model(make: str, model: str) -> str:
@@ -78,7 +88,8 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
     ``"emva:FILE"`` is a ``.npz`` of flat fields (`read_flat_fields`). None if `name` has no such
     form. Options follow a question mark: ``bits`` (by default 10 of a tuned sensor, those of the
     largest number of flat fields) and ``cfa`` (RGGB); darktable's ``file``, and ``black``,
-    ``white``, ``bits`` and ``cfa`` of its body, which are missing from the fields otherwise.
+    ``white``, ``bits`` and ``cfa`` of its body, which are missing from the fields otherwise; and
+    ``prnu`` and ``dark_current`` of all.
 
     Raises:
         ValueError: If the file or the body is not there, or is not what it should be.
@@ -89,10 +100,7 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
     stem, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     reader, known = _READERS[kind]
     try:
-        options = dict(parse_qsl(query.replace("+", "%2B"), strict_parsing=bool(query)))
-        for key in options:
-            check_key("options", key, known)
-        return reader(stem, options)
+        return reader(stem, _options(query, known)) | pixel_fields(query, known)
     except (KeyError, TypeError, AttributeError, IndexError, np.linalg.LinAlgError) as error:
         what = {"ctt": "tuning file of libcamera", "darktable": "noiseprofiles.json of darktable"}
         what["emva"] = "npz of flat fields"
@@ -100,6 +108,23 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
         raise ValueError(f"`camera` (={name!r}) must name a {what[kind]}: it {fault}") from None
     except (ValueError, OSError) as error:
         raise ValueError(f"`camera` (={name!r}) cannot be used: {error}") from None
+
+
+def pixel_fields(query: str, known: tuple[str, ...] = ()) -> dict[str, Any]:
+    """``prnu`` and ``dark_current`` of options, which may also be those that are `known`."""
+    options = _options(query, known)
+    return {key: parse_number(options[key], key) for key in _PIXEL if key in options}
+
+
+def _options(query: str, known: tuple[str, ...]) -> dict[str, str]:
+    try:
+        options = dict(parse_qsl(query.replace("+", "%2B"), strict_parsing=bool(query)))
+    except ValueError:
+        rule = "must be written NAME=VALUE, with & in between"
+        raise ValueError(f"`camera?{query}`: options {rule}") from None
+    for key in options:
+        check_key("options", key, (*known, *_PIXEL))
+    return options
 
 
 def _read(path: Path) -> Any:
@@ -253,6 +278,28 @@ class FlatFields(NamedTuple):
         fit = signal <= FITTED * signal[variance.argmax()]
         return float(signal[fit] @ extra[fit] / (signal[fit] @ signal[fit]))
 
+    @property
+    def prnu(self) -> float:
+        """Standard deviation of the pixels' gains relative to their mean."""
+        (mean, variance), (dark, _) = pair_moments(self.bright), pair_moments(self.dark)
+        signal, extra = mean - dark, _pattern(self.bright) - _pattern(self.dark)
+        fit = signal <= FITTED * signal[variance.argmax()]
+        square = signal[fit] ** 2
+        return max(float(square @ extra[fit] / (square @ square)), 0.0) ** 0.5
+
+    @property
+    def dark_current(self) -> tuple[float, float]:
+        """Electrons per second, and their standard error."""
+        times, dark = self.times * 1e-9, pair_moments(self.dark)[0]
+        (slope, _), covariance = np.polyfit(times, dark, 1, cov=True)
+        return float(slope / self.gain()), float(covariance[0, 0] ** 0.5 / self.gain())
+
+
+def _pattern(frames: np.ndarray) -> np.ndarray:
+    """Variance (N,) of what both frames of each pair (N, 2, H, W) show: their covariance."""
+    apart = frames - frames.mean(axis=(2, 3), keepdims=True)
+    return np.asarray(apart.prod(axis=1).mean(axis=(1, 2)))
+
 
 def pair_moments(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and temporal variance of each pair of frames (N, 2, H, W): two arrays (N,)."""
@@ -305,7 +352,10 @@ def _from_flat_fields(path: str, options: Mapping[str, str]) -> dict[str, Any]:
     levels = {"black_level": black, "white_level": 2**bits - 1, "bit_depth": bits}
     name = Path(path).stem
     body = {"name": f"emva_{name.lower()}", "model": name, "cfa": options.get("cfa", "RGGB")}
-    return {**body, "make": "unknown", **levels, "nlf_by_iso": {100.0: nlf}, "source": source}
+    dark_current, error = fields.dark_current
+    pixels = {"prnu": fields.prnu, "dark_current": dark_current * (dark_current > 3.0 * error)}
+    fixed = {**body, "make": "unknown", **levels, "source": source}
+    return {**fixed, **pixels, "nlf_by_iso": {100.0: nlf}}
 
 
 _READERS = {

@@ -27,7 +27,7 @@ from benchmarks.harness import Part, Report, benchmark, pivot, rounded, table
 from benchmarks.transfer import agents, tables
 from benchmarks.transfer.agents import TableSet, TransferPlan, World
 from benchmarks.work_precision.plans import distance
-from simulator import NoiseLevelFunction, exposure_ratio
+from simulator import NoiseLevelFunction, exposure_ratio, get_camera
 from simulator.networks.weights import build_modules
 from simulator.training.paper_dataset import split_dataset
 from simulator.training.scenes import detail_split
@@ -130,13 +130,16 @@ def test_errors_before_any_work(ae_env, benchmarks_here, arguments, named):
 
 
 def test_a_camera_of_counted_photons(benchmarks_here):
-    """12 bits, 0.2 DN an electron, 60 % of the photons, 2 DN of dark noise, as NumPy draws them."""
+    """12 bits, 0.2 DN an electron, 60 % of photons, 2 DN of dark noise, 1 % of PRNU, 3 e-/ns."""
     rng, size, (gain, efficiency, dark, black) = np.random.default_rng(0), 64, (0.2, 0.6, 2.0, 100)
     photons = np.append(np.linspace(0.0, 40_000.0, 21), 50_000.0)
     times = np.append(np.arange(21.0), 5.0)  # the last is of another measurement
 
+    gains = 1.0 + 0.01 * rng.standard_normal((size, size))
+
     def pairs(light):
-        electrons = rng.poisson(efficiency * light[:, None, None, None], (22, 2, size, size))
+        rate, collected = (x[:, None, None, None] for x in (efficiency * light, 3.0 * times))
+        electrons = rng.poisson(rate * gains + collected, (22, 2, size, size))
         noisy = black + gain * electrons + dark * rng.standard_normal(electrons.shape)
         return np.clip(np.rint(noisy), 0, 4095).astype(np.uint16)
 
@@ -149,9 +152,14 @@ def test_a_camera_of_counted_photons(benchmarks_here):
         found = row[kind]
         assert [*found["estimate"].values()][:4] == pytest.approx(known, rel=0.02)
         assert found["signal"][10] == pytest.approx(gain * efficiency * photons[10], rel=1e-3)
-        assert max(map(abs, [*found["estimate"].values()][6:])) < 0.2  # linear [%]
+        assert max(map(abs, [*found["estimate"].values()][6:8])) < 0.2  # linear [%]
+        assert found["estimate"]["PRNU1288"] == pytest.approx(1.0, rel=0.05)
+        dark_current = 3e9 * (kind == "real")  # its mean is subtracted
+        assert found["estimate"]["u_I_mean"] == pytest.approx(dark_current, rel=0.05, abs=2e8)
         assert found["estimate"]["u_p_sat"] == pytest.approx(3995 / gain / efficiency, abs=2001)
     assert len(row["real"]["signal"]) == 21
+    camera = get_camera(f"emva:{benchmarks_here}/mine.npz?prnu=0.1")
+    assert (camera.prnu, camera.dark_current) == (0.1, pytest.approx(3e9, rel=0.05))
 
 
 # -- measures -------------------------------------------------------------------------------------

@@ -339,7 +339,9 @@ def simulate_source_raw(
     k, camera = scene.box_factor, scene.camera
     light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
     noise = noise_generator(seed, number, iso, ev)
-    taken = ReferenceCamera(camera, box_factor=k).record(light, settings.iso, noise)
+    taken = ReferenceCamera(camera, box_factor=k).record(
+        light, settings.iso, noise, settings.exposure_time
+    )
     raw = RawImage(taken, settings, camera, white_balance=scene.white_balance, box_factor=k)
     known = Scene.from_raw(raw, scene_id=scene.scene_id)
     return replace(

@@ -335,8 +335,9 @@ def index_recorded(
     """Every capture under `folder`, by scene, frame and settings; hidden folders are left out.
 
     So is ground truth, with ``gt`` or ``ground_truth`` in a name of its path. `known` are settings
-    by name that the files do not state; those that they do come first. A `ValueError` if there is
-    no capture, one does not state its settings, or a table is wrong.
+    by name that the files do not state; those that they do come first. Warnings count the files
+    that do, and rows of tables without a file. A `ValueError` if there is no capture, one does not
+    state its settings, or a table is wrong.
     """
     tables = _read_tables(folder)
     paths = visible_files(folder, sorted(folder.rglob("*")), (*RAW_SUFFIXES, *PICTURE_SUFFIXES))
@@ -350,6 +351,19 @@ def index_recorded(
             f"`scenes` (='recorded:{folder}') must be an existing folder that has captures: raws "
             f"({', '.join(RAW_SUFFIXES[:6])} ...) or pictures ({PICTURE_SUFFIXES[0]} ...)"
         )
+    for name, value in known.items():
+        own = [f for f in found if abs(getattr(f.settings, name) / value - 1.0) > SAME]
+        if own:
+            count = f"{len(own)} of {len(found)} files state another"
+            logger.warning(f"`{name}` (={value:g}): {count}, which counts: {str(own[0].path)!r}")
+    places = set[Path]()
+    for path in paths:
+        for place in [path, *path.parents][: len(path.relative_to(folder).parts)]:
+            places |= {place, place.with_suffix("")}
+    names, rows = {p.name for p in places}, [row for row in tables if isinstance(row, Path)]
+    if lacking := [row for row in rows if row not in places and row.name not in names]:
+        count = f"{len(lacking)} of {len(rows)} rows of tables name no file that there is"
+        logger.warning(f"{str(folder)!r}: {count}, such as {str(lacking[0])!r}")
     return sorted(found, key=lambda file: (file.sequence, file.frame, file.scene, file.settings))
 
 

@@ -88,6 +88,7 @@ class Captures:
     #: from light without noise.
     source_noise: Sequence[NoiseLevelFunction] | None = None
     noisy: bool = True  #: whether the captures have noise
+    prnu: float = 0.0  #: `CameraProfile.prnu`, of native pixels
     #: How many pixels have which extent of blur; None where all have `blur_px`.
     pixel_blur: PixelBlur | None = None
     #: (B, K) float64, EV100s that are equally likely the right one; None where the incident light
@@ -136,8 +137,8 @@ class Captures:
     def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
         """Variance of a native pixel's noise in the captures, at the recorded `signal`.
 
-        The camera's own at the settings, or the source's where it has more. `signal` is
-        (B, 4, ...), at least 0, white is 1.
+        The camera's own at the settings, or the source's where it has more; and what pixels differ
+        by. `signal` is (B, 4, ...), at least 0, white is 1.
         """
         variance = torch.zeros_like(signal)
         if not self.noisy:
@@ -148,7 +149,7 @@ class Captures:
                 shot = torch.tensor([n.shot for n in noises]).reshape(shape).to(signal)
                 read = torch.tensor([n.read for n in noises]).reshape(shape).to(signal)
                 variance = variance.maximum(signal * shot + read)
-        return variance
+        return variance + (self.prnu * signal).square() if self.prnu else variance
 
     @cached_property
     def ev100(self) -> torch.Tensor:
@@ -306,8 +307,7 @@ class SceneCaptures:
         self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool
     ) -> None:
         self.camera, self.states, self.noisy = camera, list(states), noisy
-        nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in states}}
-        self._nlf = [nlfs[s.iso] for s in states]
+        self._nlf = camera.nlfs(states)
         numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
         self._times, self._f_numbers, self._log2_exposures = np.array(numbers).T
         # (K, 2) times and f-numbers of states that differ in them, and (S,) which each state has.
@@ -369,6 +369,7 @@ class SceneCaptures:
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
             source_noise=source_noise,
             noisy=self.noisy,
+            prnu=self.camera.prnu,
             pixel_blur=pixel_blur,
             likely_ev=likely,
         )

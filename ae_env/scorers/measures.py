@@ -295,9 +295,10 @@ class SignalToNoise:
     """Signal-to-noise ratio of native pixels by the noise level function, in dB.
 
     Mean over pixels and planes of ``10 log10(min(x, 1)^2 / (shot x + read))``, each held to 0 to
-    50 dB, over 50 dB; x is the noise-free signal before blur and clip. The noise is that of the
-    sensor's own pixels, not of the box-averaged frame. 50 dB is about what a full-frame sensor
-    reaches at white at ISO 100 (Nikon Z6: 51.3 dB).
+    50 dB, over 50 dB; the camera's PRNU adds ``(prnu x)^2`` to the variance. x is the noise-free
+    signal before blur and clip. The noise is that of the sensor's own pixels, not of the
+    box-averaged frame. 50 dB is about what a full-frame sensor reaches at white at ISO 100 (Nikon
+    Z6: 51.3 dB).
     """
 
     domain: Domain = "raw"
@@ -309,6 +310,7 @@ class SignalToNoise:
         read = torch.tensor([n.read for n in captures.nlf])[:, :, None, None]
         light = captures.light.clamp(min=0.0)
         variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
+        variance = variance.add_((captures.prnu * light).square_()) if captures.prnu else variance
         power = light.clamp_(max=1.0).square_().div_(variance)
         decibels = power.clamp_(min=1.0).log10_().mul_(10.0).clamp_(max=self.ceiling_db)
         return decibels.mean(dim=(1, 2, 3), dtype=torch.float64) / self.ceiling_db

@@ -86,9 +86,8 @@ class TermScores:
         #: Whether every part's expectation has one, so that no noise is drawn for it.
         self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
         self.captures = SceneCaptures(camera, states, noisy=noise)
-        isos = sorted({state.iso for state in states})
-        noises = [camera.nlf(iso) for iso in isos]
-        self._which = np.array([isos.index(state.iso) for state in states])
+        noises = [*dict.fromkeys(each := camera.nlfs(states))]
+        self._which = np.array([noises.index(nlf) for nlf in each])
         self._shot_read = np.array([[n.shot, n.read] for n in noises])[self._which]  # (S, 2, 4)
         self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
         self._dark = Shadows().shares(_SIGNALS).numpy()
@@ -152,6 +151,7 @@ class TermScores:
             if source_noise is not None:
                 other = source_noise[:, 0, :, None] * light + source_noise[:, 1, :, None]
                 variance = np.maximum(variance, other)
+            variance += (self.camera.prnu * light) ** 2
         shares: np.ndarray = Noise().shares(_SIGNALS, torch.from_numpy(variance).float()).numpy()
         return shares
 

@@ -7,6 +7,7 @@ more gain, and with more motion blur. What the detector finds in the picture its
 from __future__ import annotations
 
 import glob
+import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +31,9 @@ from simulator import CameraProfile
 from simulator.raw.develop import develop_inverse
 from simulator.settings import CameraSettings
 from simulator.utils.checks import import_extra
-from simulator.utils.files import open_picture
+from simulator.utils.files import RAW_SUFFIXES, open_picture
+
+logger = logging.getLogger(__name__)
 
 #: From a picture (H, W, 3) uint8 sRGB to what is in it: a truth value, a label, or a list of them.
 Detector = Callable[[np.ndarray], Any]
@@ -133,7 +136,10 @@ def load_detector(name: str) -> Detector:
     file = split_file_name(name)
     if file is None:
         raise ValueError(f"{rule} must be 'codes', 'tags', 'model.onnx' or 'my_file.py:Name'")
-    found = load_from_file(*file, rule, example="MyDetector")
+    try:
+        found = load_from_file(*file, rule, example="MyDetector")
+    except ValueError as error:
+        raise ValueError(f"{error}; built in are 'codes' and 'tags'") from error
     made = found() if isinstance(found, type) else found
     if not callable(made):
         raise ValueError(f"{rule} must be callable, got {type(made).__name__}")
@@ -144,22 +150,36 @@ def picture_scenes(what: str, camera: CameraProfile, size: int) -> list[Scene]:
     """Scenes of a file, folder or glob of pictures, or else of raws and radiance maps.
 
     Pictures are averaged until their longer side has at most `size` pixels; their white is the
-    sensor's. Of raws the central square counts, and the networks take the noise out.
+    sensor's. Of raws the central square counts, and the networks take the noise out. Those that
+    cannot be read are left out; a `ValueError` if none is left.
     """
     path = Path(what).expanduser()
     files = sorted(path.iterdir()) if path.is_dir() else [Path(f) for f in sorted(glob.glob(what))]
-    pictures = [f for f in files or [path] if f.suffix.lower() in _ENDINGS]
-    if not pictures:
-        scenes = load_scenes(what, "all", camera=camera, resolution=size)
-        return [SceneNetworks("compact").denoised(scene) for scene in scenes]
-    found, plain = [], replace(camera, colour_matrix=None)
-    for file in pictures:
-        with open_picture(file) as opened:
-            picture = ImageOps.exif_transpose(opened).convert("RGB")
-        picture = picture.reduce(math.ceil(max(picture.size) / size))
-        light = develop_inverse(_planes(np.asarray(picture)))[0]
-        found.append(Scene.from_array(light, _REFERENCE, plain, scene_id=file.name))
+    of_kind = ([f for f in files if f.suffix.lower() in k] for k in (_ENDINGS, RAW_SUFFIXES))
+    found, faults, given = list[Scene](), list[str](), next(filter(None, of_kind), [path])
+    for file in given:
+        try:
+            found += _scenes_of(file, camera, size)
+        except ValueError as error:
+            faults.append(str(error).replace("`scenes`", "`pictures`"))
+    if not found:
+        raise ValueError(f"`pictures` (={what!r}) must have one that can be read: {faults[0]}")
+    if faults:
+        count = f"{len(faults)} of {len(given)} pictures are left out"
+        logger.warning(f"{count}, as they cannot be read, such as: {faults[0]}")
     return found
+
+
+def _scenes_of(file: Path, camera: CameraProfile, size: int) -> list[Scene]:
+    if file.suffix.lower() not in _ENDINGS:
+        scenes = load_scenes(str(file), "all", camera=camera, resolution=size)
+        return [SceneNetworks("compact").denoised(scene) for scene in scenes]
+    with open_picture(file) as opened:
+        picture = ImageOps.exif_transpose(opened).convert("RGB")
+    picture = picture.reduce(math.ceil(max(picture.size) / size))
+    light = develop_inverse(_planes(np.asarray(picture)))[0]
+    plain = replace(camera, colour_matrix=None)
+    return [Scene.from_array(light, _REFERENCE, plain, scene_id=file.name)]
 
 
 def _planes(picture: np.ndarray) -> torch.Tensor:

@@ -64,7 +64,7 @@ class Schedules:
         self.counts = np.stack([(self.states == s).sum(axis=1) for s in range(len(grid))], axis=1)
         self.frames = (self.states >= 0).sum(axis=1)
         self.longest = np.where(self.counts > 0, exposures, 0.0).max(axis=1)
-        nlfs = [camera.nlf(s.iso).scaled(1.0 / box_factor**2) for s in grid]
+        nlfs = [nlf.scaled(1.0 / box_factor**2) for nlf in camera.nlfs(grid)]
         self.shot = np.array([np.mean(n.shot) for n in nlfs])
         self.read = np.array([np.mean(n.read) for n in nlfs])
         self.precision = lru_cache(maxsize=64)(self._precision)

@@ -91,6 +91,9 @@ class StateChooser:
         for name, cap in caps.items():
             if cap is not None:
                 values = np.array([getattr(s, name) for s in grid.states])
+                if name == "iso" and cap < (least := values.min()) * (1.0 - 1e-6):
+                    rule = f"must be at least {least:g}, the grid's lowest ISO speed"
+                    raise ValueError(f"`iso_cap` (={cap:g}) {rule}")
                 self.over_cap += np.maximum(np.log2(values / cap) - 1e-6, 0.0)
         wanted = []  # by hand
         if program in ("A", "M"):

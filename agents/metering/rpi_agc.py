@@ -154,7 +154,7 @@ def read_tuning(path: str | os.PathLike[str]) -> Tuning:
         content: Any = json.loads(read_bounded(Path(path).expanduser()))
         entries = content.get("algorithms", [content])  # files of version 1 have no list
         found = next(e["rpi.agc"] for e in entries if isinstance(e, dict) and "rpi.agc" in e)
-        if found.get("channels"):
+        if "channels" in found:
             found, prefix = found["channels"][0], f"{prefix}channels.0."
         return Tuning.model_validate(found)
     except ValidationError as error:
@@ -162,7 +162,8 @@ def read_tuning(path: str | os.PathLike[str]) -> Tuning:
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{name} must be a JSON file: {error}") from error
     except (AttributeError, LookupError, TypeError, StopIteration):
-        raise ValueError(f"{name} must have an entry 'rpi.agc' in its 'algorithms'") from None
+        rule = "an entry 'rpi.agc' in its 'algorithms', with one of 'channels' if it has them"
+        raise ValueError(f"{name} must have {rule}") from None
 
 
 @dataclass

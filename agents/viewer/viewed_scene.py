@@ -268,8 +268,9 @@ class ViewedScene:
         """The numbers about `capture`, which `view` asked for."""
         with self._lock:
             settings, height = view.settings, self.scene.light.shape[1]
-            noise = self.scene.camera.nlf(settings.iso)
-            variance = noise.read[1] + noise.shot[1] * MID_GREY
+            camera = self.scene.camera
+            noise = camera.nlf(settings.iso, settings.exposure_time)
+            variance = noise.read[1] + noise.shot[1] * MID_GREY + (camera.prnu * MID_GREY) ** 2
             values = capture.reshape(4, -1)
             counts = [torch.histc(plane, BINS, 0.0, 1.0).numpy() for plane in values]
             return Readout(

@@ -42,7 +42,10 @@ from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
-_STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "vignetting", "noise")
+_STEPS = (
+    *("noise_reduction", "aperture", "defocus", "motion_blur"),
+    *("vignetting", "pixel_response", "noise"),
+)
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
@@ -205,7 +208,10 @@ class CaptureBatch:
         places = self._frames.places(sources)
         if self._any_blurs:
             places = np.where(self._blurs[rows], self._blurred[rows], places)
-        return Transitions(self._frames.at(places), self._table[rows], remaining)
+        found = Transitions(self._frames.at(places), self._table[rows], remaining)
+        if not self.camera.prnu or self.noise is None:
+            return found
+        return found.seen_by([self.prepared_scene(i).response for i in indices.tolist()])
 
     def record(
         self,
@@ -313,7 +319,8 @@ class CaptureBatch:
             runs = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0, darkened > 0
             bits = (_BIT[name] for name in ("defocus", "motion_blur", "vignetting"))
             found = sum(bit * own for bit, own in zip(bits, runs, strict=True))
-            self._modules[planned] = found + (self.noise is not None) * _BIT["noise"]
+            own = _BIT["noise"] + bool(self.camera.prnu) * _BIT["pixel_response"]
+            self._modules[planned] = found + (self.noise is not None) * own
             self._blurs[planned] = np.logical_or.reduce(runs)
             self._excess_variance[planned] = 0.0
         self._any_blurs |= bool(self._blurs[rows].any())

@@ -21,7 +21,6 @@ from simulator.capture.decision import (
     STREAK_TO_DISC,
     Exposure,
     Origin,
-    averaged_nlf,
     decide,
     weigh_blurs,
 )
@@ -58,9 +57,7 @@ def state_columns(states: Sequence[CameraSettings]) -> np.ndarray:
 
 def noise_columns(camera: CameraProfile, states: Sequence[CameraSettings], box: int) -> np.ndarray:
     """(S, 2, 4) shot and read noise of captures, `box` squared sensor pixels averaged."""
-    noises = {iso: averaged_nlf(camera, iso, box) for iso in {state.iso for state in states}}
-    numbers = {iso: (noise.shot, noise.read) for iso, noise in noises.items()}
-    return np.array([numbers[state.iso] for state in states])
+    return np.array([(nlf.shot, nlf.read) for nlf in camera.nlfs(states)]) * (1.0 / box**2)
 
 
 def fits_columns(scene: PreparedScene, states: np.ndarray) -> bool:

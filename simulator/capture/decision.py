@@ -58,9 +58,11 @@ Origin = tuple[DenoisedLight | None, float | None]
 
 
 @functools.lru_cache(maxsize=4096)
-def averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
+def averaged_nlf(
+    camera: CameraProfile, iso: float, exposure_time: float, box_factor: int
+) -> NoiseLevelFunction:
     """Noise of `box_factor` squared sensor pixels averaged."""
-    return camera.nlf(iso).scaled(1.0 / box_factor**2)
+    return camera.nlf(iso, exposure_time).scaled(1.0 / box_factor**2)
 
 
 class Step(NamedTuple):
@@ -112,7 +114,8 @@ class Exposure:
     #: Whether a capture is wanted; else the light without noise, in which that of the source cannot
     #: count as part of the target's.
     noise: bool = True
-    #: Noise reduction, aperture, defocus, motion blur, vignetting, in the order in which they run.
+    #: Noise reduction, aperture, defocus, motion blur, vignetting, pixel response, in the order in
+    #: which they run; of the last two those that there are.
     steps: tuple[Step, ...] = field(default=(), compare=False)
 
     @cached_property
@@ -158,7 +161,8 @@ def decide(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
 ) -> Exposure:
     """The exposure of a capture; see `PreparedScene.exposure`."""
-    target = averaged_nlf(scene.camera, settings.iso, scene.box_factor)
+    time = settings.exposure_time if scene.camera.dark_current else 0.0
+    target = averaged_nlf(scene.camera, settings.iso, time, scene.box_factor)
     f_number = settings.effective_f_number
     ratio = 2.0 ** (settings.log2_exposure - scene.reference.log2_exposure)
     ratio = min(scene.gain * gain * ratio, RATIO_LIMIT)
@@ -173,7 +177,7 @@ def decide(
     wanted = _Wanted(scene, ratio, target, noise, extents, path is None, opens)
     noise_reduction = _decide_noise_reduction(wanted)
     denoised = noise_reduction.network
-    aperture, defocus, motion_blur = _decide_blurs(wanted, noise_reduction)
+    aperture, defocus, motion_blur = blurs = _decide_blurs(wanted, noise_reduction)
     defocus_px = defocus.extent if defocus.runs else 0.0
     moves, vignetting = motion_blur.runs, scene.vignetting(f_number)
     subject_path = subject_path if moves else None
@@ -191,7 +195,7 @@ def decide(
         lens=scene.lens,
         vignetting=vignetting,
         noise=noise,
-        steps=(noise_reduction, aperture, defocus, motion_blur, *_vignetting(scene, f_number)),
+        steps=(noise_reduction, *blurs, *_vignetting(scene, f_number), *_response(scene, noise)),
     )
     if exposure.source.is_zero:
         return exposure
@@ -358,6 +362,18 @@ def _vignetting(scene: PreparedScene, f_number: float) -> list[Step]:
         source = lens.corner_loss(scene.reference.effective_f_number)
         reason += f", {source:.2g} in the source"
     return [Step(name, True, reason)]
+
+
+def _response(scene: PreparedScene, noise: bool) -> list[Step]:
+    """What photosites differ by, if they do; see `PreparedScene.response`."""
+    name, prnu = "pixel_response", scene.camera.prnu
+    if not prnu:
+        return []
+    if not noise:
+        return [Step(name, False, "only the light is wanted")]
+    if not scene.nlf.is_zero:
+        return [Step(name, False, "the source has the pattern of its own sensor")]
+    return [Step(name, True, f"the gains of photosites differ by {prnu:.2%}")]
 
 
 @functools.cache

@@ -43,6 +43,7 @@ _OPERATIONS = {
     "aperture": 4,
     "motion_blur": 6,
     "vignetting": 1,
+    "pixel_response": 1,
     "noise": 14,
     "clip_and_quantise": 6,
 }

@@ -17,7 +17,14 @@ from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.columns import plan_sweep
 from simulator.capture.decision import DEFAULT_TOLERANCE, Exposure, check_tolerance, decide, disc_px
 from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
-from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
+from simulator.capture.sensor import (
+    Noise,
+    Transitions,
+    exposed_light,
+    pixel_response,
+    record,
+    sweep_keys,
+)
 from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.optics.motion import ALONG_ROWS, Movement
@@ -133,6 +140,16 @@ class PreparedScene:
         height, width = self.light.shape[-2:]
         return self.lens.illumination(f_number, (height, width), source)
 
+    @property
+    def response(self) -> torch.Tensor | None:
+        """(4, H, W) gains of the photosites relative to their mean; None where all are 1.
+
+        The pattern of a source with noise is in its light already.
+        """
+        if not self.camera.prnu or not self.nlf.is_zero:
+            return None
+        return pixel_response(self.camera, tuple(self.light.shape), self.box_factor)
+
     def __repr__(self) -> str:
         _, height, width = self.light.shape
         return f"PreparedScene({height} x {width} packed, {self.reference}, {self.camera.name})"
@@ -199,7 +216,7 @@ class PreparedScene:
         """
         exposure = self.exposure(settings)
         source = exposure.source_noise.scaled(float(self.box_factor**2))
-        return self.camera.nlf(settings.iso).at_least(source)
+        return self.camera.nlf(settings.iso, settings.exposure_time).at_least(source)
 
     # -- captures -----------------------------------------------------------------------------
 
@@ -296,7 +313,8 @@ class PreparedScene:
             lights = self.blurred_light.lights(origins[some], blurs[some], owners)
             lights = [light.contiguous() for light in lights]
             shares = None if remaining is None else remaining[some]
-            yield some, Transitions(lights, table[some], shares)
+            found = Transitions(lights, table[some], shares)
+            yield some, found.seen_by([self.response] * len(lights)) if noise else found
 
     def _frames(self, count: int, out: torch.Tensor | None) -> torch.Tensor:
         """Memory for `count` frames, `out` if that fits."""

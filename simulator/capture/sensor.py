@@ -27,6 +27,7 @@ where the read noise has rows and tails, the steps run one by one.
 from __future__ import annotations
 
 import functools
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -162,6 +163,18 @@ def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> n
     return _normals(np.array([key], np.uint64), shape, noise, torch.device("cpu"))[0].numpy()
 
 
+@functools.lru_cache(maxsize=8)
+def pixel_response(camera: CameraProfile, shape: tuple[int, ...], box_factor: int) -> torch.Tensor:
+    """Gains of the photosites relative to their mean, `shape` (4, H, W) float32, >= 0.
+
+    The pattern is a function of the camera's name: every frame of a body has it. Of `box_factor`
+    squared pixels averaged it is as many times weaker.
+    """
+    normals = frame_normals(zlib.crc32(camera.name.encode()), shape)
+    gains = 1.0 + np.float32(camera.prnu / box_factor) * normals
+    return torch.from_numpy(gains.clip(min=0.0))
+
+
 # -- a batch of frames ------------------------------------------------------------------------
 
 
@@ -213,6 +226,18 @@ class Transitions:
             share, known = gains[i].expand(-1, width), shares[i]
             shares[i] = (share if known is None else share * known).contiguous()
         return Transitions(lights, self.table, shares)
+
+    def seen_by(self, responses: Sequence[torch.Tensor | None]) -> Transitions:
+        """The same on sensors of these gains, (4, H, W) each; None for gains of 1."""
+        if all(gains is None for gains in responses):
+            return self
+        lights: Any = [
+            light if gains is None else light * gains.to(light.device)
+            for light, gains in zip(self.light, responses, strict=True)
+        ]
+        if isinstance(self.light, torch.Tensor):
+            lights = torch.stack(lights)
+        return replace(self, light=lights)
 
     def before_rounding(self, camera: CameraProfile) -> Transitions:
         """The same without the variance that rounding to whole digital numbers will add, 1/12.

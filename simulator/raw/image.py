@@ -79,7 +79,8 @@ class RawImage:
 
         A `ValueError` if neither is known.
         """
-        nlf = self.nlf if self.nlf is not None else self.camera.nlf(self.settings.iso)
+        own, nlf = self.settings, self.nlf
+        nlf = self.camera.nlf(own.iso, own.exposure_time) if nlf is None else nlf
         return nlf.scaled(1.0 / self.box_factor**2)
 
     @property

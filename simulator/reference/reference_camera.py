@@ -20,7 +20,7 @@ from torch import Tensor
 
 from simulator.camera import BayerPattern, CameraProfile
 from simulator.capture.decision import SIGNAL_LIMIT
-from simulator.capture.sensor import clip_and_quantise
+from simulator.capture.sensor import clip_and_quantise, pixel_response
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import plane_tensor
 from simulator.optics.flicker_integral import Lamp
@@ -293,8 +293,12 @@ class ReferenceCamera:
     def _black_offset(self, signal: Tensor) -> Tensor:
         return torch.tensor(self.body.black_offset).to(signal)[:, None, None]
 
-    def record(self, signal: Tensor, iso: float, generator: torch.Generator) -> Tensor:
+    def record(
+        self, signal: Tensor, iso: float, generator: torch.Generator, exposure_time: float = 0.0
+    ) -> Tensor:
         """Digital numbers of `signal` (..., 4, H, W), sensor white is 1; averaged after that.
+
+        In the `exposure_time` [s] the dark current is collected, whose mean is no signal.
 
         The variance of a sample is that of the camera's noise level function: the noise of the
         rounding to whole numbers is part of the calibrated read noise, and is not counted twice.
@@ -304,8 +308,12 @@ class ReferenceCamera:
         black, well = self._black_offset(signal), self._well(signal, iso)
         # Light far above a full well fills it in any case; its photon count would overflow.
         light = torch.minimum((signal - black).clamp(min=0.0), 2.0 * well)
+        if self.camera.prnu:
+            light = light * pixel_response(self.camera, tuple(signal.shape[-3:]), 1)
         electrons = torch.where(shot > 0, 1.0 / shot, 1.0)  # per unit of signal
-        counted = torch.poisson(light * electrons, generator=generator) / electrons
+        dark = self.camera.dark_current * exposure_time
+        counted = torch.poisson(light * electrons + dark, generator=generator) - dark
+        counted = counted / electrons
         collected = torch.minimum(torch.where(shot > 0, counted, light), well)
         span = torch.tensor(self.camera.span).to(signal)[:, None, None]
         rounding = 1.0 / (12.0 * span**2)
@@ -356,5 +364,5 @@ class ReferenceCamera:
             light = self.blurred_light(scene, settings.f_number)
         signal = self.expose(light, scene.reference, settings, lamp=lamp, start=start)
         generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
-        sample = self.record(signal, settings.iso, generator)
+        sample = self.record(signal, settings.iso, generator, settings.exposure_time)
         return ReferenceCapture(self.clip(signal, settings.iso), sample, settings)

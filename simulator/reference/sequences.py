@@ -191,8 +191,8 @@ def _has_little_noise(sequences: SequenceOf[Sequence], pair: Pair, camera: Camer
     error = math.log2(grey / right) if grey > 0 else -math.inf
     if not _FAIR_ERROR[0] <= error <= _FAIR_ERROR[1]:
         return False
-    exposed = camera.nlf(source.iso).exposed(exposure_ratio(source, target))
-    return is_cleaner(camera.nlf(target.iso), exposed, grey)
+    own, wanted = camera.nlfs([source, target])
+    return is_cleaner(wanted, own.exposed(exposure_ratio(source, target)), grey)
 
 
 def is_cleaner(target: NoiseLevelFunction, source: NoiseLevelFunction, signal: float) -> bool:

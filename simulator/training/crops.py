@@ -142,10 +142,12 @@ class ReferencePairs:
             light = cut(self._blurred_light[_light_key(scene, settings)], k)
             light = light[[0, 2, 1, 3]] if transposed else light
             signal = self.camera.expose(light, scene.reference, settings)
-            return signal, self.camera.record(signal, settings.iso, generator)
+            time = settings.exposure_time
+            return signal, self.camera.record(signal, settings.iso, generator, time)
 
         _, noisy = record(source)
         signal, sample = record(target)
+        nlf = self.camera.camera.nlf(source.iso, source.exposure_time)
         known = scene.scene_id, source.aperture_stop
         if known not in self._defocus:
             self._defocus[known] = self.camera.blur_diameter(scene, source.effective_f_number)
@@ -154,7 +156,7 @@ class ReferencePairs:
             "target": self.camera.clip(signal, target.iso),
             "sample": sample,
             "defocus": cut(self._defocus[known]),
-            **stated_fields(source, target, self.camera.camera.nlf(source.iso).scaled(1.0 / k**2)),
+            **stated_fields(source, target, nlf.scaled(1.0 / k**2)),
         }
 
 

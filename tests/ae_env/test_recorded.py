@@ -259,18 +259,22 @@ def test_pictures_of_16_bits_keep_them(tmp_path: Path) -> None:
 
 
 def test_grids_of_other_people(tmp_path: Path, caplog) -> None:
-    """Folders that are bare numbers, ground truth, and shots at one setting."""
+    """Bare numbers as folders, ground truth, shots at one setting, and what does not count."""
     for time, settings in ((1, GRID[0]), (8, GRID[2])):
         write_picture(tmp_path / "desk" / f"{time}.0" / "17.png", settings)
     write_picture(tmp_path / "desk" / "gt" / "17.png", GRID[0])
     write_picture(tmp_path / "desk" / "8.0" / "17_GT.png", GRID[0])
     write_picture(tmp_path / "walk" / "4.0" / "3.png", GRID[0])
-    (scene,) = load(f"recorded:{tmp_path}?folder=exposure_ms&iso=100&f_number=4")
+    (tmp_path / "settings.csv").write_text("file,iso\ndesk/1.0,100\ngone.png,100\n")
+    known = "iso=103&f_number=4&exposure_time=7"  # 103 counts as 100
+    (scene,) = load(f"recorded:{tmp_path}?folder=exposure_ms&{known}")
     assert scene.scene_id == "desk/17"
     assert scene.recorded.shape[0] == len(scene.allowed) == 2  # 4 ms is no state
-    truth, single = caplog.messages
+    truth, time, row, single = caplog.messages
     assert "ground truth is left out, 2 of 5 files" in truth
     assert "1 of 2 recorded scenes have fewer than two states" in single
+    assert "`exposure_time` (=7): 3 of 3 files state another" in time
+    assert "1 of 2 rows of tables name no file" in row
     options = recorded.RecordedOptions.of(
         f"recorded:{tmp_path}?folder=exposure_us&iso=1&f_number=4"
     )

@@ -76,12 +76,18 @@ def test_things_that_are_not_found_to_begin_with_do_not_count(tmp_path):
         load_detector("nothing")
 
 
-def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path):
+def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path, caplog):
     (tmp_path / "own.py").write_text("def is_bright(picture):\n    return picture.mean() > 60\n")
     Image.fromarray(np.full((48, 64, 3), 128, np.uint8)).save(tmp_path / "grey.png")
-    options = f"{tmp_path}/own.py:is_bright", f"{tmp_path}/grey.png", "-o", str(tmp_path)
-    code, out, *_ = ae_env("latitude", *options)
-    assert (code, "over " in out) == (0, True)
+    (tmp_path / "bad.jpg").write_bytes(b"no picture")
+    own, out = f"{tmp_path}/own.py:is_bright", ("-o", str(tmp_path))
+    code, said, *_ = ae_env("latitude", own, str(tmp_path), *out)
+    assert (code, "over " in said) == (0, True)
+    assert "1 of 2 pictures are left out" in caplog.messages[0]
+    for wrong in (f"{tmp_path}/bad.jpg", "nowhere"):
+        error = ae_env("latitude", own, wrong, *out)[2]
+        assert ("`pictures` (=" in error, "`scenes`" in error) == (True, False)
+    assert "'codes' and 'tags'" in ae_env("latitude", own + "er", wrong, *out)[2]
     assert (tmp_path / "latitude.csv").read_text().startswith("axis,value,noise,share,low,high")
     with Image.open(tmp_path / "latitude.png") as plot:
         assert plot.width > 300

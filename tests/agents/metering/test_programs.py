@@ -66,6 +66,8 @@ def best(found: StateChooser, target: float, preference=0.0) -> list[int]:
 )
 def test_states_that_fit_best(program, options, target, states):
     assert best(chooser(program, **options), target) == states
+    with pytest.raises(ValueError, match=r"`iso_cap` \(=50\) must be at least 100, the grid's low"):
+        chooser(program, iso_cap=50)
 
 
 def test_what_comes_first_in_the_choice_of_a_state():
@@ -501,7 +503,7 @@ def test_a_tuning_file_decides(context, photograph, tmp_path, agc):
         ),
         ({"channels": [{**CORNER, "speed": 2}]}, r"rpi.agc.channels.0.speed \(=2\)"),
         ({**CORNER, "metering_modes": {"a": {"weights": [1] * 16}}}, "a.weights .* 15 or 225"),
-        (None, "must have an entry 'rpi.agc'"),
+        *[(None, "must have an entry 'rpi.agc'"), ({"channels": []}, "one of 'channels' if")],
         (CORNER, r"`mode` \(='short'\) must be one of 'slow'"),
     ],
 )

@@ -1,14 +1,18 @@
-"""Vignetting: lensfun's model and database, and frames that have it."""
+"""Vignetting: lensfun's model and database, and frames that have it; PRNU and dark current."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from ae_env import ExposureGrid, Scene, ScoreTables, make_scorer
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, get_camera
+from simulator.camera import CameraProfile
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.optics.vignetting import Vignetting, get_lens, random_lens
 from simulator.reference.reference_camera import ReferenceCamera
 from tests.ae_env.environments import SMALL, make_env, make_envs
@@ -147,7 +151,8 @@ def test_the_reference_camera_has_the_same_lens():
 
 
 def frames(device=None, **arguments):
-    envs = make_envs(3, noise=False, observation="linear", device=device, **arguments)
+    options = {"noise": False, "observation": "linear", **arguments}
+    envs = make_envs(3, device=device, **options)
     yield envs.reset(seed=5)[0]["raw"]
     for state in (0, 21, 42, 63):
         yield envs.step(np.full(3, state))[0]["raw"]
@@ -184,3 +189,55 @@ def test_each_episode_draws_a_lens_and_its_scores_know_it():
 def test_recorded_scenes_have_their_own_lens(tmp_path):
     with pytest.raises(ValueError, match="lens"):
         make_env(**(SMALL | {"scenes": f"recorded:{tmp_path}", "lens": "random"}))
+
+
+#: 10,000 electrons at white and ISO 100, 5 electrons of read noise, 800 a second in the dark.
+NLF, CLEAN = NoiseLevelFunction((1e-4,) * 4, (2.5e-7,) * 4), NoiseLevelFunction.zero()
+BODY = CameraProfile("body", "RGGB", 4096, 65535, 16, nlf_by_iso={100.0: NLF})
+PIXELS, SECOND = replace(BODY, prnu=0.02, dark_current=800.0), CameraSettings(100, 1.0, 4)
+
+
+@pytest.mark.parametrize("case", [(0.0, 4.0, 1), (0.5, 1.0, 4), (0.5, 1 / 64, 1), (0.02, 4.0, 4)])
+def test_the_pattern_stays_and_dark_electrons_do_not(case):
+    signal, time, box = case
+    light, settings = torch.full((4, 64, 64), signal), CameraSettings(100, time, 4)
+    scene = PreparedScene(light, settings, PIXELS, CLEAN, box_factor=box)
+    reference, large = ReferenceCamera(PIXELS, box_factor=box), light.repeat(1, box, box)
+    generator, patterns = torch.Generator().manual_seed(0), []
+    for taken in (
+        [scene.capture(settings, seed)[0] for seed in range(24)],
+        [reference.record(large, 100.0, generator, time) for _ in range(24)],
+    ):
+        mean, noise = np.mean(taken, axis=0), float(np.var(taken, axis=0, ddof=1).mean())
+        assert mean.mean() == pytest.approx(signal, rel=1e-3, abs=1e-4)
+        electrons = 1e4 * signal + 800 * time + 25
+        assert noise == pytest.approx(electrons / 1e8 / box**2, rel=0.02)
+        fixed = mean.var(axis=(1, 2)).mean() - noise / 24
+        assert fixed == pytest.approx((0.02 * signal / box) ** 2, rel=0.06, abs=2e-3 * noise)
+        patterns.append(mean.ravel())
+    assert np.corrcoef(patterns)[0, 1] > 0.9 or box > 1 or not signal  # one for both
+
+
+def test_raws_keep_the_pattern_of_their_sensor():
+    scene = PreparedScene(torch.full((4, 64, 64), 0.9), SECOND, PIXELS, CLEAN)
+    raw = RawImage(scene.capture(SECOND)[0], SECOND, camera=PIXELS)
+    again = CameraSimulator(device="cpu").prepare(raw)
+    half, _ = again.capture(replace(SECOND, iso=50), 1)
+    wanted = math.hypot(0.02 * 0.45, (9000 + 800 + 25) ** 0.5 / 2e4)
+    assert float(half.std()) == pytest.approx(wanted, rel=0.05)
+    assert "pixel_response" in again.plan(SECOND).left_out
+    assert "pixel_response" not in str(replace(scene, camera=BODY).plan(SECOND).steps)
+
+
+def test_score_tables_and_environments_know_both():
+    grid = ExposureGrid((100.0,), (1 / 4, 2.0), (4.0,))
+    scene = Scene.from_array(np.full((4, 16, 16), 0.4, np.float32), SECOND, BODY, scene_id="flat")
+    table = ScoreTables(grid, PIXELS, make_scorer("noise")).table(scene)
+    for state, score in zip(grid, table.mean, strict=True):
+        signal, dark = 0.4 * state.exposure_time, 800 * state.exposure_time
+        snr = signal / math.hypot((1e4 * signal + dark + 25) ** 0.5 / 1e4, 0.02 * signal)
+        assert score == pytest.approx(1 / (1 + (18 / snr) ** 1.5), abs=5e-3)
+    cameras = (("nikon_z6?prnu=0.2", None), ("nikon_z6?prnu=0.2", "cpu"), ("nikon_z6", None))
+    found = [np.asarray(next(frames(d, camera=c, noise="bank"))) for c, d in cameras]
+    np.testing.assert_allclose(found[0], found[1], atol=1e-3)
+    assert np.abs(found[0] - found[2]).max() > 1e-3
