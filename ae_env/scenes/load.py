@@ -10,7 +10,8 @@ What `scenes=` may be:
   such views and the procedural scenes of ``"bundled:large"``, as many of each; ``"mixed:10"``:
   views of 10 of the places only;
 - any of these, or a file of light without noise, with ``"?codes"`` or ``"?tags"`` behind it:
-  codes are drawn into every scene (`ae_env.scenes.ladder`); ``"?codes=7"`` draws others;
+  codes are drawn into every scene (`ae_env.scenes.ladder`); ``"?codes=7"`` draws others,
+  ``"?codes=7,8"`` each scene twice;
 - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
 - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
   given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
@@ -119,11 +120,18 @@ def load_scenes(
         grid: States of recorded grids; by default all that their captures have.
     """
     if isinstance(spec, str) and (drawn := _LADDER.fullmatch(spec)):
-        if not re.fullmatch(r"\d{1,18}", drawn[3] or "0"):
-            raise ValueError(f"`scenes?{drawn[2]}` (={drawn[3]!r}) must be a whole number >= 0")
+        seeds = (drawn[3] or "0").split(",")
+        if not all(re.fullmatch(r"\d{1,18}", seed) for seed in seeds) or len({*seeds}) < len(seeds):
+            rule = "must be a whole number >= 0, or several with commas between them"
+            raise ValueError(f"`scenes?{drawn[2]}` (={drawn[3]!r}) {rule}")
         size: dict[str, Any] = {"resolution": resolution, "crop": crop, "resize": resize}
         plain = load_scenes(drawn[1], split, camera=camera, grid=grid, **size)
-        return [with_ladder(scene, drawn[2], int(drawn[3] or 0)) for scene in plain]
+        found = [[with_ladder(scene, drawn[2], int(seed)) for scene in plain] for seed in seeds]
+        return [
+            scene if seed == seeds[0] else replace(scene, scene_id=f"{scene.scene_id} {seed}")
+            for seed, scenes in zip(seeds, found, strict=True)
+            for scene in scenes
+        ]
     check_word("split", split, get_args(Split))
     named = isinstance(spec, str | Path | Mapping)
     if split == "validation" and named and spec not in REAL[:2]:

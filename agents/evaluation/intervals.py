@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -80,6 +80,46 @@ def difference_interval(
     tail = 50.0 * (1.0 - LEVEL)
     low, high = np.percentile(statistic, [tail, 100.0 - tail])
     return Interval(value, float(low), float(high), groups, seeds)
+
+
+def mean_rows(scores: Mapping[str, Sequence[float]], among: Sequence[str]) -> list[dict[str, Any]]:
+    """A row for each policy, the best first, of its scores in the same G source groups.
+
+    ``score`` is their mean, with its interval ``ci95``; ``more`` by how much that is above the mean
+    of the best policy of `among`, relative to it, with the paired interval ``more_ci95``.
+    """
+    known, rows = {name: np.array(own) for name, own in scores.items()}, []
+    best = max((known[name] for name in among), key=np.mean)
+    for name, own in sorted(known.items(), key=lambda pair: -pair[1].mean()):
+        alone, more = score_interval(own, np.ones_like(own)), difference_interval(own, best, best)
+        row = {"policy": name, "score": alone.value, "ci95": alone.pair}
+        rows.append(row | {"more": more.value, "more_ci95": more.pair})
+    return rows
+
+
+def rank_agreement(
+    first: Floats, second: Floats, *, resamples: int = RESAMPLES, seed: int = 0
+) -> Interval:
+    """Kendall's tau-b of the rankings of P policies by two measures, with its interval.
+
+    A ranking is by the mean over all groups. Both measures, ``(P, G)``, are of the same groups,
+    which are resampled together. 1: the same ranking; 0: unrelated ones; -1: one is the other
+    turned around.
+    """
+    (one, other), groups = np.triu_indices(len(first), 1), first.shape[1]
+
+    def tau(weights: Floats) -> Floats:
+        gaps = (weights @ (measure[one] - measure[other]).T for measure in (first, second))
+        a, b = (np.sign(np.where(np.abs(gap) > _ROUNDING, gap, 0.0)) for gap in gaps)  # (R, pairs)
+        return np.asarray((a * b).sum(1) / np.sqrt((a * a).sum(1) * (b * b).sum(1)))
+
+    value = float(tau(np.full((1, groups), 1.0 / groups))[0])
+    if groups < MIN_GROUPS:
+        return Interval(value, None, None, groups)
+    tail = 50.0 * (1.0 - LEVEL)
+    drawn = tau(group_weights(groups, resamples, seed) / groups)
+    low, high = np.percentile(drawn, [tail, 100.0 - tail])
+    return Interval(value, float(low), float(high), groups)
 
 
 @lru_cache(maxsize=16)

@@ -180,6 +180,13 @@ def test_names_of_scenes_take_ladders(monkeypatch):
     first, other = (load_scenes(f"bundled:small?codes{seed}", **options)[0] for seed in ("", "=7"))
     assert (first.scene_id, first.group) == (other.scene_id, other.group)
     assert first.ladder.texts != other.ladder.texts
+    both = load_scenes("bundled:small?codes=7,0", **options)
+    half = len(both) // 2
+    assert [both[i].ladder.texts for i in (0, half)] == [other.ladder.texts, first.ladder.texts]
+    assert [both[i].scene_id for i in (0, half)] == [first.scene_id, f"{first.scene_id} 0"]
+    for wrong in ("=7,7", "=7,", "=-1"):
+        with pytest.raises(ValueError, match=r"`scenes\?codes` .* whole number"):
+            load_scenes(f"bundled:small?codes{wrong}", **options)
     with pytest.raises(ValueError, match=r"`resolution` \(=64\) must be .*96"):
         load_scenes("bundled:small?codes", camera=CAMERA, resolution=64)
     noisy = plain(nlf=CAMERA.nlf(100))

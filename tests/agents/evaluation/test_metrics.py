@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from agents.evaluation import metrics
+from agents.evaluation import intervals, metrics
 from agents.evaluation.intervals import MIN_GROUPS, difference_interval, rank, score_interval
 
 EV = np.array([4.0, 4.05, 5.0, 6.0, 8.0])
@@ -191,6 +191,36 @@ def test_differences_far_beyond_the_noise_make_tiers():
     assert np.ptp(best.ci95) > 0.08
     assert np.ptp(low.to_best["simultaneous_ci95"]) < 0.04
     assert np.mean(low.to_best["simultaneous_ci95"]) == pytest.approx(low.to_best["difference"])
+
+
+def test_scores_are_compared_with_the_best_of_some():
+    (own,), _ = _data()
+    scores = {"low": own / 2, "third": own / 3, "best": own * 1.1}
+    best, low, third = intervals.mean_rows(scores, ("third", "low"))
+    assert [row["policy"] for row in (best, low, third)] == ["best", "low", "third"]
+    assert best["score"] == pytest.approx(1.1 * own.mean())
+    assert best["ci95"][0] < best["score"] < best["ci95"][1]
+    # Everywhere by the same factor: nothing is left to chance.
+    assert [best["more"], *best["more_ci95"]] == pytest.approx([1.2] * 3)
+    assert [third["more"], *third["more_ci95"]] == pytest.approx([-1 / 3] * 3)
+    assert low["more"] == 0.0
+
+
+def test_agreement_of_rankings_is_scipys_and_its_interval_that_of_the_groups():
+    rng = np.random.default_rng(2)
+    first = rng.random((7, 20)) + np.arange(7)[:, None] / 10
+    second = rng.random((7, 20)) + np.array([1, 0, 2, 3, 5, 4, 5])[:, None] / 10
+    second[6] = second[4]  # a tie
+
+    def tau(groups):
+        means = (np.round(own[:, groups].mean(axis=1), 9) for own in (first, second))
+        return scipy.stats.kendalltau(*means).statistic
+
+    found = intervals.rank_agreement(first, second)
+    assert found.value == pytest.approx(tau(np.arange(20)))
+    drawn = [tau(rng.integers(20, size=20)) for _ in range(2000)]
+    assert found.pair == pytest.approx(np.percentile(drawn, [2.5, 97.5]), abs=0.06)
+    assert intervals.rank_agreement(first, -first).value == -1.0
 
 
 def test_more_policies_widen_the_intervals_as_tukeys_range_does():
