@@ -11,8 +11,8 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Packages in the order of their layers: each imports those before it only.
 PACKAGES = ("simulator", "ae_env", "agents")
 #: A function is counted without its docstring.
-MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 42_058, 145, 60, 15
-MAX_LINES_OF = {"benchmarks": 7_151, "tests": 19_867}
+MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 42_208, 145, 60, 15
+MAX_LINES_OF = {"benchmarks": 7_151, "tests": 19_987}
 
 
 def module_name(path: Path) -> str:

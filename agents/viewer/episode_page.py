@@ -236,9 +236,8 @@ class EpisodePage(Tab):
             return
         frame = int(self._frame.value)
         self._holder.style(f"--now: {frame / max(self._last, 1):.4f}")
-        for x, image, facts, one in zip(
-            "AB", self._images, self._facts, self._recordings, strict=False
-        ):
+        shown = zip("AB", self._images, self._facts, self._recordings, strict=False)
+        for x, image, facts, one in shown:
             self.show(image, encoded(one.pictures[frame]))
             facts.text = (
                 f"{x} {one.name}: {self._grid[one.states[frame]]}, score "

@@ -138,10 +138,9 @@ class ExposurePage(Tab):
     @property
     def view(self) -> View:
         """State and marks of the picture that the page shows."""
+        scales = zip(_SCALES, self._settings, strict=True)
         return View(
-            CameraSettings(
-                *(v[int(s.value)] for v, s in zip(_SCALES, self._settings, strict=True))
-            ),
+            CameraSettings(*(values[int(slider.value)] for values, slider in scales)),
             speed=float(self._speed.value),
             defocus=float(self._defocus.value),
             clipping=bool(self._clipping.value),
@@ -204,10 +203,8 @@ class ExposurePage(Tab):
             return
         async with self._refreshing:
             with loading(self._spinner):
-                while (
-                    self.viewed and (asked := (self.viewed, self.view, self._kept)) != self._shown
-                ):
-                    await self._show(*asked)
+                while (asked := (self.viewed, self.view, self._kept)) != self._shown and asked[0]:
+                    await self._show(asked[0], asked[1], asked[2])
 
     async def _show(self, viewed: ViewedScene, view: View, kept: CameraSettings | None) -> None:
         picture = await run.io_bound(viewed.picture, view)
@@ -323,9 +320,8 @@ class ExposurePage(Tab):
         """Reads the sample below the pointer."""
         if self._shown is not None and self._picture is not None:
             viewed, view, _ = self._shown
-            self._facts["Photosite"].text = viewed.photosite(
-                view, self._picture.capture, *event.args
-            )
+            text = viewed.photosite(view, self._picture.capture, *event.args)
+            self._facts["Photosite"].text = text
 
     async def _draw(self) -> None:
         """Draws where a meter looks, over the whole picture."""

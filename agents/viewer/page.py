@@ -30,6 +30,7 @@ from simulator.utils.checks import did_you_mean
 
 #: Largest file that is taken [byte].
 LARGEST_UPLOAD = 300_000_000
+_TOO_LARGE = "A raw may have 300 MB at most."
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
 #: Tabs by their names in the page's address.
@@ -142,9 +143,7 @@ class Page:
                 auto_upload=True,
                 max_file_size=LARGEST_UPLOAD,
                 on_upload=_weakly(self._take_upload),
-                on_rejected=lambda: complain(
-                    f"A raw may have {LARGEST_UPLOAD // 10**6} MB at most."
-                ),
+                on_rejected=lambda: complain(_TOO_LARGE),
             ).classes("hidden")
             pick = partial(upload.run_method, "pickFiles")
             self._open = ui.button("Open raw", icon="upload", on_click=pick).props("dense")

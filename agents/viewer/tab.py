@@ -120,9 +120,8 @@ class Stage:
             self.tags = [ui.label(t).classes(f"tag {x}") for x, t in zip("AB", tags, strict=True)]
             ui.label().classes("scale")
         self._divider = ui.element("input").classes("divider")
-        self._divider.props(
-            f'type=range min=0 max=100 step=1 aria-label="divider of {tags[0]} and {tags[1]}"'
-        )
+        about = f"divider of {tags[0]} and {tags[1]}"
+        self._divider.props(f'type=range min=0 max=100 step=1 aria-label="{about}"')
         divide = "(e) => divide(e.target.parentElement.querySelector('.stage'), e.target.value)"
         self._divider.on("input", js_handler=divide)
         self.compare(None)

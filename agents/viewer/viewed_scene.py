@@ -288,10 +288,8 @@ class ViewedScene:
             noise = self.scene.camera.nlf(settings.iso)
             variance = noise.read[1] + noise.shot[1] * MID_GREY
             values = capture.reshape(4, -1)
-            stops = (
-                values.clamp(min=2.0 ** -(STOPS + 1)).masked_fill(values >= _AT_WHITE, 2.0).log2()
-            )
-            counts = [torch.histc(plane, BINS, -STOPS, 0.0).numpy() for plane in stops]
+            seen = values.clamp(min=2.0 ** -(STOPS + 1)).masked_fill(values >= _AT_WHITE, 2.0)
+            counts = [torch.histc(plane, BINS, -STOPS, 0.0).numpy() for plane in seen.log2()]
             table = self.table(view, settings)
             return Readout(
                 plan=self._part(view).plan(settings),
@@ -412,8 +410,9 @@ class ViewedScene:
         return part(down, height, WINDOW_SIZE[0]), part(right, width, WINDOW_SIZE[1])
 
     def _to_srgb(self, capture: torch.Tensor, view: View) -> np.ndarray:
-        stops, whole = view.settings.log2_exposure + self.scene.ev100, view.centre is None
-        gain = 2.0**-stops if view.equal_brightness else 1.0
+        whole, gain = view.centre is None, 1.0
+        if view.equal_brightness:
+            gain = 2.0 ** -(view.settings.log2_exposure + self.scene.ev100)
         raw = _raw(self.scene, view.settings, capture * gain)
         image = render_srgb(raw, "half" if whole else "malvar").permute(1, 2, 0).numpy()
         if view.clipping:
