@@ -433,11 +433,11 @@ def test_axe_finds_no_serious_fault_in_any_tab(page):
             page.get_by_role("tab", name=name).click()
             page.wait_for_timeout(500)
             assert faults() == []
-    page.get_by_label(re.compile("Draw metering weights")).fill("nonsense")
-    page.keyboard.press("Enter")
-    page.keyboard.press("Tab")  # closes the list
+    page.goto(page.url.replace("scene=", "scene=no-"))
+    page.wait_for_selector(".state.shown")
     page.get_by_role("button", name="Close").wait_for()
     assert faults() == []
+    page.get_by_role("button", name="Close").click()
     page.get_by_role("button", name="Scenes").click()
     page.locator(".thumb").first.wait_for()
     assert faults() == []
