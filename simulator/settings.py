@@ -24,7 +24,8 @@ _SECONDS = (
     0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.3, 1.6, 2, 2.5, 3, 3.2, 4, 5, 6, 8, 10, 13, 15, 20, 25, 30,
 )
 # fmt: on
-_NOMINAL_TIMES = (*(1.0 / n for n in _FRACTIONS), *_SECONDS)
+#: Marked exposure times [s].
+NOMINAL_TIMES = (*(1.0 / n for n in _FRACTIONS), *_SECONDS)
 
 
 @dataclass(frozen=True, order=True)
@@ -138,7 +139,7 @@ def snap_exposure_time(exposure_time: float) -> float:
     from every nominal stop is kept. Industrial cameras run at exactly what they say: use
     `CameraSettings` directly for them.
     """
-    nearest = min(_NOMINAL_TIMES, key=lambda n: abs(math.log(exposure_time / n)))
+    nearest = min(NOMINAL_TIMES, key=lambda n: abs(math.log(exposure_time / n)))
     if abs(exposure_time / nearest - 1.0) > SNAP_TOLERANCE:
         return exposure_time
     return 2.0 ** (round(3.0 * math.log2(nearest)) / 3.0)

@@ -38,6 +38,7 @@ SPOT_AREA = 0.04
 #: levels between which the brightest 2 % of the pixels should lie, corrected by so many EV at most.
 #: Chosen among ten or so settings on the bundled training scenes.
 MATRIX_ZONES, MATRIX_SIGMA = 5, 1.0
+_PROFILE = np.exp(-0.5 * ((np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2) / MATRIX_SIGMA) ** 2)
 TOP_SHARE, TOP_AT_LEAST, TOP_AT_MOST, CONSTRAINT_LIMIT_EV = 0.02, 0.5, 0.8, 3.0
 #: What the zones' logarithms and the constraints together read too low on the ordinary (not hard)
 #: training scenes, against the incident light [EV].
@@ -61,7 +62,7 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
 
     ``"centre_weighted"``: 75 % of the weight in the central circle of half the frame's height (the
     classic 12 mm circle of 35 mm cameras), the rest around it; ``"spot"``: a central circle of 4 %
-    of the area.
+    of the area; ``"matrix"``: the weights of the zones, of their logarithms.
 
     >>> round(float(weight_map("centre_weighted", 64, 64)[16:48, 16:48].sum()), 2)
     0.77
@@ -75,6 +76,9 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
         inside = radius <= CENTRE_DIAMETER / 2
         around = (1 - CENTRE_SHARE) / (~inside).sum()
         weights = np.where(inside, CENTRE_SHARE / inside.sum(), around)
+    elif name == "matrix":
+        row, column = (_PROFILE[np.arange(n) * MATRIX_ZONES // n] for n in (height, width))
+        weights = np.outer(row, column)
     else:
         area = SPOT_AREA * height * width / height**2  # in frame heights squared
         weights = (radius <= np.sqrt(area / np.pi)).astype(np.float64)
@@ -115,9 +119,7 @@ def matrix_reading(
     share = _zone_means(seen[None])  # (1, zones)
     known = np.where(share > 0.0, share, 1.0)
     level = np.log2(np.maximum(_zone_means(signal * seen) / known, BLACK_SIGNAL))
-    offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
-    profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
-    weights = np.outer(profile, profile).ravel() * share[0]
+    weights = np.outer(_PROFILE, _PROFILE).ravel() * share[0]
     weights /= weights.sum()
     saturated = _zone_means((signal >= WHITE_SIGNAL) & seen) / known @ weights
     reading = mean_reading(np.exp2(level @ weights), saturated, ev)

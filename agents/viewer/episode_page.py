@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 from nicegui import ui
 
 import ae_env  # noqa: F401  (registers the environments)
@@ -21,9 +22,9 @@ from ae_env.scenes import Scene
 from agents.evaluation.engine import fit_policies
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
-from agents.report.film import FRAME_RATE, Recording, record
+from agents.report.film import FRAME_RATE, Recording, record, write_film
 from agents.rollouts import WatchedEnvs
-from agents.viewer.tab import Tab, curves, loading
+from agents.viewer.tab import Address, Tab, draw_lines, labelled_slider, line_chart, loading
 from agents.viewer.viewed_scene import ViewedScene, encoded
 
 #: Kinds of moving light, and light that stays.
@@ -85,10 +86,11 @@ def settled(names: Sequence[str], scene: Scene) -> dict[str, int]:
 
 
 class EpisodePage(Tab):
-    """The tab, see `Tab`."""
+    """The tab, see `Tab`; `on_run` is called when it runs what `asked` tells."""
 
-    def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
+    def __init__(self, address: Address, folder: Path, on_run: Callable[[], None]) -> None:
         super().__init__(address, folder)
+        self._on_run = on_run
         self._recordings: list[Recording] = []
         self._grid = ExposureGrid.video()
         self._stopped, self._doing, self._begun = Event(), "", 0.0
@@ -97,15 +99,19 @@ class EpisodePage(Tab):
             with ui.element("div").classes("bar"):
                 choices = "".join(f'<option value="{name}">' for name in NAMES)
                 ui.html(choices, sanitize=False, tag="datalist").props("id=policies")
-                self._policies = [ui.input("policy A", value=NAMES[0])]
-                self._policies += [ui.input("policy B", value=NAMES[1])]
-                for policy in self._policies:
-                    policy.props("dense list=policies").classes("w-72")
-                self._light = ui.select(list(LIGHTS), label="light", value="shadows").props("dense")
-                self._frames = ui.number("frames", value=_FRAMES, min=2, max=512, precision=0)
-                self._seed = ui.number("seed", value=0, min=0, max=2**31, precision=0)
-                for number in (self._frames, self._seed):
-                    number.props("dense").classes("w-20")
+                #: What is asked for, by its name in an address.
+                self._fields: dict[str, Any] = {
+                    x: ui.input(f"policy {x.upper()}", value=name)
+                    .props("list=policies")
+                    .classes("w-72")
+                    for x, name in zip("ab", NAMES, strict=False)
+                }
+                self._fields["light"] = ui.select(list(LIGHTS), label="light", value="shadows")
+                for name, value, low, most in (("frames", _FRAMES, 2, 512), ("seed", 0, 0, 2**31)):
+                    number = ui.number(name, value=value, min=low, max=most, precision=0)
+                    self._fields[name] = number.classes("w-20")
+                for field in self._fields.values():
+                    field.props("dense")
                 self._run = ui.button("Run", icon="play_circle", on_click=self._record)
                 self._cancel = ui.button("Cancel", icon="close", on_click=self._stop)
                 self._status = ui.label().classes("note").props("role=status")
@@ -127,34 +133,63 @@ class EpisodePage(Tab):
             self._timer = ui.timer(1.0 / FRAME_RATE, self._advance, active=False)
             play = ui.button(icon="play_arrow", on_click=self._toggle)
             play.props('dense aria-label="play or pause"')
-            play.bind_icon_from(
-                self._timer, "active", lambda plays: "pause" if plays else "play_arrow"
-            )
-            self._frame = ui.slider(min=0, max=1, step=1, value=0, on_change=self._show_frame)
-            self._frame.props('aria-label="frame"').classes("flex-1")
-            self._number = ui.label().classes("note")
+            play.bind_icon_from(self._timer, "active", lambda on: "pause" if on else "play_arrow")
+            self._frame = labelled_slider("Frame", 1, 1, "{:.0f}".format)
+            self._frame.on_value_change(self._show_frame)
+            next(self._frame.ancestors()).classes("flex-1")
+            self._saves = {x: self.save_button(x, self._save) for x in ("csv", "gif")}
         self._charts = {}
-        for name in ("EV100: the best state's (grey) and the policies'", "Score", "Regret"):
-            ui.label(name).classes("note")
-            with ui.element("div").classes("chart") as holder:
-                content = ui.html(sanitize=False)
-                ui.element("div").classes("now")
-            self._charts[name.partition(":")[0]] = (holder, content)
+        with ui.element("div").classes("charts") as self._holder:
+            for kind, name in (("ev100", "EV100"), ("scores", "score"), ("regrets", "regret")):
+                self._charts[kind] = line_chart("frame", name, 150)
+            ui.element("div").classes("now")
+
+    @property
+    def asked(self) -> dict[str, str]:
+        """Entries of an address that `fill` takes."""
+        values = {name: field.value for name, field in self._fields.items()}
+        return {n: v if isinstance(v, str) else f"{v or 0:.0f}" for n, v in values.items()}
+
+    def fill(self, asked: Mapping[str, str]) -> None:
+        """Takes what an address asks for; nothing runs, since a policy may be a file of code."""
+        for name in self._fields.keys() & asked.keys():
+            number, value = name in ("frames", "seed"), asked[name]
+            if value.isdecimal() if number else name != "light" or value in LIGHTS:
+                self._fields[name].value = int(value) if number else value
+
+    async def _save(self, ending: str) -> None:
+        film = partial(write_film, recordings=self._recordings)
+        write: Any = film if ending == "gif" else self._write_csv
+        await self.download(self._saves[ending], f"{Path(self._scene).stem}.{ending}", write)
+
+    def _write_csv(self, path: Path) -> None:
+        tables = []
+        for one in self._recordings:
+            columns: dict[str, Any] = {
+                "policy": one.name,
+                "ev100": one.ev100,
+                "best_ev100": one.best,
+            }
+            columns |= {"score": one.scores, "regret": one.regrets}
+            for name in ("iso", "exposure_time", "f_number"):
+                columns[name] = [getattr(self._grid[state], name) for state in one.states]
+            tables.append(pd.DataFrame(columns).rename_axis("frame"))
+        pd.concat(tables).to_csv(path)
 
     def show_scene(self, viewed: ViewedScene) -> None:
         """Takes another scene for the next episode."""
         self._stop()
-        self.viewed, self._recordings = viewed, []
+        self.viewed, self._recordings, self._scene = viewed, [], viewed.scene.scene_id
         self._timer.active = False
         self._shown.set_visibility(False)
 
     async def _record(self) -> None:
         if self.viewed is None:
             return
-        names = [str(field.value) for field in self._policies]
-        names = list(dict.fromkeys(names))  # a policy beside itself is shown once
-        light, frames = str(self._light.value), int(self._frames.value or _FRAMES)
-        options = {"light": light, "frames": frames, "seed": int(self._seed.value or 0)}
+        names = list(dict.fromkeys(self.asked[x] for x in "ab"))  # one beside itself is shown once
+        asked, light = self.asked, self.asked["light"]
+        options = {"light": light, "frames": int(asked["frames"]), "seed": int(asked["seed"])}
+        self._on_run()
         found: list[Recording] | None = None
         self._stopped, self._doing, self._begun = Event(), "starting", perf_counter()
         watch = partial(self._step, self._stopped)
@@ -180,24 +215,17 @@ class EpisodePage(Tab):
 
     def _show_recordings(self, recordings: list[Recording]) -> None:
         self._recordings = recordings
-        lines = list(zip(_POLICIES, recordings, strict=False))
-        ev100 = [(_BEST, recordings[0].best), *((c, r.ev100) for c, r in lines)]
-        values = np.concatenate([np.asarray(v) for _, v in ev100])
-        self._draw("EV100", ev100, float(values.min()) - 0.5, float(values.max()) + 0.5)
-        self._draw("Score", [(c, r.scores) for c, r in lines], 0.0, 1.0)
-        regrets = [(c, r.regrets) for c, r in lines]
-        self._draw("Regret", regrets, 0.0, max(0.1, *(max(v) for _, v in regrets)))
+        next(self._images[1].ancestors()).set_visibility(len(recordings) > 1)
+        best = ("best state", _BEST, enumerate(recordings[0].best))
+        shown = list(zip(_POLICIES, recordings, strict=False))
+        for kind, chart in self._charts.items():
+            lines = [(r.name, c, enumerate(getattr(r, kind))) for c, r in shown]
+            draw_lines(chart, [*lines, best] if kind == "ev100" else lines)
         self._frame.props(f"max={self._last}")
         self._frame.value = 0
         self._show_frame()
         self._shown.set_visibility(True)
         self._timer.active = True
-
-    def _draw(
-        self, name: str, lines: Sequence[tuple[str, Sequence[float]]], low: float, high: float
-    ) -> None:
-        ends = f'<span class="high">{high:.3g}</span><span class="low">{low:.3g}</span>'
-        self._charts[name][1].content = curves(lines, low, high, 110) + ends
 
     @property
     def _last(self) -> int:
@@ -207,19 +235,12 @@ class EpisodePage(Tab):
         if not self._recordings:
             return
         frame = int(self._frame.value)
-        self._number.text = f"frame {frame} of {self._last}"
-        for holder, _ in self._charts.values():
-            holder.style(f"--now: {100.0 * frame / max(self._last, 1):.2f}%")
-        for i, (image, facts) in enumerate(zip(self._images, self._facts, strict=True)):
-            if i >= len(self._recordings):
-                facts.text = ""
-                image.set_visibility(False)
-                continue
-            one = self._recordings[i]
-            image.set_visibility(True)
+        self._holder.style(f"--now: {frame / max(self._last, 1):.4f}")
+        shown = zip("AB", self._images, self._facts, self._recordings, strict=False)
+        for x, image, facts, one in shown:
             self.show(image, encoded(one.pictures[frame]))
             facts.text = (
-                f"{'AB'[i]} {one.name}: {self._grid[one.states[frame]]}, score "
+                f"{x} {one.name}: {self._grid[one.states[frame]]}, score "
                 f"{one.scores[frame]:.3f}, regret {one.regrets[frame]:.3f}; mean score so far "
                 f"{np.mean(one.scores[: frame + 1]):.3f}"
             )

@@ -6,37 +6,42 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from nicegui import run, ui
+from nicegui.elements.mixins.text_element import TextElement
 
 from ae_env.grid import ExposureGrid
-from agents.policy_names import METERS, PROGRAMS
+from ae_env.rendering import PATH_COLOURS
+from agents.policy_names import CLASSIC_METERS, METERS, PROGRAMS
 from agents.viewer.episode_page import SETTLED, settled
-from agents.viewer.tab import Stage, Tab, curves, loading
-from agents.viewer.viewed_scene import Picture, Readout, View, ViewedScene
+from agents.viewer.tab import Address, Stage, Tab, draw_lines, labelled_slider, line_chart, loading
+from agents.viewer.viewed_scene import BINS, PLANES, STOPS, Picture, Readout, View, ViewedScene
 from simulator import CameraSettings
-from simulator.settings import format_exposure_time
+from simulator.reference.sequences import ISO_SPEEDS
+from simulator.settings import NOMINAL_TIMES, format_exposure_time
 from simulator.utils.checks import parse_number
 
 _GRID = ExposureGrid.default()
 #: Values of the sliders, in third stops as cameras mark them; the default grid's are among them.
-ISOS = (
-    *(100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000),
-    *(2500, 3200, 4000, 5000, 6400),
-)
-TIMES = (
-    *(1 / n for n in (1000, 800, 640, 500, 400, 320, 250, 200, 160, 125, 100, 80, 60, 50, 40)),
-    *(1 / n for n in (30, 25, 20, 15, 13, 10, 8, 6, 5, 4)),
-    *(0.3, 0.4, 0.5),
-)
+ISOS = ISO_SPEEDS[:19]
+TIMES = tuple(time for time in NOMINAL_TIMES if 1 / 1000 <= time <= 0.5)
 F_NUMBERS = (4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.0)
+#: The sliders, their values, how these are read, and whether a step brightens or darkens.
+_NAMES = ("ISO", "Shutter", "Aperture")
+_SCALES = (ISOS, TIMES, F_NUMBERS)
+_TEXTS = "{:g}".format, format_exposure_time, "f/{:g}".format
+_SIGNS = (1, 1, -1)
 #: Policies whose states can be marked; others are typed.
 POLICIES = (*METERS, *(f"matrix:{name}" for name in PROGRAMS), "rpi_agc", "regression", "ppo")
-_LETTERS = "ABCDEFGH"
+#: What can be drawn over the picture: where meters look; regions are typed.
+_DRAWN = ["nothing", *CLASSIC_METERS]
+#: Options of a choice that also takes what is typed.
+_TYPED: dict[str, Any] = {"with_input": True, "new_value_mode": "add-unique"}
 #: Colours of the planes R, G1, G2, B in a histogram.
 _PLANES = ("#ff5c5c", "#4fd36b", "#b6f0a0", "#6aa5ff")
 
@@ -44,119 +49,102 @@ _PLANES = ("#ff5c5c", "#4fd36b", "#b6f0a0", "#6aa5ff")
 class ExposurePage(Tab):
     """The tab, see `Tab`; `on_view` is called when it shows another view."""
 
-    def __init__(
-        self, address: Callable[[bytes], str], folder: Path, on_view: Callable[[], None]
-    ) -> None:
+    def __init__(self, address: Address, folder: Path, on_view: Callable[[], None]) -> None:
         super().__init__(address, folder)
         self._on_view = on_view
         self._refreshing = asyncio.Lock()
-        self._shown: tuple[ViewedScene, View] | None = None
+        self._shown: tuple[ViewedScene, View, CameraSettings | None] | None = None
+        self._compared: View | None = None  # what is on the right of the divider
+        self._kept: CameraSettings | None = None  # its settings
+        self._picture: Picture | None = None
         self._centre: tuple[float, float] | None = None
         self._marks: dict[str, int] = {}
-        self._rows: dict[str, ui.element] = {}
-        self._states: dict[int, tuple[ui.element, ui.label]] = {}
+        self._states: dict[int, TextElement] = {}
         self._facts: dict[str, ui.label] = {}
-        with ui.element("div").classes("columns waiting") as self._columns:
+        with ui.element("div").classes("columns three waiting") as self._columns:
             with ui.element("div").classes("column looked-at"):
                 self._build_picture()
             with ui.element("div").classes("column controls"):
-                self._iso = self._stops("ISO", ISOS, "{:g}".format)
-                self._time = self._stops("Shutter", TIMES, format_exposure_time)
-                self._f_number = self._stops("Aperture", F_NUMBERS, "f/{:g}".format)
+                self._settings = list(map(self._stops, _NAMES, _SCALES, _TEXTS))
+                self._levels = [0, 0, 0]
+                self._lock = ui.switch("Lock the exposure (L)")
                 self._build_map()
-                self._speed = self._slider("Motion", 2.0, 0.05, "{:.2f} H/s".format)
-                self._defocus = self._slider("Defocus", 8.0, 0.25, "{:.2f} px".format)
-                ui.label(
-                    "Motion of the image in frame heights a second; defocus at f/4, in pixels of a "
-                    "frame 64 pixels high."
-                ).classes("note")
-            with ui.element("div").classes("column"):
-                self._histogram = ui.html(sanitize=False)
-                self._histogram.props('role=img aria-label="histogram of the raw planes"')
-                ui.label(
-                    "Raw histogram of R, G1, G2 and B, black to white level (height: square root "
-                    "of the pixel share)."
-                ).classes("note")
+                self._speed = labelled_slider("Motion", 2.0, 0.05, "{:.2f} H/s".format)
+                self._defocus = labelled_slider("Defocus", 8.0, 0.25, "{:.2f} px".format)
+                for slider in (self._speed, self._defocus):
+                    slider.on_value_change(self._refresh)
+                ui.label("Motion: heights a second. Defocus: at f/4, of 64 pixels.").classes("note")
+            with ui.element("div").classes("column readouts"):
                 with ui.element("div").classes("facts"):
-                    for name in ("Score", "Noise", "Blur", "Clipped", "Time"):
+                    for name in ("Score", "Exposure", "Noise", "Blur", "Clipped", "Photosite"):
                         ui.label(name).classes("name")
-                        self._facts[name] = ui.label()
-                self._plan = ui.label().classes("plan")
+                        self._facts[name] = ui.label("point at the picture" * (name == "Photosite"))
+                        if name == "Score":
+                            self._parts = ui.html(sanitize=False).classes("parts")
+                self._histogram = line_chart("stops below white", "samples (%)", 190)
+                self._histogram.options["xAxis"] |= {"min": -STOPS, "max": 0}
+                with ui.expansion("How it was simulated").props("dense").classes("w-full"):
+                    self._plan = ui.label().classes("plan")
         ui.keyboard(on_key=self._on_key)
 
     def _build_picture(self) -> None:
-        self._stage = Stage(self, "simulated capture", "divider between the two states")
-        for image in self._stage.images:
-            image.on(
-                "click",
-                self._on_click,
-                js_handler="(e) => emit(e.offsetY / e.target.clientHeight, "
-                "e.offsetX / e.target.clientWidth)",
-            )
+        self._stage = Stage(self, "simulated capture", ("A", "B"))
+        self._stage.on("click", self._on_click)
+        self._stage.on("mousemove", self._point)
         with ui.element("div").classes("bar"):
             self._clipping = ui.switch("Clipping (C)", on_change=self._refresh)
             self._pixels = ui.switch("Raw pixels (Z)", on_change=self._zoom)
-            self._compare = ui.switch("Compare with this (P)", on_change=self._pin)
+            self._compare = ui.switch("Keep this as B (P)", on_change=self._keep)
+            self._equal = ui.switch("Equal brightness (E)", on_change=self._refresh)
+            about = "Draw metering weights, or a region: left,top,width,height"
+            choice = {"value": "nothing", "label": about, "on_change": self._draw, **_TYPED}
+            self._drawn = ui.select(_DRAWN, **choice).props("dense").classes("flex-1")
             self._spinner = ui.spinner(size="sm")
             self._spinner.visible = False
-        self._across = self._slider("Across", 1.0, 0.01, "{:.0%}".format, self._move)
-        self._down = self._slider("Down", 1.0, 0.01, "{:.0%}".format, self._move)
-        self._pinned = ui.label().classes("note")
-        self._show_window()
+        self._across = labelled_slider("Across", 1.0, 0.01, "{:.0%}".format)
+        self._down = labelled_slider("Down", 1.0, 0.01, "{:.0%}".format)
+        for slider in (self._across, self._down):
+            slider.on_value_change(self._move)
+            next(slider.ancestors()).bind_visibility_from(self._pixels, "value")
 
     def _stops(self, name: str, values: Sequence[float], text: Callable[[float], str]) -> ui.slider:
-        return self._slider(name, len(values) - 1, 1, lambda i: text(values[int(i)]))
-
-    def _slider(
-        self,
-        name: str,
-        most: float,
-        step: float,
-        text: Callable[[float], str],
-        on_change: Callable[[], Any] | None = None,
-    ) -> ui.slider:
-        with ui.element("div").classes("setting") as self._rows[name]:
-            ui.label(name)
-            change = on_change or self._refresh
-            slider = ui.slider(min=0, max=most, step=step, value=0, on_change=change)
-            slider.props(f'aria-label="{name}" dense')
-            ui.label().classes("value").bind_text_from(slider, "value", text)
-        return slider
+        slider = labelled_slider(name, len(values) - 1, 1, lambda i: text(values[int(i)]))
+        return slider.on_value_change(partial(self._step, slider))
 
     def _build_map(self) -> None:
-        with ui.element("div").classes("maps"):
-            for n, f_number in enumerate(_GRID.f_numbers):
+        """The states as on a contact sheet: a panel per ISO, shutter across, aperture down."""
+        about = "scores of the 64 states; arrow keys choose"
+        with ui.element("div").classes("maps").props(f'role=radiogroup aria-label="{about}"'):
+            for i, iso in enumerate(_GRID.isos):
                 with ui.element("div").classes("map"):
-                    ui.label(f"f/{f_number:g}: ISO down, shutter across").classes("head")
-                    for i, t in np.ndindex(len(_GRID.isos), len(_GRID.exposure_times)):
-                        state = _GRID.index(i, t, n)
-                        button = ui.element("button").classes("state")
-                        button.on("click", partial(self.set, _GRID[state]))
-                        with button:
-                            self._states[state] = (button, ui.label())
-        with ui.element("div").classes("bar"):
-            self._names = ui.select(
-                list(POLICIES),
-                label=f"Mark where policies stand after {SETTLED} frames",
-                multiple=True,
-                with_input=True,
-                new_value_mode="add-unique",
-                on_change=self._mark,
-            )
-            self._names.props("dense use-chips").classes("w-full")
-        self._legend = ui.label().classes("note legend")
+                    times = (format_exposure_time(t)[:-2] for t in _GRID.exposure_times)
+                    for text in (f"ISO {iso:g}", *times):
+                        ui.label(text).classes("head")
+                    for n, f_number in enumerate(_GRID.f_numbers):
+                        ui.label(f"f/{f_number:g}").classes("head")
+                        for t in range(len(_GRID.exposure_times)):
+                            state = _GRID.index(i, t, n)
+                            button = TextElement(tag="button", text="").props("role=radio")
+                            button.on("click", partial(self.set, _GRID[state])).classes("state")
+                            self._states[state] = button
+        ui.label("Star: the best state. Dashed: as bright as the state shown.").classes("note")
+        about = f"Mark where policies stand after {SETTLED} frames"
+        choice = {"multiple": True, "label": about, "on_change": self._mark, **_TYPED}
+        self._names = ui.select(list(POLICIES), **choice).props("dense use-chips")
+        self._legend = ui.html(sanitize=False).classes("note legend")
 
     # -- what is shown ----------------------------------------------------------------------------
 
     @property
     def view(self) -> View:
         """State and marks of the picture that the page shows."""
-        iso, time = ISOS[int(self._iso.value)], TIMES[int(self._time.value)]
+        scales = zip(_SCALES, self._settings, strict=True)
         return View(
-            CameraSettings(iso, time, F_NUMBERS[int(self._f_number.value)]),
+            CameraSettings(*(values[int(slider.value)] for values, slider in scales)),
             speed=float(self._speed.value),
             defocus=float(self._defocus.value),
             clipping=bool(self._clipping.value),
+            equal_brightness=bool(self._equal.value),
             centre=self._centre,
         )
 
@@ -178,19 +166,36 @@ class ExposurePage(Tab):
         self._names.value = []
         self._pixels.value = self._compare.value = False
         self._speed.value = self._defocus.value = 0.0
-        self._legend.text = ""
-        self._show_compared(None)
-        self._show_window()
+        self._legend.content, self._drawn.value = "", "nothing"
         best = settings or await self.work(viewed.best)
         if best is not None:
             await (self.set(best) if self.view.settings == before else self._refresh())
 
     async def set(self, settings: CameraSettings) -> None:
         """Shows the scene at `settings`, which the sliders have."""
-        self._iso.value = ISOS.index(round(settings.iso))
-        self._time.value = TIMES.index(settings.exposure_time)
-        self._f_number.value = F_NUMBERS.index(settings.f_number)
+        values = round(settings.iso), settings.exposure_time, settings.f_number
+        await self._set_levels([s.index(v) for s, v in zip(_SCALES, values, strict=True)])
+
+    async def _set_levels(self, levels: list[int]) -> None:
+        self._levels = levels
+        for slider, level in zip(self._settings, levels, strict=True):
+            slider.value = level
         await self._refresh()
+
+    async def _step(self, moved: ui.slider) -> None:
+        """Shows what a slider asks for; under the lock the others move against it.
+
+        All three have third stops. What the others cannot take up, the slider moves back.
+        """
+        levels = [int(slider.value) for slider in self._settings]
+        if self._lock.value:
+            changes = zip(_SIGNS, levels, self._levels, strict=True)
+            excess = sum(sign * (level - before) for sign, level, before in changes)
+            for k in sorted((1, 0, 2), key=lambda k: self._settings[k] is moved):  # itself last
+                level = min(max(levels[k] - _SIGNS[k] * excess, 0), len(_SCALES[k]) - 1)
+                excess += _SIGNS[k] * (level - levels[k])
+                levels[k] = level
+        await self._set_levels(levels)
 
     async def _refresh(self) -> None:
         """Shows the view that the page asks for; a view asked for meanwhile comes next, alone."""
@@ -198,56 +203,87 @@ class ExposurePage(Tab):
             return
         async with self._refreshing:
             with loading(self._spinner):
-                while self.viewed is not None and (self.viewed, self.view) != self._shown:
-                    await self._show_view(self.viewed, self.view)
+                while (asked := (self.viewed, self.view, self._kept)) != self._shown and asked[0]:
+                    await self._show(asked[0], asked[1], asked[2])
 
-    async def _show_view(self, viewed: ViewedScene, view: View) -> None:
+    async def _show(self, viewed: ViewedScene, view: View, kept: CameraSettings | None) -> None:
         picture = await run.io_bound(viewed.picture, view)
-        self._shown = viewed, view
+        self._shown, self._picture = (viewed, view, kept), picture
         if picture is None:  # the program ends
             return
         self._columns.classes(remove="waiting")
         self._on_view()
-        self._stage.show(picture.jpeg, picture.aspect, "pixels" if view.centre else "whole")
+        kind = "pixels" if view.centre else "whole"
+        self._stage.show(picture.jpeg, picture.aspect, kind, picture.photosites)
+        other = replace(view, settings=kept, clipping=False) if kept else None
+        if other != self._compared:
+            beside = await run.io_bound(viewed.picture, other) if other else None
+            self._stage.compare(beside.jpeg if beside else None)
+            self._compared = other
+        left, right = self._stage.tags
+        left.text, right.text = f"A: {view.settings}", f"B: {kept}"
         if self.view != view:
             return
         readout = await run.io_bound(viewed.readout, view, picture.capture)
         if self.view == view and readout is not None:
-            self._show_readout(readout, picture)
+            self._show_readout(readout, picture, view)
             await self._show_scores(viewed, view)
 
-    def _show_readout(self, readout: Readout, picture: Picture) -> None:
-        self._histogram.content = histogram(readout.histogram)
+    def _show_readout(self, readout: Readout, picture: Picture, view: View) -> None:
+        stops = np.linspace(-STOPS, 0, 2 * BINS + 1)[1::2].tolist()  # middles of the bins
+        planes = zip(PLANES, _PLANES, 100 * readout.histogram, strict=True)
+        lines = [(n, c, zip(stops, v.tolist(), strict=True)) for n, c, v in planes]
+        ends = ((0, readout.white, "right", "#ff5ce0"), (-STOPS, readout.black, "left", "#62b0ff"))
+        marks = [
+            {"xAxis": x, "lineStyle": {"color": c}, "label": {"formatter": f"{v:.1%}", "align": a}}
+            for x, v, a, c in ends
+        ]
+        draw_lines(self._histogram, lines, marks)
         plan, facts = readout.plan, self._facts
         facts["Score"].text = f"{readout.score:.3f}"
+        self._parts.content = "".join(
+            f"<span>{name}</span><meter value={part:.3f} aria-label={name}></meter>"
+            f"<span>{part:.2f}</span><span>{f'costs {cost:.2f}' if cost >= 0.005 else ''}</span>"
+            for name, (part, cost) in readout.parts.items()
+        )
+        facts[
+            "Exposure"
+        ].text = f"EV100 {-view.settings.log2_exposure:.1f}, {readout.ev:+.1f} EV from right"
         facts["Noise"].text = f"SNR at mid grey: {readout.snr:.1f} dB per photosite"
         if plan.excess_noise:
             facts["Noise"].text += f", {plan.excess_noise:.0%} more variance than the camera's"
         facts["Blur"].text = f"motion {readout.motion:.1f} px, defocus {readout.defocus:.1f} px"
         facts["Clipped"].text = f"{readout.white:.2%} at white, {readout.black:.2%} at black"
         capture, developing = picture.milliseconds
-        facts["Time"].text = (
-            f"{capture:.0f} ms to simulate, {developing:.0f} ms to develop; error "
-            f"{plan.predicted_error:.2f} of the noise"
-        )
-        self._plan.text = plan.explain()
+        times = f"{capture:.0f} ms to simulate, {developing:.0f} ms to develop"
+        self._plan.text = f"{plan.explain()}\n{times}"
 
     async def _show_scores(self, viewed: ViewedScene, view: View) -> None:
         table = await run.io_bound(viewed.table, view)
         if table is None:
             return
-        best = table.oracle
-        for state, (button, label) in self._states.items():
-            letters = [_LETTERS[i] for i, s in enumerate(self._marks.values()) if s == state]
-            score = float(table.mean[state])
+        best, exposure = table.oracle, view.settings.log2_exposure
+        shown = next((s for s in self._states if _GRID[s] == view.settings), None)
+        for state, button in self._states.items():
+            score, settings = float(table.mean[state]), _GRID[state]
             background, ink = score_colour(score)
-            text = f"{'★' * (state == best)}{''.join(letters)} {score:.2f}"
-            label.text = text.replace(" 0.", " .").strip()
-            size = 12 if len(label.text) <= 6 else 9
-            button.style(f"background:{background};color:{ink};font-size:{size}px")
-            button.props["aria-label"] = f"{_GRID[state]}: score {score:.2f}"
-            button.classes(replace="state shown" if _GRID[state] == view.settings else "state")
-            button.update()
+            names = [name for name, s in self._marks.items() if s == state]
+            for k, colour in enumerate(map(self._colour, names)):
+                dot = f"{colour} 4px, #000 4px 5px, #0000 5px"
+                background = f"radial-gradient(circle at {6 + 11 * k}px 5px, {dot}), {background}"
+            button.text = f"{'★' * (state == best)}{score:.2f}".replace("0.", ".")
+            button.style(f"background:{background};color:{ink}")
+            even = " even" * (abs(settings.log2_exposure - exposure) < 0.1)
+            button.classes(replace="state shown" if state == shown else f"state{even}")
+            told = ", ".join([f"{settings}: score {score:.2f}, EV100 {settings.ev100:.1f}", *names])
+            stop = state == (best if shown is None else shown)  # the one that Tab leads to
+            props = {"aria-label": told, "title": told, "tabindex": 0 if stop else -1}
+            props["aria-checked"] = str(state == shown).lower()
+            if not props.items() <= button.props.items():  # most stay as they are
+                button.props.update(props)
+
+    def _colour(self, name: str) -> str:
+        return PATH_COLOURS[list(self._marks).index(name)]
 
     # -- events -----------------------------------------------------------------------------------
 
@@ -255,53 +291,50 @@ class ExposurePage(Tab):
         if not event.action.keydown or event.action.repeat or event.modifiers.ctrl:
             return
         switches = {"c": self._clipping, "z": self._pixels, "p": self._compare}
+        switches |= {"e": self._equal, "l": self._lock}
         switch = switches.get(str(event.key.name).lower())
         if switch is not None:
             switch.value = not switch.value
 
     async def _on_click(self, event: Any) -> None:
-        down, right = event.args
-        if not self._pixels.value:
-            self._centre = (min(max(down, 0.0), 1.0), min(max(right, 0.0), 1.0))
+        self._centre = event.args[0], event.args[1]
         self._pixels.value = not self._pixels.value
 
     async def _zoom(self) -> None:
-        if not self._pixels.value:
-            self._centre = None
-        elif self._centre is None:
-            self._centre = (0.5, 0.5)
-        self._compare.value = False
-        self._show_window()
+        self._centre = (self._centre or (0.5, 0.5)) if self._pixels.value else None
+        if self._centre is not None:
+            self._down.value, self._across.value = (round(share, 2) for share in self._centre)
         await self._refresh()
+        await self._draw()
 
     async def _move(self) -> None:
         if self._pixels.value:
             self._centre = (self._down.value, self._across.value)
             await self._refresh()
 
-    def _show_window(self) -> None:
-        for slider, name, place in ((self._down, "Down", 0), (self._across, "Across", 1)):
-            self._rows[name].set_visibility(self._centre is not None)
-            if self._centre is not None:
-                slider.value = round(self._centre[place], 2)
+    async def _keep(self) -> None:
+        self._kept = self.view.settings if self._compare.value else None
+        await self._refresh()
 
-    async def _pin(self) -> None:
-        if not self._compare.value or self.viewed is None:
-            self._show_compared(None)
-            return
-        view = replace(self.view, clipping=False)
-        picture = await self.work(self.viewed.picture, view)
-        if picture is not None:
-            self._show_compared(picture, f"right of the divider: {view.settings}")
+    async def _point(self, event: Any) -> None:
+        """Reads the sample below the pointer."""
+        if self._shown is not None and self._picture is not None:
+            viewed, view, _ = self._shown
+            text = viewed.photosite(view, self._picture.capture, *event.args)
+            self._facts["Photosite"].text = text
 
-    def _show_compared(self, picture: Picture | None, text: str = "") -> None:
-        self._stage.compare(None if picture is None else picture.jpeg)
-        self._pinned.text = text
+    async def _draw(self) -> None:
+        """Draws where a meter looks, over the whole picture."""
+        name, png = str(self._drawn.value or "nothing"), None
+        with loading(self._spinner):
+            if self.viewed and self._centre is None and name != "nothing":
+                png = self.viewed.weights_over(name)
+        self._stage.draw_over(png)
 
     async def _mark(self) -> None:
         if self.viewed is None:
             return
-        viewed, names = self.viewed, self._marked[: len(_LETTERS)]
+        viewed, names = self.viewed, self._marked[: len(PATH_COLOURS)]
         missing = [name for name in names if name not in self._marks]
         if missing:
             with loading(self._spinner, Exception):  # whatever a policy of the user's raises
@@ -312,10 +345,9 @@ class ExposurePage(Tab):
             self._names.value = [name for name in names if name not in missing]
             return
         self._marks = {name: self._marks[name] for name in self._marked if name in self._marks}
-        self._legend.text = "\n".join(
-            f"{letter} {name}: {_GRID[state]}"
-            for letter, (name, state) in zip(_LETTERS, self._marks.items(), strict=False)
-        )
+        dot = '<i style="background:{}"></i> '.format
+        lines = (f"{dot(self._colour(n))}{escape(n)}: {_GRID[s]}" for n, s in self._marks.items())
+        self._legend.content = "<br>".join(lines)
         await self._show_scores(viewed, self.view)
 
     @property
@@ -329,7 +361,7 @@ def asked_settings(asked: Mapping[str, str]) -> CameraSettings | None:
         wanted = [parse_number(asked.get(name, "")) for name in ("iso", "t", "n")]
     except ValueError:
         return None
-    sliders = zip((ISOS, TIMES, F_NUMBERS), wanted, strict=True)
+    sliders = zip(_SCALES, wanted, strict=True)
     return CameraSettings(
         *(values[np.abs(np.subtract(values, v)).argmin()] for values, v in sliders)
     )
@@ -338,12 +370,5 @@ def asked_settings(asked: Mapping[str, str]) -> CameraSettings | None:
 def score_colour(score: float) -> tuple[str, str]:
     """Background and ink of a score in [0, 1]."""
     red, green, blue, _ = matplotlib.colormaps["viridis"](min(max(score, 0.0), 1.0))
-    ink = "#000" if 0.3 * red + 0.59 * green + 0.11 * blue > 0.45 else "#fff"
+    ink = "#000" if score > 0.433 else "#fff"  # either has a contrast of 4.5 at least
     return matplotlib.colors.to_hex((red, green, blue)), ink
-
-
-def histogram(shares: np.ndarray) -> str:
-    """Histogram of the raw planes, an SVG: black level on the left, white level on the right."""
-    tallest = float(np.sqrt(shares[:, 1:-1].max())) or 1.0  # clipped samples would hide the rest
-    heights = np.minimum(np.sqrt(shares) / tallest, 1.0)
-    return curves(zip(_PLANES, heights, strict=True), 0.0, 1.0, 96)

@@ -11,8 +11,8 @@ from nicegui import run, ui
 
 from ae_env.scenes import Scene
 from agents.report.judging import GRID, Judging
-from agents.viewer.page import STYLE, PictureStore
-from agents.viewer.tab import complain
+from agents.viewer.page import PictureStore, style_page
+from agents.viewer.tab import complain, heading
 from agents.viewer.viewed_scene import OpenedScene, View, ViewedScene
 from simulator import CameraSimulator
 
@@ -23,10 +23,10 @@ _UNDO = "Backspace"
 
 async def show_pairs(judging: Judging, scenes: Mapping[str, Scene], store: PictureStore) -> None:
     """Puts the page together, for one tab of the browser: each shows the pair that is next."""
-    ui.add_css(STYLE.read_text())
+    style_page()
     busy, shown, begun = asyncio.Lock(), -1, 0.0
     with ui.element("header").classes("bar"):
-        ui.label("Which picture is better?").classes("title")
+        heading("Which picture is better?", 1)
         progress = ui.label()
     with ui.element("div").classes("players judged"):
         images = [ui.element("img").props(f"alt={side}") for side in ("left", "right")]

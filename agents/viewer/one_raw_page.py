@@ -17,7 +17,7 @@ from PIL import Image
 
 from agents.applications.hdr import hdr_picture, linear_rgb, write_exr
 from agents.applications.refocus import NOTHING_FOUND, refocus
-from agents.viewer.tab import Stage, Tab, complain
+from agents.viewer.tab import Address, Stage, Tab, complain, heading, labelled_slider
 from agents.viewer.viewed_scene import ViewedScene, encoded
 from simulator import CameraSimulator, RawImage, render_srgb, write_dng
 from simulator.raw.develop import upright_picture
@@ -93,9 +93,7 @@ def fused(raw: RawImage, simulator: CameraSimulator) -> RenderedImage:
 class OneRawPage(Tab):
     """The tab, see `Tab`; `simulator` reduces noise, and estimates the blur."""
 
-    def __init__(
-        self, address: Callable[[bytes], str], folder: Path, simulator: CameraSimulator
-    ) -> None:
+    def __init__(self, address: Address, folder: Path, simulator: CameraSimulator) -> None:
         super().__init__(address, folder)
         self._simulator = simulator
         self._f_numbers: tuple[float, ...] = ()
@@ -104,34 +102,28 @@ class OneRawPage(Tab):
         self._saves: dict[str, ui.button] = {}
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("column looked-at"):
-                self._stage = Stage(self, "the raw", "divider between the raw and the result")
+                self._stage = Stage(self, "the raw", ("raw", "result"))
                 self._raw_text = ui.label().classes("note")
                 with ui.element("div").classes("bar"):
                     self._spinner = ui.spinner(size="sm")
                     self._status = ui.label().props("role=status")
             with ui.element("div").classes("column controls"):
-                ui.label("Shallow depth of field").classes("title")
-                with ui.element("div").classes("setting"):
-                    ui.label("Aperture")
-                    self._slider = ui.slider(min=0, max=1, step=1, value=0)
-                    self._slider.props('aria-label="Wider aperture" dense')
-                    ui.label().classes("value").bind_text_from(
-                        self._slider, "value", lambda i: self._marked(int(i or 0))
-                    )
+                heading("Shallow depth of field", 2)
+                self._slider = labelled_slider("Wider aperture", 1, 1, self._marked)
                 with ui.element("div").classes("bar"):
                     self._open = ui.button("Open the aperture", icon="camera", on_click=self._opens)
-                    self._save_button("dng")
+                    self._saves["dng"] = self.save_button("dng", self._save)
                 ui.label(
                     "Wider than the lens of the raw. Blurred areas are assumed to be background; a "
                     "raw that is sharp throughout stays as it is. A depth map does more: ae-env "
                     "refocus --depth."
                 ).classes("note")
-                ui.label("HDR").classes("title")
+                heading("HDR", 2)
                 with ui.element("div").classes("bar"):
                     fuse = partial(self._render, "fusing", fused)
                     self._fuse = ui.button("Fuse a bracket", icon="hdr_on", on_click=fuse)
-                    self._save_button("png")
-                    self._save_button("exr")
+                    for ending in ("png", "exr"):
+                        self._saves[ending] = self.save_button(ending, self._save)
                 ui.label(
                     "A bracket is simulated from the raw with its noise reduced, and fused: PNG. "
                     "The EXR holds the light, 1 at the raw's white."
@@ -139,13 +131,8 @@ class OneRawPage(Tab):
         self._clock = ui.timer(1.0, self._tick, active=False)
         self._update()
 
-    def _save_button(self, ending: str) -> None:
-        button = ui.button(ending.upper(), icon="download", on_click=lambda: self._save(ending))
-        button.props(f'dense aria-label="save {ending.upper()}"')
-        self._saves[ending] = button
-
-    def _marked(self, place: int) -> str:
-        return f"f/{self._f_numbers[place]:g}" if place < len(self._f_numbers) else ""
+    def _marked(self, place: float) -> str:
+        return f"f/{self._f_numbers[int(place)]:g}" if place < len(self._f_numbers) else ""
 
     def _update(self) -> None:
         """Enables what can be done now."""

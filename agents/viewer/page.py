@@ -22,7 +22,7 @@ from nicegui import app, run, ui
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage, asked_settings
 from agents.viewer.one_raw_page import OneRawPage
-from agents.viewer.tab import complain, loading, new_file
+from agents.viewer.tab import complain, heading, loading, new_file
 from agents.viewer.viewed_scene import Library, ViewedScene
 from simulator import CameraSettings, CameraSimulator
 from simulator.camera_simulator import Depth
@@ -30,13 +30,12 @@ from simulator.utils.checks import did_you_mean
 
 #: Largest file that is taken [byte].
 LARGEST_UPLOAD = 300_000_000
+_TOO_LARGE = "A raw may have 300 MB at most."
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
 #: Tabs by their names in the page's address.
 _TABS = {"exposure": "Exposure", "episode": "Episode", "raw": "Refocus, HDR"}
 _RAW = _TABS["raw"]
-#: The looks of all pages.
-STYLE = Path(__file__).with_name("page.css")
 
 
 class PictureStore:
@@ -107,9 +106,15 @@ def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+def style_page() -> None:
+    """Gives a page its looks, and what its pictures and its map do in the browser itself."""
+    ui.add_css(Path(__file__).with_name("page.css").read_text())
+    ui.add_head_html(f"<script>{Path(__file__).with_name('page.js').read_text()}</script>")
+
+
 async def show_page(options: Options) -> None:
     """Puts the page together, for one tab of the browser, and opens the first scene."""
-    ui.add_css(STYLE.read_text())
+    style_page()
     client = ui.context.client
     asked = dict(client.request.query_params)
     await client.connected()
@@ -127,18 +132,18 @@ class Page:
         self._folder = folder = Path(tempfile.mkdtemp(dir=options.folder.name))
         ui.context.client.on_delete(lambda: shutil.rmtree(folder, ignore_errors=True))
         with ui.element("header").classes("bar"):
-            self._title = ui.label("ae-env view").classes("title")
+            self._title = heading("ae-env view", 1)
             with ui.dialog() as self._picker, ui.card().classes("w-full"):
-                ui.label("Scenes").classes("title")
+                self._picker.props("aria-label=Scenes")
+                heading("Scenes", 2)
                 self._thumbs = ui.element("div").classes("thumbs w-full")
             self._listed: set[str] = set()
             ui.button("Scenes", icon="photo_library", on_click=self._open_picker).props("dense")
-            most = f"a raw may have {LARGEST_UPLOAD // 10**6} MB at most"
             upload = ui.upload(
                 auto_upload=True,
                 max_file_size=LARGEST_UPLOAD,
                 on_upload=_weakly(self._take_upload),
-                on_rejected=lambda: ui.notify(most, type="negative"),
+                on_rejected=lambda: complain(_TOO_LARGE),
             ).classes("hidden")
             pick = partial(upload.run_method, "pickFiles")
             self._open = ui.button("Open raw", icon="upload", on_click=pick).props("dense")
@@ -153,7 +158,7 @@ class Page:
             with ui.tab_panel(first).classes("p-0"):
                 self._exposure = ExposurePage(*shared, self._show_address)
             with ui.tab_panel(_TABS["episode"]).classes("p-0"):
-                self._episode = EpisodePage(*shared)
+                self._episode = EpisodePage(*shared, self._show_address)
             with ui.tab_panel(_RAW).classes("p-0"):
                 self._one_raw = OneRawPage(*shared, options.simulator)
         self._scene, self._address, self._following = "", "", False
@@ -174,6 +179,7 @@ class Page:
             complain(f"There is no scene {name!r} here{did_you_mean(name, readers)}")
             name = self._library.first
         settings, self._following = asked_settings(asked), True
+        self._episode.fill(asked)
         self._address = urlencode(asked, safe="/:")
         self._panels.value = _TABS.get(asked.get("tab", ""), self._panels.value)
         if name != self._scene:
@@ -187,6 +193,8 @@ class Page:
         """Puts what is shown into the address: another scene or tab is a place to go back to."""
         tab = next(key for key, title in _TABS.items() if title == self._panels.value)
         place, settings = {"scene": self._scene, "tab": tab}, self._exposure.asked
+        if tab == "episode":
+            settings |= self._episode.asked
         address, before = urlencode(place | settings, safe="/:"), self._address
         if self._following or address == before:
             return

@@ -121,7 +121,7 @@ def serve(title: str, show: Callable[[], Any], files: Any, port: int, open_brows
     path = f"/?token={token}"
     app.add_middleware(TokenGuard, token=token, port=port)
     address = f"http://{HOST}:{port}{path}"
-    ui.page("/", title=title, dark=True)(show)
+    ui.page("/", title=title, dark=True, language="en-US")(show)
     # Uploads and downloads are gone with the program, however its pages were left.
     with files as folder:
 

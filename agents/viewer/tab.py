@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from nicegui import run, ui
+from nicegui.elements.mixins.text_element import TextElement
 
 from agents.viewer.viewed_scene import ViewedScene
 
-_CHART_WIDTH = 640
-_DIVIDE = (
-    "(e) => e.target.closest('.columns').querySelector('.stage')"
-    ".style.setProperty('--cut', e.target.value + '%')"
-)
+#: Gives a picture an address for the browser.
+Address = Callable[[bytes], str]
 
 
 def new_file(folder: Path, name: str) -> Path:
@@ -28,12 +25,9 @@ def new_file(folder: Path, name: str) -> Path:
 
 
 class Tab:
-    """One tab of the page, put together where it is made.
+    """One tab of the page, put together where it is made; files to download lie in `folder`."""
 
-    `address` gives a picture an address for the browser; files to download lie in `folder`.
-    """
-
-    def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
+    def __init__(self, address: Address, folder: Path) -> None:
         self.address, self.folder = address, folder
         self.viewed: ViewedScene | None = None
 
@@ -49,6 +43,11 @@ class Tab:
         viewed = self.viewed
         found = await run.io_bound(function, *arguments, **options)
         return found if viewed is self.viewed else None
+
+    def save_button(self, ending: str, save: Callable[[str], Any]) -> ui.button:
+        """A button that calls `save` with the ending of a file."""
+        button = ui.button(ending.upper(), icon="download", on_click=lambda: save(ending))
+        return button.props(f'dense aria-label="save {ending.upper()}"')
 
     async def download(self, button: ui.button, name: str, write: Callable[[Path], object]) -> None:
         """Sends the browser the file called `name` that `write` writes to a path."""
@@ -82,63 +81,111 @@ def loading(
 def complain(error: Exception | str) -> None:
     """Shows an error as a notice."""
     text = " ".join(str(error).split()).encode(errors="replace").decode()  # names of files, too
-    ui.notify(text, type="negative", multi_line=True, timeout=10_000)
+    ui.notify(text, type="negative", multi_line=True, timeout=0, close_button="Close")
+
+
+def heading(text: str, level: int) -> TextElement:
+    """A heading of the page: 1 for its title."""
+    return TextElement(tag=f"h{level}", text=text).classes("title")
+
+
+def labelled_slider(name: str, most: float, step: float, text: Callable[[Any], str]) -> ui.slider:
+    """A slider from 0 to `most` after its name, before its value as `text`, which is read out."""
+    with ui.element("div").classes("setting"):
+        ui.label(name)
+        slider = ui.slider(min=0, max=most, step=step, value=0)
+        slider.props(f'aria-label="{name}" aria-valuetext="{text(0)}" dense')
+        slider.on_value_change(lambda e: slider.props.update({"aria-valuetext": text(e.value)}))
+        ui.label().classes("value").bind_text_from(slider, "value", text)
+    return slider
 
 
 class Stage:
-    """A picture, and another one over it on the right of a divider.
+    """A picture, and another one over it on the right of a divider; wheel and drags zoom and move.
 
-    It is put together where it is made, within an element of class ``columns``; `alt` and `divider`
-    say what the picture is, and what is divided.
+    It is put together where it is made, within an element of class ``columns``; `alt` says what the
+    picture is, `tags` what lies on either side of the divider.
     """
 
-    def __init__(self, tab: Tab, alt: str, divider: str) -> None:
-        self._tab = tab
+    def __init__(self, tab: Tab, alt: str, tags: tuple[str, str]) -> None:
+        self._tab, self._kind = tab, ""
         with ui.element("div").classes("stage whole") as self._holder:
-            self._image = ui.element("img").props(f'alt="{alt}" draggable=false')
-            self._over = ui.element("img").classes("over").props('alt="" draggable=false')
+            keys = f"{alt}: plus and minus zoom, arrows move it"
+            self._holder.props(f'tabindex=0 role=group aria-label="{keys}"')
+            with ui.element("div").classes("zoomed"):
+                self._image = ui.element("img").props(f'alt="{alt}" draggable=false')
+                self._over = ui.element("img").classes("over").props('alt="" draggable=false')
+                self._overlay = ui.element("img").classes("overlay").props('alt="" draggable=false')
             self._edge = ui.element("div").classes("edge")
+            self.tags = [ui.label(t).classes(f"tag {x}") for x, t in zip("AB", tags, strict=True)]
+            ui.label().classes("scale")
         self._divider = ui.element("input").classes("divider")
-        self._divider.props(f'type=range min=0 max=100 value=50 step=1 aria-label="{divider}"')
-        self._divider.on("input", js_handler=_DIVIDE)
+        about = f"divider of {tags[0]} and {tags[1]}"
+        self._divider.props(f'type=range min=0 max=100 step=1 aria-label="{about}"')
+        divide = "(e) => divide(e.target.parentElement.querySelector('.stage'), e.target.value)"
+        self._divider.on("input", js_handler=divide)
         self.compare(None)
+        self.draw_over(None)
 
-    @property
-    def images(self) -> tuple[ui.element, ui.element]:
-        """The picture, and the one over it."""
-        return self._image, self._over
+    def on(self, event: str, handler: Callable[[Any], Any]) -> None:
+        """Calls `handler` with the place of an event, down and right as shares of the picture."""
+        place = "(e) => emit(e.offsetY / e.target.height, e.offsetX / e.target.width)"
+        for image in (self._image, self._over):
+            image.on(event, handler, js_handler=place, throttle=0.05)
 
-    def show(self, jpeg: bytes, aspect: float, kind: str = "whole") -> None:
-        """Shows a picture: ``"whole"``, or its ``"pixels"``."""
+    def show(self, jpeg: bytes, aspect: float, kind: str = "whole", photosites: int = 0) -> None:
+        """Shows a picture: ``"whole"``, or its ``"pixels"``; so many photosites wide."""
         self._tab.show(self._image, jpeg)
         self._holder.classes(replace=f"stage {kind}")
-        self._holder.style(f"--aspect: {aspect:.4f}")
+        self._holder.style(f"--aspect: {aspect:.4f}; --photosites: {photosites}")
+        if kind != self._kind:
+            self._kind = kind
+            ui.run_javascript(f"place(getHtmlElement({self._holder.id}), 0, 0, 1)")
 
     def compare(self, jpeg: bytes | None) -> None:
         """Shows a picture right of the divider, or none."""
-        for element in (self._over, self._edge, self._divider):
+        for element in (self._over, self._edge, self._divider, *self.tags):
             element.set_visibility(jpeg is not None)
         if jpeg is not None:
             self._tab.show(self._over, jpeg)
+
+    def draw_over(self, png: bytes | None) -> None:
+        """Draws a transparent picture over both, or none."""
+        self._overlay.set_visibility(png is not None)
+        self._tab.show(self._overlay, png)
 
     def clear(self) -> None:
         """Shows no picture."""
         self.compare(None)
         self._tab.show(self._image, None)
+        self._kind = ""
 
 
-def curves(lines: Iterable[tuple[str, Any]], low: float, high: float, height: int) -> str:
-    """An SVG of lines, pairs of a colour and values from `low` to `high`: numbers alone."""
-    scale, drawn = (height - 4) / max(high - low, 1e-9), []
-    for colour, values in lines:
-        step = _CHART_WIDTH / max(len(values) - 1, 1)
-        heights = height - 2 - (np.asarray(values, float) - low) * scale
-        points = " ".join(f"{i * step:.1f},{y:.1f}" for i, y in enumerate(heights))
-        drawn.append(
-            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2" '
-            'vector-effect="non-scaling-stroke"/>'
-        )
-    return (
-        f'<svg viewBox="0 0 {_CHART_WIDTH} {height}" preserveAspectRatio="none" '
-        f'style="width:100%;height:{height}px;display:block">{"".join(drawn)}</svg>'
-    )
+def line_chart(x: str, y: str, height: int) -> ui.echart:
+    """A chart of lines with named axes, still empty, see `draw_lines`."""
+    axis = {"type": "value", "scale": True, "nameLocation": "middle", "splitNumber": 4}
+    axis |= {"axisLabel": {"color": "#b4b4b4"}, "nameTextStyle": {"color": "#b4b4b4"}}
+    axis |= {"splitLine": {"lineStyle": {"color": "#333"}}}
+    options = {
+        "animation": False,
+        "grid": {"left": 52, "right": 14, "top": 18, "bottom": 40},
+        "xAxis": axis | {"name": x, "nameGap": 24, "min": "dataMin", "max": "dataMax"},
+        "yAxis": axis | {"name": y, "nameGap": 36},
+        "tooltip": {"trigger": "axis", ":valueFormatter": "v => (+v).toPrecision(3)"},
+    }
+    chart = ui.echart(options).style(f"height:{height}px")
+    return chart.props(f'role=img aria-label="{y} against {x}"')
+
+
+def draw_lines(chart: ui.echart, lines: Iterable[Any], marks: Sequence[Any] = ()) -> None:
+    """Draws lines, each a name, colour and points (x, y); `marks` as ECharts takes them."""
+    looks: dict[str, Any] = {"type": "line", "step": "middle", "symbol": "none"}
+    series = [looks | {"name": n, "color": c, "data": list(points)} for n, c, points in lines]
+    series[0]["markLine"] = {
+        "symbol": "none",
+        "silent": True,
+        "label": {"color": "#ececec"},
+        "data": marks,
+    }
+    chart.options["series"] = series
+    chart.update()

@@ -26,6 +26,9 @@ from ae_env.scenes.recorded import PREFIX
 from ae_env.scenes.scene import SceneRequest, SceneSet
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from agents.metering.meters import weight_map
+from agents.metering.reading import Region
+from agents.policy_names import CLASSIC_METERS
 from simulator import (
     CameraSettings,
     CameraSimulator,
@@ -54,8 +57,10 @@ FRAME_SIZE = (512, 768)
 WINDOW_SIZE = (128, 192)
 #: Pixels a side that scores are found at, as in the environment.
 SCORED_PIXELS = 64
-#: Bins of a histogram.
-BINS = 64
+#: Names of the planes.
+PLANES = ("R", "G1", "G2", "B")
+#: Stops below white that a histogram shows, and its bins.
+STOPS, BINS = 10, 40
 #: Signal of the mid grey that noise is stated at.
 MID_GREY = 0.12
 #: Colours of clipped pixels: a plane at white, a plane at or below black.
@@ -188,6 +193,7 @@ class View:
     speed: float = 0.0  # image speed [frame heights per second]
     defocus: float = 0.0  # diameter of the defocus disc at f/4 [pixel of a 64-pixel frame]
     clipping: bool = False  # whether clipped pixels are marked
+    equal_brightness: bool = False  # developed as if exposed as the scene asks for
     #: Middle of the part shown pixel by pixel, down and to the right, as shares of the upright
     #: picture; None for the whole frame.
     centre: tuple[float, float] | None = None
@@ -199,6 +205,7 @@ class Picture:
 
     jpeg: bytes
     aspect: float
+    photosites: int  # of the sensor across it
     capture: torch.Tensor  # (4, H, W)
     milliseconds: tuple[float, float]  # of the capture, and of its development
 
@@ -209,12 +216,16 @@ class Readout:
 
     plan: SimulationPlan
     score: float  # expected
+    #: Score of each part of the scorer, and how much higher the whole were if that were 1; the
+    #: costliest first.
+    parts: dict[str, tuple[float, float]]
+    ev: float  # exposure relative to the right one [stop]
     snr: float  # of mid grey, of one photosite [dB]
     motion: float  # length of the streak
     defocus: float  # diameter of the disc
     white: float
     black: float
-    histogram: np.ndarray  # (4, BINS) of each plane, from black to white
+    histogram: np.ndarray  # (4, BINS) of each plane, from `STOPS` below white up
 
 
 class ViewedScene:
@@ -236,11 +247,16 @@ class ViewedScene:
         self._tables: dict[object, ScoreTable] = {}
         self._lock = threading.RLock()  # one capture at a time: more would share the cores
 
+    @property
+    def _averaged(self) -> int:
+        """Packed pixels a side that one of `small` is the mean of."""
+        sides = zip(self.scene.light.shape[1:], FRAME_SIZE, strict=True)
+        return max(math.ceil(side / most) for side, most in sides)
+
     @cached_property
     def small(self) -> Scene:
         """The scene averaged to at most `FRAME_SIZE`; what fills no whole pixel is left out."""
-        sides = zip(self.scene.light.shape[1:], FRAME_SIZE, strict=True)
-        return self.scene.averaged(max(math.ceil(side / most) for side, most in sides))
+        return self.scene.averaged(self._averaged)
 
     @cached_property
     def scored(self) -> Scene:
@@ -262,7 +278,8 @@ class ViewedScene:
             image = self._to_srgb(capture, view)
             jpeg = encoded(image, quality=88 if view.centre is None else 95)
             times = 1e3 * (taken - begun), 1e3 * (perf_counter() - taken)
-            return Picture(jpeg, image.shape[1] / image.shape[0], capture, times)
+            photosites = image.shape[1] * (2 * self._averaged if view.centre is None else 1)
+            return Picture(jpeg, image.shape[1] / image.shape[0], photosites, capture, times)
 
     def readout(self, view: View, capture: torch.Tensor) -> Readout:
         """The numbers about `capture`, which `view` asked for."""
@@ -272,10 +289,14 @@ class ViewedScene:
             noise = camera.nlf(settings.iso, settings.exposure_time)
             variance = noise.read[1] + noise.shot[1] * MID_GREY + (camera.prnu * MID_GREY) ** 2
             values = capture.reshape(4, -1)
-            counts = [torch.histc(plane, BINS, 0.0, 1.0).numpy() for plane in values]
+            seen = values.clamp(min=2.0 ** -(STOPS + 1)).masked_fill(values >= _AT_WHITE, 2.0)
+            counts = [torch.histc(plane, BINS, -STOPS, 0.0).numpy() for plane in seen.log2()]
+            table = self.table(view, settings)
             return Readout(
                 plan=self._part(view).plan(settings),
-                score=float(self.table(view, settings).mean[0]),
+                score=float(table.mean[0]),
+                parts=self._costs(table),
+                ev=settings.log2_exposure + self.scene.ev100,
                 snr=20.0 * math.log10(MID_GREY / math.sqrt(variance)) if variance else math.inf,
                 motion=view.speed * height * settings.exposure_time,
                 defocus=view.defocus * height / SCORED_PIXELS * 4.0 / settings.effective_f_number,
@@ -283,6 +304,39 @@ class ViewedScene:
                 black=float((values <= _AT_BLACK).float().mean()),
                 histogram=np.stack(counts) / values.shape[1],
             )
+
+    def _costs(self, table: ScoreTable) -> dict[str, tuple[float, float]]:
+        costs = {}
+        for name, score in table.parts.items():
+            perfect = float(self._scorer.combine({**table.parts, name: np.ones(1)})[0])
+            costs[name] = float(score[0]), max(perfect - float(table.mean[0]), 0.0)
+        return dict(sorted(costs.items(), key=lambda item: -item[1][1]))
+
+    def photosite(self, view: View, capture: torch.Tensor, down: float, right: float) -> str:
+        """The sample of `capture` at a place of its upright picture, in shares of that."""
+        camera, k, start = self.scene.camera, self._averaged, [0, 0]
+        if view.centre is not None:
+            k, start = 1, [part.start for part in self._window(view.centre)]
+        sides = np.array(capture.shape[1:])
+        place = np.minimum(2 * sides * self._to_frame(down, right), 2 * sides - 1).astype(int)
+        plane = camera.cfa.offsets.index(tuple(place % 2))
+        black, white = camera.black_level[plane], camera.white_level
+        number = black + float(capture[plane, *(place // 2)]) * (white - black)
+        row, column = 2 * (np.array(start) + k * (place // 2)) + place % 2
+        text = f"{PLANES[plane]} {number:.0f} of {black:.0f} to {white:.0f}, row {row}, "
+        return f"{text}column {column}{f', mean of {k} x {k}' * (k > 1)}"
+
+    def weights_over(self, meter: str) -> bytes:
+        """A PNG of where `meter`, or a region ``"left,top,width,height"``, looks in the picture."""
+        size, side, (height, width) = (SCORED_PIXELS,) * 2, 256, self.scene.light.shape[1:]
+        seen = None if meter in CLASSIC_METERS else Region(meter, None, (4, *size)).masks({})
+        weights = weight_map(meter, *size) if seen is None else seen[0].astype(float)
+        square = Image.fromarray(np.uint8(150 * weights / weights.max())).resize((side, side), 0)
+        full = [round(side * length / min(height, width)) for length in (width, height)]
+        alpha, picture = Image.new("L", full), Image.new("RGBA", full, "#ffa500")
+        alpha.paste(square, ((full[0] - side) // 2, (full[1] - side) // 2))
+        picture.putalpha(alpha)
+        return encoded(self._upright(np.asarray(picture)), "PNG")
 
     def table(self, view: View, settings: CameraSettings | None = None) -> ScoreTable:
         """Scores of `settings` alone, or of the default grid's states, moving as in `view`."""
@@ -339,12 +393,15 @@ class ViewedScene:
             defocus=view.defocus * height / SCORED_PIXELS,
         )
 
-    def _window(self, centre: tuple[float, float]) -> tuple[slice, slice]:
-        down, right = centre
+    def _to_frame(self, down: float, right: float) -> tuple[float, float]:
+        """A place of the upright picture on the sensor, as `as_recorded`."""
         flip = 0 if self.photograph is None else self.photograph.metadata.get("flip", 0)
-        if flip & 4:  # from the upright picture to the frame, as `as_recorded`
+        if flip & 4:
             down, right = right, down
-        down, right = 1.0 - down if flip & 2 else down, 1.0 - right if flip & 1 else right
+        return 1.0 - down if flip & 2 else down, 1.0 - right if flip & 1 else right
+
+    def _window(self, centre: tuple[float, float]) -> tuple[slice, slice]:
+        down, right = self._to_frame(*centre)
 
         def part(share: float, side: int, size: int) -> slice:
             start = round(min(max(share * side - size / 2, 0), max(side - size, 0)))
@@ -354,8 +411,10 @@ class ViewedScene:
         return part(down, height, WINDOW_SIZE[0]), part(right, width, WINDOW_SIZE[1])
 
     def _to_srgb(self, capture: torch.Tensor, view: View) -> np.ndarray:
-        raw = _raw(self.scene, view.settings, capture)
-        whole = view.centre is None
+        whole, gain = view.centre is None, 1.0
+        if view.equal_brightness:
+            gain = 2.0 ** -(view.settings.log2_exposure + self.scene.ev100)
+        raw = _raw(self.scene, view.settings, capture * gain)
         image = render_srgb(raw, "half" if whole else "malvar").permute(1, 2, 0).numpy()
         if view.clipping:
             image = image.copy()

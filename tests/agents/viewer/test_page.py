@@ -15,6 +15,7 @@ from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from fastapi.responses import PlainTextResponse
@@ -54,13 +55,53 @@ def test_the_window_lies_where_the_upright_picture_was_clicked(flip):
     light = torch.full((4, 700, 900), 0.02)
     light[:, 120:124, 700:704] = 0.9  # a spot
     seen = viewed(light, flip)
-    whole = image(seen.picture(View(SETTINGS))).mean(axis=2)
+    picture = seen.picture(View(SETTINGS))
+    whole = image(picture).mean(axis=2)
     down, right = np.unravel_index(whole.argmax(), whole.shape)
     centre = ((down + 0.5) / whole.shape[0], (right + 0.5) / whole.shape[1])
     window = image(seen.picture(View(SETTINGS, centre=centre))).mean(axis=2)
     assert sorted(window.shape) == sorted(2 * side for side in WINDOW_SIZE)
     found = np.argwhere(window > 0.8 * window.max()).mean(axis=0)
     np.testing.assert_allclose(found, np.array(window.shape) / 2, atol=8)
+    close = View(SETTINGS, centre=centre)
+    for view, place in ((View(SETTINGS), centre), (close, (0.5, 0.5))):  # two pixels averaged, none
+        text = seen.photosite(view, seen.picture(view).capture, *place)
+        number, black, white, row, column = map(int, re.findall(r"(?<![A-Z])\d+", text)[:5])
+        assert number == pytest.approx(black + 0.9 * (white - black), rel=0.05)
+        np.testing.assert_allclose((row, column), (243.5, 1403.5), atol=4)
+
+
+@pytest.mark.parametrize(("down", "right", "plane"), [(0, 0, 0), (0, 1, 1), (1, 0, 2), (1, 1, 3)])
+def test_a_photosite_has_its_filter_and_digital_number(down, right, plane):
+    light = torch.tensor([0.1, 0.2, 0.3, 0.4])[:, None, None].expand(4, 64, 64).contiguous()
+    seen, view = viewed(light), View(SETTINGS)
+    assert CAMERA.cfa == "RGGB"
+    place = ((20.5 + down) / 128, (30.5 + right) / 128)
+    text = seen.photosite(view, seen.picture(view).capture, *place)
+    name, number = text.split()[:2]
+    assert name == ("R", "G1", "G2", "B")[plane]
+    span = CAMERA.white_level - CAMERA.black_level[plane]
+    assert int(number) == pytest.approx(
+        CAMERA.black_level[plane] + float(light[plane, 0, 0]) * span, rel=0.1
+    )
+    assert text.endswith(f"row {20 + down}, column {30 + right}")
+
+
+def test_a_meter_or_region_is_drawn_where_it_looks():
+    seen = viewed(torch.full((4, 64, 96), 0.1))
+    for name, middle in (
+        ("spot", True),
+        ("matrix", True),
+        ("average", True),
+        ("0,0,0.25,0.25", False),
+    ):
+        alpha = np.asarray(Image.open(io.BytesIO(seen.weights_over(name))))[..., 3]
+        assert alpha.shape == (256, 384)
+        assert (alpha[128, 192] == 150) == middle
+        assert (alpha[10, 70] > 0) == (name != "spot")  # in the square that policies see
+        assert not alpha[:, :60].any()
+    with pytest.raises(ValueError, match="`roi`"):
+        seen.weights_over("nonsense")
 
 
 def test_clipped_pixels_are_marked():
@@ -90,9 +131,17 @@ def test_numbers_of_a_flat_scene():
         readout = large.readout(shown, large.picture(shown).capture)
         assert readout.motion == pytest.approx(0.5 * 512 / 16)
         assert readout.defocus == pytest.approx(4.0 * 512 / 64)
-    dark = View(CameraSettings(100, 1 / 128, 4))
+    dark = View(CameraSettings(100, 1 / 100, 4))
     readout = seen.readout(dark, seen.picture(dark).capture)
-    assert readout.histogram.argmax(axis=1).tolist() == [8] * 4  # 0.125 of white, in 64 bins
+    assert readout.histogram.argmax(axis=1).tolist() == [29] * 4  # 0.16 of white, -2.64 stops
+    noise, cost = readout.parts["noise"]
+    assert cost == pytest.approx(readout.score * (noise**-0.2 - 1), abs=1e-9)  # of a product
+    grey = [
+        replace(view, settings=CameraSettings(iso, 1 / 100, 4), equal_brightness=True)
+        for iso in (100, 200)
+    ]
+    levels = [image(seen.picture(replace(view, defocus=0.0))).mean() for view in grey]
+    assert levels[0] == pytest.approx(levels[1], abs=3)
     np.testing.assert_allclose(readout.histogram.sum(axis=1), 1.0)
     nlf = CAMERA.nlf(100)
     snr = 20 * math.log10(0.12 / math.sqrt(nlf.read[1] + nlf.shot[1] * 0.12))
@@ -291,10 +340,10 @@ def slider(page, name):
 def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect, capsys):
     """From the key to the frame of the screen after the picture has loaded: see docs/viewer.md."""
     expect(page.locator(".state", has_text=re.compile(r"\d"))).to_have_count(64)
-    scores = [float(text.split()[-1]) for text in page.locator(".state").all_inner_texts()]
+    scores = [float(text.lstrip("★")) for text in page.locator(".state").all_inner_texts()]
     shown = page.locator(".state.shown")
     expect(shown).to_contain_text("★")
-    assert float(shown.inner_text().split()[-1]) == max(scores)
+    assert float(shown.inner_text().lstrip("★")) == max(scores)
     page.evaluate("""() => {
       window.times = []; let begun = 0;
       document.addEventListener('keydown', () => { begun = performance.now(); }, true);
@@ -322,8 +371,18 @@ def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect
     page.keyboard.press("Escape")
     page.locator("body").press("z")
     expect(page.locator(".stage.whole")).to_be_visible()
+    # A locked exposure stays: what ISO takes, the time gives back.
+    ev = page.get_by_text(re.compile("^EV100 "))
+    locked = ev.inner_text()
+    page.locator("body").press("l")
+    slider(page, "ISO").focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("[aria-label=ISO]")).to_have_attribute("aria-valuetext", "125")
+    expect(page.get_by_text(re.compile("^ISO 125"))).to_be_attached()
+    assert ev.inner_text() == locked
+    page.locator("body").press("l")
     # Two states, with a divider.
-    page.get_by_text("Compare with this (P)").click()
+    page.get_by_text("Keep this as B (P)").click()
     over = page.locator(".stage .over[src]")
     over.wait_for()
     pinned = over.get_attribute("src")
@@ -336,35 +395,94 @@ def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect
     page.locator("input.divider").focus()
     page.keyboard.press("Home")
     expect(over).to_have_css("clip-path", "inset(0px 0px 0px 0%)")
+    box = page.locator(".stage").bounding_box()
+    page.mouse.move(box["x"] + 2, box["y"] + 90)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 90, steps=3)
+    page.mouse.up()
+    expect(over).to_have_css("clip-path", re.compile(r"inset\(0px 0px 0px (49|50)"))
+    expect(page.locator(".stage.whole")).to_be_visible()  # a drag is no click
+    page.mouse.wheel(0, -100)
+    expect(page.locator(".scale")).to_have_attribute("data-text", re.compile(r"\d px, zoom 1.2"))
+    # The map has one stop of the Tab key; arrows choose.
+    expect(page.locator(".state[tabindex='0']")).to_have_count(1)
+    page.locator("[title^='ISO 400, 1/1000 s, f/11']").click()
+    for key, state in (
+        ("ArrowRight", "ISO 400, 1/125 s, f/11"),
+        ("ArrowDown", "ISO 6400, 1/125 s, f/4"),
+    ):
+        page.keyboard.press(key)
+        expect(page.locator(".state:focus")).to_have_attribute("aria-label", re.compile(state))
+        expect(page.locator(".state.shown")).to_have_attribute("title", re.compile(state))
+    page.mouse.move(box["x"] + 90, box["y"] + 90)
+    expect(page.get_by_text(re.compile(r"^(R|G1|G2|B) \d+ of 1008 to 15520, row"))).to_be_visible()
 
 
 @pytest.mark.slow
-def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
+def test_axe_finds_no_serious_fault_in_any_tab(page):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+
+    def faults():
+        found = axe.run(page).response["violations"]
+        found = [v for v in found if v["impact"] in ("serious", "critical")]
+        return [(v["id"], [node["html"] for node in v["nodes"]]) for v in found]
+
+    for width in (390, 1280):
+        page.set_viewport_size({"width": width, "height": 800})
+        for name in ("Episode", "Refocus, HDR", "Exposure"):
+            page.get_by_role("tab", name=name).click()
+            page.wait_for_timeout(500)
+            assert faults() == []
+    page.goto(page.url.replace("scene=", "scene=no-"))
+    page.wait_for_selector(".state.shown")
+    page.get_by_role("button", name="Close").wait_for()
+    assert faults() == []
+    page.get_by_role("button", name="Close").click()
+    page.get_by_role("button", name="Scenes").click()
+    page.locator(".thumb").first.wait_for()
+    assert faults() == []
+
+
+@pytest.mark.slow
+def test_policies_in_two_tabs_that_fit_the_width(page, expect, address, tmp_path):
     page.get_by_label(re.compile("Mark where policies")).click()
     page.get_by_role("option", name="average", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^A average: ISO"))).to_be_visible()
-    expect(page.locator(".state", has_text="A")).to_have_count(1)
+    expect(page.get_by_text(re.compile("average: ISO"))).to_be_visible()
+    expect(page.locator(".state[title$='average']")).to_have_count(1)
     page.get_by_role("tab", name="Episode").click()
     for label, name in (("policy A", "average"), ("policy B", "rpi_agc")):
         page.get_by_label(label).fill(name)
     page.get_by_label("frames").fill("6")
     page.get_by_role("button", name="Run").click()
-    expect(page.get_by_text("frame 6 of 6")).to_be_visible()
+    frame = page.locator("[aria-label=Frame]")
+    expect(frame).to_have_attribute("aria-valuetext", "6")
     expect(page.get_by_text(re.compile(r"^A average: .* regret"))).to_have_count(1)
     expect(page.get_by_text(re.compile(r"^B rpi_agc: .* regret"))).to_have_count(1)
-    expect(page.locator(".chart polyline")).to_have_count(3 + 2 + 2)
+    expect(page.locator(".charts canvas")).to_have_count(3)
+    rows = pd.read_csv(saved(page, "save CSV", tmp_path))
+    assert rows.policy.tolist() == ["average"] * 7 + ["rpi_agc"] * 7
+    np.testing.assert_allclose(
+        rows.ev100, np.log2(rows.f_number**2 / rows.exposure_time * 100 / rows.iso), atol=0.05
+    )
+    assert saved(page, "save GIF", tmp_path).read_bytes()[:6] == b"GIF89a"
+    link = "a=average&b=rpi_agc&light=shadows&frames=6&seed=0"
+    assert page.url.endswith(link)
     page.get_by_label("policy A").fill("averagee")
     page.get_by_role("button", name="Run").click()
     expect(page.get_by_text(re.compile("did you mean"))).to_be_visible()
+    page.get_by_role("button", name="Close").click()
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 844})
         for name, there in (("Refocus, HDR", "text=Fuse a bracket"), ("Exposure", ".state.shown")):
             page.get_by_role("tab", name=name).click()
             page.locator(there).wait_for()
             page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
+        if width == 1280:  # all is in sight
+            assert page.evaluate("document.documentElement.scrollHeight") <= 844
+            continue
         page.evaluate("scrollTo(0, 400)")
         top = "document.querySelector('.stage').getBoundingClientRect().top"
-        page.wait_for_function(f"w => scrollY > 200 && ({top} === 0) === (w < 900)", arg=width)
+        page.wait_for_function(f"() => scrollY > 200 && {top} === 0")
     # Another tab of the browser shows another scene, and goes back, forward, and loads it again.
     other = page.context.new_page()
     other.goto(address.partition("?")[0])  # the cookie has the token
@@ -379,6 +497,8 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address):
     other.wait_for_url(f"**scene={name}&**")
     other.go_back()
     expect(other.locator(".title", has_text=name)).to_have_count(0)
+    other.goto(f"{address.partition('?')[0]}?tab=episode&{link}7")
+    expect(other.get_by_label("policy B")).to_have_value("rpi_agc")
     other.goto(f"{address.partition('?')[0]}?scene={name}&iso=1600&t=1/15&n=4&tab=exposure")
     other.locator("button.shown[aria-label^='ISO 1600, 1/15 s, f/4']").wait_for()
     expect(other.locator(".title").first).to_have_text(name)
