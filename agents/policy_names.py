@@ -283,7 +283,7 @@ def _known(base: str, head: str) -> str:
     """What a name may be, for an error about the unknown `base`, which begins with `head`."""
     if head in (*METERS, "rpi_agc"):
         known = [f"{head}:{p}" for p in (PROGRAMS if head in METERS else MANUAL_PROGRAMS)]
-        return f" must be one of {', '.join(known)}{did_you_mean(base, known)}"
+        return f" must be one of {', '.join(known)}{did_you_mean(base, known, cutoff=0.9)}"
     files = [f"{head}:{argument.upper()}" for head, (_, argument) in WITH_FILE.items()]
     names = [*_POLICIES, *files, *_BRACKETS]
     single = [name for name in names if name.partition(":")[0] not in METERS]
