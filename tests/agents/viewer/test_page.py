@@ -422,7 +422,12 @@ def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect
 def test_axe_finds_no_serious_fault_in_any_tab(page):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
 
+    # What fades in has its contrast at the end.
+    ended = "() => Promise.allSettled(document.getAnimations().map(a => a.effect.getTiming()"
+    ended += ".iterations === Infinity ? 0 : a.finished))"
+
     def faults():
+        page.evaluate(ended)
         found = axe.run(page).response["violations"]
         found = [v for v in found if v["impact"] in ("serious", "critical")]
         return [(v["id"], [node["html"] for node in v["nodes"]]) for v in found]
@@ -431,7 +436,7 @@ def test_axe_finds_no_serious_fault_in_any_tab(page):
         page.set_viewport_size({"width": width, "height": 800})
         for name in ("Episode", "Refocus, HDR", "Exposure"):
             page.get_by_role("tab", name=name).click()
-            page.wait_for_timeout(500)
+            page.wait_for_timeout(500)  # its pictures
             assert faults() == []
     page.goto(page.url.replace("scene=", "scene=no-"))
     page.wait_for_selector(".state.shown")
