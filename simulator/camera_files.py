@@ -27,7 +27,6 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import parse_qsl
 from zipfile import is_zipfile
 
 import numpy as np
@@ -35,10 +34,10 @@ import numpy as np
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.checks import (
     check_integer,
-    check_key,
     check_number,
     did_you_mean,
     parse_number,
+    parse_options,
 )
 
 #: Share of the variance of a photosite in HH of the green that PPG makes of a flat field; LibRaw's
@@ -100,7 +99,8 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
     stem, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     reader, known = _READERS[kind]
     try:
-        return reader(stem, _options(query, known)) | pixel_fields(query, known)
+        options = parse_options("camera", query, (*known, *_PIXEL))
+        return reader(stem, options) | pixel_fields(query, known)
     except (KeyError, TypeError, AttributeError, IndexError, np.linalg.LinAlgError) as error:
         what = {"ctt": "tuning file of libcamera", "darktable": "noiseprofiles.json of darktable"}
         what["emva"] = "npz of flat fields"
@@ -112,19 +112,8 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
 
 def pixel_fields(query: str, known: tuple[str, ...] = ()) -> dict[str, Any]:
     """``prnu`` and ``dark_current`` of options, which may also be those that are `known`."""
-    options = _options(query, known)
-    return {key: parse_number(options[key], key) for key in _PIXEL if key in options}
-
-
-def _options(query: str, known: tuple[str, ...]) -> dict[str, str]:
-    try:
-        options = dict(parse_qsl(query.replace("+", "%2B"), strict_parsing=bool(query)))
-    except ValueError:
-        rule = "must be written NAME=VALUE, with & in between"
-        raise ValueError(f"`camera?{query}`: options {rule}") from None
-    for key in options:
-        check_key("options", key, (*known, *_PIXEL))
-    return options
+    options = parse_options("camera", query, (*known, *_PIXEL))
+    return {key: parse_number(options[key], f"camera?{key}") for key in _PIXEL if key in options}
 
 
 def _read(path: Path) -> Any:

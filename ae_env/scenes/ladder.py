@@ -105,6 +105,11 @@ def _tag(rng: Generator) -> tuple[str, Array]:
 KINDS: dict[str, Callable[[Generator], tuple[str, Array]]] = {"codes": _code, "tags": _tag}
 
 
+def check_size(resolution: object) -> None:
+    """A `ValueError` unless scenes of so many pixels a side can have codes drawn into them."""
+    check_integer("resolution", resolution, MIN_SIZE, 4096, more=" to draw codes into scenes")
+
+
 def with_ladder(scene: Scene, kind: str = "codes", seed: int = 0) -> Scene:
     """`scene` with boards of codes, which its name and `seed` decide, and with `Scene.ladder`.
 
@@ -112,8 +117,8 @@ def with_ladder(scene: Scene, kind: str = "codes", seed: int = 0) -> Scene:
 
     A `ValueError` if the scene has noise of its own, is recorded or smaller than `MIN_SIZE`.
     """
-    height, least = scene.light.shape[1], min(scene.light.shape[1:])
-    check_integer("resolution", least, MIN_SIZE, 4096, more=" to draw codes into scenes")
+    height = scene.light.shape[1]
+    check_size(min(scene.light.shape[1:]))
     if not scene.noise_free or scene.recorded is not None:
         raise ValueError(
             f"`scenes` ({scene.scene_id!r}) must be light without noise to have codes drawn into "

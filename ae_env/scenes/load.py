@@ -45,7 +45,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes.bundled import HARD, KINDS, Size, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
 from ae_env.scenes.ladder import KINDS as LADDERS
-from ae_env.scenes.ladder import with_ladder
+from ae_env.scenes.ladder import check_size, with_ladder
 from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest, SceneSet, Split
@@ -122,8 +122,10 @@ def load_scenes(
     if isinstance(spec, str) and (drawn := _LADDER.fullmatch(spec)):
         seeds = (drawn[3] or "0").split(",")
         if not all(re.fullmatch(r"\d{1,18}", seed) for seed in seeds) or len({*seeds}) < len(seeds):
-            rule = "must be a whole number >= 0, or several with commas between them"
+            rule = "must be a whole number >= 0, or several that differ, with commas and no spaces"
             raise ValueError(f"`scenes?{drawn[2]}` (={drawn[3]!r}) {rule}")
+        if resolution is not None:  # before any scene is drawn
+            check_size(resolution)
         size: dict[str, Any] = {"resolution": resolution, "crop": crop, "resize": resize}
         plain = load_scenes(drawn[1], split, camera=camera, grid=grid, **size)
         found = [[with_ladder(scene, drawn[2], int(seed)) for scene in plain] for seed in seeds]

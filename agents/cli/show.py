@@ -190,7 +190,7 @@ def scorers() -> None:
 
 
 def policies() -> None:
-    """List the built-in policies of single frames.
+    """List the built-in policies of single frames and of video.
 
     Example: `ae-env policies` lists them; docs/policies.md says what they are.
     """
@@ -217,6 +217,7 @@ def cameras() -> None:
         model = f"{camera.make} {camera.model.removeprefix(camera.make).strip()}"
         rows.append((camera.name, model, calibrated, by))
     print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
+    print_line("options: NAME?prnu=0.005&dark_current=30")
     print_line("others by a file: ctt:FILE, darktable:MAKER MODEL, emva:FILE (docs/cameras.md)")
 
 

@@ -10,16 +10,15 @@ import functools
 import math
 from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import parse_qsl
 
 import numpy as np
 
 from simulator.utils.checks import (
-    check_key,
     check_type,
     did_you_mean,
     import_extra,
     parse_number,
+    parse_options,
 )
 
 #: Lenses that `random_lens` chooses from.
@@ -116,12 +115,8 @@ def get_lens(lens: str | Vignetting | None) -> Vignetting | None:
         rule = f"'{_PREFIX}NAME', a `Vignetting` or None; environments also take 'random'"
         raise ValueError(f"`lens` (={lens!r}) must be {rule}")
     name, _, query = lens.removeprefix(_PREFIX).partition("?")
-    pairs = parse_qsl(query, keep_blank_values=True)
-    numbers = dict(pairs)
-    if len(numbers) < len(pairs):
-        raise ValueError(f"`lens` (={lens!r}) must have each option once")
+    numbers = parse_options("lens", query, _KEYS)
     for key, value in numbers.items():
-        check_key("lens", key, _KEYS)
         if not 0.0 < parse_number(value, f"lens?{key}") < math.inf:
             raise ValueError(f"`lens?{key}` (={value}) must be above 0 and finite")
     return _from_lensfun(name, *(float(numbers.get(key, 0.0)) for key in _KEYS))

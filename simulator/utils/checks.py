@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
+from urllib.parse import parse_qsl
 
 #: Units of times [s].
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -65,6 +66,20 @@ def check_key(name: str, key: Any, known: tuple[str, ...]) -> None:
     if key not in known:
         rule = f"its keys are {', '.join(map(repr, known))}" if known else "it has none"
         raise ValueError(f"`{name}` must not have {key!r}: {rule}{did_you_mean(key, known)}")
+
+
+def parse_options(name: str, query: str, known: tuple[str, ...]) -> dict[str, str]:
+    """Options ``KEY=VALUE&KEY=VALUE`` of what `name` names; each at most once, of `known` keys."""
+    try:
+        pairs = parse_qsl(query.replace("+", "%2B"), True, strict_parsing=bool(query))
+    except ValueError:
+        rule = "must be written NAME=VALUE, with & in between"
+        raise ValueError(f"`{name}?{query}`: options {rule}") from None
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError(f"`{name}?{query}` must have each option once")
+    for key, _ in pairs:
+        check_key(name, key, known)
+    return dict(pairs)
 
 
 def check_type(name: str, value: Any, *kinds: type | None, more: str = "") -> None:
