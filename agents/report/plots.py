@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Dash patterns of the rounds through the colours.
-_DASHES = ("-", "--", ":", "-.")
+#: Dash patterns, the next one after each five colours: some of ten look alike to the colour-blind.
+_DASHES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
 #: Shape and vertical offset of each part's marks.
 _PARTS = {"all": ("o", 0.0), "hard": ("v", 0.2), "rest": ("^", -0.2), "all conditions": ("s", 0.38)}
-#: Panels in a row of the plot of EV errors.
-_COLUMNS = 4
+#: Panels in a row of the plot of EV errors: as many as stay legible on a page.
+_COLUMNS = 3
 #: Paths on one contact sheet, and frames of a path.
 _PATHS, _PATH_FRAMES = 5, 8
 #: Most sheets, and the quality of their compression.
@@ -35,7 +35,7 @@ _SHEETS, _QUALITY = 2, 75
 _KINDS = ("photograph", "backlit")
 
 
-def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str = "") -> Path:
+def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str]) -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     `rows` are those of `result_rows`, and of ``"all conditions"``, where there are several; those
@@ -67,8 +67,6 @@ def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str
     _tidy(axes, axis="x", color="0.92")
     columns = 2 if len(shown) > 3 else 3
     axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
-    if title:
-        figure.suptitle(_text(title), fontsize=11)
     return write_figure(path, figure)
 
 
@@ -76,35 +74,33 @@ def plot_convergence(
     path: Path, results: Mapping[str, EvaluationResult], order: Sequence[str]
 ) -> Path:
     """Draw the mean EV error of every frame, a panel per condition, and write it as PNG."""
-    columns = min(_COLUMNS, len(results))
-    rows = -(-len(results) // columns)
-    width = max(3.1 * columns + 1.0, 6.0)
-    longest = 0.5 + 0.065 * max(map(len, order))  # of a line of the legend [inch]
+    rows = -(-len(results) // _COLUMNS)
+    columns = -(-len(results) // rows)
+    width = max(2.5 * columns + 0.5, 6.0)
+    longest = 0.5 + 0.075 * max(map(len, order))  # of a line of the legend [inch]
     wide = max(1, min(len(order), int(width / longest)))
     figure = _figure(width, 2.1 * rows + 0.8 + 0.2 * -(-len(order) // wide))
     panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)
-    lines: list[Any] = []
     for panel, (name, result) in zip(panels.flat, results.items(), strict=False):
-        lines = []
         for i, policy in enumerate(order):
             errors = result.episode_metrics(policy)["ev_error"].mean(axis=0)  # (E, T)
             means = metrics.group_means(errors.T, result.groups).mean(axis=-1)
             frames = np.arange(1, len(means) + 1)
-            lines += panel.plot(frames, means, lw=1.3, **line_style(i))
+            panel.plot(frames, means, lw=1.3, **line_style(i))
         panel.set_title(name, fontsize=9)
         panel.set_yscale("symlog", linthresh=1.0, linscale=1.0)
         panel.set_yticks([0, 1, 2, 4, 8, 16], ["0", "1", "2", "4", "8", "16"], fontsize=8)
         panel.set_ylim(0, None)
         panel.xaxis.get_major_locator().set_params(integer=True)
         _tidy(panel, labelsize=8)
-    for panel in panels.flat[len(results) :]:
-        panel.set_visible(False)
-    for panel in panels.flat[max(len(results) - columns, 0) : len(results)]:  # nothing is below
-        panel.tick_params(labelbottom=True)
-        panel.set_xlabel("frame", fontsize=9)
+    for empty in panels.flat[len(results) :]:
+        empty.set_visible(False)
+    for lowest in panels.flat[max(len(results) - columns, 0) : len(results)]:
+        lowest.tick_params(labelbottom=True)
+        lowest.set_xlabel("frame", fontsize=9)
     figure.supylabel("mean EV error [EV]", fontsize=9)
-    labels = [_text(policy) for policy in order]
-    figure.legend(lines, labels, loc="outside lower center", ncols=wide, fontsize=8)
+    shown = panel.get_lines(), [_text(policy) for policy in order]
+    figure.legend(*shown, loc="outside lower center", ncols=wide, fontsize=8)
     return write_figure(path, figure)
 
 
@@ -170,10 +166,10 @@ def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
     return write_figure(path, figure)
 
 
-def line_style(index: int) -> dict[str, str]:
-    """Colour and dashes of a policy by its position in the ranking."""
-    round_, colour = divmod(index, len(PATH_COLOURS))
-    return {"color": PATH_COLOURS[colour], "linestyle": _DASHES[round_ % len(_DASHES)]}
+def line_style(index: int) -> dict[str, Any]:
+    """Colour and dashes of a policy by its position in the ranking; no two are equal below 50."""
+    colour, dashes = PATH_COLOURS[index % len(PATH_COLOURS)], _DASHES[index // 5 % len(_DASHES)]
+    return {"color": colour, "linestyle": dashes}
 
 
 def pareto_front(
@@ -201,6 +197,8 @@ def plot_cost(
 
     `order` are the policies in the order of the colours.
     """
+    from matplotlib.ticker import LogLocator
+
     figure = _figure(7.5, 4.0 + 0.1 * len(scores))
     axes = figure.add_subplot()
     front = pareto_front(costs, scores)
@@ -210,7 +208,9 @@ def plot_cost(
     points = {name: (costs[name], scores[name]) for name in scores}
     colours = [line_style(order.index(name))["color"] for name in scores]
     axes.scatter([costs[name] for name in scores], [*scores.values()], c=colours, zorder=2)
-    axes.set_xscale("log")
+    axes.set_xscale("log", subs=[])
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.margins(x=0.18, y=0.12)
     axes.set_xlabel("time of a decision for one camera alone [ms]")
     axes.set_ylabel("normalised score (random 0, oracle 1)")
@@ -237,7 +237,7 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Seque
     for name, spot, colour in zip(points, spots, colours, strict=True):
         arrow = {"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 0, "shrinkB": 3}
         how: Any = {"textcoords": "offset points", "arrowprops": arrow, "in_layout": False}
-        how |= {"fontsize": 7, "color": colour, "va": "bottom"}
+        how |= {"fontsize": 8, "color": colour, "va": "bottom"}
         text = axes.annotate(_text(name), points[name], (0, 0), **how)
         size = np.array(Text.get_window_extent(text).size)  # without the line
         steps = [d * (r + size / 2) - size / 2 for r in (7, 12, 20, 30, 45, 65) for d in around]
@@ -266,9 +266,10 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
 
     if not result.scenes or len(result.grid) > MAX_SHEET_STATES:
         return {}
-    every, best = np.arange(len(result.kinds)), [result.tracks[name].states for name in order[:3]]
-    ends = [result.scores[every, -1, states[0, :, -1]] for states in best]
-    episode = int(np.argmax(np.std(ends, axis=0) + np.isin(result.kinds, _KINDS)))
+    ends = np.array([result.tracks[name].states[0, :, -1] for name in order[:_PATHS]])
+    spread = np.std([result.scores[np.arange(len(own)), -1, own] for own in ends], axis=0)
+    differing = [len(set(own)) for own in ends.T.tolist()]  # states that policies end in
+    episode = int(np.argmax(_PATHS * np.isin(result.kinds, _KINDS) + differing + spread))
     options, start = result.plan.options(), int(result.start_states[episode])
     files = {}
     for k, first in enumerate(range(0, min(len(order), _SHEETS * _PATHS), _PATHS)):
