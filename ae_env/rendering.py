@@ -302,7 +302,7 @@ class _Sheet:
             figure = Figure((_CHARTS / 100, height / 100), dpi=100, layout="constrained")
             panels = figure.subplots(len(values), sharex=True)
             for panel, value, labels in zip(panels, values, ([], [], *self.labels), strict=True):
-                widths = np.linspace(1.4 * len(names), 1.8, len(names))  # so that all are seen
+                widths = np.linspace(2.0 * len(names), 1.8, len(names))  # so that all are seen
                 for states, *own in zip(self.paths.values(), self.colours, widths, strict=True):
                     panel.plot(value[states], color=own[0], lw=own[1])
                 panel.axhline(value[self.table.oracle], color="white", ls=":", lw=1.5)
@@ -331,7 +331,7 @@ class _Sheet:
         for x, text in ((0, "0"), (75, "expected score"), (150, f"{best:.2f}")):
             draw.text((_MARGIN + x, y + 15), text, _FAINT, _font(12), anchor="lmr"[x // 75] + "a")
         draw.polygon(_star(_MARGIN + 180, y + 7, 10), "white")
-        draw.text((_MARGIN + 195, y + 7), "oracle", _INK, _font(14), anchor="lm")
+        draw.text((_MARGIN + 195, y + 7), "best state", _INK, _font(14), anchor="lm")
 
 
 def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
