@@ -283,7 +283,7 @@ def _write_pictures(
     scores = dict(zip(ranked.policy, ranked.normalised_score, strict=True))
     if scores:
         pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores, order)
-    return pictures | path_sheets(folder, result, order)
+    return pictures | path_sheets(folder, results, order)
 
 
 def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:

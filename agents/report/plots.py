@@ -39,13 +39,11 @@ def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str]) -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     `rows` are those of `result_rows`, and of ``"all conditions"``, where there are several; those
-    of a single other condition are left out. `order` are the policies in the order of the colours.
+    of a single other condition are left out. `order` are the policies from the top.
     """
     parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
-    ordered = parts["all"].sort_values("normalised_score", kind="stable").policy
-    names = [name for name in ordered if name != "oracle"]
-    figure = _figure(7.5, 1.6 + 0.42 * len(names))
-    axes = figure.add_subplot()
+    names = [name for name in reversed(order) if name != "oracle"]
+    axes = (figure := _figure(7.5, 1.6 + 0.42 * len(names))).add_subplot()
     shown = [part for part in _PARTS if part in parts]
     for part in shown:
         marker, offset = _PARTS[part]
@@ -65,8 +63,8 @@ def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str]) -> Path:
     axes.set_ylim(-0.6, len(names) - 0.4)
     axes.set_xlabel("normalised score (random 0, oracle 1); bars: 95 % interval")
     _tidy(axes, axis="x", color="0.92")
-    columns = 2 if len(shown) > 3 else 3
-    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
+    where: Any = {"loc": "lower center", "bbox_to_anchor": (0.4, 1.0), "frameon": False}
+    axes.legend(ncols=2 if len(shown) > 3 else 3, **where)
     return write_figure(path, figure)
 
 
@@ -201,11 +199,10 @@ def plot_cost(
 
     figure = _figure(7.5, 4.0 + 0.1 * len(scores))
     axes = figure.add_subplot()
-    front = pareto_front(costs, scores)
-    steps = [costs[n] for n in front], [scores[n] for n in front]
+    points = {name: (costs[name], scores[name]) for name in scores}
+    steps = np.transpose([points[name] for name in pareto_front(costs, scores)])
     label = "nothing else is both faster and better"
     axes.step(*steps, where="post", color="0.6", lw=1.0, label=label)
-    points = {name: (costs[name], scores[name]) for name in scores}
     colours = [line_style(order.index(name))["color"] for name in scores]
     axes.scatter([costs[name] for name in scores], [*scores.values()], c=colours, zorder=2)
     axes.set_xscale("log", subs=[])
@@ -232,8 +229,7 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Seque
         ends = axes.transData.transform(line.get_path().vertices)
         boxes += [*np.hstack([np.minimum(ends[1:], ends[:-1]), np.maximum(ends[1:], ends[:-1])])]
     frame = axes.get_window_extent().extents
-    angles = np.arange(16) * np.pi / 8
-    around = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    around = [np.array([np.cos(a), np.sin(a)]) for a in np.arange(16) * np.pi / 8]
     for name, spot, colour in zip(points, spots, colours, strict=True):
         arrow = {"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 0, "shrinkB": 3}
         how: Any = {"textcoords": "offset points", "arrowprops": arrow, "in_layout": False}
@@ -256,18 +252,22 @@ def _label_cost(box: Any, spot: Any, spots: Any, boxes: Sequence[Any], frame: An
     return covered, outside, own > far.min(), own
 
 
-def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
+def path_sheets(
+    folder: Path, results: Mapping[str, EvaluationResult], order: Sequence[str]
+) -> dict[str, Path]:
     """Write contact sheets of one scene's states with the paths of the best policies.
 
     They are ``contact_sheet.webp``, and ``contact_sheet_2.webp`` for more policies; none where the
-    scenes are not known, or the grid has more states than a sheet shows.
+    light changes at once, the scenes are not known, or the grid has too many states for a sheet.
     """
     from ae_env.rendering import MAX_SHEET_STATES, contact_sheet
 
-    if not result.scenes or len(result.grid) > MAX_SHEET_STATES:
+    steady = [r for r in results.values() if not np.ptp(r.scores[:, :_PATH_FRAMES], axis=1).any()]
+    if not steady or not steady[0].scenes or len(steady[0].grid) > MAX_SHEET_STATES:
         return {}
-    ends = np.array([result.tracks[name].states[0, :, -1] for name in order[:_PATHS]])
-    spread = np.std([result.scores[np.arange(len(own)), -1, own] for own in ends], axis=0)
+    result, last = steady[0], min(_PATH_FRAMES, steady[0].scores.shape[1]) - 1
+    ends = np.array([result.tracks[name].states[0, :, last] for name in order[:_PATHS]])
+    spread = np.std([result.scores[np.arange(len(own)), last, own] for own in ends], axis=0)
     differing = [len(set(own)) for own in ends.T.tolist()]  # states that policies end in
     episode = int(np.argmax(_PATHS * np.isin(result.kinds, _KINDS) + differing + spread))
     options, start = result.plan.options(), int(result.start_states[episode])
