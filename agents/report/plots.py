@@ -108,13 +108,13 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
     `curves` are, by training, ``frames`` and each value it reported after so many.
     """
     values = [name for name in next(iter(curves.values())) if name != "frames"]
-    figure = _figure(max(7.5, 4.5 * len(values)), 3.6)
+    figure = _figure(max(7.5, 3.2 * len(values)), 3.2)
     panels = figure.subplots(1, len(values), squeeze=False)[0]
     for panel, value in zip(panels, values, strict=True):
         for i, (training, curve) in enumerate(curves.items()):
             panel.plot(curve["frames"], curve[value], lw=1.3, label=training, **line_style(i))
-        panel.set_xlabel("frames", fontsize=9)
-        panel.set_ylabel(f"{value} in training", fontsize=9)
+        panel.set(xlabel="frames", ylabel=f"{value} in training")
+        panel.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
         if value != "reward":  # an error, which falls
             panel.set_yscale("log")
         _tidy(panel, labelsize=8)
