@@ -75,8 +75,7 @@ def plot_convergence(
     rows = -(-len(results) // _COLUMNS)
     columns = -(-len(results) // rows)
     width = max(2.5 * columns + 0.5, 6.0)
-    longest = 0.5 + 0.075 * max(map(len, order))  # of a line of the legend [inch]
-    wide = max(1, min(len(order), int(width / longest)))
+    wide = max(1, min(len(order), int(width / (0.5 + 0.065 * max(map(len, order))))))  # legend
     figure = _figure(width, 2.1 * rows + 0.8 + 0.2 * -(-len(order) // wide))
     panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)
     for panel, (name, result) in zip(panels.flat, results.items(), strict=False):
@@ -96,7 +95,8 @@ def plot_convergence(
     for lowest in panels.flat[max(len(results) - columns, 0) : len(results)]:
         lowest.tick_params(labelbottom=True)
         lowest.set_xlabel("frame", fontsize=9)
-    figure.supylabel("mean EV error [EV]", fontsize=9)
+    for left in panels[:, 0]:
+        left.set_ylabel("mean EV error [EV]", fontsize=9)
     shown = panel.get_lines(), [_text(policy) for policy in order]
     figure.legend(*shown, loc="outside lower center", ncols=wide, fontsize=8)
     return write_figure(path, figure)
