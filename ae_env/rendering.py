@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import linear_signal
@@ -38,6 +39,8 @@ _font: Any = ImageFont.load_default
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
 _BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
 _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
+#: Of a sheet with paths: height of the strip below each picture, and width of the charts [pixel].
+_STRIP, _CHARTS = 21, 400
 
 
 def render_frame(
@@ -52,16 +55,6 @@ def render_frame(
     factor = -(-FRAME_PIXELS // min(image.shape[:2]))
     picture = Image.fromarray(np.repeat(np.repeat(image, factor, 0), factor, 1))
     lines = (str(settings), f"EV100 {settings.ev100:.1f}   score {score:.3f}")
-    return np.asarray(_captioned(picture, lines)).copy()
-
-
-def developed(signal: torch.Tensor, scene: Scene) -> np.ndarray:
-    """Captures (B, 4, H, W) of `scene` as sRGB pictures (B, H, W, 3) uint8."""
-    rgb = develop(signal, scene.white_balance, scene.camera.colour_matrix)
-    return np.asarray(rgb.mul(255.0).round_().byte().permute(0, 2, 3, 1).numpy())
-
-
-def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
     size = max(12, picture.height // 20)
     height = int(1.35 * size * len(lines) + 0.5 * size)
     band = Image.new("RGBA", (picture.width, height), (0, 0, 0, 150))
@@ -69,9 +62,14 @@ def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
     for i, line in enumerate(lines):
         font = fitting_font(draw, line, size, picture.width - size, least=6)
         draw.text((size // 2, size // 4 + int(1.35 * size * i)), line, _INK, font)
-    captioned = picture.convert("RGBA")
-    captioned.alpha_composite(band, (0, picture.height - height))
-    return captioned.convert("RGB")
+    picture.paste(band, (0, picture.height - height), band)
+    return np.asarray(picture).copy()
+
+
+def developed(signal: torch.Tensor, scene: Scene) -> np.ndarray:
+    """Captures (B, 4, H, W) of `scene` as sRGB pictures (B, H, W, 3) uint8."""
+    rgb = develop(signal, scene.white_balance, scene.camera.colour_matrix)
+    return np.asarray(rgb.mul(255.0).round_().byte().permute(0, 2, 3, 1).numpy())
 
 
 def contact_sheet(
@@ -90,9 +88,10 @@ def contact_sheet(
     """All exposure states of a scene as one picture.
 
     One panel per ISO; in it the exposure time grows to the right and the f-number downwards. The
-    frame of each capture shows its expected score, a star marks the oracle, and numbered lines show
-    which states policies chose, frame by frame. A `ValueError` if the grid has more states, or a
-    path leaves it, or `scene` is none.
+    frame of each capture shows its expected score, and a star marks the oracle. With paths, the
+    strip below a capture names the frames in which each policy chose its state, and charts beside
+    the sheet show score, EV100 and controls of each policy over the frames. A `ValueError` if the
+    grid has more states, or a path leaves it, or `scene` is none.
 
     Args:
         scene: Of any size and shape; large ones are averaged down first.
@@ -109,10 +108,10 @@ def contact_sheet(
     if len(grid) > MAX_SHEET_STATES:
         raise ValueError(f"`grid` ({len(grid)} states) must have at most {MAX_SHEET_STATES} states")
     paths = _checked_paths(path, len(grid))
+    colours = [*itertools.islice(itertools.cycle(colours), len(paths))]
     scene = scene.averaged(max(1, min(scene.light.shape[1:]) // CAPTURE_PIXELS))
-    tables = ScoreTables(grid, camera, make_scorer(scorer))
     moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
-    table = tables.table(scene, **moves)
+    table = ScoreTables(grid, camera, make_scorer(scorer)).table(scene, **moves)
     frames: Iterable[torch.Tensor]
     if scene.recorded is None:
         frames = prepare_scene(scene, camera, **moves).stream(grid.states, seed=seed)
@@ -120,8 +119,7 @@ def contact_sheet(
         frames = scene.recorded[scene.frame_of_state]
         frames = (f * float(a) for f, a in zip(frames, np.asarray(scene.allowed), strict=True))
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
-    title = _title(scene, moves, grid, table)
-    return _Sheet(grid, table, pictures, paths, colours).draw(title)
+    return _Sheet(grid, table, pictures, paths, colours).draw(_title(scene, moves, grid, table))
 
 
 def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
@@ -142,7 +140,8 @@ def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
 def _title(
     scene: Scene, moves: dict[str, Any], grid: ExposureGrid, table: ScoreTable
 ) -> tuple[str, str]:
-    light = "light unknown" if scene.illuminance is None else f"{scene.illuminance:,.4g} lux"
+    lux = scene.illuminance
+    light = "light unknown" if lux is None else f"{float(f'{lux:.4g}'):,g} lux"
     parts = [scene.scene_id, f"{light} (EV100 {scene.ev100:.1f})"]
     expected = "score" if scene.recorded is not None else "expected score"
     best = f"best state: {grid[table.oracle]}, {expected} {table.mean[table.oracle]:.3f}"
@@ -160,17 +159,6 @@ def _title(
     return "   ·   ".join(parts), best
 
 
-def _visits(states: Sequence[int]) -> dict[int, str]:
-    """For each state visited, its frames: ``{5: "0", 9: "1-3,5"}``."""
-    labels: dict[int, list[str]] = {}
-    frame = 0
-    for state, run in itertools.groupby(states):
-        last = frame + len(list(run)) - 1
-        labels.setdefault(state, []).append(str(frame) if last == frame else f"{frame}-{last}")
-        frame = last + 1
-    return {state: ",".join(names) for state, names in labels.items()}
-
-
 @dataclass(frozen=True)
 class _Sheet:
     """Layout and drawing of a contact sheet."""
@@ -179,7 +167,7 @@ class _Sheet:
     table: ScoreTable
     pictures: list[Image.Image]
     paths: dict[str, list[int]]
-    colours: Sequence[str] = PATH_COLOURS
+    colours: Sequence[str] = ()  # of the paths
 
     @property
     def thumb(self) -> tuple[int, int]:
@@ -188,28 +176,36 @@ class _Sheet:
         return max(24, min(2 * THUMB_PIXELS, THUMB_PIXELS * width // height)), THUMB_PIXELS
 
     @property
+    def pitch(self) -> int:
+        """Height of one picture with its strip and the gap below it."""
+        return THUMB_PIXELS + _GAP + (_STRIP if self.paths else 0)
+
+    @property
     def panel(self) -> tuple[int, int]:
         """Width and height of the captures of one ISO, without labels."""
         _, times, apertures = self.grid.shape
-        return times * (self.thumb[0] + _GAP) - _GAP, apertures * (THUMB_PIXELS + _GAP) - _GAP
+        return times * (self.thumb[0] + _GAP) - _GAP, apertures * self.pitch - _GAP
+
+    @property
+    def labels(self) -> tuple[list[str], list[str], list[str]]:
+        """Names of the values of the controls: ISO, exposure time, f-number."""
+        times = [format_exposure_time(value) for value in self.grid.exposure_times]
+        isos = [f"ISO {value:.5g}" for value in self.grid.isos]
+        return isos, times, [f"f/{value:g}" for value in self.grid.f_numbers]
 
     @property
     def panel_columns(self) -> int:
         """Panels side by side, so that the sheet comes out about square."""
-        count = self.grid.shape[0]
-        width, height = self.panel
-
-        def lopsidedness(columns: int) -> float:
-            return abs(float(np.log(columns * width / (-(-count // columns) * height))))
-
-        return min(range(1, count + 1), key=lopsidedness)
+        columns, (width, height) = np.arange(1, self.grid.shape[0] + 1), self.panel
+        ratios = columns * width / (-(-len(columns) // columns) * height)
+        return int(np.abs(np.log(ratios)).argmin()) + 1
 
     def corner(self, state: int) -> tuple[int, int]:
         """Upper left corner of the picture of `state`."""
         iso, time, aperture = self.grid.controls(state)
         row, column = divmod(int(iso), self.panel_columns)
         x, y = self.panel_corner(row, column)
-        return x + int(time) * (self.thumb[0] + _GAP), y + int(aperture) * (THUMB_PIXELS + _GAP)
+        return x + int(time) * (self.thumb[0] + _GAP), y + int(aperture) * self.pitch
 
     def panel_corner(self, row: int, column: int) -> tuple[int, int]:
         """Upper left corner of a panel's first picture."""
@@ -223,8 +219,9 @@ class _Sheet:
         rows = -(-self.grid.shape[0] // self.panel_columns)
         right, bottom = self.panel_corner(rows, self.panel_columns)
         width = max(right - _LABEL_WIDTH - _PANEL_GAP + _MARGIN, 560)
-        height = bottom - 2 * _LABEL_HEIGHT + 58
-        sheet = Image.new("RGB", (width, height), _BACKGROUND)
+        room = (700 + 20 * len(self.paths)) * bool(self.paths)  # for the charts
+        height = max(bottom - 2 * _LABEL_HEIGHT + 58, room)
+        sheet = Image.new("RGB", (width + _CHARTS * bool(self.paths), height), _BACKGROUND)
         draw = ImageDraw.Draw(sheet)
         font = fitting_font(draw, title[0], 20, width - 2 * _MARGIN)
         draw.text((_MARGIN, 14), title[0], _INK, font)
@@ -237,9 +234,11 @@ class _Sheet:
                 self._draw_picture(sheet, draw, state, picture)
         self._draw_legend(sheet, draw)
         overlay = Image.new("RGBA", (2 * width, 2 * height))  # at twice the size: smooth lines
-        self._draw_paths(ImageDraw.Draw(overlay))
+        self._draw_visits(ImageDraw.Draw(overlay))
         self._draw_star(ImageDraw.Draw(overlay))
         sheet.paste(overlay.reduce(2).convert("RGB"), mask=overlay.reduce(2).getchannel("A"))
+        if self.paths:
+            sheet.paste(self._charts(height), (width, 0))
         return sheet
 
     def _colour(self, score: float) -> tuple[int, int, int]:
@@ -250,16 +249,16 @@ class _Sheet:
         return int(red), int(green), int(blue)
 
     def _draw_labels(self, draw: ImageDraw.ImageDraw) -> None:
-        width, _ = self.thumb
-        for i, iso in enumerate(self.grid.isos):
+        (width, _), (isos, times, f_numbers) = self.thumb, self.labels
+        for i, iso in enumerate(isos):
             x, y = self.panel_corner(*divmod(i, self.panel_columns))
-            draw.text((x, y - 2 * _LABEL_HEIGHT - 2), f"ISO {iso:.5g}", _INK, _font(17))
-            for j, time in enumerate(self.grid.exposure_times):
-                text, at = format_exposure_time(time), x + j * (width + _GAP) + width // 2
-                draw.text((at, y - 5), text, _FAINT, _font(13), anchor="md")
-            for k, f_number in enumerate(self.grid.f_numbers):
-                at = y + k * (THUMB_PIXELS + _GAP) + THUMB_PIXELS // 2
-                draw.text((x - 6, at), f"f/{f_number:g}", _FAINT, _font(13), anchor="rm")
+            draw.text((x, y - 2 * _LABEL_HEIGHT - 2), iso, _INK, _font(17))
+            for j, time in enumerate(times):
+                at = x + j * (width + _GAP) + width // 2
+                draw.text((at, y - 5), time, _FAINT, _font(13), anchor="md")
+            for k, f_number in enumerate(f_numbers):
+                at = y + k * self.pitch + THUMB_PIXELS // 2
+                draw.text((x - 6, at), f_number, _FAINT, _font(13), anchor="rm")
 
     def _draw_picture(
         self, sheet: Image.Image, draw: ImageDraw.ImageDraw, state: int, picture: Image.Image
@@ -270,28 +269,53 @@ class _Sheet:
         inner = (width - 2 * _BORDER, height - 2 * _BORDER)
         sheet.paste(picture.resize(inner, Image.Resampling.BICUBIC), (x + _BORDER, y + _BORDER))
         corner = (x + _BORDER, y + height - _BORDER)
-        text = f"{score:.2f}"
-        box = draw.textbbox((corner[0] + 4, corner[1] - 2), text, _font(12), anchor="lb")
+        where: Any = {"xy": (corner[0] + 4, corner[1] - 2), "text": f"{score:.2f}", "anchor": "lb"}
+        where["font"] = _font(18 if state == self.table.oracle else 13)
+        box = draw.textbbox(**where)
         draw.rectangle((corner[0], box[1] - 3, box[2] + 3, corner[1] - 1), (0, 0, 0))
-        draw.text((corner[0] + 4, corner[1] - 2), text, _INK, _font(12), anchor="lb")
+        draw.text(**where, fill=_INK)
 
-    def _draw_paths(self, draw: ImageDraw.ImageDraw) -> None:
-        width, height = self.thumb
-        columns = min(3, len(self.paths)) or 1
-        rows = -(-len(self.paths) // columns)
-        for i, states in enumerate(self.paths.values()):
-            row, column = divmod(i, columns)
-            dx = int(width * (column + 1) / (columns + 1))
-            dy = int((height - 16) * (row + 1) / (rows + 1)) + 2
-            corners = {state: self.corner(state) for state in states}
-            spots = {s: (2 * (x + dx), 2 * (y + dy)) for s, (x, y) in corners.items()}
-            colour = self.colours[i % len(self.colours)]
-            route = [spots[s] for s, _ in itertools.groupby(states)]
-            for ink, thickness in (("black", 11), (colour, 6)):
-                if len(route) > 1:
-                    draw.line(route, ink, thickness, joint="curve")
-            for state, label in _visits(states).items():
-                _draw_pill(draw, spots[state], label, colour)
+    def _draw_visits(self, draw: ImageDraw.ImageDraw) -> None:
+        """Below a picture the first frame of each policy there, at a place of the policy's own."""
+        for i, (colour, states) in enumerate(zip(self.colours, self.paths.values(), strict=True)):
+            width = 2 * self.thumb[0] // len(self.paths)
+            ink = "white" if np.dot(ImageColor.getrgb(colour)[:3], (3, 6, 1)) < 1000 else "black"
+            for state in dict.fromkeys(states):
+                x, y = self.corner(state)
+                x, y = 2 * x + i * width, 2 * (y + THUMB_PIXELS) + 5
+                draw.rounded_rectangle((x, y, x + width - 2, y + 34), 9, colour)
+                label = f"{states.index(state)}{'+' * (states.count(state) > 1)}"
+                draw.text((x + width // 2, y + 17), label, ink, _font(25), anchor="mm")
+
+    def _charts(self, height: int) -> Image.Image:
+        """Score, EV100 and controls of each policy over the frames; dotted: of the best state."""
+        from matplotlib import style
+        from matplotlib.figure import Figure
+
+        names = [name if len(name) < 45 else f"…{name[-43:]}" for name in self.paths]
+        controls = self.grid.controls(np.arange(len(self.grid))).T
+        values = self.table.mean, self.grid.ev100, *controls
+        look: dict[str, Any] = dict.fromkeys(("figure.facecolor", "axes.facecolor"), "#1b1b1b")
+        look |= {"text.parse_math": False, "axes.titlelocation": "left", "legend.frameon": False}
+        look |= {"axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "0.5"}
+        with style.context(["dark_background", look]):
+            figure = Figure((_CHARTS / 100, height / 100), dpi=100, layout="constrained")
+            panels = figure.subplots(len(values), sharex=True)
+            for panel, value, labels in zip(panels, values, ([], [], *self.labels), strict=True):
+                widths = np.linspace(2.0 * len(names), 1.8, len(names))  # so that all are seen
+                for states, *own in zip(self.paths.values(), self.colours, widths, strict=True):
+                    panel.plot(value[states], color=own[0], lw=own[1])
+                panel.axhline(value[self.table.oracle], color="white", ls=":", lw=1.5)
+                if labels:
+                    each = -(-len(labels) // 6)
+                    panel.set_yticks(range(0, len(labels), each), labels[::each])
+            panels[0].set_title("score on the sheet", fontsize=11)
+            panels[1].set_title("EV100", fontsize=11)
+            panel.set_xlabel("frame")
+            panel.xaxis.get_major_locator().set_params(integer=True)
+            figure.legend(panel.get_lines(), [*names, "best state"], loc="outside upper left")
+            figure.savefig(stream := io.BytesIO(), format="png")
+        return Image.open(stream)
 
     def _draw_star(self, draw: ImageDraw.ImageDraw) -> None:
         x, y = self.corner(self.table.oracle)
@@ -304,27 +328,10 @@ class _Sheet:
         best, y = float(self.table.mean.max()), sheet.height - 40
         for i in range(150):
             draw.line((_MARGIN + i, y, _MARGIN + i, y + 12), self._colour(best * i / 149))
-        draw.text((_MARGIN, y + 15), "0", _FAINT, _font(12))
-        draw.text((_MARGIN + 150, y + 15), f"{best:.2f}", _FAINT, _font(12), anchor="ra")
-        draw.text((_MARGIN + 75, y + 15), "expected score", _FAINT, _font(12), anchor="ma")
-        x = _MARGIN + 180
-        draw.polygon(_star(x, y + 7, 10), "white")
-        draw.text((x + 15, y + 7), "oracle", _INK, _font(14), anchor="lm")
-        x += 84
-        for name, colour in zip(self.paths, itertools.cycle(self.colours), strict=False):
-            length = 40 + int(draw.textlength(name, _font(14)))
-            if x + length > sheet.width:
-                x, y = _MARGIN + 264, y + 20
-            draw.line((x, y + 7, x + 24, y + 7), colour, 4)
-            draw.text((x + 30, y + 7), name, _INK, _font(14), anchor="lm")
-            x += length + 12
-
-
-def _draw_pill(draw: ImageDraw.ImageDraw, centre: tuple[int, int], label: str, colour: str) -> None:
-    half = max(17, int(draw.textlength(label, _font(24))) // 2 + 9)
-    x, y = centre
-    draw.rounded_rectangle((x - half, y - 17, x + half, y + 17), 17, colour, "black", 3)
-    draw.text((x, y), label, "black", _font(24), anchor="mm")
+        for x, text in ((0, "0"), (75, "expected score"), (150, f"{best:.2f}")):
+            draw.text((_MARGIN + x, y + 15), text, _FAINT, _font(12), anchor="lmr"[x // 75] + "a")
+        draw.polygon(_star(_MARGIN + 180, y + 7, 10), "white")
+        draw.text((_MARGIN + 195, y + 7), "best state", _INK, _font(14), anchor="lm")
 
 
 def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:

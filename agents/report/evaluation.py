@@ -244,7 +244,6 @@ def write_report(
         }
     rows = result_rows(results, source=source, split=split, resamples=resamples)
     meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
-    title = result.plan.name
     ends = pd.DataFrame([pair or (None, None) for pair in rows.ci95])
     table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
     columns = [name for name in ROW_COLUMNS if name != "ci95"]
@@ -256,10 +255,9 @@ def write_report(
         files[name] = write_atomically(folder / name, text)
     order = ranking.policy.tolist()
     order += [name for name in result.tracks if name not in order]
-    pictures = _write_pictures(folder, results, rows, ranking, title, order)
-    shown = {"title": title, "pictures": pictures, "next_commands": next_commands}
-    text = _report(results, rows, meta, order, **shown)
-    page = html_report(text, pictures, f"Exposure policies compared: {title}")
+    pictures = _write_pictures(folder, results, rows, ranking, order)
+    text = _report(results, rows, meta, order, pictures=pictures, next_commands=next_commands)
+    page = html_report(text, pictures, f"Exposure policies compared: {result.plan.name}")
     return {
         **files,
         **pictures,
@@ -269,12 +267,7 @@ def write_report(
 
 
 def _write_pictures(
-    folder: Path,
-    results: Results,
-    rows: pd.DataFrame,
-    ranking: pd.DataFrame,
-    title: str,
-    order: Sequence[str],
+    folder: Path, results: Results, rows: pd.DataFrame, ranking: pd.DataFrame, order: Sequence[str]
 ) -> dict[str, Path]:
     result = results[static_condition(results)]
     if len(results) > 1:
@@ -282,7 +275,7 @@ def _write_pictures(
         named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
         rows = pd.concat([rows, together.assign(**named)])
     pictures = {
-        "scores.png": plot_scores(folder / "scores.png", rows, order, title),
+        "scores.png": plot_scores(folder / "scores.png", rows, order),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
     }
     alone = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
@@ -290,7 +283,7 @@ def _write_pictures(
     scores = dict(zip(ranked.policy, ranked.normalised_score, strict=True))
     if scores:
         pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores, order)
-    return pictures | path_sheets(folder, result, order)
+    return pictures | path_sheets(folder, results, order)
 
 
 def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:

@@ -52,8 +52,7 @@ def record(
     `seed` decides the light and the start, and the scene where its id is not given.
     """
     base: Any = envs.unwrapped
-    options = None if scene is None else {"scene": scene}
-    observations, info = envs.reset(seed=seed, options=options)
+    observations, info = envs.reset(seed=seed, options=None if scene is None else {"scene": scene})
     with errors_of(name, "reset"):
         policy.reset(1, seed=seed)
     found = Recording(name)

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Dash patterns of the rounds through the colours.
-_DASHES = ("-", "--", ":", "-.")
+#: Dash patterns, the next one after each five colours: some of ten look alike to the colour-blind.
+_DASHES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
 #: Shape and vertical offset of each part's marks.
 _PARTS = {"all": ("o", 0.0), "hard": ("v", 0.2), "rest": ("^", -0.2), "all conditions": ("s", 0.38)}
-#: Panels in a row of the plot of EV errors.
-_COLUMNS = 4
+#: Panels in a row of the plot of EV errors: as many as stay legible on a page.
+_COLUMNS = 3
 #: Paths on one contact sheet, and frames of a path.
 _PATHS, _PATH_FRAMES = 5, 8
 #: Most sheets, and the quality of their compression.
@@ -35,17 +35,15 @@ _SHEETS, _QUALITY = 2, 75
 _KINDS = ("photograph", "backlit")
 
 
-def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str = "") -> Path:
+def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str]) -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     `rows` are those of `result_rows`, and of ``"all conditions"``, where there are several; those
-    of a single other condition are left out. `order` are the policies in the order of the colours.
+    of a single other condition are left out. `order` are the policies from the top.
     """
     parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
-    ordered = parts["all"].sort_values("normalised_score", kind="stable").policy
-    names = [name for name in ordered if name != "oracle"]
-    figure = _figure(7.5, 1.6 + 0.42 * len(names))
-    axes = figure.add_subplot()
+    names = [name for name in reversed(order) if name != "oracle"]
+    axes = (figure := _figure(7.5, 1.6 + 0.42 * len(names))).add_subplot()
     shown = [part for part in _PARTS if part in parts]
     for part in shown:
         marker, offset = _PARTS[part]
@@ -65,10 +63,8 @@ def plot_scores(path: Path, rows: pd.DataFrame, order: Sequence[str], title: str
     axes.set_ylim(-0.6, len(names) - 0.4)
     axes.set_xlabel("normalised score (random 0, oracle 1); bars: 95 % interval")
     _tidy(axes, axis="x", color="0.92")
-    columns = 2 if len(shown) > 3 else 3
-    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
-    if title:
-        figure.suptitle(_text(title), fontsize=11)
+    where: Any = {"loc": "lower center", "bbox_to_anchor": (0.4, 1.0), "frameon": False}
+    axes.legend(ncols=2 if len(shown) > 3 else 3, **where)
     return write_figure(path, figure)
 
 
@@ -76,35 +72,33 @@ def plot_convergence(
     path: Path, results: Mapping[str, EvaluationResult], order: Sequence[str]
 ) -> Path:
     """Draw the mean EV error of every frame, a panel per condition, and write it as PNG."""
-    columns = min(_COLUMNS, len(results))
-    rows = -(-len(results) // columns)
-    width = max(3.1 * columns + 1.0, 6.0)
-    longest = 0.5 + 0.065 * max(map(len, order))  # of a line of the legend [inch]
-    wide = max(1, min(len(order), int(width / longest)))
+    rows = -(-len(results) // _COLUMNS)
+    columns = -(-len(results) // rows)
+    width = max(2.5 * columns + 0.5, 6.0)
+    wide = max(1, min(len(order), int(width / (0.5 + 0.065 * max(map(len, order))))))  # legend
     figure = _figure(width, 2.1 * rows + 0.8 + 0.2 * -(-len(order) // wide))
     panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)
-    lines: list[Any] = []
     for panel, (name, result) in zip(panels.flat, results.items(), strict=False):
-        lines = []
         for i, policy in enumerate(order):
             errors = result.episode_metrics(policy)["ev_error"].mean(axis=0)  # (E, T)
             means = metrics.group_means(errors.T, result.groups).mean(axis=-1)
             frames = np.arange(1, len(means) + 1)
-            lines += panel.plot(frames, means, lw=1.3, **line_style(i))
+            panel.plot(frames, means, lw=1.3, **line_style(i))
         panel.set_title(name, fontsize=9)
         panel.set_yscale("symlog", linthresh=1.0, linscale=1.0)
         panel.set_yticks([0, 1, 2, 4, 8, 16], ["0", "1", "2", "4", "8", "16"], fontsize=8)
         panel.set_ylim(0, None)
         panel.xaxis.get_major_locator().set_params(integer=True)
         _tidy(panel, labelsize=8)
-    for panel in panels.flat[len(results) :]:
-        panel.set_visible(False)
-    for panel in panels.flat[max(len(results) - columns, 0) : len(results)]:  # nothing is below
-        panel.tick_params(labelbottom=True)
-        panel.set_xlabel("frame", fontsize=9)
-    figure.supylabel("mean EV error [EV]", fontsize=9)
-    labels = [_text(policy) for policy in order]
-    figure.legend(lines, labels, loc="outside lower center", ncols=wide, fontsize=8)
+    for empty in panels.flat[len(results) :]:
+        empty.set_visible(False)
+    for lowest in panels.flat[max(len(results) - columns, 0) : len(results)]:
+        lowest.tick_params(labelbottom=True)
+        lowest.set_xlabel("frame", fontsize=9)
+    for left in panels[:, 0]:
+        left.set_ylabel("mean EV error [EV]", fontsize=9)
+    shown = panel.get_lines(), [_text(policy) for policy in order]
+    figure.legend(*shown, loc="outside lower center", ncols=wide, fontsize=8)
     return write_figure(path, figure)
 
 
@@ -114,13 +108,13 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
     `curves` are, by training, ``frames`` and each value it reported after so many.
     """
     values = [name for name in next(iter(curves.values())) if name != "frames"]
-    figure = _figure(max(7.5, 4.5 * len(values)), 3.6)
+    figure = _figure(max(7.5, 3.2 * len(values)), 3.2)
     panels = figure.subplots(1, len(values), squeeze=False)[0]
     for panel, value in zip(panels, values, strict=True):
         for i, (training, curve) in enumerate(curves.items()):
             panel.plot(curve["frames"], curve[value], lw=1.3, label=training, **line_style(i))
-        panel.set_xlabel("frames", fontsize=9)
-        panel.set_ylabel(f"{value} in training", fontsize=9)
+        panel.set(xlabel="frames", ylabel=f"{value} in training")
+        panel.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
         if value != "reward":  # an error, which falls
             panel.set_yscale("log")
         _tidy(panel, labelsize=8)
@@ -170,10 +164,10 @@ def plot_stability(path: Path, found: Stability, rows: pd.DataFrame) -> Path:
     return write_figure(path, figure)
 
 
-def line_style(index: int) -> dict[str, str]:
-    """Colour and dashes of a policy by its position in the ranking."""
-    round_, colour = divmod(index, len(PATH_COLOURS))
-    return {"color": PATH_COLOURS[colour], "linestyle": _DASHES[round_ % len(_DASHES)]}
+def line_style(index: int) -> dict[str, Any]:
+    """Colour and dashes of a policy by its position in the ranking; no two are equal below 50."""
+    colour, dashes = PATH_COLOURS[index % len(PATH_COLOURS)], _DASHES[index // 5 % len(_DASHES)]
+    return {"color": colour, "linestyle": dashes}
 
 
 def pareto_front(
@@ -201,16 +195,19 @@ def plot_cost(
 
     `order` are the policies in the order of the colours.
     """
+    from matplotlib.ticker import LogLocator
+
     figure = _figure(7.5, 4.0 + 0.1 * len(scores))
     axes = figure.add_subplot()
-    front = pareto_front(costs, scores)
-    steps = [costs[n] for n in front], [scores[n] for n in front]
+    points = {name: (costs[name], scores[name]) for name in scores}
+    steps = np.transpose([points[name] for name in pareto_front(costs, scores)])
     label = "nothing else is both faster and better"
     axes.step(*steps, where="post", color="0.6", lw=1.0, label=label)
-    points = {name: (costs[name], scores[name]) for name in scores}
     colours = [line_style(order.index(name))["color"] for name in scores]
     axes.scatter([costs[name] for name in scores], [*scores.values()], c=colours, zorder=2)
-    axes.set_xscale("log")
+    axes.set_xscale("log", subs=[])
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.margins(x=0.18, y=0.12)
     axes.set_xlabel("time of a decision for one camera alone [ms]")
     axes.set_ylabel("normalised score (random 0, oracle 1)")
@@ -232,12 +229,11 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]], colours: Seque
         ends = axes.transData.transform(line.get_path().vertices)
         boxes += [*np.hstack([np.minimum(ends[1:], ends[:-1]), np.maximum(ends[1:], ends[:-1])])]
     frame = axes.get_window_extent().extents
-    angles = np.arange(16) * np.pi / 8
-    around = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    around = [np.array([np.cos(a), np.sin(a)]) for a in np.arange(16) * np.pi / 8]
     for name, spot, colour in zip(points, spots, colours, strict=True):
         arrow = {"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 0, "shrinkB": 3}
         how: Any = {"textcoords": "offset points", "arrowprops": arrow, "in_layout": False}
-        how |= {"fontsize": 7, "color": colour, "va": "bottom"}
+        how |= {"fontsize": 8, "color": colour, "va": "bottom"}
         text = axes.annotate(_text(name), points[name], (0, 0), **how)
         size = np.array(Text.get_window_extent(text).size)  # without the line
         steps = [d * (r + size / 2) - size / 2 for r in (7, 12, 20, 30, 45, 65) for d in around]
@@ -256,19 +252,24 @@ def _label_cost(box: Any, spot: Any, spots: Any, boxes: Sequence[Any], frame: An
     return covered, outside, own > far.min(), own
 
 
-def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
+def path_sheets(
+    folder: Path, results: Mapping[str, EvaluationResult], order: Sequence[str]
+) -> dict[str, Path]:
     """Write contact sheets of one scene's states with the paths of the best policies.
 
     They are ``contact_sheet.webp``, and ``contact_sheet_2.webp`` for more policies; none where the
-    scenes are not known, or the grid has more states than a sheet shows.
+    light changes at once, the scenes are not known, or the grid has too many states for a sheet.
     """
     from ae_env.rendering import MAX_SHEET_STATES, contact_sheet
 
-    if not result.scenes or len(result.grid) > MAX_SHEET_STATES:
+    steady = [r for r in results.values() if not np.ptp(r.scores[:, :_PATH_FRAMES], axis=1).any()]
+    if not steady or not steady[0].scenes or len(steady[0].grid) > MAX_SHEET_STATES:
         return {}
-    every, best = np.arange(len(result.kinds)), [result.tracks[name].states for name in order[:3]]
-    ends = [result.scores[every, -1, states[0, :, -1]] for states in best]
-    episode = int(np.argmax(np.std(ends, axis=0) + np.isin(result.kinds, _KINDS)))
+    result, last = steady[0], min(_PATH_FRAMES, steady[0].scores.shape[1]) - 1
+    ends = np.array([result.tracks[name].states[0, :, last] for name in order[:_PATHS]])
+    spread = np.std([result.scores[np.arange(len(own)), last, own] for own in ends], axis=0)
+    differing = [len(set(own)) for own in ends.T.tolist()]  # states that policies end in
+    episode = int(np.argmax(_PATHS * np.isin(result.kinds, _KINDS) + differing + spread))
     options, start = result.plan.options(), int(result.start_states[episode])
     files = {}
     for k, first in enumerate(range(0, min(len(order), _SHEETS * _PATHS), _PATHS)):

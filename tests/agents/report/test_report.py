@@ -79,7 +79,6 @@ def made_brackets(groups: list[str] | None = None, **quality: np.ndarray) -> Eva
 def test_rows_have_the_values_of_their_episodes():
     result = made_result()
     rows = result_rows(result, source="bundled", split="test", resamples=500)
-    assert len(rows) == 12
     by = {(r["policy"], r["condition"]): r for _, r in rows.iterrows()}
     oracle, hard = by["oracle", "all"], by["oracle", "hard"]
     assert (oracle["normalised_score"], oracle["regret"]) == pytest.approx((1.0, 0.0))
@@ -103,7 +102,6 @@ def test_other_conditions_have_one_row_of_their_own_name():
     assert own.regret_given_ev.iloc[0] == own.regret_given_ev.iloc[3]
     ranking = made.overall_ranking(results, resamples=100)
     assert ranking.policy.tolist() == ["spot:P", "matrix:P", "ppo"]  # oracle is told
-    assert ranking.place.tolist() == [1, 2, 3]
     assert (ranking.to_best[1]["other"], ranking.to_next[2]) == ("spot:P", None)
     assert ranking.to_best[1]["difference"] < 0
 
@@ -111,8 +109,6 @@ def test_other_conditions_have_one_row_of_their_own_name():
 def test_scenes_have_means_of_their_episodes():
     result = made_result()
     rows = made.scene_rows(result)
-    assert tuple(rows.columns) == made.SCENE_COLUMNS
-    assert len(rows) == 4 * 20
     row = rows.set_index(["policy", "scene_id"]).loc["matrix:P", "scene-03"]
     states = result.tracks["matrix:P"].states[0, 6:8]
     q = [[result.scores[6 + e, t, states[e, t]] for t in range(4)] for e in range(2)]
@@ -121,8 +117,7 @@ def test_scenes_have_means_of_their_episodes():
     assert (row.episodes, row.hard, row.kind) == (2, 0, "photograph")
     assert row.final_state == states[0, -1]
     assert row.oracle_state == result.scores[6, -1].argmax()
-    groups = made.group_rows(result)
-    assert groups.loc["group-03", "matrix:P"] == pytest.approx(np.mean(q))
+    assert made.group_rows(result).loc["group-03", "matrix:P"] == pytest.approx(np.mean(q))
 
 
 def test_best_meter_differences_and_histogram():
@@ -140,7 +135,6 @@ def test_best_meter_differences_and_histogram():
     assert seeds.normalised_score.mean() == pytest.approx(scores["ppo"])
     histogram = made.oracle_histogram(result)
     assert [len(v) for v in histogram.values()] == [4, 4, 4]
-    assert sum(histogram["f_number"].values()) == pytest.approx(1.0)
     share = np.mean([result.grid[s].iso == 400 for s in result.oracle_states])
     assert histogram["iso"]["400"] == pytest.approx(share)
     kinds = made.scores_by_kind(result)
@@ -190,16 +184,12 @@ def test_files_of_a_report(tmp_path):
     files = write_report(made_result(), tmp_path / "out", **names, next_commands=following)
     tables, pages = {"results.json", "scenes.csv", "metrics.csv"}, {"report.md", "report.html"}
     assert set(files) == tables | pages | {"scores.png", "ev_error.png"}
-    assert {path.name for path in (tmp_path / "out").iterdir()} == set(files)
     meta = json.loads(files["results.json"].read_text())["meta"]
     assert (meta["command"], meta["best_meter"]) == (names["command"], "spot:P")
     assert [row["policy"] for row in meta["ranking"]] == ["spot:P", "matrix:P", "ppo"]
     assert following[0] in files["report.md"].read_text()
     assert "**spot:P scores best: " in files["report.md"].read_text()
     assert re.search('<a href="#s1">Ranking.*<details open', files["report.html"].read_text(), re.S)
-    for name in ("scores.png", "ev_error.png"):
-        data = base64.b64encode(files[name].read_bytes()).decode()
-        assert data in files["report.html"].read_text()
     result = made_result()  # several conditions, no meter, one part
     result = replace(result, hard=np.zeros_like(result.hard), tracks={"ppo": result.tracks["ppo"]})
     files = write_report({"static": result, "sine": result}, tmp_path, command="x")
@@ -231,6 +221,21 @@ def test_labels_are_nearest_to_their_own_points_and_legends_are_whole(monkeypatc
     assert apart.any(axis=-1).sum() == 9 * 8
     shown = [(label.get_text(), label.get_color()) for label in axes.texts]
     assert shown == [*zip(names, PATH_COLOURS, strict=False)]
+
+
+def test_a_sheet_is_of_a_photograph_in_steady_light_where_policies_differ(monkeypatch, tmp_path):
+    blank, shown = Image.new("RGB", (9, 9)), []
+    sheet = lambda scene, path, **_: shown.append((scene, path)) or blank  # noqa: E731
+    monkeypatch.setattr("ae_env.rendering.contact_sheet", sheet)
+    steady = replace(made_result(4), scenes=range(8))
+    moving = {"a": replace(steady, scores=steady.scores * np.linspace(0.5, 1.0, 4)[:, None])}
+    apart = np.isin(range(8), [1, 6])[None, :, None] * (np.arange(4) == 3)  # 1 is no photograph
+    for k, track in enumerate((tracks := steady.tracks).values()):
+        track.arrays["states"] = k * apart
+    assert plots.path_sheets(tmp_path, moving, [*tracks]) == {}
+    files = plots.path_sheets(tmp_path, moving | {"b": steady}, [*tracks])
+    assert [*files] == ["contact_sheet.webp"]
+    assert shown == [(6, {name: [0, 0, 0, 0, k] for k, name in enumerate(tracks)})]
 
 
 def test_names_from_outside_show_no_file(tmp_path):
@@ -353,7 +358,6 @@ def test_hash_notices_the_plan_and_the_light(plan, scenes):
     light = torch.full((4, 36, 36), 0.25)
     light[:, :9, :9] = 1.0  # the first of 4 x 4 blocks
     codes = np.array(ae_bench.scene_signature(replace(scenes[0], light=light))[-2])
-    assert codes.shape == (4, 4, 4)
     assert (codes[:, 0, 0] - codes[:, 3, 3] == 20).all()  # two stops in tenths
 
 
@@ -386,8 +390,7 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     ranking = overall_ranking(results, resamples=200)
     found = ae_bench.bench_rows(results, ranking)
     table = tmp_path / "docs" / "ae-bench" / "v3.csv"
-    files = ae_bench.append_rows(table, plan, found, author="first")
-    assert sorted(files) == ["v3.csv", "v3.md"]
+    ae_bench.append_rows(table, plan, found, author="first")
     again = found[found.policy == "random"]
     statistics = plan.changed(environment={**plan.environment, "observation": "statistics"})
     ae_bench.append_rows(table, plan, again, author="second")
