@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -200,6 +201,7 @@ class BlurredFrames:
         self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
+        self._passes = list[Pass]()  # that are still to run
 
     @property
     def is_full(self) -> bool:
@@ -264,6 +266,7 @@ class BlurredFrames:
         """
         if self.is_full:
             self._free_others(indices, slots)
+        self._passes.clear()
         behind_lens = blurs["defocus_px"] > 0.0
         known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
         known &= self._diameter[indices, slots] == blurs["defocus_px"]
@@ -282,7 +285,8 @@ class BlurredFrames:
             some, source = indices[darkened], light[darkened]
             self._give_memory(some)
             light[darkened] = self._moved[some]
-            self._darken(blurs["vignetting"][darkened], source, light[darkened])
+            self._darken(some, blurs["vignetting"][darkened], source, light[darkened])
+        _run(self._passes, self._shape)
         return light
 
     def _give_memory(self, indices: np.ndarray) -> None:
@@ -303,7 +307,7 @@ class BlurredFrames:
             own = indices[blends], blurs[blends]
             self._blend(*own, self._made_levels(*own, source[blends]), to[blends])
         one = ~blends  # disc everywhere
-        self._blur(blurs["defocus_px"][one], source[one], to[one])
+        self._blur(indices[one], blurs["defocus_px"][one], source[one], to[one])
 
     def _made_levels(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray
@@ -320,15 +324,17 @@ class BlurredFrames:
         frame, level = frame[first], level[first]
         made = self._take(len(frame))
         self._levels[indices[frame], level] = made
-        self._blur(np.array(DIAMETERS)[level], source[frame], made)
+        self._blur(indices[frame], np.array(DIAMETERS)[level], source[frame], made)
         # Levels without a share are read too, times 0: any image does.
         levels = self._levels[indices]
         levels[:, 0] = source
         return np.where(levels == 0, source[:, None], levels)
 
-    # Each writes frames to the places `to` (K,): behind one disc, behind discs of the pixels' own,
-    # and moved.
-    def _blur(self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+    # Each writes frames of scenes to the places `to` (K,): behind one disc, behind discs of the
+    # pixels' own, moved, and darkened. Costs are about microseconds at 128 x 128.
+    def _blur(
+        self, indices: np.ndarray, diameters: np.ndarray, source: np.ndarray, to: np.ndarray
+    ) -> None:
         radii = np.zeros(len(diameters))
         for i, diameter in enumerate(diameters.tolist()):
             if diameter > WIDE_PX:
@@ -336,53 +342,94 @@ class BlurredFrames:
                 wide_disc(light, diameter, LIGHT_LIMIT, out)
             else:
                 radii[i] = _radius(diameter)
-        cost = np.where(radii > 0.0, 6.0 + radii**2, 0.0)
-        _run(blur_discs, cost, self._shape, source, to, radii)
+        narrow = radii > 0.0
+        cost = (40.0 + 10.0 * radii**2)[narrow]
+        self._add(blur_discs, indices[narrow], cost, source[narrow], to[narrow], radii[narrow])
 
     def _blend(
         self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
     ) -> None:
-        _run(blend_discs, np.ones(len(to)), self._shape, to, blurs, levels)
+        self._add(blend_discs, indices, np.full(len(to), 60.0), to, blurs, levels)
 
     def _move(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
-        # Sums of taps take as long as these are many; with a subject there are three.
-        taps = 12.0 + np.minimum(blurs["motion_px"], sum(self._shape[1:]))
-        taps *= np.where(blurs["mask"] > 0, 2.5, 1.0)
-        streaks = blurs["streaks"]
-        _run(move_along_rows, taps * streaks, self._shape, source, to, blurs)
-        _run(move_along_paths, taps * ~streaks, self._shape, source, to, blurs)
+        # Sums of taps take as long as these are many; with a subject there are more.
+        taps = 40.0 + 6.0 * np.minimum(blurs["motion_px"], sum(self._shape[1:]))
+        taps *= np.where(blurs["mask"] > 0, 2.0, 1.0)
+        for task, own in (move_along_rows, blurs["streaks"]), (move_along_paths, ~blurs["streaks"]):
+            self._add(task, indices[own], taps[own], source[own], to[own], blurs[own])
 
-    def _darken(self, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+    def _darken(
+        self, indices: np.ndarray, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray
+    ) -> None:
         """Writes the light of the places `source`, times the maps at `vignetting`, to `to`."""
-        _run(darken, np.ones(len(to)), self._shape, source, to, vignetting)
+        self._add(darken, indices, np.full(len(to), 20.0), source, to, vignetting)
+
+    def _add(self, *one: Any) -> None:
+        if len(one[1]):
+            self._passes.append(Pass(one[0], one[1], one[2], one[3:]))
+
+
+class Pass(NamedTuple):
+    """A kind of blur, of K frames."""
+
+    task: Any  # compiled, see `blur_discs`
+    scenes: np.ndarray  # (K,) whose frames they are
+    cost: np.ndarray  # (K,)
+    columns: tuple[np.ndarray, ...]  # (K,) each, for the task
 
 
 _radius = functools.lru_cache(maxsize=4096)(disc_radius)
 
 
-def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]
-    """Calls a pass for units of each frame on all threads, which share the cost (K,)."""
-    todo = np.flatnonzero(cost)
-    if not len(todo):
+def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
+    """Runs passes, in order, on frames of `shape`, on all threads.
+
+    A thread has all passes of a scene. Where scenes are few, threads share each pass instead.
+    """
+    if not passes:
         return
     threads = torch.get_num_threads()
-    # Frames are shared out whole, unless they are few and large: then by planes, and by rows where
-    # there are more threads.
-    parts = 1
-    if len(todo) < 2 * threads and math.prod(shape) >= _LARGE:
-        parts = shape[0] * min(1 + (threads - 1) // (len(todo) * shape[0]), shape[1])
-    order = todo[np.argsort(-cost[todo], kind="stable")]
-    costs = np.repeat(cost[order], parts)
+    scenes, owner = np.unique(np.concatenate([p.scenes for p in passes]), return_inverse=True)
+    if len(scenes) >= 2 * threads:
+        ends = np.cumsum([len(p.scenes) for p in passes])
+        _run_shared(passes, np.split(owner, ends[:-1]), 1, shape, threads)
+        return
+    for one in passes:
+        count, parts = len(one.scenes), 1
+        # Frames are shared out whole, unless they are few and large: then by planes, and by rows
+        # where there are more threads.
+        if count < 2 * threads and math.prod(shape) >= _LARGE:
+            parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
+        _run_shared([one], [np.arange(count)], parts, shape, min(threads, count * parts))
+
+
+def _run_shared(
+    passes: Sequence[Pass],
+    owners: Sequence[np.ndarray],
+    parts: int,
+    shape: tuple[int, ...],
+    threads: int,
+) -> None:
+    """Runs passes, on threads which share the cost of the `owners` (K,) of their frames."""
+    cost = np.bincount(np.concatenate(owners), np.concatenate([p.cost for p in passes]))
+    order = np.argsort(-cost, kind="stable")
+    costs, place = np.repeat(cost[order], parts), np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
     # A unit belongs to the thread in whose share of the cost its middle is.
-    share = (costs.cumsum() - 0.5 * costs) * (threads / costs.sum())
-    ends = np.searchsorted(share, np.arange(threads + 1)).tolist()
-    fixed = order, parts, *shape, *columns
+    share = ((costs.cumsum() - 0.5 * costs) * (threads / costs.sum())).reshape(-1, parts)
+    work = []
+    for one, owner in zip(passes, owners, strict=True):
+        own = np.argsort(place[owner], kind="stable")
+        ends = np.searchsorted(share[place[owner[own]]].ravel(), np.arange(threads + 1)).tolist()
+        work.append((one.task, ends, (own, parts, *shape, *one.columns)))
 
     def do(first: int, last: int) -> None:
         for thread in range(first, last):
-            task(ends[thread], ends[thread + 1], *fixed)
+            for task, ends, fixed in work:
+                if ends[thread] < ends[thread + 1]:
+                    task(ends[thread], ends[thread + 1], *fixed)
 
     parallel_ranges(do, threads)
 

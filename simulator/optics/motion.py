@@ -44,8 +44,8 @@ _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 _LENGTH_POINTS = 32
 #: The first row: a literal 0 would compile what takes it twice.
 _TOP = np.int64(0)
-#: Taps that are added to all rows together.
-_TAPS = 128
+#: Taps that are added to all rows together, and samples of the rows that are looked at.
+_TAPS, _BAND = 128, 2**17
 #: Shares below this are left out.
 _LEAST_WEIGHT = 1e-9
 _jit = functools.partial(kernel, fastmath={"contract"})
@@ -424,24 +424,28 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
     reach = down = 0
     for k in range(len(weights)):
         reach, down = max(reach, abs(columns[k])), max(down, abs(rows[k]))
-    pitch, count = width + 2 * reach, last - first
+    pitch = width + 2 * reach
+    most = min(last - first, max(_BAND // pitch - 2 * down, 2 * down, 1))
     wide = (width + LANES - 1) // LANES * LANES  # what a sum reads behind its row does not count
-    memory = np.empty((count + 2 * down) * pitch + wide - width, np.float32)
-    padded = memory[: (count + 2 * down) * pitch].reshape(count + 2 * down, pitch)
-    pad_rows(plane, first - down, _TOP, height, reach, limit, padded)
-    memory[padded.size :] = np.float32(0)
+    memory = np.empty((most + 2 * down) * pitch + wide - width, np.float32)
+    memory[memory.size - wide + width :] = np.float32(0)
+    padded = memory[: (most + 2 * down) * pitch].reshape(most + 2 * down, pitch)
     offsets = (rows + down) * pitch + columns + reach
-    sums = out[first:last] if wide == width else np.empty((count, wide), np.float32)
-    sums[:] = np.float32(0)
-    # Some taps for all rows, then the next: rows have most of what they look at in common.
-    for k in range(0, len(weights), _TAPS):
-        some, shares = offsets[k : k + _TAPS], weights[k : k + _TAPS]
-        for y in range(count):
-            for x in range(0, wide, LANES):
-                add_shifts(memory[y * pitch + x :], some, shares, sums[y, x:])  # type: ignore[call-arg]
-    if wide > width:
-        for y in range(count):
-            copy_row(sums[y, :width], out[first + y])
+    kept = np.empty((most if wide > width else 0, wide), np.float32)
+    for top in range(first, last, most):
+        count = min(most, last - top)
+        pad_rows(plane, top - down, _TOP, height, reach, limit, padded[: count + 2 * down])
+        sums = kept[:count] if wide > width else out[top : top + count]
+        sums[:] = np.float32(0)
+        # Some taps for all rows, then the next: rows have most of what they look at in common.
+        for k in range(0, len(weights), _TAPS):
+            some, shares = offsets[k : k + _TAPS], weights[k : k + _TAPS]
+            for y in range(count):
+                for x in range(0, wide, LANES):
+                    add_shifts(memory[y * pitch + x :], some, shares, sums[y, x:])  # type: ignore[call-arg]
+        if wide > width:
+            for y in range(count):
+                copy_row(sums[y, :width], out[top + y])
 
 
 @_jit()
