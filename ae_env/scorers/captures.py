@@ -328,6 +328,20 @@ class SceneCaptures:
         source_noise: Sequence[NoiseLevelFunction] | None,
     ) -> Captures:
         """Captures at `states` (B,) of a scene each; see `describe_captures`."""
+        moves = {"speed": speed, "defocus": defocus, "movements": movements}
+        blur = self.blur_of(scenes, states, **moves)
+        return self._captures(scenes, states, gain, row_gain, source_noise, *blur)
+
+    def blur_of(
+        self,
+        scenes: Sequence[Scene],
+        states: np.ndarray,
+        *,
+        speed: np.ndarray,
+        defocus: np.ndarray,
+        movements: np.ndarray | None,
+    ) -> tuple[torch.Tensor, PixelBlur | None]:
+        """`Captures.blur_px` and `Captures.pixel_blur` alone, of what `of` takes."""
         height = scenes[0].light.shape[-2]
         times, f_numbers = self._times[states], self._f_numbers[states]
         discs = defocus * (4.0 / f_numbers) * height / 64.0
@@ -336,8 +350,7 @@ class SceneCaptures:
             own[:] = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
         moves = np.zeros((len(scenes), 4)) if movements is None else movements
         blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, own)
-        lights = gain, row_gain, source_noise
-        return self._captures(scenes, states, *lights, torch.from_numpy(blur), pixel_blur)
+        return torch.from_numpy(blur), pixel_blur
 
     def _captures(
         self,
