@@ -328,8 +328,7 @@ class SceneCaptures:
         source_noise: Sequence[NoiseLevelFunction] | None,
     ) -> Captures:
         """Captures at `states` (B,) of a scene each; see `describe_captures`."""
-        moves = {"speed": speed, "defocus": defocus, "movements": movements}
-        blur = self.blur_of(scenes, states, **moves)
+        blur = self.blur_of(scenes, states, speed=speed, defocus=defocus, movements=movements)
         return self._captures(scenes, states, gain, row_gain, source_noise, *blur)
 
     def blur_of(

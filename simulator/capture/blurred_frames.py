@@ -24,12 +24,12 @@ from simulator.optics.discs import (
     LIGHT_LIMIT,
     WIDE_PX,
     blend_rows,
-    disc_image,
     disc_radius,
+    disc_taps,
     mark_levels,
     wide_disc,
 )
-from simulator.optics.motion import blur_apart, blur_rows, move_rows, streak_share, taps_of
+from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak_share, taps_of
 from simulator.utils.checks import check_number, check_type
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
@@ -468,7 +468,7 @@ def blur_discs(  # type: ignore[no-untyped-def]
     for unit in range(first, last):
         i, rows = order[unit // parts], _share(unit, parts, shape[0])
         image, out = _array_at(source[i], shape), _array_at(to[i], shape)
-        disc_image(rows[0], rows[1], image, height, radii[i], _MOST, out)
+        blur_planes(rows[0], rows[1], image, height, disc_taps(radii[i]), _MOST, out)
 
 
 @_jit()
@@ -520,22 +520,18 @@ def move_along_paths(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, light, to, blurs
 ):
     """Light that moves along a path, and a subject that moves along its own."""
-    still, shape = 0.0, (planes, height, width)
+    still, shape = 0.0, (planes * height, width)
     for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, planes * height)
+        i, rows = order[unit // parts], _share(unit, parts, shape[0])
         blur, image, out = blurs[i], _array_at(light[i], shape), _array_at(to[i], shape)
-        begin, end = rows[0] // height, (rows[1] + height - 1) // height  # planes
         path = blur.extent, blur.direction, blur.turn
         taps = taps_of(path[0], path[1], path[2], still, still, height, width)
-        if blur.mask:
-            if rows[0] % height:  # whoever has the first rows of a plane does all of it
-                continue
+        if not blur.mask:
+            blur_planes(rows[0], rows[1], image, height, taps, _MOST, out)
+        elif rows[0] % height == 0:  # whoever has the first rows of a plane does all of it
             drift = blur.drift_x, blur.drift_y
             own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
             mask = _array_at(blur.mask, (height, width))
             behind = _array_at(blur.behind, (height, width)).view(np.int32)
+            begin, end = rows[0], (rows[1] + height - 1) // height * height
             blur_apart(image[begin:end], mask, behind, taps, own, _MOST, out[begin:end])
-            continue
-        for plane in range(begin, end):
-            top, bottom = max(rows[0] - plane * height, 0), min(rows[1] - plane * height, height)
-            blur_rows(top, bottom, image[plane], taps[0], taps[1], taps[2], _MOST, out[plane])

@@ -1,8 +1,8 @@
 """Defocus: uniform discs, and a bank of them that blends a blur for each pixel.
 
 Discs are energy-preserving and, as streaks are (`simulator.optics.motion`), matched in second
-moment: that of a continuous disc is its diameter squared / 16 per axis. On the CPU a disc is a sum of
-weighted shifts, as a path is.
+moment: that of a continuous disc is its diameter squared / 16 per axis. On the CPU a disc is a sum
+of weighted shifts, as a path is.
 
 A bank blurs once with every disc of a few diameters and interpolates between neighbours, per pixel
 and in the *squared* diameter (second moments add, so that is where blur is linear): any map of blur
@@ -23,14 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from simulator.optics.motion import (
-    Taps,
-    blur_rows,
-    by_rows,
-    has_kernels,
-    motion_kernel,
-    streak_share,
-)
+from simulator.optics.motion import Taps, has_kernels, motion_kernel, path_blur, streak_share
 from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
@@ -44,7 +37,7 @@ _SUBROWS = 32
 _LONGEST_KERNEL = 4096.0
 #: Kernels wider than this are applied in the Fourier domain; and where the kernel for the CPU does
 #: the sum of a single image.
-_FFT_TAPS, _DIRECT_TAPS = 11, 25
+_FFT_TAPS, _DIRECT_TAPS = 11, 41
 #: Discs wider than this are cheaper in the Fourier domain than as a sum, in a batch [pixel].
 WIDE_PX = 40.0
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
@@ -165,9 +158,7 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
         return light
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
-        fixed = height, disc_radius(diameter_px), np.float32(math.inf)
-        cost = (taps // 2 + 1) ** 2
-        return by_rows(light, lambda a, b, rows, to: disc_image(a, b, rows, *fixed, to), cost)
+        return path_blur(light, Taps(*disc_taps(disc_radius(diameter_px))))
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
@@ -191,7 +182,7 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
 
 
 @_jit()
-def _disc_taps(radius):  # type: ignore[no-untyped-def]
+def disc_taps(radius):  # type: ignore[no-untyped-def]
     """Rows, columns and weights of the `Taps` of a disc."""
     quadrant = coverage(radius)
     reach, count = len(quadrant) - 1, 0
@@ -204,18 +195,6 @@ def _disc_taps(radius):  # type: ignore[no-untyped-def]
                 count += 1
     count = (count + 7) // 8 * 8
     return rows[:count], columns[:count], weights[:count].astype(np.float32)
-
-
-@_jit()
-def disc_image(first, last, rows, height, radius, limit, out):  # type: ignore[no-untyped-def]
-    """Rows from `first` to `last` of planes (P * H, W) behind a disc of `radius`."""
-    taps = _disc_taps(radius)
-    y = first
-    while y < last:
-        top = y // height * height
-        end, plane = min(last - top, height), rows[top : top + height]
-        blur_rows(y - top, end, plane, taps[0], taps[1], taps[2], limit, out[top : top + height])
-        y = top + end
 
 
 # -- a bank of discs --------------------------------------------------------------------------

@@ -449,15 +449,26 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
 
 
 @_jit()
+def blur_planes(first, last, rows, height, taps, limit, out):  # type: ignore[no-untyped-def]
+    """Rows from `first` to `last` of planes (P * H, W) as sums of their shifts."""
+    y = first
+    while y < last:
+        top = y // height * height
+        end, plane = min(last - top, height), rows[top : top + height]
+        blur_rows(y - top, end, plane, taps[0], taps[1], taps[2], limit, out[top : top + height])
+        y = top + end
+
+
+@_jit()
 def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
     """A subject that moves along its path, in front of a background that moves along another.
 
-    ``(1 - A) (K_b * B) + K_s * (M L)`` of the planes (P, H, W), L, with the `mask` of the subject,
+    ``(1 - A) (K_b * B) + K_s * (M L)`` of the planes (P * H, W), L, with the `mask` of the subject,
     M, A = K_s * M, the `own` taps of its path, K_s, those of the background's, K_b, and the
     background B that continues behind it: which pixel, counted row by row, it shows in place of
     each is `behind`. Uniform light stays uniform.
     """
-    count, height, width = planes.shape
+    height, width = mask.shape
     rows, columns, weights = own
     # What the subject is smeared over: elsewhere there is nothing of it.
     top, bottom, left, right = height, 0, width, 0
@@ -478,8 +489,8 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
         for x in range(right - left):
             apart[y, x] = mask[y, left + x]
     blur_rows(top, bottom, apart, rows, columns, weights, limit, cover)
-    for plane in range(count):
-        source, result = planes[plane], out[plane]
+    for plane in range(0, len(planes), height):
+        source, result = planes[plane : plane + height], out[plane : plane + height]
         flat = source.reshape(-1)
         copy_row(flat, back.reshape(-1))
         for y in range(top, bottom):
@@ -500,8 +511,8 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
 
 
 def path_blur(light: Tensor, taps: Taps) -> Tensor:
-    """Motion of `light` (P, H, W) float32 along a path, on the CPU; the borders are replicated."""
-    out = torch.empty(light.shape)
-    for plane, to in zip(light.contiguous().numpy(), out.numpy(), strict=True):
-        blur_rows(_TOP, len(plane), plane, *taps, np.float32(math.inf), to)
-    return out
+    """Motion of float32 `light` (..., H, W) along a path, on the CPU; borders are replicated."""
+    fixed = light.shape[-2], tuple(taps), np.float32(math.inf)
+    return by_rows(
+        light, lambda a, b, rows, to: blur_planes(a, b, rows, *fixed, to), len(taps.rows)
+    )
