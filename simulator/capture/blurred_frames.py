@@ -384,45 +384,34 @@ _radius = functools.lru_cache(maxsize=4096)(disc_radius)
 
 
 def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
-    """Runs passes, in order, on frames of `shape`, on all threads.
+    """Runs passes, in order, on frames of `shape`, on all threads, which share the cost.
 
-    A thread has all passes of a scene. Where scenes are few, threads share each pass instead.
+    A thread has all passes of a scene. Where scenes are few, threads share each pass instead, and
+    of few large frames planes, or rows where there are more threads.
     """
     if not passes:
         return
-    threads = torch.get_num_threads()
-    scenes, owner = np.unique(np.concatenate([p.scenes for p in passes]), return_inverse=True)
-    if len(scenes) >= 2 * threads:
-        ends = np.cumsum([len(p.scenes) for p in passes])
-        _run_shared(passes, np.split(owner, ends[:-1]), 1, shape, threads)
-        return
-    for one in passes:
-        count, parts = len(one.scenes), 1
-        # Frames are shared out whole, unless they are few and large: then by planes, and by rows
-        # where there are more threads.
+    threads, parts = torch.get_num_threads(), 1
+    different, owner = np.unique(np.concatenate([p.scenes for p in passes]), return_inverse=True)
+    if len(different) < 2 * threads:
+        if len(passes) > 1:
+            for one in passes:
+                _run([one], shape)
+            return
+        owner, count = np.arange(len(owner)), len(owner)
         if count < 2 * threads and math.prod(shape) >= _LARGE:
             parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
-        _run_shared([one], [np.arange(count)], parts, shape, min(threads, count * parts))
-
-
-def _run_shared(
-    passes: Sequence[Pass],
-    owners: Sequence[np.ndarray],
-    parts: int,
-    shape: tuple[int, ...],
-    threads: int,
-) -> None:
-    """Runs passes, on threads which share the cost of the `owners` (K,) of their frames."""
-    cost = np.bincount(np.concatenate(owners), np.concatenate([p.cost for p in passes]))
+        threads = min(threads, count * parts)
+    cost = np.bincount(owner, np.concatenate([p.cost for p in passes]))
     order = np.argsort(-cost, kind="stable")
-    costs, place = np.repeat(cost[order], parts), np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
+    costs, place = np.repeat(cost[order], parts), np.argsort(order)
     # A unit belongs to the thread in whose share of the cost its middle is.
     share = ((costs.cumsum() - 0.5 * costs) * (threads / costs.sum())).reshape(-1, parts)
     work = []
-    for one, owner in zip(passes, owners, strict=True):
-        own = np.argsort(place[owner], kind="stable")
-        ends = np.searchsorted(share[place[owner[own]]].ravel(), np.arange(threads + 1)).tolist()
+    for one in passes:
+        at, owner = np.split(owner, [len(one.cost)])
+        own = np.argsort(place[at], kind="stable")
+        ends = np.searchsorted(share[place[at[own]]].ravel(), np.arange(threads + 1)).tolist()
         work.append((one.task, ends, (own, parts, *shape, *one.columns)))
 
     def do(first: int, last: int) -> None:
