@@ -214,16 +214,18 @@ class AutoExposure(Task):
         new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
         if len(new) >= _MANY:
             found = self._scores_of_new(frames, source_noise, new)
-            self._scores[lights[new], states[new]] = np.stack(list(found.values()), axis=1)
+            each = np.stack([found[name] for name in self._known], axis=1)
+            self._scores[lights[new], states[new]] = each
             self._scored[lights[new], states[new]] = True
-        else:  # one by one takes longer than all states of a light at once
-            for index, light in zip(env_indices[new].tolist(), lights[new].tolist(), strict=True):
-                scene = self.episodes.scene.item(index)
-                seen = self.episodes.scenes[scene], self._captures.prepared_scene(light)
-                found = self._light_scores_of(scene, light)
-                found = found | self._terms.closed_form_terms(*seen, "blur")
-                self._scores[light] = np.stack([found[name] for name in self._known], axis=1)
-                self._scored[light] = True
+            new = new[:0]
+        # One by one takes longer than all states of a light at once.
+        scenes = self.episodes.scene[env_indices[new]].tolist()
+        for scene, light in zip(scenes, lights[new].tolist(), strict=True):
+            seen = self.episodes.scenes[scene], self._captures.prepared_scene(light)
+            of_blur = self._terms.closed_form_terms(*seen, "blur")
+            found = self._light_scores_of(scene, light) | of_blur
+            self._scores[light] = np.stack([found[name] for name in self._known], axis=1)
+            self._scored[light] = True
         return dict(zip(self._known, self._scores[lights, states].T, strict=True))
 
     def _scores_of_new(
@@ -235,10 +237,10 @@ class AutoExposure(Task):
             return self._terms.torch_scores(None, described, "light", "blur")
         env_indices = frames.env_indices[new]
         scenes, states, moves = self._seen(env_indices)
-        lights = self.episodes.light_index[env_indices].tolist()
-        pairs = zip(self.episodes.scene[env_indices].tolist(), lights, strict=True)
-        each = [*zip(map(self._light_scores_of, *zip(*pairs, strict=True)), states, strict=True)]
-        found = {n: np.array([of[n][state] for of, state in each]) for n in each[0][0]}
+        owners = (self.episodes.scene[env_indices], self.episodes.light_index[env_indices])
+        each = [*map(self._light_scores_of, *(column.tolist() for column in owners))]
+        pairs = [*zip(each, states.tolist(), strict=True)]
+        found = {name: np.array([of[name][state] for of, state in pairs]) for name in each[0]}
         if self._terms.only_sharpness:
             blur, pixel_blur = self._terms.captures.blur_of(scenes, states, **moves)
             score = Sharpness.of(pixel_blur or blur, scenes[0].light.shape[-2]).numpy()

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
@@ -58,6 +58,8 @@ _HALF_STEP = np.float32(0.51 / _LEVELS)
 _KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
 _MOST, _TOP = np.float32(LIGHT_LIMIT), np.int64(0)  # of their types, lest they compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
+#: A kind of blur of K frames: a kernel, the scenes (K,), the cost of each, and what it is given.
+Pass = tuple[Any, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,9 +344,9 @@ class BlurredFrames:
                 wide_disc(light, diameter, LIGHT_LIMIT, out)
             else:
                 radii[i] = _radius(diameter)
-        narrow = radii > 0.0
-        cost = (40.0 + 10.0 * radii**2)[narrow]
-        self._add(blur_discs, indices[narrow], cost, source[narrow], to[narrow], radii[narrow])
+        own = radii > 0.0
+        cost = 40.0 + 10.0 * radii[own] ** 2
+        self._add(blur_discs, indices[own], cost, source[own], to[own], radii[own])
 
     def _blend(
         self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
@@ -366,18 +368,9 @@ class BlurredFrames:
         """Writes the light of the places `source`, times the maps at `vignetting`, to `to`."""
         self._add(darken, indices, np.full(len(to), 20.0), source, to, vignetting)
 
-    def _add(self, *one: Any) -> None:
-        if len(one[1]):
-            self._passes.append(Pass(one[0], one[1], one[2], one[3:]))
-
-
-class Pass(NamedTuple):
-    """A kind of blur, of K frames."""
-
-    task: Any  # compiled, see `blur_discs`
-    scenes: np.ndarray  # (K,) whose frames they are
-    cost: np.ndarray  # (K,)
-    columns: tuple[np.ndarray, ...]  # (K,) each, for the task
+    def _add(self, task: Any, scenes: np.ndarray, cost: np.ndarray, *columns: np.ndarray) -> None:
+        if len(scenes):
+            self._passes.append((task, scenes, cost, columns))
 
 
 _radius = functools.lru_cache(maxsize=4096)(disc_radius)
@@ -392,7 +385,7 @@ def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
     if not passes:
         return
     threads, parts = torch.get_num_threads(), 1
-    different, owner = np.unique(np.concatenate([p.scenes for p in passes]), return_inverse=True)
+    different, owner = np.unique(np.concatenate([p[1] for p in passes]), return_inverse=True)
     if len(different) < 2 * threads:
         if len(passes) > 1:
             for one in passes:
@@ -402,17 +395,17 @@ def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
         if count < 2 * threads and math.prod(shape) >= _LARGE:
             parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
         threads = min(threads, count * parts)
-    cost = np.bincount(owner, np.concatenate([p.cost for p in passes]))
+    cost = np.bincount(owner, np.concatenate([p[2] for p in passes]))
     order = np.argsort(-cost, kind="stable")
     costs, place = np.repeat(cost[order], parts), np.argsort(order)
     # A unit belongs to the thread in whose share of the cost its middle is.
     share = ((costs.cumsum() - 0.5 * costs) * (threads / costs.sum())).reshape(-1, parts)
     work = []
-    for one in passes:
-        at, owner = np.split(owner, [len(one.cost)])
+    for task, scenes, _, columns in passes:
+        at, owner = np.split(owner, [len(scenes)])
         own = np.argsort(place[at], kind="stable")
         ends = np.searchsorted(share[place[at[own]]].ravel(), np.arange(threads + 1)).tolist()
-        work.append((one.task, ends, (own, parts, *shape, *one.columns)))
+        work.append((task, ends, (own, parts, *shape, *columns)))
 
     def do(first: int, last: int) -> None:
         for thread in range(first, last):
