@@ -29,7 +29,7 @@ from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
 from ae_env.scorers.captures import Captures
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from ae_env.scorers.terms import CompositeScorer, depends_on
+from ae_env.scorers.terms import CompositeScorer, Sharpness, depends_on
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES, FrameSource
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -213,29 +213,53 @@ class AutoExposure(Task):
         states = self.episodes.state[env_indices]
         new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
         if len(new) >= _MANY:
-            described = self._describe(frames, source_noise, new)
-            found = self._terms.torch_scores(None, described, "light", "blur")
-            self._scores[lights[new], states[new]] = np.stack(list(found.values()), axis=1)
+            found = self._scores_of_new(frames, source_noise, new)
+            each = np.stack([found[name] for name in self._known], axis=1)
+            self._scores[lights[new], states[new]] = each
             self._scored[lights[new], states[new]] = True
-        else:  # one by one takes longer than all states of a light at once
-            for index, light in zip(env_indices[new].tolist(), lights[new].tolist(), strict=True):
-                found = self._scores_of_light(self.episodes.scene.item(index), light)
-                self._scores[light] = np.stack([found[name] for name in self._known], axis=1)
-                self._scored[light] = True
+            new = new[:0]
+        # One by one takes longer than all states of a light at once.
+        scenes = self.episodes.scene[env_indices[new]].tolist()
+        for scene, light in zip(scenes, lights[new].tolist(), strict=True):
+            seen = self.episodes.scenes[scene], self._captures.prepared_scene(light)
+            of_blur = self._terms.closed_form_terms(*seen, "blur")
+            found = self._light_scores_of(scene, light) | of_blur
+            self._scores[light] = np.stack([found[name] for name in self._known], axis=1)
+            self._scored[light] = True
         return dict(zip(self._known, self._scores[lights, states].T, strict=True))
 
-    def _scores_of_light(self, scene: int, light: int) -> dict[str, np.ndarray]:
-        """Scores (S,) of the parts that look at no frame; some depend on the scene alone.
+    def _scores_of_new(
+        self, frames: FrameBatch, source_noise: np.ndarray, new: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Scores (K,) of the frames `new` (K,) by part, of those that look at no frame."""
+        if source_noise[new].any():  # blur averages it
+            described = self._describe(frames, source_noise, new)
+            return self._terms.torch_scores(None, described, "light", "blur")
+        env_indices = frames.env_indices[new]
+        scenes, states, moves = self._seen(env_indices)
+        owners = (self.episodes.scene[env_indices], self.episodes.light_index[env_indices])
+        each = [*map(self._light_scores_of, *(column.tolist() for column in owners))]
+        pairs = [*zip(each, states.tolist(), strict=True)]
+        found = {name: np.array([of[name][state] for of, state in pairs]) for name in each[0]}
+        if self._terms.only_sharpness:
+            blur, pixel_blur = self._terms.captures.blur_of(scenes, states, **moves)
+            score = Sharpness.of(pixel_blur or blur, scenes[0].light.shape[-2]).numpy()
+            return found | dict.fromkeys(self._terms.only_sharpness, score)
+        described = self._describe(frames, source_noise, new)
+        return found | self._terms.torch_scores(None, described, "blur")
+
+    def _light_scores_of(self, scene: int, light: int) -> dict[str, np.ndarray]:
+        """Scores (S,) of the parts that depend on a scene's light alone.
 
         Blur averages the noise of a source, so only scores of light without noise are cached.
         """
-        shown, prepared = self.episodes.scenes[scene], self._captures.prepared_scene(light)
-        of_light = self._light_scores.get(scene)
-        if of_light is None:
-            of_light = self._terms.closed_form_terms(shown, prepared, "light")
+        found = self._light_scores.get(scene)
+        if found is None:
+            shown, prepared = self.episodes.scenes[scene], self._captures.prepared_scene(light)
+            found = self._terms.closed_form_terms(shown, prepared, "light")
             if prepared.nlf.is_zero:
-                self._light_scores[scene] = of_light
-        return of_light | self._terms.closed_form_terms(shown, prepared, "blur")
+                self._light_scores[scene] = found
+        return found
 
     def _expected_means(
         self, frames: FrameBatch, transitions: FindTransitions, boxes: np.ndarray
@@ -254,24 +278,29 @@ class AutoExposure(Task):
     def _describe(
         self, frames: FrameBatch, source_noise: np.ndarray, part: Any = slice(None)
     ) -> Captures:
-        episodes, env_indices, rows = self.episodes, frames.env_indices[part], frames.rows
-        scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
-        noises = movements = None
-        if episodes.subject_speed[env_indices].any():  # else they do not matter
-            movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
+        scenes, states, moves = self._seen(frames.env_indices[part])
+        noises, rows = None, frames.rows
         if source_noise[part].any():
             pairs = source_noise[part].tolist()
             noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
         return self._terms.captures.of(
             scenes,
-            episodes.state[env_indices],
-            speed=episodes.speed[env_indices],
-            defocus=episodes.defocus[env_indices],
-            movements=movements,
+            states,
+            **moves,
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],
             source_noise=noises,
         )
+
+    def _seen(self, env_indices: np.ndarray) -> tuple[list[Scene], np.ndarray, dict[str, Any]]:
+        """Scenes, states, and how the scenes move, as `SceneCaptures.blur_of` takes them."""
+        episodes = self.episodes
+        scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
+        moves = {"speed": episodes.speed[env_indices], "defocus": episodes.defocus[env_indices]}
+        movements = None
+        if episodes.subject_speed[env_indices].any():  # else they do not matter
+            movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
+        return scenes, episodes.state[env_indices], moves | {"movements": movements}
 
 
 class AutoExposureBase(SpecProperty):

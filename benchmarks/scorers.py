@@ -25,7 +25,7 @@ import ae_env  # noqa: F401  registers the environment
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
-from ae_env.scorers.captures import describe_captures, prepare_scene
+from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from benchmarks import harness
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, ssim, table
 from benchmarks.isolated import timed
@@ -95,7 +95,7 @@ def milliseconds(repeats: int) -> list[Row]:
 
 def _described(scene: Scene, states: list[CameraSettings], camera: CameraProfile) -> Captures:
     zeros, scenes = np.zeros(len(states)), [scene] * len(states)
-    return describe_captures(scenes, states, camera, speed=zeros, defocus=zeros, gain=zeros + 1.0)
+    return SceneCaptures(camera, states).of(scenes, speed=zeros, defocus=zeros, gain=zeros + 1.0)
 
 
 # -- what they like -------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from PIL import Image
 from ae_env.observation import decode_observation, encode_array
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.ladder import RUNGS
-from ae_env.scorers.captures import describe_captures, prepare_scene
+from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from ae_env.scorers.detection import Legibility
 from ae_env.scorers.terms import developed
 from agents.applications.latitude import load_detector, measure_latitude, picture_scenes
@@ -86,7 +86,7 @@ def curves(seed: int, quick: bool) -> list[Row]:
             own = speed / 60.0 / used.exposure_time
             frame = prepare_scene(scene, CAMERA, speed=own).expose([used], seed=seed).clamp_(0, 1)
             one: Any = {"speed": np.array([own]), "defocus": np.zeros(1), "gain": np.ones(1)}
-            captures = describe_captures([scene], [used], CAMERA, **one)
+            captures = SceneCaptures(CAMERA, [used]).of([scene], **one)
             shown = developed(frame, captures.white_balance, captures.colour_matrices)
             read = scorer.read(shown, captures)[0].reshape(-1, len(RUNGS)).mean(axis=0)
             found.append((read.mean(), read[0], read[-1]))

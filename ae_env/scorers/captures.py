@@ -206,72 +206,6 @@ def source_noises(
     return found
 
 
-def describe_captures(
-    scenes: Sequence[Scene],
-    settings: Sequence[CameraSettings],
-    camera: CameraProfile,
-    *,
-    speed: np.ndarray,
-    defocus: np.ndarray,
-    movements: np.ndarray | None = None,
-    gain: np.ndarray,
-    row_gain: np.ndarray | None = None,
-    source_noise: Sequence[NoiseLevelFunction] | None = None,
-    noisy: bool = True,
-) -> Captures:
-    """`Captures` of one state each of `scenes`, all (B,) long, by one body.
-
-    Args:
-        scenes, settings, camera: Scene and settings of each capture, and the body.
-        speed, defocus: (B,) each, see `prepare_scene`.
-        movements: (B, 4) numbers of each `Movement`, in its order; None for along the rows.
-        gain: (B,) light relative to the scenes' own.
-        row_gain: (B, H) light of each row relative to that; None where all rows have the same.
-        source_noise, noisy: See `Captures`.
-    """
-    return SceneCaptures(camera, settings, noisy=noisy).of(
-        scenes,
-        np.arange(len(settings)),
-        speed=speed,
-        defocus=defocus,
-        movements=movements,
-        gain=gain,
-        row_gain=row_gain,
-        source_noise=source_noise,
-    )
-
-
-def all_blur(
-    scenes: Sequence[Scene],
-    movements: np.ndarray,
-    speed: np.ndarray,
-    times: np.ndarray,
-    discs: np.ndarray,
-    own: np.ndarray,
-) -> tuple[np.ndarray, PixelBlur | None]:
-    """`Captures.blur_px` and `Captures.pixel_blur` of B captures.
-
-    `movements` (B, 4) and `speed` (B,) are those of `describe_captures`; all others are (B,):
-    exposure times [s], diameters of the largest disc of defocus, and the scenes' own blur [pixel].
-    """
-    height = scenes[0].light.shape[-2]
-    # Exactly the others' where `own` is 0.
-    blur = np.hypot(np.hypot(speed * times * height, discs), own)
-    differs = (discs != 0.0) | (movements[:, 2] != 0.0)
-    parts = [_ALIKE] * len(scenes)
-    for i in np.flatnonzero(differs).tolist():
-        layout = scenes[i].layout
-        parts[i] = _ALIKE if layout is None else layout.shares
-    if all(part is _ALIKE for part in parts):
-        return blur, None
-    ends = np.cumsum([0] + [part.shape[1] for part in parts])
-    levels, shares = np.zeros((2, len(scenes), int(np.diff(ends).max())))
-    numbers = np.stack([speed, times, discs, own, blur], axis=1)
-    sorts = np.concatenate(parts, axis=1)
-    _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur)
-    return blur, PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
-
-
 @kernel()
 def _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur):  # type: ignore[no-untyped-def]
     """`PixelBlur` of captures; `sorts` are the `Layout.shares` of all, one behind the other.
@@ -304,18 +238,44 @@ class SceneCaptures:
     """
 
     def __init__(
-        self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool
+        self, camera: CameraProfile, states: Sequence[CameraSettings], *, noisy: bool = True
     ) -> None:
         self.camera, self.states, self.noisy = camera, list(states), noisy
         self._nlf = camera.nlfs(states)
         numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
         self._times, self._f_numbers, self._log2_exposures = np.array(numbers).T
-        # (K, 2) times and f-numbers of states that differ in them, and (S,) which each state has.
-        blurs = np.array(numbers)[:, :2]
-        self._blurs, which = np.unique(blurs, axis=0, return_inverse=True)
+        # Which of the different times and f-numbers each state has, (S,).
+        which = np.unique(np.array(numbers)[:, :2], axis=0, return_inverse=True)[1]
         self._which = which.reshape(-1)
 
     def of(
+        self,
+        scenes: Sequence[Scene],
+        states: np.ndarray | None = None,
+        *,
+        speed: np.ndarray,
+        defocus: np.ndarray,
+        movements: np.ndarray | None = None,
+        gain: np.ndarray,
+        row_gain: np.ndarray | None = None,
+        source_noise: Sequence[NoiseLevelFunction] | None = None,
+    ) -> Captures:
+        """Captures of a scene each, all (B,) long.
+
+        Args:
+            scenes: Scene of each capture.
+            states: (B,) of the grid; None for one capture at each.
+            speed, defocus: (B,) each, see `prepare_scene`.
+            movements: (B, 4) numbers of each `Movement`, in its order; None for along the rows.
+            gain: (B,) light relative to the scenes' own.
+            row_gain: (B, H) light of each row relative to that; None where all rows have the same.
+            source_noise: See `Captures`.
+        """
+        states = np.arange(len(self.states)) if states is None else states
+        blur = self.blur_of(scenes, states, speed=speed, defocus=defocus, movements=movements)
+        return self._captures(scenes, states, gain, row_gain, source_noise, *blur)
+
+    def blur_of(
         self,
         scenes: Sequence[Scene],
         states: np.ndarray,
@@ -323,11 +283,8 @@ class SceneCaptures:
         speed: np.ndarray,
         defocus: np.ndarray,
         movements: np.ndarray | None,
-        gain: np.ndarray,
-        row_gain: np.ndarray | None,
-        source_noise: Sequence[NoiseLevelFunction] | None,
-    ) -> Captures:
-        """Captures at `states` (B,) of a scene each; see `describe_captures`."""
+    ) -> tuple[torch.Tensor, PixelBlur | None]:
+        """`Captures.blur_px` and `Captures.pixel_blur` alone, of what `of` takes."""
         height = scenes[0].light.shape[-2]
         times, f_numbers = self._times[states], self._f_numbers[states]
         discs = defocus * (4.0 / f_numbers) * height / 64.0
@@ -335,9 +292,19 @@ class SceneCaptures:
         if any(scene.defocus_map is not None for scene in scenes):
             own[:] = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
         moves = np.zeros((len(scenes), 4)) if movements is None else movements
-        blur, pixel_blur = all_blur(scenes, moves, speed, times, discs, own)
-        lights = gain, row_gain, source_noise
-        return self._captures(scenes, states, *lights, torch.from_numpy(blur), pixel_blur)
+        blur = np.hypot(np.hypot(speed * times * height, discs), own)  # the others' if own is 0
+        parts = [_ALIKE] * len(scenes)
+        for i in np.flatnonzero((discs != 0.0) | (moves[:, 2] != 0.0)).tolist():
+            layout = scenes[i].layout
+            parts[i] = _ALIKE if layout is None else layout.shares
+        if all(part is _ALIKE for part in parts):
+            return torch.from_numpy(blur), None
+        ends = np.cumsum([0] + [part.shape[1] for part in parts])
+        levels, shares = np.zeros((2, len(scenes), int(np.diff(ends).max())))
+        numbers = np.stack([speed, times, discs, own, blur], axis=1)
+        sorts = np.concatenate(parts, axis=1)
+        _fill_levels(height, sorts, ends, moves, numbers, levels, shares, blur)
+        return torch.from_numpy(blur), PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
 
     def _captures(
         self,
@@ -405,13 +372,14 @@ class SceneCaptures:
             `Captures.blur_px` (K,) and `Captures.pixel_blur`; and (S,) int64, which of the K each
             state has.
         """
-        few, alike = np.unique(self._which[part], return_inverse=True)
-        times, f_numbers = self._blurs[few].T
-        movement, height = prepared.movement, scene.light.shape[-2]
-        own = [scene.own_blur(f_number) for f_number in f_numbers.tolist()]
-        # In steps of a 64-pixel frame, as episodes state it: to the bit as in `describe_captures`.
-        discs = (prepared.defocus * 64.0 / height) * (4.0 / f_numbers) * height / 64.0
-        moves = np.tile(np.array(astuple(movement)), (len(few), 1))
-        speeds = np.full(len(few), prepared.image_speed)
-        blur, pixel_blur = all_blur([scene] * len(few), moves, speeds, times, discs, np.array(own))
-        return torch.from_numpy(blur), pixel_blur, torch.from_numpy(alike)
+        _, few, alike = np.unique(self._which[part], return_index=True, return_inverse=True)
+        # In steps of a 64-pixel frame, as episodes state it: to the bit as in `of`.
+        defocus = prepared.defocus * 64.0 / scene.light.shape[-2]
+        blur, pixel_blur = self.blur_of(
+            [scene] * len(few),
+            np.arange(len(self.states))[part][few],
+            speed=np.full(len(few), prepared.image_speed),
+            defocus=np.full(len(few), defocus),
+            movements=np.tile(np.array(astuple(prepared.movement)), (len(few), 1)),
+        )
+        return blur, pixel_blur, torch.from_numpy(alike)

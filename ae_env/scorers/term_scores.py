@@ -31,6 +31,7 @@ from ae_env.scorers.terms import (
     Shadows,
     Sharpness,
     code_signals,
+    depends_on,
 )
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import PreparedScene
@@ -85,6 +86,10 @@ class TermScores:
         self.reads_captures = any(type(part) not in _COLUMNS for part in self.parts.values())
         #: Whether every part's expectation has one, so that no noise is drawn for it.
         self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
+        #: Names of the parts of `torch_terms` that depend on blur, if all are `Sharpness`.
+        self.only_sharpness = [n for n, part in others.items() if depends_on(part) == "blur"]
+        if not all(type(others[name]) is Sharpness for name in self.only_sharpness):
+            self.only_sharpness = []
         self.captures = SceneCaptures(camera, states, noisy=noise)
         noises = [*dict.fromkeys(each := camera.nlfs(states))]
         self._which = np.array([noises.index(nlf) for nlf in each])
@@ -124,12 +129,11 @@ class TermScores:
         names = [] if self.torch_terms is None else self.torch_terms.names(*kinds)
         if self.torch_terms is None or not names:
             return {}
-        terms = [self.torch_terms.parts[name] for name in names]
-        if all(type(term) is Sharpness for term in terms):  # few states differ in blur
+        if names == self.only_sharpness:  # few states differ in blur
             blur, pixel_blur, alike = self.captures.blur(scene, prepared)
             score = Sharpness.of(pixel_blur or blur, scene.light.shape[-2])[alike].numpy()
             return dict.fromkeys(names, score)
-        chunks = []
+        terms, chunks = [self.torch_terms.parts[name] for name in names], []
         for part in slices(len(self.states), CHUNK if any(map(reads_pixels, terms)) else None):
             captures = self.captures.describe(scene, prepared, part, gain, row_gain)
             chunks.append(self.torch_scores(None, captures, *kinds))

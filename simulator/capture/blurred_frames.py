@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numba
 import numpy as np
@@ -23,12 +24,12 @@ from simulator.optics.discs import (
     LIGHT_LIMIT,
     WIDE_PX,
     blend_rows,
-    disc_image,
     disc_radius,
+    disc_taps,
     mark_levels,
     wide_disc,
 )
-from simulator.optics.motion import blur_apart, blur_rows, move_rows, streak_share, taps_of
+from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak_share, taps_of
 from simulator.utils.checks import check_number, check_type
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
@@ -57,6 +58,8 @@ _HALF_STEP = np.float32(0.51 / _LEVELS)
 _KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
 _MOST, _TOP = np.float32(LIGHT_LIMIT), np.int64(0)  # of their types, lest they compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
+#: A kind of blur of K frames: a kernel, the scenes (K,), the cost of each, and what it is given.
+Pass = tuple[Any, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +203,7 @@ class BlurredFrames:
         self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
+        self._passes = list[Pass]()  # that are still to run
 
     @property
     def is_full(self) -> bool:
@@ -264,6 +268,7 @@ class BlurredFrames:
         """
         if self.is_full:
             self._free_others(indices, slots)
+        self._passes.clear()
         behind_lens = blurs["defocus_px"] > 0.0
         known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
         known &= self._diameter[indices, slots] == blurs["defocus_px"]
@@ -282,7 +287,8 @@ class BlurredFrames:
             some, source = indices[darkened], light[darkened]
             self._give_memory(some)
             light[darkened] = self._moved[some]
-            self._darken(blurs["vignetting"][darkened], source, light[darkened])
+            self._darken(some, blurs["vignetting"][darkened], source, light[darkened])
+        _run(self._passes, self._shape)
         return light
 
     def _give_memory(self, indices: np.ndarray) -> None:
@@ -303,7 +309,7 @@ class BlurredFrames:
             own = indices[blends], blurs[blends]
             self._blend(*own, self._made_levels(*own, source[blends]), to[blends])
         one = ~blends  # disc everywhere
-        self._blur(blurs["defocus_px"][one], source[one], to[one])
+        self._blur(indices[one], blurs["defocus_px"][one], source[one], to[one])
 
     def _made_levels(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray
@@ -320,15 +326,17 @@ class BlurredFrames:
         frame, level = frame[first], level[first]
         made = self._take(len(frame))
         self._levels[indices[frame], level] = made
-        self._blur(np.array(DIAMETERS)[level], source[frame], made)
+        self._blur(indices[frame], np.array(DIAMETERS)[level], source[frame], made)
         # Levels without a share are read too, times 0: any image does.
         levels = self._levels[indices]
         levels[:, 0] = source
         return np.where(levels == 0, source[:, None], levels)
 
-    # Each writes frames to the places `to` (K,): behind one disc, behind discs of the pixels' own,
-    # and moved.
-    def _blur(self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+    # Each writes frames of scenes to the places `to` (K,): behind one disc, behind discs of the
+    # pixels' own, moved, and darkened. Costs are about microseconds at 128 x 128.
+    def _blur(
+        self, indices: np.ndarray, diameters: np.ndarray, source: np.ndarray, to: np.ndarray
+    ) -> None:
         radii = np.zeros(len(diameters))
         for i, diameter in enumerate(diameters.tolist()):
             if diameter > WIDE_PX:
@@ -336,53 +344,74 @@ class BlurredFrames:
                 wide_disc(light, diameter, LIGHT_LIMIT, out)
             else:
                 radii[i] = _radius(diameter)
-        cost = np.where(radii > 0.0, 6.0 + radii**2, 0.0)
-        _run(blur_discs, cost, self._shape, source, to, radii)
+        own = radii > 0.0
+        cost = 40.0 + 10.0 * radii[own] ** 2
+        self._add(blur_discs, indices[own], cost, source[own], to[own], radii[own])
 
     def _blend(
         self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
     ) -> None:
-        _run(blend_discs, np.ones(len(to)), self._shape, to, blurs, levels)
+        self._add(blend_discs, indices, np.full(len(to), 60.0), to, blurs, levels)
 
     def _move(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
-        # Sums of taps take as long as these are many; with a subject there are three.
-        taps = 12.0 + np.minimum(blurs["motion_px"], sum(self._shape[1:]))
-        taps *= np.where(blurs["mask"] > 0, 2.5, 1.0)
-        streaks = blurs["streaks"]
-        _run(move_along_rows, taps * streaks, self._shape, source, to, blurs)
-        _run(move_along_paths, taps * ~streaks, self._shape, source, to, blurs)
+        # Sums of taps take as long as these are many; with a subject there are more.
+        taps = 40.0 + 6.0 * np.minimum(blurs["motion_px"], sum(self._shape[1:]))
+        taps *= np.where(blurs["mask"] > 0, 2.0, 1.0)
+        for task, own in (move_along_rows, blurs["streaks"]), (move_along_paths, ~blurs["streaks"]):
+            self._add(task, indices[own], taps[own], source[own], to[own], blurs[own])
 
-    def _darken(self, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+    def _darken(
+        self, indices: np.ndarray, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray
+    ) -> None:
         """Writes the light of the places `source`, times the maps at `vignetting`, to `to`."""
-        _run(darken, np.ones(len(to)), self._shape, source, to, vignetting)
+        self._add(darken, indices, np.full(len(to), 20.0), source, to, vignetting)
+
+    def _add(self, task: Any, scenes: np.ndarray, cost: np.ndarray, *columns: np.ndarray) -> None:
+        if len(scenes):
+            self._passes.append((task, scenes, cost, columns))
 
 
 _radius = functools.lru_cache(maxsize=4096)(disc_radius)
 
 
-def _run(task, cost: np.ndarray, shape: tuple[int, ...], *columns: np.ndarray) -> None:  # type: ignore[no-untyped-def]
-    """Calls a pass for units of each frame on all threads, which share the cost (K,)."""
-    todo = np.flatnonzero(cost)
-    if not len(todo):
+def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
+    """Runs passes, in order, on frames of `shape`, on all threads, which share the cost.
+
+    A thread has all passes of a scene. Where scenes are few, threads share each pass instead, and
+    of few large frames planes, or rows where there are more threads.
+    """
+    if not passes:
         return
-    threads = torch.get_num_threads()
-    # Frames are shared out whole, unless they are few and large: then by planes, and by rows where
-    # there are more threads.
-    parts = 1
-    if len(todo) < 2 * threads and math.prod(shape) >= _LARGE:
-        parts = shape[0] * min(1 + (threads - 1) // (len(todo) * shape[0]), shape[1])
-    order = todo[np.argsort(-cost[todo], kind="stable")]
-    costs = np.repeat(cost[order], parts)
+    threads, parts = torch.get_num_threads(), 1
+    different, owner = np.unique(np.concatenate([p[1] for p in passes]), return_inverse=True)
+    if len(different) < 2 * threads:
+        if len(passes) > 1:
+            for one in passes:
+                _run([one], shape)
+            return
+        owner, count = np.arange(len(owner)), len(owner)
+        if count < 2 * threads and math.prod(shape) >= _LARGE:
+            parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
+        threads = min(threads, count * parts)
+    cost = np.bincount(owner, np.concatenate([p[2] for p in passes]))
+    order = np.argsort(-cost, kind="stable")
+    costs, place = np.repeat(cost[order], parts), np.argsort(order)
     # A unit belongs to the thread in whose share of the cost its middle is.
-    share = (costs.cumsum() - 0.5 * costs) * (threads / costs.sum())
-    ends = np.searchsorted(share, np.arange(threads + 1)).tolist()
-    fixed = order, parts, *shape, *columns
+    share = ((costs.cumsum() - 0.5 * costs) * (threads / costs.sum())).reshape(-1, parts)
+    work = []
+    for task, scenes, _, columns in passes:
+        at, owner = np.split(owner, [len(scenes)])
+        own = np.argsort(place[at], kind="stable")
+        ends = np.searchsorted(share[place[at[own]]].ravel(), np.arange(threads + 1)).tolist()
+        work.append((task, ends, (own, parts, *shape, *columns)))
 
     def do(first: int, last: int) -> None:
         for thread in range(first, last):
-            task(ends[thread], ends[thread + 1], *fixed)
+            for task, ends, fixed in work:
+                if ends[thread] < ends[thread + 1]:
+                    task(ends[thread], ends[thread + 1], *fixed)
 
     parallel_ranges(do, threads)
 
@@ -421,7 +450,7 @@ def blur_discs(  # type: ignore[no-untyped-def]
     for unit in range(first, last):
         i, rows = order[unit // parts], _share(unit, parts, shape[0])
         image, out = _array_at(source[i], shape), _array_at(to[i], shape)
-        disc_image(rows[0], rows[1], image, height, radii[i], _MOST, out)
+        blur_planes(rows[0], rows[1], image, height, disc_taps(radii[i]), _MOST, out)
 
 
 @_jit()
@@ -473,22 +502,18 @@ def move_along_paths(  # type: ignore[no-untyped-def]
     first, last, order, parts, planes, height, width, light, to, blurs
 ):
     """Light that moves along a path, and a subject that moves along its own."""
-    still, shape = 0.0, (planes, height, width)
+    still, shape = 0.0, (planes * height, width)
     for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, planes * height)
+        i, rows = order[unit // parts], _share(unit, parts, shape[0])
         blur, image, out = blurs[i], _array_at(light[i], shape), _array_at(to[i], shape)
-        begin, end = rows[0] // height, (rows[1] + height - 1) // height  # planes
         path = blur.extent, blur.direction, blur.turn
         taps = taps_of(path[0], path[1], path[2], still, still, height, width)
-        if blur.mask:
-            if rows[0] % height:  # whoever has the first rows of a plane does all of it
-                continue
+        if not blur.mask:
+            blur_planes(rows[0], rows[1], image, height, taps, _MOST, out)
+        elif rows[0] % height == 0:  # whoever has the first rows of a plane does all of it
             drift = blur.drift_x, blur.drift_y
             own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
             mask = _array_at(blur.mask, (height, width))
             behind = _array_at(blur.behind, (height, width)).view(np.int32)
+            begin, end = rows[0], (rows[1] + height - 1) // height * height
             blur_apart(image[begin:end], mask, behind, taps, own, _MOST, out[begin:end])
-            continue
-        for plane in range(begin, end):
-            top, bottom = max(rows[0] - plane * height, 0), min(rows[1] - plane * height, height)
-            blur_rows(top, bottom, image[plane], taps[0], taps[1], taps[2], _MOST, out[plane])

@@ -91,7 +91,9 @@ class DeviceFrames(BlurredFrames):
 
     # -- passes -------------------------------------------------------------------------------
 
-    def _blur(self, diameters: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+    def _blur(
+        self, indices: np.ndarray, diameters: np.ndarray, source: np.ndarray, to: np.ndarray
+    ) -> None:
         for diameter in np.unique(diameters).tolist():
             alike = diameters == diameter
             light = self._clamped(source[alike])
@@ -167,7 +169,9 @@ class DeviceFrames(BlurredFrames):
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
             self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
 
-    def _darken(self, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray) -> None:
+    def _darken(
+        self, indices: np.ndarray, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray
+    ) -> None:
         for address in np.unique(vignetting).tolist():
             same = vignetting == address
             left = torch.from_numpy(frame_at(address, self._shape[1:])).to(self._frames)

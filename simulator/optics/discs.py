@@ -2,7 +2,7 @@
 
 Discs are energy-preserving and, as streaks are (`simulator.optics.motion`), matched in second
 moment: that of a continuous disc is its diameter squared / 16 per axis. On the CPU a disc is a sum
-over shifts; its symmetry saves three of four products.
+of weighted shifts, as a path is.
 
 A bank blurs once with every disc of a few diameters and interpolates between neighbours, per pixel
 and in the *squared* diameter (second moments add, so that is where blur is linear): any map of blur
@@ -23,17 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from simulator.optics.motion import (
-    GROUP,
-    Taps,
-    add_rows,
-    by_rows,
-    copy_row,
-    has_kernels,
-    motion_kernel,
-    pad_rows,
-    streak_share,
-)
+from simulator.optics.motion import Taps, has_kernels, motion_kernel, path_blur, streak_share
 from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
@@ -47,7 +37,7 @@ _SUBROWS = 32
 _LONGEST_KERNEL = 4096.0
 #: Kernels wider than this are applied in the Fourier domain; and where the kernel for the CPU does
 #: the sum of a single image.
-_FFT_TAPS, _DIRECT_TAPS = 11, 25
+_FFT_TAPS, _DIRECT_TAPS = 11, 41
 #: Discs wider than this are cheaper in the Fourier domain than as a sum, in a batch [pixel].
 WIDE_PX = 40.0
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
@@ -168,9 +158,7 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
         return light
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
-        fixed = height, disc_radius(diameter_px), np.float32(math.inf)
-        cost = (taps // 2 + 1) ** 2
-        return by_rows(light, lambda a, b, rows, to: disc_image(a, b, rows, *fixed, to), cost)
+        return path_blur(light, Taps(*disc_taps(disc_radius(diameter_px))))
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
@@ -194,53 +182,19 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
 
 
 @_jit()
-def _quadrant(radius):  # type: ignore[no-untyped-def]
-    """Weights (r + 1, r + 1) of a disc's quadrant, and the last non-zero one of each row."""
-    weights = coverage(radius).astype(np.float32)
-    reach = np.zeros(len(weights), np.int64)
-    for i in range(len(weights)):
-        for j in range(len(weights)):
-            if weights[i, j] > 0:
-                reach[i] = j
-    return weights, reach
-
-
-@_jit()
-def disc_image(first, last, rows, height, radius, limit, out):  # type: ignore[no-untyped-def]
-    """Rows from `first` to `last` of planes (P * H, W) behind a disc of `radius`."""
-    weights, reach = _quadrant(radius)
-    width, border = rows.shape[1], len(weights) - 1
-    pitch = width + 2 * border
-    many = max(1, min(height, GROUP // pitch))
-    padded = np.empty((many + 2 * border, pitch), np.float32)
-    flat = padded.reshape(-1)
-    size = many * pitch
-    total, both = np.zeros((many, pitch), np.float32), np.zeros(size, np.float32)
-    inner = total.reshape(-1)[border : size - border]
-    y = first
-    while y < last:
-        top = y // height * height
-        count = min(many, last - y, top + height - y)
-        pad_rows(rows, y - border, top, top + height, border, limit, padded)
-        for i in range(border + 1):
-            above, below = (border - i) * pitch, (border + i) * pitch
-            if i:
-                add_rows(flat[above : above + size], flat[below:], both)
-            else:
-                copy_row(flat[above:], both)
-                inner[:] = np.float32(0)
-            weight, middle = weights[i, 0], both[border:]
-            for x in range(len(inner)):
-                inner[x] += weight * middle[x]
-            for j in range(1, reach[i] + 1):
-                weight, left, right = weights[i, j], both[border - j :], both[border + j :]
-                for x in range(len(inner)):
-                    inner[x] += weight * (left[x] + right[x])
-        for i in range(count):
-            row = np.uint64(y + i)
-            for x in range(width):
-                out[row, x] = total[i, np.uint64(border + x)]
-        y += count
+def disc_taps(radius):  # type: ignore[no-untyped-def]
+    """Rows, columns and weights of the `Taps` of a disc."""
+    quadrant = coverage(radius)
+    reach, count = len(quadrant) - 1, 0
+    size = ((2 * reach + 1) ** 2 + 7) // 8 * 8
+    rows, columns, weights = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size)
+    for y in range(-reach, reach + 1):
+        for x in range(-reach, reach + 1):
+            if quadrant[abs(y), abs(x)] > 0.0:
+                rows[count], columns[count], weights[count] = y, x, quadrant[abs(y), abs(x)]
+                count += 1
+    count = (count + 7) // 8 * 8
+    return rows[:count], columns[:count], weights[:count].astype(np.float32)
 
 
 # -- a bank of discs --------------------------------------------------------------------------

@@ -44,8 +44,8 @@ _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 _LENGTH_POINTS = 32
 #: The first row: a literal 0 would compile what takes it twice.
 _TOP = np.int64(0)
-#: Taps that are added to all rows together.
-_TAPS = 128
+#: Taps that are added to all rows together, and samples of the rows that are looked at.
+_TAPS, _BAND = 128, 2**17
 #: Shares below this are left out.
 _LEAST_WEIGHT = 1e-9
 _jit = functools.partial(kernel, fastmath={"contract"})
@@ -424,36 +424,51 @@ def blur_rows(first, last, plane, rows, columns, weights, limit, out):  # type: 
     reach = down = 0
     for k in range(len(weights)):
         reach, down = max(reach, abs(columns[k])), max(down, abs(rows[k]))
-    pitch, count = width + 2 * reach, last - first
+    pitch = width + 2 * reach
+    most = min(last - first, max(_BAND // pitch - 2 * down, 2 * down, 1))
     wide = (width + LANES - 1) // LANES * LANES  # what a sum reads behind its row does not count
-    memory = np.empty((count + 2 * down) * pitch + wide - width, np.float32)
-    padded = memory[: (count + 2 * down) * pitch].reshape(count + 2 * down, pitch)
-    pad_rows(plane, first - down, _TOP, height, reach, limit, padded)
-    memory[padded.size :] = np.float32(0)
+    memory = np.empty((most + 2 * down) * pitch + wide - width, np.float32)
+    memory[memory.size - wide + width :] = np.float32(0)
+    padded = memory[: (most + 2 * down) * pitch].reshape(most + 2 * down, pitch)
     offsets = (rows + down) * pitch + columns + reach
-    sums = out[first:last] if wide == width else np.empty((count, wide), np.float32)
-    sums[:] = np.float32(0)
-    # Some taps for all rows, then the next: rows have most of what they look at in common.
-    for k in range(0, len(weights), _TAPS):
-        some, shares = offsets[k : k + _TAPS], weights[k : k + _TAPS]
-        for y in range(count):
-            for x in range(0, wide, LANES):
-                add_shifts(memory[y * pitch + x :], some, shares, sums[y, x:])  # type: ignore[call-arg]
-    if wide > width:
-        for y in range(count):
-            copy_row(sums[y, :width], out[first + y])
+    kept = np.empty((most if wide > width else 0, wide), np.float32)
+    for top in range(first, last, most):
+        count = min(most, last - top)
+        pad_rows(plane, top - down, _TOP, height, reach, limit, padded[: count + 2 * down])
+        sums = kept[:count] if wide > width else out[top : top + count]
+        sums[:] = np.float32(0)
+        # Some taps for all rows, then the next: rows have most of what they look at in common.
+        for k in range(0, len(weights), _TAPS):
+            some, shares = offsets[k : k + _TAPS], weights[k : k + _TAPS]
+            for y in range(count):
+                for x in range(0, wide, LANES):
+                    add_shifts(memory[y * pitch + x :], some, shares, sums[y, x:])  # type: ignore[call-arg]
+        if wide > width:
+            for y in range(count):
+                copy_row(sums[y, :width], out[top + y])
+
+
+@_jit()
+def blur_planes(first, last, rows, height, taps, limit, out):  # type: ignore[no-untyped-def]
+    """Rows from `first` to `last` of planes (P * H, W) as sums of their shifts."""
+    y = first
+    while y < last:
+        top = y // height * height
+        end, plane = min(last - top, height), rows[top : top + height]
+        blur_rows(y - top, end, plane, taps[0], taps[1], taps[2], limit, out[top : top + height])
+        y = top + end
 
 
 @_jit()
 def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
     """A subject that moves along its path, in front of a background that moves along another.
 
-    ``(1 - A) (K_b * B) + K_s * (M L)`` of the planes (P, H, W), L, with the `mask` of the subject,
+    ``(1 - A) (K_b * B) + K_s * (M L)`` of the planes (P * H, W), L, with the `mask` of the subject,
     M, A = K_s * M, the `own` taps of its path, K_s, those of the background's, K_b, and the
     background B that continues behind it: which pixel, counted row by row, it shows in place of
     each is `behind`. Uniform light stays uniform.
     """
-    count, height, width = planes.shape
+    height, width = mask.shape
     rows, columns, weights = own
     # What the subject is smeared over: elsewhere there is nothing of it.
     top, bottom, left, right = height, 0, width, 0
@@ -474,8 +489,8 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
         for x in range(right - left):
             apart[y, x] = mask[y, left + x]
     blur_rows(top, bottom, apart, rows, columns, weights, limit, cover)
-    for plane in range(count):
-        source, result = planes[plane], out[plane]
+    for plane in range(0, len(planes), height):
+        source, result = planes[plane : plane + height], out[plane : plane + height]
         flat = source.reshape(-1)
         copy_row(flat, back.reshape(-1))
         for y in range(top, bottom):
@@ -496,8 +511,8 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
 
 
 def path_blur(light: Tensor, taps: Taps) -> Tensor:
-    """Motion of `light` (P, H, W) float32 along a path, on the CPU; the borders are replicated."""
-    out = torch.empty(light.shape)
-    for plane, to in zip(light.contiguous().numpy(), out.numpy(), strict=True):
-        blur_rows(_TOP, len(plane), plane, *taps, np.float32(math.inf), to)
-    return out
+    """Motion of float32 `light` (..., H, W) along a path, on the CPU; borders are replicated."""
+    fixed = light.shape[-2], tuple(taps), np.float32(math.inf)
+    return by_rows(
+        light, lambda a, b, rows, to: blur_planes(a, b, rows, *fixed, to), len(taps.rows)
+    )

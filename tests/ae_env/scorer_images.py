@@ -5,7 +5,7 @@ import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
-from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.captures import SceneCaptures
 from simulator import get_camera, incident_ev100
 
 CAMERA = get_camera("nikon_z6")
@@ -42,7 +42,7 @@ def make_captures(scenes, states, speed=0.0, defocus=0.0, gain=1.0, row_gain=Non
     ones = np.ones(len(states))
     scenes = [scenes] * len(states) if isinstance(scenes, Scene) else scenes
     blur = {"speed": speed * ones, "defocus": defocus * ones}
-    return describe_captures(scenes, states, CAMERA, **blur, gain=gain * ones, row_gain=row_gain)
+    return SceneCaptures(CAMERA, states).of(scenes, **blur, gain=gain * ones, row_gain=row_gain)
 
 
 def captures_of(light, states):

@@ -16,7 +16,7 @@ from gymnasium.wrappers.vector import NumpyToTorch
 from ae_env.observation import encode_observation
 from ae_env.scenes.load import _LOADED
 from ae_env.scorers import make_scorer
-from ae_env.scorers.captures import describe_captures, prepare_scene
+from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from simulator.camera import get_camera
 from simulator.capture.sensor import clip_and_quantise, exposed_light, frame_normals, noise_keys
 from simulator.noise.noise_level_function import ReadNoise
@@ -227,7 +227,7 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer):
         rows = lamp.row_light(1 / 24, settings.exposure_time, 40, CAMERA.row_time, 8)
         blur = {"speed": np.array([0.05]), "defocus": np.array([0.5])}
         gains = {"gain": np.array([rows.mean()]), "row_gain": rows[None] / rows.mean()}
-        captures = describe_captures([scene], [settings], CAMERA, **blur, **gains, noisy=False)
+        captures = SceneCaptures(CAMERA, [settings], noisy=False).of([scene], **blur, **gains)
         images = clip_and_quantise(captures.light, CAMERA).clamp(0.0, 1.0)
         wanted = float(make_scorer(scorer)(images, captures))
         assert q[state] == pytest.approx(wanted, abs=2e-3)  # rows at the edge of a code

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scorers import CompositeScorer, make_scorer
-from ae_env.scorers.captures import describe_captures, prepare_scene, source_noises
+from ae_env.scorers.captures import SceneCaptures, prepare_scene, source_noises
 from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.term_scores import TermScores
 from ae_env.scorers.terms import Highlights, Noise, Sharpness
@@ -200,9 +200,8 @@ def test_sharpness_of_all_states_at_once_is_that_of_each_capture(layout, movemen
     found = tables.term_scores.closed_form_terms(scene, prepared, "blur")
     for index, state in enumerate(BLUR_GRID):
         numbers = {"speed": np.array([0.2]), "defocus": np.array([6.0]), "gain": np.ones(1)}
-        capture = describe_captures(
-            [scene], [state], CAMERA, movements=np.array([astuple(movement)]), **numbers
-        )
+        numbers["movements"] = np.array([astuple(movement)])
+        capture = SceneCaptures(CAMERA, [state]).of([scene], **numbers)
         assert Sharpness()(None, capture).item() == found["sharpness"][index]
 
 
