@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import math
 import threading
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import chain, count
@@ -275,7 +276,8 @@ class ViewedScene:
             prepared = self._part(view)
             (capture,) = prepared.expose([view.settings])
             taken = perf_counter()
-            image = self._to_srgb(capture, view)
+            with _one_thread():
+                image = self._to_srgb(capture, view)
             jpeg = encoded(image, quality=88 if view.centre is None else 95)
             times = 1e3 * (taken - begun), 1e3 * (perf_counter() - taken)
             photosites = image.shape[1] * (2 * self._averaged if view.centre is None else 1)
@@ -283,14 +285,17 @@ class ViewedScene:
 
     def readout(self, view: View, capture: torch.Tensor) -> Readout:
         """The numbers about `capture`, which `view` asked for."""
-        with self._lock:
+        with self._lock, _one_thread():
             settings, height = view.settings, self.scene.light.shape[1]
             camera = self.scene.camera
             noise = camera.nlf(settings.iso, settings.exposure_time)
             variance = noise.read[1] + noise.shot[1] * MID_GREY + (camera.prnu * MID_GREY) ** 2
-            values = capture.reshape(4, -1)
-            seen = values.clamp(min=2.0 ** -(STOPS + 1)).masked_fill(values >= _AT_WHITE, 2.0)
-            counts = [torch.histc(plane, BINS, -STOPS, 0.0).numpy() for plane in seen.log2()]
+            values, bins = capture.reshape(4, -1), BINS // STOPS  # of a stop
+            # A stop more lies below the histogram, and a bin of what is at white above it.
+            stops = values.div(_AT_WHITE).clamp_(2.0 ** -(STOPS + 1), 1.0).log2_()
+            at = stops.add_(STOPS + 1).mul_(bins).int()
+            shares = np.stack([torch.bincount(a, minlength=BINS + bins + 1) for a in at])
+            shares = shares / values.shape[1]
             table = self.table(view, settings)
             return Readout(
                 plan=self._part(view).plan(settings),
@@ -300,9 +305,9 @@ class ViewedScene:
                 snr=20.0 * math.log10(MID_GREY / math.sqrt(variance)) if variance else math.inf,
                 motion=view.speed * height * settings.exposure_time,
                 defocus=view.defocus * height / SCORED_PIXELS * 4.0 / settings.effective_f_number,
-                white=float((values >= _AT_WHITE).float().mean()),
-                black=float((values <= _AT_BLACK).float().mean()),
-                histogram=np.stack(counts) / values.shape[1],
+                white=float(shares[:, -1].mean()),
+                black=int(torch.count_nonzero(values <= _AT_BLACK)) / values.numel(),
+                histogram=shares[:, bins:-1],
             )
 
     def _costs(self, table: ScoreTable) -> dict[str, tuple[float, float]]:
@@ -429,6 +434,17 @@ class ViewedScene:
     def _upright(self, image: np.ndarray) -> np.ndarray:
         seen = image if self.photograph is None else upright(image, self.photograph)
         return np.ascontiguousarray(seen)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch computes on this thread alone: on busy cores a small picture would wait for another."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:
