@@ -120,6 +120,11 @@ addEventListener('keydown', (e) => {
 });
 
 // Quasar's list of options can be focused itself, which hides the options from a screen reader.
-addEventListener('DOMContentLoaded', () => new MutationObserver(() => requestAnimationFrame(() => {
+const lists = new MutationObserver((changes) => {
+  const added = changes.flatMap((change) => [...change.addedNodes]);
+  for (const node of added.filter((n) => (n.id || '').startsWith('q-portal'))) {
+    lists.observe(node, { childList: true, subtree: true });
+  }
   for (const list of document.querySelectorAll('.q-virtual-scroll__content')) list.removeAttribute('tabindex');
-})).observe(document.body, { childList: true }));
+});
+addEventListener('DOMContentLoaded', () => lists.observe(document.body, { childList: true }));
