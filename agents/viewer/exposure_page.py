@@ -240,16 +240,14 @@ class ExposurePage(Tab):
             for x, v, a, c in ends
         ]
         draw_lines(self._histogram, lines, marks)
-        plan, facts = readout.plan, self._facts
+        plan, facts, ev100 = readout.plan, self._facts, -view.settings.log2_exposure
         facts["Score"].text = f"{readout.score:.3f}"
         self._parts.content = "".join(
             f"<span>{name}</span><meter value={part:.3f} aria-label={name}></meter>"
             f"<span>{part:.2f}</span><span>{f'costs {cost:.2f}' if cost >= 0.005 else ''}</span>"
             for name, (part, cost) in readout.parts.items()
         )
-        facts[
-            "Exposure"
-        ].text = f"EV100 {-view.settings.log2_exposure:.1f}, {readout.ev:+.1f} EV from right"
+        facts["Exposure"].text = f"EV100 {ev100:.1f}, {readout.ev:+.1f} EV from right"
         facts["Noise"].text = f"SNR at mid grey: {readout.snr:.1f} dB per photosite"
         if plan.excess_noise:
             facts["Noise"].text += f", {plan.excess_noise:.0%} more variance than the camera's"

@@ -187,11 +187,7 @@ def draw_lines(chart: ui.echart, lines: Iterable[Any], marks: Sequence[Any] = ()
     """Draws lines, each a name, colour and points (x, y); `marks` as ECharts takes them."""
     looks: dict[str, Any] = {"type": "line", "step": "middle", "symbol": "none"}
     series = [looks | {"name": n, "color": c, "data": list(points)} for n, c, points in lines]
-    series[0]["markLine"] = {
-        "symbol": "none",
-        "silent": True,
-        "label": {"color": "#ececec"},
-        "data": marks,
-    }
+    label = {"color": "#ececec"}
+    series[0]["markLine"] = {"symbol": "none", "silent": True, "label": label, "data": marks}
     chart.options["series"] = series
     chart.update()
