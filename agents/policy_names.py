@@ -69,6 +69,38 @@ _BRACKETS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 #: What shorter names stand for.
 _SHORT = {"oracle": "oracle:last_frame", "rpi_agc": "rpi_agc:P", **{m: f"{m}:P" for m in METERS}}
+#: What the built-in policies do, as `ae-env policies` lists them.
+ABOUT = {
+    "random": "a random allowed state for every frame; scores 0 by definition",
+    "best_fixed": "the state with the best mean score on the training scenes",
+    "oracle": "privileged: the best state for the light of the last frame",
+    "oracle:clairvoyant": "privileged: the best state for the light of the frames to come",
+    "average": "meter: the mean of the frame",
+    "centre_weighted": "meter: 75 % in a circle of half the frame's height, 25 % around it",
+    "spot": "meter: a central circle of 4 % of the area",
+    "matrix": "meter: 5 x 5 zones, corrected for the brightest 2 % of the pixels",
+    "highlight_weighted": "meter: puts the brightest 1 % at 0.9 of white",
+    "skewness": "meter: makes the histogram symmetric about an 18 % card",
+    "entropy": "meter: seeks the highest entropy of the histogram",
+    "shim": "meter: seeks most gradient information (Shim et al. 2014)",
+    "zhang": "meter: seeks the highest soft percentile of the gradient (Zhang et al. 2017)",
+    "METER:P": "program, the default: a shutter and aperture without blur, then a low gain",
+    "METER:A": "program: f/8; then a shutter without blur, then the lowest ISO",
+    "METER:S": "program: 1/125 s; then the lowest ISO",
+    "METER:M": "program: f/8 and 1/125 s; the ISO follows the meter",
+    "METER:tuned": "program: the best state on training scenes for the EV, motion and defocus",
+    "METER:tuned_blind": "program: the same for the EV alone",
+    "rpi_agc": "libcamera's AGC of the Raspberry Pi; also with :A, :S and :M",
+    "regression": "trained agent: predicts the score of every state; regression:PATH is yours",
+    "ppo": "trained agent: PPO; ppo:PATH is yours",
+    "regression:video": "the same for AutoExposureVideo-v0",
+    "ppo:video": "PPO for AutoExposureVideo-v0, with the last twelve readings",
+    "recorded:FOLDER": "frame k takes the state nearest to raw k of a folder",
+    "bracket": "ExposureBracket-v0: plans again after each frame, and counts blur",
+    "bracket:planned": "likewise, without blur",
+    "bracket:fixed": "likewise: the metered exposure, and steps above and below it",
+    "bracket:hasinoff": "likewise: the largest worst-case SNR (Hasinoff et al. 2010)",
+}
 #: Where options begin: a question mark before a slash of a path is a part of the path.
 _OPTIONS = re.compile(r"\?(?![^=]*/)")
 
@@ -76,6 +108,12 @@ _OPTIONS = re.compile(r"\?(?![^=]*/)")
 def list_policies() -> list[str]:
     """Names of the built-in policies of single frames that need no file."""
     return sorted(_POLICIES)
+
+
+def default_options(name: str) -> dict[str, Any]:
+    """Options that may follow the built-in policy called `name`, and their defaults."""
+    known = _parameters(*_find(name, name))
+    return {key: p.default for key, p in known.items() if key not in ("network", "device")}
 
 
 def is_metering(name: str) -> bool:
@@ -270,13 +308,18 @@ def _check_class(name: str, cls: Any, context: PolicyContext) -> None:
 
 def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str, Any]) -> None:
     """Raises a `ValueError` if `cls` does not take one of the `options`."""
-    parameters = list(inspect.signature(cls).parameters.values())[1:]  # the first is the context
-    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+    known = _parameters(cls, fixed)
+    if any(p.kind is p.VAR_KEYWORD for p in known.values()):
         return
-    known = [p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and p.name not in fixed]
     for option in set(options) - set(known):
         takes = f"; it takes {', '.join(known) or 'none'}{did_you_mean(option, known)}"
         raise _refusal(name, f": {cls.__name__} does not take the option {option!r}{takes}")
+
+
+def _parameters(cls: Any, fixed: dict[str, Any]) -> dict[str, inspect.Parameter]:
+    """Those of a policy's class by name, without the context and what its name has `fixed`."""
+    found = list(inspect.signature(cls).parameters.values())[1:]
+    return {p.name: p for p in found if p.kind is not p.VAR_POSITIONAL and p.name not in fixed}
 
 
 def _known(base: str, head: str) -> str:
@@ -285,17 +328,13 @@ def _known(base: str, head: str) -> str:
         known = [f"{head}:{p}" for p in (PROGRAMS if head in METERS else MANUAL_PROGRAMS)]
         return f" must be one of {', '.join(known)}{did_you_mean(base, known, cutoff=0.9)}"
     files = [f"{head}:{argument.upper()}" for head, (_, argument) in WITH_FILE.items()]
-    names = [*_POLICIES, *files, *_BRACKETS]
-    single = [name for name in names if name.partition(":")[0] not in METERS]
     path = re.search(r"[./\\]", head)  # which no built-in name has
-    hint = did_you_mean(base, [*_SHORT, *names], cutoff=0.6 if path else 0.5)
+    names = [*_SHORT, *_POLICIES, *files, *_BRACKETS]
+    hint = did_you_mean(base, names, cutoff=0.6 if path else 0.5)
+    own = "package.module:Class or path.py:Class"
     if path:
-        own = "one of your own is package.module:Class or path.py:Class"
-        return f": there is no module and no Python file {head!r}; {own}{hint}"
-    return (
-        f" must be one of {', '.join(single)}; a meter ({', '.join(METERS)}), alone or with a "
-        f"program ({', '.join(PROGRAMS)}); package.module:Class or path.py:Class{hint}"
-    )
+        return f": there is no module and no Python file {head!r}; one of your own is {own}{hint}"
+    return f" must be one that `ae-env policies` lists, {own}{hint}"
 
 
 def _refusal(policy: Any, text: str) -> ValueError:

@@ -29,15 +29,9 @@ terminal = Console()
 
 _INT64_MAX = 2**63 - 1
 Seed = Annotated[int, Option(help="Seed of everything random.", min=0, max=_INT64_MAX)]
-OwnSeed = Annotated[
-    int | None, Option(help="Seed instead of the one in the YAML.", min=0, max=_INT64_MAX)
-]
-OnError = Annotated[
-    str, Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
-]
-Trust = Annotated[
-    bool, Option("--trust", help="Let the YAML file name Python code, which then runs.")
-]
+OwnSeed = Annotated[int | None, Option(help="In place of the YAML's.", min=0, max=_INT64_MAX)]
+OnError = Annotated[str, Option(help="At a file of --scenes that cannot be read: stop, or skip.")]
+Trust = Annotated[bool, Option("--trust", help="Let the YAML file name Python code, and run it.")]
 Device = Annotated[str, Option(help="Torch device: auto, cpu, cuda.")]
 Policies = Annotated[list[str] | None, Option(help="A policy; give the option several times.")]
 Raw = Annotated[Path, Argument(help="Any Bayer raw that LibRaw reads.")]
@@ -60,9 +54,7 @@ Weights = Annotated[
         "only add noise."
     ),
 ]
-Depth = Annotated[
-    str, Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens.")
-]
+Depth = Annotated[str, Option(help="far, or unknown: blur what is out of focus as f/ opens.")]
 Cache = Annotated[bool, Option(help="Cache the outputs of the networks between runs.")]
 Tolerance = Annotated[
     float,

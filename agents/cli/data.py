@@ -49,9 +49,7 @@ def download(
 
     with progress_bars() as progress, progress("maps") as task:
         fetched = download(url=url or URL, progress=task)
-    console.terminal.print(
-        f"{len(fetched)} of {len(list_assets())} maps were fetched, all are there"
-    )
+    print_line(f"{len(fetched)} of {len(list_assets())} maps were fetched, all are there")
     print_line("try next: ae-env quickstart --scenes polyhaven --out real_scenes")
 
 
@@ -118,9 +116,6 @@ Engine = Annotated[
         "ray://head:10001 or auto."
     ),
 ]
-TakesNoiseOut = Annotated[
-    str, Option(help="Networks that take the noise out of raws; none for none.")
-]
 
 
 @console.takes_source
@@ -140,7 +135,7 @@ def score_tables(
     ] = "default",
     scorer: Annotated[str, Option(help="Scorer, as for `evaluate`.")] = "balanced",
     camera: Annotated[str, Option(help="Camera for radiance maps.")] = "nikon_z6",
-    weights: TakesNoiseOut = "compact",
+    weights: Annotated[str, Option(help="Networks that denoise the raws, or none.")] = "compact",
     captures: Annotated[bool, Option(help="Also write the captures.")] = False,
     seed: console.Seed = 0,
     source: Any = None,
@@ -164,8 +159,7 @@ def score_tables(
     if weights != "none":
         check_weights(weights)
     options: dict[str, Any] = {"resolution": resolution, "camera": camera, "grid": grid}
-    options |= {"per_shard": per_shard, "scorer": scorer, "weights": weights}
-    options["settings"] = source
+    options |= {"per_shard": per_shard, "scorer": scorer, "weights": weights, "settings": source}
     plan = ShardPlan.of(what, out, **options, captures=captures, seed=seed)
     console.make_folder(out)
     begun = perf_counter()

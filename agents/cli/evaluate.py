@@ -48,34 +48,24 @@ def evaluate(
     context: typer.Context,
     policy: console.Policies = None,
     preset: Preset = None,
-    env: Annotated[
-        str | None, Option(help="Environment: a preset of configs/env, or a .yaml file.")
-    ] = None,
+    env: Annotated[str | None, Option(help="A preset of configs/env, or a .yaml file.")] = None,
     scenes: Scenes = None,
     on_error: console.OnError = "stop",
     source: Any = None,
     split: Annotated[str | None, Option(help="train, validation, test (default) or all.")] = None,
     grid: Annotated[str | None, Option(help="default, third_stop, video or bracket.")] = None,
     scorer: Annotated[str | None, Option(help="The scorer of the states: balanced...")] = None,
-    lighting: Annotated[
-        str | None, Option(help="static (default), step, ramp, sine, tunnel...")
-    ] = None,
+    lighting: Annotated[str | None, Option(help="static (default), step, ramp, sine...")] = None,
     delay: Annotated[
         int | None, Option(help="Frames from a decision to its frame; 0 by default.", min=0)
     ] = None,
     observation: Annotated[str | None, Option(help="uint8 (default), statistics...")] = None,
-    sensors: Annotated[
-        bool | None, Option(help="Whether speed and defocus are observed (yes).")
-    ] = None,
+    sensors: Annotated[bool | None, Option(help="Observe speed and defocus (yes).")] = None,
     resolution: Annotated[int | None, Option(help="Packed pixels a side; 64 by default.")] = None,
-    episodes: Annotated[
-        int | None, Option(help="Episodes per scene and start: so many seeds.", min=1)
-    ] = None,
+    episodes: Annotated[int | None, Option(help="Seeds per scene and start.", min=1)] = None,
     frames: Annotated[int | None, Option(help="Frames per episode.", min=1)] = None,
     out: console.Folder = Path("evaluation"),
-    append: Annotated[
-        Path | None, Option(help="Benchmark table (CSV) to add the results to.")
-    ] = None,
+    append: Annotated[Path | None, Option(help="Benchmark table (CSV) to add rows to.")] = None,
     author: Annotated[str, Option(help="For --append: who made the policy.")] = "",
     trained_on: Annotated[str, Option(help="For --append: scenes that it learnt from.")] = "",
     frames_seen: Annotated[int | None, Option(help="Likewise: frames that it saw.", min=1)] = None,
@@ -101,9 +91,7 @@ def evaluate(
     plan = make_plan(preset, env, policy or [], given)
     if append is not None:
         if plan.hash is None:
-            rule = (
-                "takes the results of a benchmark only: give --preset ae_bench_v3_video, _still, "
-            )
+            rule = "takes results of a benchmark only: give --preset ae_bench_v3_video, _still, "
             raise ValueError(f"`append` (={str(append)!r}) {rule}_unknown or _bracket")
         console.make_folder(append.parent, name="append", file=append, make=False)
     elif author or trained_on or frames_seen:

@@ -222,6 +222,7 @@ def _as_typed(text: str) -> str:
         return text
     name, value, rule, meant, more = found.groups()
     if meant is not None and rule.startswith("must be "):
+        name = "scene" if name == "what" else name
         return f"Unknown {name} {value}. Did you mean {meant} It {rule}{more}"
     if name == "path":
         return value.strip("'") + f" {rule}"

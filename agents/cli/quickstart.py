@@ -28,14 +28,12 @@ PPO_FRAMES = 55_000
 #: Episodes per scene of the evaluation.
 EPISODES = 2
 
-Scenes = Annotated[
-    str, Option(help="'bundled', 'polyhaven', or a folder or file of raws or .hdr/.exr maps.")
-]
-
 
 @console.takes_source
 def quickstart(
-    scenes: Scenes = "bundled",
+    scenes: Annotated[
+        str, Option(help="'bundled', 'polyhaven', or a folder or file of raws or .hdr/.exr maps.")
+    ] = "bundled",
     out: console.Folder = Path("quickstart"),
     on_error: console.OnError = "stop",
     source: Any = None,

@@ -62,7 +62,8 @@ def view(
     with progress_bars() as progress, progress("scenes") as task:
         library = find_scenes(what, source)
         task(1, 1)
-    options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
+    how = {"depth": depth, "tolerance": tolerance, "scorer": scorer}
+    options = Options(library, simulator, how)
     serve("ae-env view", partial(show_page, options), options.folder, port, open_browser)
 
 
@@ -190,16 +191,18 @@ def scorers() -> None:
 
 
 def policies() -> None:
-    """List the built-in policies of single frames and of video.
+    """List the built-in policies and their options.
 
-    Example: `ae-env policies` lists them; docs/policies.md says what they are.
+    Example: `ae-env policies` lists them; docs/policies.md says more.
     """
-    from agents import policy_names as names
+    from agents.policy_names import ABOUT, default_options
 
-    rows = [(name,) for name in names.list_policies() if not names.is_metering(name)]
-    rows += [(f"{meter}:PROGRAM",) for meter in (*names.METERS, "rpi_agc")]
-    print_table("policies", rows, "name")
-    print_line(f"programs: {', '.join(names.PROGRAMS)} (of rpi_agc the first four); P by default")
+    print_table("policies", ABOUT.items(), "name", "what it is")
+    for name in ("average", "rpi_agc", "regression", "bracket:fixed"):
+        named = default_options(name).items()
+        options = ", ".join(key if value is None else f"{key}={value}" for key, value in named)
+        print_line(f"options of {name if name != 'average' else 'METER:PROGRAM'}: {options}")
+    print_line("for example: matrix:tuned?foresight=learnt&compensation=-1")
 
 
 def cameras() -> None:
@@ -213,9 +216,8 @@ def cameras() -> None:
     for camera in map(get_camera, list_cameras()):
         isos = sorted(camera.nlf_by_iso)
         calibrated = f"ISO {isos[0]:g} to {isos[-1]:g}" if isos else "-"
-        by = camera.source.partition(";")[0]
         model = f"{camera.make} {camera.model.removeprefix(camera.make).strip()}"
-        rows.append((camera.name, model, calibrated, by))
+        rows.append((camera.name, model, calibrated, camera.source.partition(";")[0]))
     print_table("cameras", rows, "name", "make and model", "noise calibrated", "by")
     print_line("options: NAME?prnu=0.005&dark_current=30")
     print_line("others by a file: ctt:FILE, darktable:MAKER MODEL, emva:FILE (docs/cameras.md)")

@@ -230,7 +230,8 @@ def refocus(
     from simulator import read_raw
     from simulator.raw.develop import as_recorded
 
-    f_number = parse_number(aperture, "aperture")
+    with console.option_names(f_number="aperture"):
+        f_number = parse_number(aperture, "f_number")
     for_depth = {"depth-kind": depth_kind, "depth-scale": depth_scale}
     for_depth |= {"depth-layer": depth_layer, "focus": focus}
     for_depth |= {"focal-length": focal_length, "pixel-pitch": pixel_pitch}

@@ -137,9 +137,8 @@ def export(
 
     kind = policy.partition(":")[0].partition("?")[0]
     if kind not in LEARNT_AGENTS or "*" in policy or "?" in policy:
-        raise ValueError(
-            f"`policy` (={policy!r}) must be regression or ppo, alone or with :video or :PATH"
-        )
+        rule = "must be regression or ppo, alone or with :video or :PATH"
+        raise ValueError(f"`policy` (={policy!r}) {rule}")
     console.check_outputs(out=(out, ".onnx"))
     name = training_seeds(policy)[0]
     _, card = load_agent(name.partition(":")[2], kind)
@@ -153,8 +152,6 @@ def export(
     agent.name = policy  # for errors
     file = export_agent(agent, out)
     controller = Controller(file)
-    console.terminal.print(
-        f"{len(controller.states)} states, frames of {controller.frame_shape}, "
-        f"{file.stat().st_size / 1e6:.2f} MB"
-    )
+    size, frame = file.stat().st_size / 1e6, controller.frame_shape
+    print_line(f"{len(controller.states)} states, frames of {frame}, {size:.2f} MB")
     print_files({"agent": file})

@@ -100,12 +100,10 @@ class EpisodePage(Tab):
                 choices = "".join(f'<option value="{name}">' for name in NAMES)
                 ui.html(choices, sanitize=False, tag="datalist").props("id=policies")
                 #: What is asked for, by its name in an address.
-                self._fields: dict[str, Any] = {
-                    x: ui.input(f"policy {x.upper()}", value=name)
-                    .props("list=policies")
-                    .classes("w-72")
-                    for x, name in zip("ab", NAMES, strict=False)
-                }
+                self._fields: dict[str, Any] = {}
+                for x, name in zip("ab", NAMES, strict=False):
+                    field = ui.input(f"policy {x.upper()}", value=name).props("list=policies")
+                    self._fields[x] = field.classes("w-72")
                 self._fields["light"] = ui.select(list(LIGHTS), label="light", value="shadows")
                 for name, value, low, most in (("frames", _FRAMES, 2, 512), ("seed", 0, 0, 2**31)):
                     number = ui.number(name, value=value, min=low, max=most, precision=0)
@@ -165,12 +163,8 @@ class EpisodePage(Tab):
     def _write_csv(self, path: Path) -> None:
         tables = []
         for one in self._recordings:
-            columns: dict[str, Any] = {
-                "policy": one.name,
-                "ev100": one.ev100,
-                "best_ev100": one.best,
-            }
-            columns |= {"score": one.scores, "regret": one.regrets}
+            columns: dict[str, Any] = {"policy": one.name, "ev100": one.ev100}
+            columns |= {"best_ev100": one.best, "score": one.scores, "regret": one.regrets}
             for name in ("iso", "exposure_time", "f_number"):
                 columns[name] = [getattr(self._grid[state], name) for state in one.states]
             tables.append(pd.DataFrame(columns).rename_axis("frame"))

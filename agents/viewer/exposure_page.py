@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -220,8 +220,9 @@ class ExposurePage(Tab):
             beside = await run.io_bound(viewed.picture, other) if other else None
             self._stage.compare(beside.jpeg if beside else None)
             self._compared = other
-        left, right = self._stage.tags
-        left.text, right.text = f"A: {view.settings}", f"B: {kept}"
+        if kept:
+            left, right = self._stage.tags
+            left.text, right.text = f"A: {view.settings}", f"B: {kept}"
         if self.view != view:
             return
         readout = await run.io_bound(viewed.readout, view, picture.capture)
@@ -239,16 +240,14 @@ class ExposurePage(Tab):
             for x, v, a, c in ends
         ]
         draw_lines(self._histogram, lines, marks)
-        plan, facts = readout.plan, self._facts
+        plan, facts, ev100 = readout.plan, self._facts, -view.settings.log2_exposure
         facts["Score"].text = f"{readout.score:.3f}"
         self._parts.content = "".join(
             f"<span>{name}</span><meter value={part:.3f} aria-label={name}></meter>"
             f"<span>{part:.2f}</span><span>{f'costs {cost:.2f}' if cost >= 0.005 else ''}</span>"
             for name, (part, cost) in readout.parts.items()
         )
-        facts[
-            "Exposure"
-        ].text = f"EV100 {-view.settings.log2_exposure:.1f}, {readout.ev:+.1f} EV from right"
+        facts["Exposure"].text = f"EV100 {ev100:.1f}, {readout.ev:+.1f} EV from right"
         facts["Noise"].text = f"SNR at mid grey: {readout.snr:.1f} dB per photosite"
         if plan.excess_noise:
             facts["Noise"].text += f", {plan.excess_noise:.0%} more variance than the camera's"
@@ -266,7 +265,7 @@ class ExposurePage(Tab):
         shown = next((s for s in self._states if _GRID[s] == view.settings), None)
         for state, button in self._states.items():
             score, settings = float(table.mean[state]), _GRID[state]
-            background, ink = score_colour(score)
+            background, ink = score_colour(round(score, 3))
             names = [name for name, s in self._marks.items() if s == state]
             for k, colour in enumerate(map(self._colour, names)):
                 dot = f"{colour} 4px, #000 4px 5px, #0000 5px"
@@ -367,6 +366,7 @@ def asked_settings(asked: Mapping[str, str]) -> CameraSettings | None:
     )
 
 
+@cache
 def score_colour(score: float) -> tuple[str, str]:
     """Background and ink of a score in [0, 1]."""
     red, green, blue, _ = matplotlib.colormaps["viridis"](min(max(score, 0.0), 1.0))

@@ -10,6 +10,7 @@ function place(stage, x, y, zoom) {
   stage.style.setProperty('--zoom', zoom);
   stage.style.setProperty('--x', clamp(x, 100 - 100 * zoom, 0) + '%');
   stage.style.setProperty('--y', clamp(y, 100 - 100 * zoom, 0) + '%');
+  stage.style.touchAction = zoom > 1 ? 'none' : '';  // a finger scrolls the page, or moves what is enlarged
   drawScale(stage);
 }
 
@@ -72,6 +73,31 @@ addEventListener('click', (e) => {
 }, true);
 addEventListener('pointerup', () => setTimeout(() => { drag = null; }));
 
+// Two fingers zoom and move: the distance between them, and their middle in percents of the stage.
+let pinch = null;
+const pinched = (stage, [one, other]) => {
+  const box = stage.getBoundingClientRect(), middle = (a, b, from, size) => 50 * (a + b - 2 * from) / size;
+  return {
+    stage, size: Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY),
+    right: middle(one.clientX, other.clientX, box.left, box.width),
+    down: middle(one.clientY, other.clientY, box.top, box.height),
+  };
+};
+addEventListener('touchstart', (e) => {
+  const stage = e.touches.length === 2 && e.target.closest('.stage');
+  pinch = stage ? pinched(stage, e.touches) : null;
+  if (pinch) drag = null;
+});
+addEventListener('touchmove', (e) => {
+  if (!pinch) return;
+  e.preventDefault();  // the page does not scroll
+  const { stage, size, right, down } = pinch, [x, y, zoom] = placed(stage);
+  pinch = pinched(stage, e.touches);
+  place(stage, x + pinch.right - right, y + pinch.down - down, zoom);
+  zoomBy(stage, pinch.size / size, pinch.right, pinch.down);
+}, { passive: false });
+for (const end of ['touchend', 'touchcancel']) addEventListener(end, () => { pinch = null; });
+
 addEventListener('keydown', (e) => {
   const arrow = ARROWS[e.key], stage = e.target.closest && e.target.closest('.stage');
   if (e.ctrlKey || e.altKey || e.metaKey) return;
@@ -92,3 +118,13 @@ addEventListener('keydown', (e) => {
   next.focus();
   next.click();
 });
+
+// Quasar's list of options can be focused itself, which hides the options from a screen reader.
+const lists = new MutationObserver((changes) => {
+  const added = changes.flatMap((change) => [...change.addedNodes]);
+  for (const node of added.filter((n) => (n.id || '').startsWith('q-portal'))) {
+    lists.observe(node, { childList: true, subtree: true });
+  }
+  for (const list of document.querySelectorAll('.q-virtual-scroll__content')) list.removeAttribute('tabindex');
+});
+addEventListener('DOMContentLoaded', () => lists.observe(document.body, { childList: true }));

@@ -25,7 +25,6 @@ from agents.viewer.one_raw_page import OneRawPage
 from agents.viewer.tab import complain, heading, loading, new_file
 from agents.viewer.viewed_scene import Library, ViewedScene
 from simulator import CameraSettings, CameraSimulator
-from simulator.camera_simulator import Depth
 from simulator.utils.checks import did_you_mean
 
 #: Largest file that is taken [byte].
@@ -80,9 +79,7 @@ class Options:
 
     library: Library
     simulator: CameraSimulator
-    depth: Depth
-    tolerance: float
-    scorer: str
+    how: Mapping[str, Any]  # other options of `ViewedScene`
     folder: tempfile.TemporaryDirectory[str] = field(
         default_factory=lambda: tempfile.TemporaryDirectory(prefix="ae-env-view-")
     )
@@ -90,8 +87,7 @@ class Options:
 
     def viewed(self, library: Library, name: str) -> ViewedScene:
         """The scene called `name`, to be shown."""
-        how = {"depth": self.depth, "tolerance": self.tolerance, "scorer": self.scorer}
-        return ViewedScene(library.open(name), self.simulator, **how)  # type: ignore[arg-type]
+        return ViewedScene(library.open(name), self.simulator, **self.how)
 
 
 def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -99,8 +95,7 @@ def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
     known = WeakMethod(method)
 
     async def call(event: Any) -> None:
-        found = known()
-        if found is not None:
+        if (found := known()) is not None:
             await found(event)
 
     return call

@@ -11,7 +11,6 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from fastapi.responses import PlainTextResponse
 from nicegui import app, background_tasks, ui
@@ -30,9 +29,9 @@ _COOKIE = "ae-env-view"
 class TokenGuard:
     """Refuses every request without the token of this start.
 
-    The printed address contains the token in its query; a cookie keeps it for later requests of
-    the page. Requests to or from other names are refused, too: a foreign page may make its own
-    name lead here, and whoever reaches the page can name a Python file as a policy.
+    The printed address contains it, and a cookie keeps it. Requests to or from other names are
+    refused, too: a foreign page may make its own name lead here, and whoever reaches the page can
+    name a Python file as a policy.
     """
 
     def __init__(self, app: Any, token: str, port: int) -> None:
@@ -57,12 +56,9 @@ class TokenGuard:
             await refusal(scope, receive, send)
             return
 
-        if int(asked.headers.get("content-length", "0")) > _LARGEST_REQUEST:
-            await PlainTextResponse("The file is too large.", 413)(scope, receive, send)
-            return
         taken = 0
 
-        async def limited() -> Any:  # a body may come without its length
+        async def limited() -> Any:
             nonlocal taken
             message = await receive()
             taken += len(message.get("body", b""))
@@ -77,18 +73,10 @@ class TokenGuard:
                     headers.append("set-cookie", value)
             await send(message)
 
-        try:
-            await self._app(scope, limited if scope["type"] == "http" else receive, with_cookie)
-        except AttributeError:  # NiceGUI takes every entry of a form for a file
-            if "/upload/" not in scope["path"]:
-                raise
-            await PlainTextResponse("Only a file can be uploaded.", 400)(scope, receive, send)
+        await self._app(scope, limited if scope["type"] == "http" else receive, with_cookie)
 
     def _is_own(self, origin: str | None) -> bool:
-        try:
-            return origin is None or urlsplit(origin).netloc in self._hosts
-        except ValueError:
-            return False
+        return origin is None or origin.removeprefix("http://") in self._hosts
 
     def _cookies(self, asked: HTTPConnection) -> list[str]:
         """Values of the cookie; other servers of this machine may set one of the same name."""

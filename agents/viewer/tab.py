@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ from agents.viewer.viewed_scene import ViewedScene
 
 #: Gives a picture an address for the browser.
 Address = Callable[[bytes], str]
+#: Time after which a spinner shows that work is under way [s].
+_SPINNER_AFTER = 0.3
 
 
 def new_file(folder: Path, name: str) -> Path:
@@ -61,7 +64,7 @@ class Tab:
 def loading(
     element: ui.button | ui.spinner, errors: Any = (ValueError, OSError, ImportError, RuntimeError)
 ) -> Iterator[None]:
-    """Shows by a button or spinner that work is under way; `errors` become notices."""
+    """Shows by a button, or a spinner soon, that work is under way; `errors` become notices."""
 
     def show(busy: bool) -> None:
         if isinstance(element, ui.spinner):
@@ -69,12 +72,15 @@ def loading(
         else:
             element.props["loading"] = busy
 
-    show(True)
+    # What is over at once shows no spinner: the page would be drawn for it twice more.
+    wait = _SPINNER_AFTER if isinstance(element, ui.spinner) else 0.0
+    shown = asyncio.get_running_loop().call_later(wait, show, True)
     try:
         yield
     except errors as error:
         complain(error)
     finally:
+        shown.cancel()
         show(False)
 
 
@@ -181,11 +187,7 @@ def draw_lines(chart: ui.echart, lines: Iterable[Any], marks: Sequence[Any] = ()
     """Draws lines, each a name, colour and points (x, y); `marks` as ECharts takes them."""
     looks: dict[str, Any] = {"type": "line", "step": "middle", "symbol": "none"}
     series = [looks | {"name": n, "color": c, "data": list(points)} for n, c, points in lines]
-    series[0]["markLine"] = {
-        "symbol": "none",
-        "silent": True,
-        "label": {"color": "#ececec"},
-        "data": marks,
-    }
+    label = {"color": "#ececec"}
+    series[0]["markLine"] = {"symbol": "none", "silent": True, "label": label, "data": marks}
     chart.options["series"] = series
     chart.update()

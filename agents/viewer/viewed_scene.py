@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import math
 import threading
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import chain, count
@@ -22,8 +23,9 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.bundled import bundled_scenes
 from ae_env.scenes.folder import find_files
+from ae_env.scenes.load import NAMED
 from ae_env.scenes.recorded import PREFIX
-from ae_env.scenes.scene import SceneRequest, SceneSet
+from ae_env.scenes.scene import SceneRequest
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.metering.meters import weight_map
@@ -113,11 +115,9 @@ def _read_raw(path: Path, name: str, **settings: float) -> OpenedScene:
 
 
 def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({})) -> Library:
-    """The library of what ``ae-env view`` was asked to show.
+    """The library of a raw or radiance map, a folder or glob, scenes by name, or a scene's id.
 
-    That is a raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them (of
-    a recorded grid the light that its captures tell together), or a bundled scene's id. `settings`
-    are of all raws, in place of their files'.
+    A recorded grid is the light that its captures tell together; `settings` are of all raws.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
@@ -144,7 +144,7 @@ def find_scenes(what: str, settings: Mapping[str, float] = MappingProxyType({}))
         raise ValueError(
             f"`what` (={what!r}) must be a raw, a radiance map, a folder, scenes such as bundled, "
             f"or the id of a bundled scene, such as {next(iter(bundled))}"
-            f"{did_you_mean(what, bundled)}"
+            f"{did_you_mean(what, (*NAMED, *bundled))}"
         )
     return Library(bundled, what)
 
@@ -155,10 +155,9 @@ def _first_readable(what: str, readers: Mapping[str, Callable[[], OpenedScene]])
     for name, read in readers.items():
         try:
             read()
+            return name
         except (ValueError, OSError) as error:
             broken.append(f"{name}: {error}")
-        else:
-            return name
     if len(broken) > _MOST_NAMED:
         broken[_MOST_NAMED:] = [f"and {len(broken) - _MOST_NAMED} more"]
     named = "; ".join(broken)
@@ -175,13 +174,11 @@ def _loaded(spec: str, taken: Container[str] = ()) -> dict[str, Callable[[], Ope
 def _bundled() -> dict[str, Callable[[], OpenedScene]]:
     """The bundled scenes by id, each drawn when it is opened."""
 
-    def draw(scenes: SceneSet, index: int) -> OpenedScene:
-        return OpenedScene(scenes[index])
-
     found: dict[str, Callable[[], OpenedScene]] = {}
     for split in ("train", "test"):
         scenes = bundled_scenes(SceneRequest(split, get_camera(CAMERA), resolution=None))
-        found |= {name: partial(draw, scenes, i) for i, name in enumerate(scenes.scene_ids)}
+        for i, name in enumerate(scenes.scene_ids):
+            found[name] = partial(lambda scenes, i: OpenedScene(scenes[i]), scenes, i)
     return found
 
 
@@ -275,7 +272,8 @@ class ViewedScene:
             prepared = self._part(view)
             (capture,) = prepared.expose([view.settings])
             taken = perf_counter()
-            image = self._to_srgb(capture, view)
+            with _one_thread():
+                image = self._to_srgb(capture, view)
             jpeg = encoded(image, quality=88 if view.centre is None else 95)
             times = 1e3 * (taken - begun), 1e3 * (perf_counter() - taken)
             photosites = image.shape[1] * (2 * self._averaged if view.centre is None else 1)
@@ -283,14 +281,17 @@ class ViewedScene:
 
     def readout(self, view: View, capture: torch.Tensor) -> Readout:
         """The numbers about `capture`, which `view` asked for."""
-        with self._lock:
+        with self._lock, _one_thread():
             settings, height = view.settings, self.scene.light.shape[1]
             camera = self.scene.camera
             noise = camera.nlf(settings.iso, settings.exposure_time)
             variance = noise.read[1] + noise.shot[1] * MID_GREY + (camera.prnu * MID_GREY) ** 2
-            values = capture.reshape(4, -1)
-            seen = values.clamp(min=2.0 ** -(STOPS + 1)).masked_fill(values >= _AT_WHITE, 2.0)
-            counts = [torch.histc(plane, BINS, -STOPS, 0.0).numpy() for plane in seen.log2()]
+            values, bins = capture.reshape(4, -1), BINS // STOPS  # of a stop
+            # A stop more lies below the histogram, and a bin of what is at white above it.
+            stops = values.div(_AT_WHITE).clamp_(2.0 ** -(STOPS + 1), 1.0).log2_()
+            at = stops.add_(STOPS + 1).mul_(bins).int()
+            shares = np.stack([torch.bincount(a, minlength=BINS + bins + 1) for a in at])
+            shares = shares / values.shape[1]
             table = self.table(view, settings)
             return Readout(
                 plan=self._part(view).plan(settings),
@@ -300,9 +301,9 @@ class ViewedScene:
                 snr=20.0 * math.log10(MID_GREY / math.sqrt(variance)) if variance else math.inf,
                 motion=view.speed * height * settings.exposure_time,
                 defocus=view.defocus * height / SCORED_PIXELS * 4.0 / settings.effective_f_number,
-                white=float((values >= _AT_WHITE).float().mean()),
-                black=float((values <= _AT_BLACK).float().mean()),
-                histogram=np.stack(counts) / values.shape[1],
+                white=float(shares[:, -1].mean()),
+                black=int(torch.count_nonzero(values <= _AT_BLACK)) / values.numel(),
+                histogram=shares[:, bins:-1],
             )
 
     def _costs(self, table: ScoreTable) -> dict[str, tuple[float, float]]:
@@ -347,9 +348,9 @@ class ViewedScene:
                 if settings is not None:
                     values = (settings.iso,), (settings.exposure_time,), (settings.f_number,)
                     grid = ExposureGrid(*values)
-                moves: dict[str, Any] = {"speed": view.speed, "defocus": view.defocus}
                 tables = ScoreTables(grid, self.scene.camera, self._scorer)
-                self._tables[key] = tables.table(self.scored, **moves)
+                speed, defocus = view.speed, view.defocus
+                self._tables[key] = tables.table(self.scored, speed=speed, defocus=defocus)
             return self._tables[key]
 
     def write_dng(self, path: Path, view: View) -> Path:
@@ -369,8 +370,7 @@ class ViewedScene:
         factor = max(1, min(self.scene.light.shape[1:]) // _THUMBNAIL[1])
         small = self.scene.averaged(factor)
         capture = replace(small, denoised=None).prepared.expected(settings)
-        image = render_srgb(_raw(small, settings, capture.clamp(0.0, 1.0)), "half")
-        return encoded(self._upright(image.permute(1, 2, 0).numpy()), quality=80)
+        return encoded(self._to_srgb(capture.clamp(0.0, 1.0), View(settings)), quality=80)
 
     def _prepare(self, scene: Scene) -> PreparedScene:
         return self._simulator.prepare(scene.prepared, depth=self._depth, tolerance=self._tolerance)
@@ -418,17 +418,26 @@ class ViewedScene:
         image = render_srgb(raw, "half" if whole else "malvar").permute(1, 2, 0).numpy()
         if view.clipping:
             image = image.copy()
-            scale = 1 if whole else 2
-            for clipped, colour in (
-                ((capture <= _AT_BLACK).all(dim=0), _BLACK_MARK),
-                ((capture >= _AT_WHITE).any(dim=0), _WHITE_MARK),
-            ):
+            scale, black = 1 if whole else 2, (capture <= _AT_BLACK).all(dim=0)
+            marks = (black, _BLACK_MARK), ((capture >= _AT_WHITE).any(dim=0), _WHITE_MARK)
+            for clipped, colour in marks:
                 image[clipped.numpy().repeat(scale, 0).repeat(scale, 1)] = colour
         return self._upright(image)
 
     def _upright(self, image: np.ndarray) -> np.ndarray:
         seen = image if self.photograph is None else upright(image, self.photograph)
         return np.ascontiguousarray(seen)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch computes on this thread alone: on busy cores a small picture would wait for another."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:

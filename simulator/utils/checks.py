@@ -14,8 +14,8 @@ from urllib.parse import parse_qsl
 
 #: Units of times [s].
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-
-
+#: Examples of numbers, by the name of what they are.
+_EXAMPLES = {"iso": "200", "exposure_time": "1/125 or 8ms", "f_number": "5.6 or f/5.6"}
 #: Level of log lines about work under way, which only the command line shows.
 NOTE = 25
 
@@ -49,7 +49,8 @@ def parse_number(text: str, name: str = "") -> float:
         return float(top) / float(bottom or 1) * UNITS.get(unit, 1.0)
     except (ValueError, ZeroDivisionError):
         found = f"`{name}` (={text!r})" if name else repr(text)
-        raise ValueError(f"{found} must be a number, such as 200, 1/125 or f5.6") from None
+        example = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
+        raise ValueError(f"{found} must be a number{example}") from None
 
 
 def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -> None:

@@ -27,6 +27,10 @@ def test_every_listed_name_makes_a_policy(context):
     names = policy_names.list_policies()
     meters = len(policy_names.METERS) * len(policy_names.PROGRAMS) + 4  # and rpi_agc
     assert len(names) == len(set(names)) == 8 + meters
+    heads = {name.partition(":")[0] for name in names}
+    assert heads | {n for n in names if n.endswith(":video")} < policy_names.ABOUT.keys()
+    for name in policy_names.ABOUT:
+        policy_names.check_policy(name.replace("METER", "spot"))
     learnt = {"ppo", "regression", "ppo:video", "regression:video"}
     assert learnt < set(names)
     for name in set(names) - learnt:  # they come at one resolution, below

@@ -80,24 +80,18 @@ def test_a_photosite_has_its_filter_and_digital_number(down, right, plane):
     text = seen.photosite(view, seen.picture(view).capture, *place)
     name, number = text.split()[:2]
     assert name == ("R", "G1", "G2", "B")[plane]
-    span = CAMERA.white_level - CAMERA.black_level[plane]
-    assert int(number) == pytest.approx(
-        CAMERA.black_level[plane] + float(light[plane, 0, 0]) * span, rel=0.1
-    )
+    black = CAMERA.black_level[plane]
+    share = (int(number) - black) / (CAMERA.white_level - black)
+    assert share == pytest.approx(float(light[plane, 0, 0]), rel=0.1)
     assert text.endswith(f"row {20 + down}, column {30 + right}")
 
 
 def test_a_meter_or_region_is_drawn_where_it_looks():
     seen = viewed(torch.full((4, 64, 96), 0.1))
-    for name, middle in (
-        ("spot", True),
-        ("matrix", True),
-        ("average", True),
-        ("0,0,0.25,0.25", False),
-    ):
+    for name in ("spot", "matrix", "average", "0,0,0.25,0.25"):
         alpha = np.asarray(Image.open(io.BytesIO(seen.weights_over(name))))[..., 3]
         assert alpha.shape == (256, 384)
-        assert (alpha[128, 192] == 150) == middle
+        assert (alpha[128, 192] == 150) == (name[0] != "0")
         assert (alpha[10, 70] > 0) == (name != "spot")  # in the square that policies see
         assert not alpha[:, :60].any()
     with pytest.raises(ValueError, match="`roi`"):
@@ -136,11 +130,10 @@ def test_numbers_of_a_flat_scene():
     assert readout.histogram.argmax(axis=1).tolist() == [29] * 4  # 0.16 of white, -2.64 stops
     noise, cost = readout.parts["noise"]
     assert cost == pytest.approx(readout.score * (noise**-0.2 - 1), abs=1e-9)  # of a product
-    grey = [
-        replace(view, settings=CameraSettings(iso, 1 / 100, 4), equal_brightness=True)
-        for iso in (100, 200)
-    ]
-    levels = [image(seen.picture(replace(view, defocus=0.0))).mean() for view in grey]
+    levels = []
+    for iso in (100, 200):
+        grey = View(CameraSettings(iso, 1 / 100, 4), equal_brightness=True)
+        levels.append(image(seen.picture(grey)).mean())
     assert levels[0] == pytest.approx(levels[1], abs=3)
     np.testing.assert_allclose(readout.histogram.sum(axis=1), 1.0)
     nlf = CAMERA.nlf(100)
@@ -161,9 +154,9 @@ def test_a_folder_opens_at_its_first_readable_raw_and_few_are_kept(tmp_path):
     for byte in (b"\xfe", b"\xff"):  # no UTF-8
         shutil.copy(tmp_path / "1.dng", os.fsencode(tmp_path) + b"/" + byte + b".dng")
     library = find_scenes(str(tmp_path))
-    assert library.first == "1.dng"
-    assert list(library.readers)[-2:] == ["\\udcfe.dng", "\\udcff.dng"]
-    assert list(library.readers)[:2] == ["00.dng", "01.dng"]
+    names = list(library.readers)
+    assert (library.first, names[:2]) == ("1.dng", ["00.dng", "01.dng"])
+    assert names[-2:] == ["\\udcfe.dng", "\\udcff.dng"]
     for i in range(1, 7):
         library.open(f"{i}.dng")
     for path in tmp_path.iterdir():
@@ -194,8 +187,9 @@ def test_thumbnails_are_made_once_and_last_and_an_episode_can_be_stopped(tmp_pat
 def test_a_scene_is_found_by_its_id_and_what_is_none_is_refused():
     found = find_scenes("snow-1000")
     assert (found.first, "snow-1000" in found.readers) == ("snow-1000", True)
-    for what in ("snow-9999", "no/such/folder", "recorded:no/such"):
-        with pytest.raises(ValueError, match=f"`.*` .*{what.rpartition('/')[2]}"):
+    said = {"bundeld": "did you mean 'bundled'"}
+    for what in ("snow-9999", "no/such/folder", "recorded:no/such", "bundeld"):
+        with pytest.raises(ValueError, match=f"`.*` .*{said.get(what) or what.rpartition('/')[2]}"):
             find_scenes(what)
 
 
@@ -404,13 +398,16 @@ def test_the_best_state_comes_first_and_a_key_shows_another_at_once(page, expect
     expect(page.locator(".stage.whole")).to_be_visible()  # a drag is no click
     page.mouse.wheel(0, -100)
     expect(page.locator(".scale")).to_have_attribute("data-text", re.compile(r"\d px, zoom 1.2"))
+    screen = page.context.new_cdp_session(page)
+    for kind, apart in (("Start", 30), ("Move", 45), ("Move", 60), ("End", 0)):  # two fingers
+        points = [{"x": box["x"] + 90 + k * apart, "y": box["y"] + 90} for k in (-1, 1) if apart]
+        screen.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+    expect(page.locator(".scale")).to_have_attribute("data-text", re.compile(r"\d px, zoom 2.4"))
     # The map has one stop of the Tab key; arrows choose.
     expect(page.locator(".state[tabindex='0']")).to_have_count(1)
     page.locator("[title^='ISO 400, 1/1000 s, f/11']").click()
-    for key, state in (
-        ("ArrowRight", "ISO 400, 1/125 s, f/11"),
-        ("ArrowDown", "ISO 6400, 1/125 s, f/4"),
-    ):
+    states = {"ArrowRight": "ISO 400, 1/125 s, f/11", "ArrowDown": "ISO 6400, 1/125 s, f/4"}
+    for key, state in states.items():
         page.keyboard.press(key)
         expect(page.locator(".state:focus")).to_have_attribute("aria-label", re.compile(state))
         expect(page.locator(".state.shown")).to_have_attribute("title", re.compile(state))
@@ -432,12 +429,18 @@ def test_axe_finds_no_serious_fault_in_any_tab(page):
         found = [v for v in found if v["impact"] in ("serious", "critical")]
         return [(v["id"], [node["html"] for node in v["nodes"]]) for v in found]
 
+    choices = {"Episode": "light", "Refocus, HDR": "", "Exposure": "Draw metering weights"}
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 800})
-        for name in ("Episode", "Refocus, HDR", "Exposure"):
+        for name, choice in choices.items():
             page.get_by_role("tab", name=name).click()
             page.wait_for_timeout(500)  # its pictures
             assert faults() == []
+            if choice:
+                page.get_by_label(choice).click()
+                page.get_by_role("option").first.wait_for()
+                assert faults() == []
+                page.keyboard.press("Escape")
     page.goto(page.url.replace("scene=", "scene=no-"))
     page.wait_for_selector(".state.shown")
     page.get_by_role("button", name="Close").wait_for()
@@ -466,9 +469,8 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address, tmp_path
     expect(page.locator(".charts canvas")).to_have_count(3)
     rows = pd.read_csv(saved(page, "save CSV", tmp_path))
     assert rows.policy.tolist() == ["average"] * 7 + ["rpi_agc"] * 7
-    np.testing.assert_allclose(
-        rows.ev100, np.log2(rows.f_number**2 / rows.exposure_time * 100 / rows.iso), atol=0.05
-    )
+    ev100 = np.log2(rows.f_number**2 / rows.exposure_time * 100 / rows.iso)
+    np.testing.assert_allclose(rows.ev100, ev100, atol=0.05)
     assert saved(page, "save GIF", tmp_path).read_bytes()[:6] == b"GIF89a"
     link = "a=average&b=rpi_agc&light=shadows&frames=6&seed=0"
     assert page.url.endswith(link)
@@ -513,10 +515,8 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address, tmp_path
 def test_takes_a_raw_and_gives_files_back(page, expect, tmp_path):
     openexr = pytest.importorskip("OpenEXR")
     (bad := tmp_path / "holiday.dng").write_bytes(b"not a raw at all" * 100)
-    with page.expect_request("**/upload/*") as asked:
-        page.locator("input[type=file]").set_input_files(bad)
+    page.locator("input[type=file]").set_input_files(bad)
     expect(page.locator(".q-notification", has_text="holiday.dng")).to_be_visible()
-    assert page.request.post(asked.value.url, form={"file": "none"}).status == 400
     page.get_by_role("tab", name="Refocus, HDR").click()
     expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
     expect(page.get_by_role("button", name="Fuse a bracket")).to_be_disabled()
