@@ -130,10 +130,8 @@ def test_numbers_of_a_flat_scene():
     assert readout.histogram.argmax(axis=1).tolist() == [29] * 4  # 0.16 of white, -2.64 stops
     noise, cost = readout.parts["noise"]
     assert cost == pytest.approx(readout.score * (noise**-0.2 - 1), abs=1e-9)  # of a product
-    levels = []
-    for iso in (100, 200):
-        grey = View(CameraSettings(iso, 1 / 100, 4), equal_brightness=True)
-        levels.append(image(seen.picture(grey)).mean())
+    greys = (View(CameraSettings(iso, 0.01, 4), equal_brightness=True) for iso in (100, 200))
+    levels = [image(seen.picture(grey)).mean() for grey in greys]
     assert levels[0] == pytest.approx(levels[1], abs=3)
     np.testing.assert_allclose(readout.histogram.sum(axis=1), 1.0)
     nlf = CAMERA.nlf(100)
