@@ -1,0 +1,81 @@
+"""Where the time of a step goes, and what more cores would bring.
+
+`python examples/profile_step.py [SIZE]` steps 64 environments with random actions on one thread. It
+times the sections that threads share (`simulator.utils.compute.parallel_ranges`); all else is the
+interpreter's, on one thread whatever there are. A step on n threads takes at least the rest and an
+n-th of the sections.
+"""
+
+import gc
+import sys
+import time
+from collections import defaultdict
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+import ae_env  # noqa: F401  (registers the environments)
+from simulator.utils import compute
+
+NUM_ENVS, STEPS, ROUNDS = 64, 40, 9
+CALLERS = {
+    "_run": "blur: discs, blends, motion",
+    "_record_fused": "exposure, noise, clip, codes",
+    "measured": "histograms of codes for the score",
+}
+
+
+def timed_sections(spent):
+    """Makes every module's `parallel_ranges` add its seconds to `spent`, by the caller's name."""
+    original = compute.parallel_ranges
+
+    def timed(task, count, **options):
+        name = sys._getframe(1).f_code.co_name
+        begun = time.perf_counter()
+        try:
+            original(task, count, **options)
+        finally:
+            spent[name] += time.perf_counter() - begun
+
+    for module in list(sys.modules.values()):
+        if getattr(module, "parallel_ranges", None) is original:
+            module.parallel_ranges = timed
+
+
+def main(size=64):
+    """Measures and prints a table."""
+    torch.set_num_threads(1)
+    options = {"scenes": "bundled:small", "resolution": size, "autoreset_mode": "SAME_STEP"}
+    envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=NUM_ENVS, **options)
+    envs.reset(seed=0)
+    actions = np.random.default_rng(0).integers(0, 64, (100 + ROUNDS * STEPS, NUM_ENVS))
+    for chosen in actions[:100]:
+        envs.step(chosen)
+    rows, spent = [], defaultdict(float)
+    timed_sections(spent)
+    gc.collect()
+    for chosen in np.split(actions[100:], ROUNDS):
+        spent.clear()
+        begun = time.perf_counter()
+        for own in chosen:
+            envs.step(own)
+        whole = time.perf_counter() - begun
+        rows.append({**spent, "whole": whole})
+    scale = 1e6 / (STEPS * NUM_ENVS)
+    of = {name: scale * np.median([row[name] for row in rows]) for name in rows[0]}
+    whole, rest = of["whole"], of["whole"] - sum(of[name] for name in of if name != "whole")
+    print(f"{NUM_ENVS} environments, {size} x {size}, microseconds a frame, median of {ROUNDS}")
+    for name in sorted(of, key=of.get, reverse=True):
+        if name != "whole":
+            print(f"{CALLERS.get(name, name):34} {of[name]:7.1f} {of[name] / whole:5.0%}")
+    print(f"{'interpreter and NumPy':34} {rest:7.1f} {rest / whole:5.0%}")
+    for threads in (1, 2, 8, 16):
+        least = rest + (whole - rest) / threads
+        print(
+            f"{f'step on {threads} threads, at least':34} {least:7.1f} {whole / least:5.2f} times"
+        )
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
