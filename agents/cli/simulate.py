@@ -97,10 +97,11 @@ def simulate(
 def _remarks(source: RawImage, result: RawImage, *, details: bool) -> Iterator[str]:
     """Lines about what the result hides at the ends of its range, and what had to be guessed."""
     from simulator import exposure_ratio
+    from simulator.camera import LOW_CLIP
 
-    numbers, white = result.to_mosaic(), result.camera.white_level
-    ends = [(numbers == end).mean() for end in (0, white)]
-    yield f"recorded: {ends[0]:.2%} of the samples at black, {ends[1]:.2%} at white"
+    high = (result.to_mosaic() == result.camera.white_level).mean()
+    low = (result.data <= LOW_CLIP).double().mean()
+    yield f"recorded: {low:.2%} of the samples at black, {high:.2%} at white"
     stops = result.camera.nlf(result.settings.iso).extrapolation
     if stops and not details:  # the plan's details have said so
         where = "above" if stops > 0 else "below"

