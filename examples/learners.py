@@ -55,7 +55,7 @@ from simulator.utils.files import data_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "learners"
 NAMES = ("ppo", "a2c", "dqn", "qrdqn", "sac", "ppo_video", "recurrent_ppo", "drl_ae")
-FRAMES, SEEDS, CHECKPOINTS, EXAM = 16_384, range(5), 10, ("bundled", "test", 32)
+FRAMES, SEEDS, CHECKPOINTS, EXAM = 98_304, range(5), 10, ("bundled", "test", 32)
 STILL = "ae_env/AutoExposure-v0"
 DELAY = {"iso": 1, "exposure_time": 2, "f_number": 2}
 
