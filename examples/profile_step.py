@@ -78,4 +78,7 @@ def main(size=64):
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    sizes = sys.argv[1:]
+    if len(sizes) > 1 or not all(size.isdecimal() and int(size) >= 36 for size in sizes):
+        sys.exit("usage: python examples/profile_step.py [SIZE], 36 or more")
+    main(*map(int, sizes))
