@@ -51,6 +51,7 @@ from simulator.utils.files import RAW_SUFFIXES, printable
 CAMERA = "nikon_z6"
 #: Raws kept in memory: one of 24 megapixels takes 0.1 GB, with its noise reduced twice that.
 _KEPT = 4
+_THREADS = torch.get_num_threads()  # as the process began
 #: Most files that an error names.
 _MOST_NAMED = 8
 #: Largest picture of a whole frame, height and width [packed pixel].
@@ -432,12 +433,11 @@ class ViewedScene:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Torch computes on this thread alone: on busy cores a small picture would wait for another."""
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(_THREADS)
 
 
 def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:

@@ -56,7 +56,7 @@ _LEVELS = 255
 #: A bit more than half of a level.
 _HALF_STEP = np.float32(0.51 / _LEVELS)
 _KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
-_MOST, _TOP = np.float32(LIGHT_LIMIT), np.int64(0)  # of their types, lest they compile twice
+_MOST = np.float32(LIGHT_LIMIT)  # of its type, lest kernels compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
 #: A kind of blur of K frames: a kernel, the scenes (K,), the cost of each, and what it is given.
 Pass = tuple[Any, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]

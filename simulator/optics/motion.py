@@ -37,7 +37,7 @@ from simulator.utils.compute import LANES, add_shifts, kernel, parallel_ranges
 #: Samples from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
 #: Samples that are summed together: they stay in the first-level cache.
-GROUP = 2048
+_GROUP = 2048
 #: Points of a path, per pixel of its length and at most: longer ones are sampled more coarsely.
 _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 #: Points that the length of a path is summed over.
@@ -262,7 +262,7 @@ def _box(current, following, length, out):  # type: ignore[no-untyped-def]
 def _streak(first, last, rows, radius, share, full, limit, out):  # type: ignore[no-untyped-def]
     width = rows.shape[1]
     pitch = width + 2 * radius
-    many = max(1, GROUP // pitch)
+    many = max(1, _GROUP // pitch)
     padded = np.empty((many, pitch), np.float32)
     box = np.zeros((many, pitch), np.float32)  # rows behind one another: one long vector
     current, following = np.zeros(many * pitch, np.float32), np.zeros(many * pitch, np.float32)
