@@ -27,9 +27,9 @@ from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
-from ae_env.scorers.captures import Captures
+from ae_env.scorers.captures import Captures, SceneSharpness
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from ae_env.scorers.terms import CompositeScorer, Sharpness, depends_on
+from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES, FrameSource
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -40,8 +40,6 @@ from simulator.utils.checks import check_seed, check_word
 logger = logging.getLogger(__name__)
 
 Observation = dict[str, np.ndarray]
-#: From so many new captures on, each is scored alone; below, all states of their lights are.
-_MANY = 8
 #: Memory for score tables [byte]: some eight thousand of 64 states.
 TABLES_BYTES = 2**25
 _FIRST = np.array([0])
@@ -88,8 +86,11 @@ class AutoExposure(Task):
         self._known = [n for n, part in torch_parts.items() if depends_on(part) != "image"]
         self._scores = np.zeros((lights, states, len(self._known)))
         self._scored = np.zeros((lights, states), bool)
-        self._light_scores: dict[int, dict[str, np.ndarray]] = {}  # by scene
+        # Of the parts that depend on a scene's light alone; NaN where they are not known.
+        self._of_light = [n for n in self._known if depends_on(torch_parts[n]) == "light"]
+        self._light_scores = np.full((len(episodes.scenes), states, len(self._of_light)), np.nan)
         self._means = np.full((lights, states, 3), np.nan)
+        self._sharpness = SceneSharpness(episodes.scenes, terms.captures)
         self._tables: LruCache[ScoreTable] = LruCache(max(TABLES_BYTES, 128 * count * states))
 
     def forget(self, lights: np.ndarray) -> None:
@@ -212,20 +213,11 @@ class AutoExposure(Task):
         lights = self.episodes.light_index[env_indices]
         states = self.episodes.state[env_indices]
         new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
-        if len(new) >= _MANY:
+        if len(new):
             found = self._scores_of_new(frames, source_noise, new)
             each = np.stack([found[name] for name in self._known], axis=1)
             self._scores[lights[new], states[new]] = each
             self._scored[lights[new], states[new]] = True
-            new = new[:0]
-        # One by one takes longer than all states of a light at once.
-        scenes = self.episodes.scene[env_indices[new]].tolist()
-        for scene, light in zip(scenes, lights[new].tolist(), strict=True):
-            seen = self.episodes.scenes[scene], self._captures.prepared_scene(light)
-            of_blur = self._terms.closed_form_terms(*seen, "blur")
-            found = self._light_scores_of(scene, light) | of_blur
-            self._scores[light] = np.stack([found[name] for name in self._known], axis=1)
-            self._scored[light] = True
         return dict(zip(self._known, self._scores[lights, states].T, strict=True))
 
     def _scores_of_new(
@@ -236,30 +228,20 @@ class AutoExposure(Task):
             described = self._describe(frames, source_noise, new)
             return self._terms.torch_scores(None, described, "light", "blur")
         env_indices = frames.env_indices[new]
-        scenes, states, moves = self._seen(env_indices)
-        owners = (self.episodes.scene[env_indices], self.episodes.light_index[env_indices])
-        each = [*map(self._light_scores_of, *(column.tolist() for column in owners))]
-        pairs = [*zip(each, states.tolist(), strict=True)]
-        found = {name: np.array([of[name][state] for of, state in pairs]) for name in each[0]}
+        episodes, states = self.episodes, self.episodes.state[env_indices]
+        scenes = episodes.scene[env_indices]
+        unknown = np.isnan(self._light_scores[scenes, 0]).any(axis=1)
+        for env_index in env_indices[unknown].tolist():  # without noise the motion is no matter
+            scene, light = episodes.scene.item(env_index), episodes.light_index.item(env_index)
+            shown = episodes.scenes[scene], self._captures.prepared_scene(light)
+            of_light = self._terms.closed_form_terms(*shown, "light")
+            self._light_scores[scene] = np.stack([*of_light.values()], axis=1)
+        found = dict(zip(self._of_light, self._light_scores[scenes, states].T, strict=True))
         if self._terms.only_sharpness:
-            blur, pixel_blur = self._terms.captures.blur_of(scenes, states, **moves)
-            score = Sharpness.of(pixel_blur or blur, scenes[0].light.shape[-2]).numpy()
+            score = self._sharpness.of(scenes, states, **self._moves(env_indices))
             return found | dict.fromkeys(self._terms.only_sharpness, score)
         described = self._describe(frames, source_noise, new)
         return found | self._terms.torch_scores(None, described, "blur")
-
-    def _light_scores_of(self, scene: int, light: int) -> dict[str, np.ndarray]:
-        """Scores (S,) of the parts that depend on a scene's light alone.
-
-        Blur averages the noise of a source, so only scores of light without noise are cached.
-        """
-        found = self._light_scores.get(scene)
-        if found is None:
-            shown, prepared = self.episodes.scenes[scene], self._captures.prepared_scene(light)
-            found = self._terms.closed_form_terms(shown, prepared, "light")
-            if prepared.nlf.is_zero:
-                self._light_scores[scene] = found
-        return found
 
     def _expected_means(
         self, frames: FrameBatch, transitions: FindTransitions, boxes: np.ndarray
@@ -278,29 +260,26 @@ class AutoExposure(Task):
     def _describe(
         self, frames: FrameBatch, source_noise: np.ndarray, part: Any = slice(None)
     ) -> Captures:
-        scenes, states, moves = self._seen(frames.env_indices[part])
+        episodes, env_indices = self.episodes, frames.env_indices[part]
         noises, rows = None, frames.rows
         if source_noise[part].any():
             pairs = source_noise[part].tolist()
             noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
         return self._terms.captures.of(
-            scenes,
-            states,
-            **moves,
+            [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()],
+            episodes.state[env_indices],
+            **self._moves(env_indices),
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],
             source_noise=noises,
         )
 
-    def _seen(self, env_indices: np.ndarray) -> tuple[list[Scene], np.ndarray, dict[str, Any]]:
-        """Scenes, states, and how the scenes move, as `SceneCaptures.blur_of` takes them."""
+    def _moves(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
+        """How the scenes move, as `SceneCaptures.of` takes it."""
         episodes = self.episodes
-        scenes = [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()]
-        moves = {"speed": episodes.speed[env_indices], "defocus": episodes.defocus[env_indices]}
-        movements = None
-        if episodes.subject_speed[env_indices].any():  # else they do not matter
-            movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
-        return scenes, episodes.state[env_indices], moves | {"movements": movements}
+        movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
+        speed, defocus = episodes.speed[env_indices], episodes.defocus[env_indices]
+        return {"speed": speed, "defocus": defocus, "movements": movements}
 
 
 class AutoExposureBase(SpecProperty):

@@ -207,10 +207,13 @@ def source_noises(
 
 
 @kernel()
-def _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur):  # type: ignore[no-untyped-def]
-    """`PixelBlur` of captures; `sorts` are the `Layout.shares` of all, one behind the other.
+def _fill_levels(  # type: ignore[no-untyped-def]
+    height, sorts, first, last, movements, numbers, levels, shares, blur, sharpness
+):
+    """`PixelBlur` of captures, where `levels` and `shares` have memory for it.
 
-    `blur` (B,) become the root mean squares over the pixels.
+    Each has the columns `first` to before `last` of `sorts`, which are `Layout.shares`. `blur`
+    (B,) become the root mean squares over the pixels, `sharpness` the means of `Sharpness`.
     """
     for i in range(len(numbers)):
         speed, time, disc, own = numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3]
@@ -219,16 +222,17 @@ def _fill_levels(height, sorts, ends, movements, numbers, levels, shares, blur):
         x, y = drift * math.cos(angle), drift * math.sin(angle)
         rest = (extent * height) ** 2 + own * own
         apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + own * own
-        squares = 0.0
-        for k in range(ends[i + 1] - ends[i]):
-            sort = ends[i] + k
-            level = min(disc * sorts[0, sort], _WIDEST)  # as in the frame
+        squares = sharp = 0.0
+        for sort in range(first[i], last[i]):
+            circle = min(disc * sorts[0, sort], _WIDEST)  # as in the frame
             moved = apart if sorts[1, sort] > 0.0 and drift > 0.0 else rest
             alike = sorts[0, sort] < 0.0
-            levels[i, k] = numbers[i, 4] if alike else math.sqrt(level * level + moved)
-            shares[i, k] = sorts[2, sort]
-            squares += shares[i, k] * levels[i, k] ** 2
-        blur[i] = math.sqrt(squares)
+            level = numbers[i, 4] if alike else math.sqrt(circle * circle + moved)
+            squares += sorts[2, sort] * level**2
+            sharp += sorts[2, sort] / (1.0 + (level * (64.0 / height)) ** 2)
+            if levels.size:
+                levels[i, sort - first[i]], shares[i, sort - first[i]] = level, sorts[2, sort]
+        blur[i], sharpness[i] = math.sqrt(squares), sharp
 
 
 class SceneCaptures:
@@ -243,7 +247,7 @@ class SceneCaptures:
         self.camera, self.states, self.noisy = camera, list(states), noisy
         self._nlf = camera.nlfs(states)
         numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
-        self._times, self._f_numbers, self._log2_exposures = np.array(numbers).T
+        self._times, self.f_numbers, self._log2_exposures = np.array(numbers).T
         # Which of the different times and f-numbers each state has, (S,).
         which = np.unique(np.array(numbers)[:, :2], axis=0, return_inverse=True)[1]
         self._which = which.reshape(-1)
@@ -286,25 +290,38 @@ class SceneCaptures:
     ) -> tuple[torch.Tensor, PixelBlur | None]:
         """`Captures.blur_px` and `Captures.pixel_blur` alone, of what `of` takes."""
         height = scenes[0].light.shape[-2]
-        times, f_numbers = self._times[states], self._f_numbers[states]
-        discs = defocus * (4.0 / f_numbers) * height / 64.0
         own = np.zeros(len(scenes))
         if any(scene.defocus_map is not None for scene in scenes):
-            own[:] = [c.own_blur(f) for c, f in zip(scenes, f_numbers.tolist(), strict=True)]
+            f_numbers = self.f_numbers[states].tolist()
+            own[:] = [c.own_blur(f) for c, f in zip(scenes, f_numbers, strict=True)]
         moves = np.zeros((len(scenes), 4)) if movements is None else movements
-        blur = np.hypot(np.hypot(speed * times * height, discs), own)  # the others' if own is 0
+        numbers = self.extents(height, states, speed, defocus, own)
+        blur = numbers[:, 4].copy()
         parts = [_ALIKE] * len(scenes)
-        for i in np.flatnonzero((discs != 0.0) | (moves[:, 2] != 0.0)).tolist():
+        for i in np.flatnonzero((numbers[:, 2] != 0.0) | (moves[:, 2] != 0.0)).tolist():
             layout = scenes[i].layout
             parts[i] = _ALIKE if layout is None else layout.shares
         if all(part is _ALIKE for part in parts):
             return torch.from_numpy(blur), None
         ends = np.cumsum([0] + [part.shape[1] for part in parts])
         levels, shares = np.zeros((2, len(scenes), int(np.diff(ends).max())))
-        numbers = np.stack([speed, times, discs, own, blur], axis=1)
-        sorts = np.concatenate(parts, axis=1)
-        _fill_levels(height, sorts, ends, moves, numbers, levels, shares, blur)
+        sorts = np.concatenate(parts, axis=1), ends[:-1], ends[1:]
+        _fill_levels(height, *sorts, moves, numbers, levels, shares, blur, np.empty(len(blur)))
         return torch.from_numpy(blur), PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
+
+    def extents(
+        self,
+        height: int,
+        states: np.ndarray,
+        speed: np.ndarray,
+        defocus: np.ndarray,
+        own: np.ndarray,
+    ) -> np.ndarray:
+        """(B, 5) speed, exposure time, disc, the scene's own blur, and all blur of a pixel."""
+        times = self._times[states]
+        discs = defocus * (4.0 / self.f_numbers[states]) * height / 64.0
+        blur = np.hypot(np.hypot(speed * times * height, discs), own)  # the others' if own is 0
+        return np.stack([speed, times, discs, own, blur], axis=1)
 
     def _captures(
         self,
@@ -383,3 +400,46 @@ class SceneCaptures:
             movements=np.tile(np.array(astuple(prepared.movement)), (len(few), 1)),
         )
         return blur, pixel_blur, torch.from_numpy(alike)
+
+
+class SceneSharpness:
+    """`Sharpness` of captures of many scenes, which become columns when they are first shown."""
+
+    def __init__(self, scenes: Sequence[Scene], captures: SceneCaptures) -> None:
+        self._scenes, self._captures = scenes, captures
+        self._known, self._height = np.zeros(len(scenes), bool), 0
+        self._own = np.zeros((len(scenes), len(captures.states)))
+        # `Layout.shares` of all scenes, one behind the other, and where those of each are.
+        self._sorts, self._ends = _ALIKE, np.zeros((2, len(scenes)), np.int64)
+
+    def of(
+        self,
+        scenes: np.ndarray,
+        states: np.ndarray,
+        speed: np.ndarray,
+        defocus: np.ndarray,
+        movements: np.ndarray,
+    ) -> np.ndarray:
+        """Scores (B,) of scenes (B,), by their indices; for the others see `SceneCaptures.of`."""
+        if not self._known[scenes].all():
+            self._add(np.unique(scenes[~self._known[scenes]]).tolist())
+        own, height = self._own[scenes, states], self._height
+        numbers = self._captures.extents(height, states, speed, defocus, own)
+        apart = (numbers[:, 2] != 0.0) | (movements[:, 2] != 0.0)
+        first, last = np.where(apart, self._ends[:, scenes], [[0], [1]])
+        scores, nothing = np.empty(len(scenes)), np.empty((0, 0))
+        columns = self._sorts, first, last, movements, numbers, nothing, nothing
+        _fill_levels(height, *columns, numbers[:, 4].copy(), scores)
+        return scores
+
+    def _add(self, scenes: list[int]) -> None:
+        layouts = [self._scenes[index].layout for index in scenes]
+        parts = [_ALIKE if layout is None else layout.shares for layout in layouts]
+        ends = self._sorts.shape[1] + np.cumsum([0] + [part.shape[1] for part in parts])
+        self._sorts = np.concatenate([self._sorts, *parts], axis=1)
+        self._ends[:, scenes], self._known[scenes] = (ends[:-1], ends[1:]), True
+        for index in scenes:
+            scene = self._scenes[index]
+            self._height = scene.light.shape[-2]
+            if scene.defocus_map is not None:
+                self._own[index] = [*map(scene.own_blur, self._captures.f_numbers.tolist())]

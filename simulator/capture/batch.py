@@ -47,6 +47,7 @@ _STEPS = (
     *("vignetting", "pixel_response", "noise"),
 )
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
+_BLUR_BITS = np.array([_BIT[name] for name in ("defocus", "motion_blur", "vignetting")])
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -141,7 +142,8 @@ class CaptureBatch:
         self._columns = state_columns(states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
         self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
-        self._targets: dict[int, np.ndarray] = {}  # by box factor, (S, 2, 4)
+        # Noise of captures, (S, 2, 4) for each of the box factors.
+        self._boxes, self._targets = list[int](), np.empty((0, len(states), 2, 4))
         # Scenes as columns; whether their captures are planned in columns, too: where the light has
         # no noise of its own, and no aperture is opened.
         self._scenes: dict[int, PreparedScene] = {}
@@ -162,8 +164,7 @@ class CaptureBatch:
         # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
         self._modules = np.zeros(count, np.int64)
-        # Whether the light must be blurred, else it is the source itself; and whether any ever was.
-        self._blurs, self._any_blurs = np.zeros(count, bool), False
+        self._blurs = np.zeros(count, bool)  # whether it must be, else the light is the source
         self._blurred = np.zeros(count, np.uintp)  # its place
         # Light (4, H, W) that it starts from; of captures that are not planned in columns,
         # `Exposure.remaining_variance` and the exposure.
@@ -194,20 +195,18 @@ class CaptureBatch:
         stale = self._gain[rows] != gains
         if stale.any():
             self._plan(indices[stale], rows[stale], gains[stale])
-        if self._any_blurs:
-            missing = self._blurs[rows] & (self._blurred_row[indices] != rows)
-            if missing.any():
-                self._blur_frames(np.unique(rows[missing]))
+        missing = self._blurs[rows] & (self._blurred_row[indices] != rows)
+        if missing.any():
+            self._blur_frames(np.unique(rows[missing]))
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
         rows, remaining = indices * len(self.states) + states, None
         if self._any_remaining:  # else all of the source's variance remains
             remaining = self._remaining_variance[rows]
-        sources = self._source[rows]
-        places = self._frames.places(sources)
-        if self._any_blurs:
-            places = np.where(self._blurs[rows], self._blurred[rows], places)
+        places, plain = self._blurred[rows], np.flatnonzero(~self._blurs[rows])
+        if len(plain):
+            places[plain] = self._frames.places(self._source[rows[plain]])
         found = Transitions(self._frames.at(places), self._table[rows], remaining)
         if not self.camera.prnu or self.noise is None:
             return found
@@ -286,12 +285,14 @@ class CaptureBatch:
         scene = self.prepared_scene(index)
         self._light[index] = scene.light.contiguous()
         box = scene.box_factor
-        if box not in self._targets:
-            self._targets[box] = noise_columns(self.camera, self.states, box)
+        if box not in self._boxes:
+            self._boxes.append(box)
+            own = noise_columns(self.camera, self.states, box)[None]
+            self._targets = np.concatenate([self._targets, own])
         self._vignetting[index] = vignetting_column(scene, self.states)
         self._in_columns[index] = fits_columns(scene, self._columns)
         if self._in_columns[index]:
-            self._scene_columns[index] = scene_column(scene, list(self._targets).index(box))
+            self._scene_columns[index] = scene_column(scene, self._boxes.index(box))
             self._statistics[index] = statistics_column(scene)
             self._widest[index] = widest_defocus(scene, self._columns)
             self._subjects[index] = subject_column(scene)
@@ -311,19 +312,16 @@ class CaptureBatch:
             self._source[planned] = self._light[indices[inside]]
             columns = self._blur, self._table, self._predicted_error
             known = self._scene_columns, self._statistics, self._columns
-            targets, height = np.stack([*self._targets.values()]), self._light[indices[0]].shape[-2]
-            plan_frames(*known, targets, height, indices[inside], planned, gains[inside], *columns)
+            height, own = self._light[indices[0]].shape[-2], indices[inside]
+            plan_frames(*known, self._targets, height, own, planned, gains[inside], *columns)
             blur = self._blur[planned]
             darkened = self._vignetting[indices[inside], planned % len(self.states)]
             self._blur["vignetting"][planned] = darkened
-            runs = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0, darkened > 0
-            bits = (_BIT[name] for name in ("defocus", "motion_blur", "vignetting"))
-            found = sum(bit * own for bit, own in zip(bits, runs, strict=True))
-            own = _BIT["noise"] + bool(self.camera.prnu) * _BIT["pixel_response"]
-            self._modules[planned] = found + (self.noise is not None) * own
-            self._blurs[planned] = np.logical_or.reduce(runs)
+            runs = np.array([blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0, darkened > 0])
+            added = _BIT["noise"] + bool(self.camera.prnu) * _BIT["pixel_response"]
+            self._modules[planned] = _BLUR_BITS @ runs + (self.noise is not None) * added
+            self._blurs[planned] = runs.any(axis=0)
             self._excess_variance[planned] = 0.0
-        self._any_blurs |= bool(self._blurs[rows].any())
         self._gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
 

@@ -229,7 +229,7 @@ class BlurredFrames:
         lacking = count - len(self._free)
         if lacking > 0:
             self._give_back(self._more(lacking))
-        taken, self._free = np.split(self._free, [count])
+        taken, self._free = self._free[:count], self._free[count:]
         return taken
 
     def _give_back(self, places: np.ndarray) -> None:
@@ -385,24 +385,27 @@ def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
     if not passes:
         return
     threads, parts = torch.get_num_threads(), 1
-    different, owner = np.unique(np.concatenate([p[1] for p in passes]), return_inverse=True)
+    owner = np.concatenate([p[1] for p in passes])
+    cost = np.bincount(owner, np.concatenate([p[2] for p in passes]))
+    different = np.flatnonzero(cost)
     if len(different) < 2 * threads:
         if len(passes) > 1:
             for one in passes:
                 _run([one], shape)
             return
-        owner, count = np.arange(len(owner)), len(owner)
+        owner = different = np.arange(count := len(owner))
+        cost = passes[0][2]
         if count < 2 * threads and math.prod(shape) >= _LARGE:
             parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
         threads = min(threads, count * parts)
-    cost = np.bincount(owner, np.concatenate([p[2] for p in passes]))
-    order = np.argsort(-cost, kind="stable")
-    costs, place = np.repeat(cost[order], parts), np.argsort(order)
+    order = different[np.argsort(-cost[different], kind="stable")]
+    costs, place = np.repeat(cost[order], parts), np.empty(len(cost), np.int64)
+    place[order] = np.arange(len(order))
     # A unit belongs to the thread in whose share of the cost its middle is.
     share = ((costs.cumsum() - 0.5 * costs) * (threads / costs.sum())).reshape(-1, parts)
     work = []
     for task, scenes, _, columns in passes:
-        at, owner = np.split(owner, [len(scenes)])
+        at, owner = owner[: len(scenes)], owner[len(scenes) :]
         own = np.argsort(place[at], kind="stable")
         ends = np.searchsorted(share[place[at[own]]].ravel(), np.arange(threads + 1)).tolist()
         work.append((task, ends, (own, parts, *shape, *columns)))

@@ -148,9 +148,18 @@ def noise_bank() -> np.ndarray:
 
 def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
     """(B, count) float64: `count` standard normals for each key, apart from its frame's noise."""
-    words = mixed((keys[:, None] ^ _SINGLES) + KEY_STEP * np.arange(1, count + 1, dtype=np.uint64))
-    values = noise_bank()[words & np.uint64(BANK_SIZE - 1)].astype(np.float64)
-    return np.where(words >> np.uint64(63), -values, values)
+    found = np.empty((len(keys), count))
+    _look_up(keys, noise_bank(), found)
+    return found
+
+
+@kernel()
+def _look_up(keys, bank, found):  # type: ignore[no-untyped-def]
+    for i in range(len(keys)):
+        for number in range(found.shape[1]):
+            word = mixed_word((keys[i] ^ _SINGLES) + KEY_STEP * np.uint64(number + 1))
+            value = bank[word & np.uint64(BANK_SIZE - 1)]
+            found[i, number] = -value if word >> np.uint64(63) else value
 
 
 def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
@@ -353,12 +362,13 @@ def record(
         transitions = transitions.in_bands(row_gain)
     transitions = transitions.before_rounding(camera)
     given = {"signals": signals, "codes": codes, "numbers": numbers}
-    outputs = {name: torch.as_tensor(out) for name, out in given.items() if out is not None}
+    outputs: dict[str, Any] = {name: out for name, out in given.items() if out is not None}
     stepwise = isinstance(transitions.light, torch.Tensor) or not transitions.light[0].is_cpu
     if stepwise or (read_noise is not None and keys is not None):
         kind: Noise = "exact" if noise == "sensor" else noise
-        return record_stepwise(transitions, camera, keys, kind, outputs, read_noise, count=count)
-    arrays = {name: out.numpy() for name, out in outputs.items()}
+        tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
+        return record_stepwise(transitions, camera, keys, kind, tensors, read_noise, count=count)
+    arrays = {name: np.asarray(out) for name, out in outputs.items()}
     return _record_fused(transitions, camera, keys, noise, arrays, count)
 
 
