@@ -27,7 +27,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
-from ae_env.scorers.captures import Captures, SceneSharpness
+from ae_env.scorers.captures import Captures, SceneBlur
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
@@ -90,7 +90,7 @@ class AutoExposure(Task):
         self._of_light = [n for n in self._known if depends_on(torch_parts[n]) == "light"]
         self._light_scores = np.full((len(episodes.scenes), states, len(self._of_light)), np.nan)
         self._means = np.full((lights, states, 3), np.nan)
-        self._sharpness = SceneSharpness(episodes.scenes, terms.captures)
+        self._blur = SceneBlur(episodes.scenes, terms.captures)
         self._tables: LruCache[ScoreTable] = LruCache(max(TABLES_BYTES, 128 * count * states))
 
     def forget(self, lights: np.ndarray) -> None:
@@ -209,9 +209,8 @@ class AutoExposure(Task):
 
     def _known_scores(self, frames: FrameBatch, source_noise: np.ndarray) -> dict[str, np.ndarray]:
         """Scores in static light of the parts that look at no frame, cached."""
-        env_indices = frames.env_indices
-        lights = self.episodes.light_index[env_indices]
-        states = self.episodes.state[env_indices]
+        episodes, env_indices = self.episodes, frames.env_indices
+        lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
         new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
         if len(new):
             found = self._scores_of_new(frames, source_noise, new)
@@ -227,9 +226,8 @@ class AutoExposure(Task):
         if source_noise[new].any():  # blur averages it
             described = self._describe(frames, source_noise, new)
             return self._terms.torch_scores(None, described, "light", "blur")
-        env_indices = frames.env_indices[new]
-        episodes, states = self.episodes, self.episodes.state[env_indices]
-        scenes = episodes.scene[env_indices]
+        episodes, env_indices = self.episodes, frames.env_indices[new]
+        scenes, states = episodes.scene[env_indices], episodes.state[env_indices]
         unknown = np.isnan(self._light_scores[scenes, 0]).any(axis=1)
         for env_index in env_indices[unknown].tolist():  # without noise the motion is no matter
             scene, light = episodes.scene.item(env_index), episodes.light_index.item(env_index)
@@ -238,8 +236,8 @@ class AutoExposure(Task):
             self._light_scores[scene] = np.stack([*of_light.values()], axis=1)
         found = dict(zip(self._of_light, self._light_scores[scenes, states].T, strict=True))
         if self._terms.only_sharpness:
-            score = self._sharpness.of(scenes, states, **self._moves(env_indices))
-            return found | dict.fromkeys(self._terms.only_sharpness, score)
+            *_, scores = self._blur.of(scenes, states, **self._moves(env_indices))
+            return found | dict.fromkeys(self._terms.only_sharpness, scores)
         described = self._describe(frames, source_noise, new)
         return found | self._terms.torch_scores(None, described, "blur")
 
@@ -274,7 +272,7 @@ class AutoExposure(Task):
             source_noise=noises,
         )
 
-    def _moves(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
+    def _moves(self, env_indices: np.ndarray) -> dict[str, Any]:
         """How the scenes move, as `SceneCaptures.of` takes it."""
         episodes = self.episodes
         movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)

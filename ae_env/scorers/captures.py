@@ -247,10 +247,7 @@ class SceneCaptures:
         self.camera, self.states, self.noisy = camera, list(states), noisy
         self._nlf = camera.nlfs(states)
         numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
-        self._times, self.f_numbers, self._log2_exposures = np.array(numbers).T
-        # Which of the different times and f-numbers each state has, (S,).
-        which = np.unique(np.array(numbers)[:, :2], axis=0, return_inverse=True)[1]
-        self._which = which.reshape(-1)
+        self.times, self.f_numbers, self._log2_exposures = np.array(numbers).T
 
     def of(
         self,
@@ -276,52 +273,10 @@ class SceneCaptures:
             source_noise: See `Captures`.
         """
         states = np.arange(len(self.states)) if states is None else states
-        blur = self.blur_of(scenes, states, speed=speed, defocus=defocus, movements=movements)
-        return self._captures(scenes, states, gain, row_gain, source_noise, *blur)
-
-    def blur_of(
-        self,
-        scenes: Sequence[Scene],
-        states: np.ndarray,
-        *,
-        speed: np.ndarray,
-        defocus: np.ndarray,
-        movements: np.ndarray | None,
-    ) -> tuple[torch.Tensor, PixelBlur | None]:
-        """`Captures.blur_px` and `Captures.pixel_blur` alone, of what `of` takes."""
-        height = scenes[0].light.shape[-2]
-        own = np.zeros(len(scenes))
-        if any(scene.defocus_map is not None for scene in scenes):
-            f_numbers = self.f_numbers[states].tolist()
-            own[:] = [c.own_blur(f) for c, f in zip(scenes, f_numbers, strict=True)]
-        moves = np.zeros((len(scenes), 4)) if movements is None else movements
-        numbers = self.extents(height, states, speed, defocus, own)
-        blur = numbers[:, 4].copy()
-        parts = [_ALIKE] * len(scenes)
-        for i in np.flatnonzero((numbers[:, 2] != 0.0) | (moves[:, 2] != 0.0)).tolist():
-            layout = scenes[i].layout
-            parts[i] = _ALIKE if layout is None else layout.shares
-        if all(part is _ALIKE for part in parts):
-            return torch.from_numpy(blur), None
-        ends = np.cumsum([0] + [part.shape[1] for part in parts])
-        levels, shares = np.zeros((2, len(scenes), int(np.diff(ends).max())))
-        sorts = np.concatenate(parts, axis=1), ends[:-1], ends[1:]
-        _fill_levels(height, *sorts, moves, numbers, levels, shares, blur, np.empty(len(blur)))
-        return torch.from_numpy(blur), PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
-
-    def extents(
-        self,
-        height: int,
-        states: np.ndarray,
-        speed: np.ndarray,
-        defocus: np.ndarray,
-        own: np.ndarray,
-    ) -> np.ndarray:
-        """(B, 5) speed, exposure time, disc, the scene's own blur, and all blur of a pixel."""
-        times = self._times[states]
-        discs = defocus * (4.0 / self.f_numbers[states]) * height / 64.0
-        blur = np.hypot(np.hypot(speed * times * height, discs), own)  # the others' if own is 0
-        return np.stack([speed, times, discs, own, blur], axis=1)
+        movements = np.zeros((len(scenes), 4)) if movements is None else movements
+        moves = states, speed, defocus, movements
+        found = SceneBlur(scenes, self).of(np.arange(len(scenes)), *moves, pixels=True)
+        return self._captures(scenes, states, gain, row_gain, source_noise, *found[:2])
 
     def _captures(
         self,
@@ -371,45 +326,35 @@ class SceneCaptures:
         For `gain` and `row_gain` see `ScoreTables.table`.
         """
         states = np.arange(len(self.states))[part]
-        blur, pixel_blur, alike = self.blur(scene, prepared, part)
-        if pixel_blur is not None:
-            pixel_blur = PixelBlur(*(values[alike] for values in pixel_blur))
+        blur, pixel_blur, _ = self.blur(scene, prepared, states)
         gains = np.broadcast_to(gain, len(self.states))[part]
         noise = source_noises(prepared, self.states[part], gains)
         rows = None if row_gain is None else row_gain[part]
         scenes = [scene] * len(states)
-        return self._captures(scenes, states, gains, rows, noise, blur[alike], pixel_blur)
+        return self._captures(scenes, states, gains, rows, noise, blur, pixel_blur)
 
     def blur(
-        self, scene: Scene, prepared: PreparedScene, part: slice = slice(None)
-    ) -> tuple[torch.Tensor, PixelBlur | None, torch.Tensor]:
-        """The blur that there is, of few states: the ISO blurs nothing. See `describe`.
-
-        Returns:
-            `Captures.blur_px` (K,) and `Captures.pixel_blur`; and (S,) int64, which of the K each
-            state has.
-        """
-        _, few, alike = np.unique(self._which[part], return_index=True, return_inverse=True)
+        self, scene: Scene, prepared: PreparedScene, states: np.ndarray
+    ) -> tuple[torch.Tensor, PixelBlur | None, np.ndarray]:
+        """`SceneBlur.of` captures at `states` (B,); see `describe`."""
         # In steps of a 64-pixel frame, as episodes state it: to the bit as in `of`.
         defocus = prepared.defocus * 64.0 / scene.light.shape[-2]
-        blur, pixel_blur = self.blur_of(
-            [scene] * len(few),
-            np.arange(len(self.states))[part][few],
-            speed=np.full(len(few), prepared.image_speed),
-            defocus=np.full(len(few), defocus),
-            movements=np.tile(np.array(astuple(prepared.movement)), (len(few), 1)),
-        )
-        return blur, pixel_blur, torch.from_numpy(alike)
+        one = np.zeros(len(states), np.int64)
+        moves = one + prepared.image_speed, one + defocus
+        movements = np.tile(np.array(astuple(prepared.movement)), (len(states), 1))
+        return SceneBlur([scene], self).of(one, states, *moves, movements, pixels=True)
 
 
-class SceneSharpness:
-    """`Sharpness` of captures of many scenes, which become columns when they are first shown."""
+class SceneBlur:
+    """Blur of captures of many scenes; what it takes of a scene becomes columns when it is shown.
+
+    `captures` are those of the states.
+    """
 
     def __init__(self, scenes: Sequence[Scene], captures: SceneCaptures) -> None:
         self._scenes, self._captures = scenes, captures
-        self._known, self._height = np.zeros(len(scenes), bool), 0
-        self._own = np.zeros((len(scenes), len(captures.states)))
-        # `Layout.shares` of all scenes, one behind the other, and where those of each are.
+        self._own = np.full((len(scenes), len(captures.states)), np.nan)  # of the scenes' own maps
+        # `Layout.shares` of scenes, one behind the other, and where those of each are.
         self._sorts, self._ends = _ALIKE, np.zeros((2, len(scenes)), np.int64)
 
     def of(
@@ -419,27 +364,40 @@ class SceneSharpness:
         speed: np.ndarray,
         defocus: np.ndarray,
         movements: np.ndarray,
-    ) -> np.ndarray:
-        """Scores (B,) of scenes (B,), by their indices; for the others see `SceneCaptures.of`."""
-        if not self._known[scenes].all():
-            self._add(np.unique(scenes[~self._known[scenes]]).tolist())
-        own, height = self._own[scenes, states], self._height
-        numbers = self._captures.extents(height, states, speed, defocus, own)
-        apart = (numbers[:, 2] != 0.0) | (movements[:, 2] != 0.0)
+        *,
+        pixels: bool = False,
+    ) -> tuple[torch.Tensor, PixelBlur | None, np.ndarray]:
+        """Blur of captures of `scenes` (B,), by their indices; see `SceneCaptures.of`.
+
+        Returns:
+            `Captures.blur_px`; `Captures.pixel_blur`, None unless asked for by `pixels`; and the
+            scores (B,) of `Sharpness`.
+        """
+        times, f_numbers = self._captures.times[states], self._captures.f_numbers[states]
+        height = self._scenes[scenes.item(0)].light.shape[-2]
+        own = self._own[scenes, states]
+        if (new := np.isnan(own)).any():
+            for i in np.flatnonzero(new).tolist():
+                own[i] = self._scenes[scenes.item(i)].own_blur(f_numbers.item(i))
+            self._own[scenes, states] = own
+        discs = defocus * (4.0 / f_numbers) * height / 64.0
+        blur = np.hypot(np.hypot(speed * times * height, discs), own)  # the others' if own is 0
+        apart = (discs != 0.0) | (movements[:, 2] != 0.0)
+        new = apart & (self._ends[1, scenes] == 0)
+        if new.any():
+            self._add(np.unique(scenes[new]).tolist())
         first, last = np.where(apart, self._ends[:, scenes], [[0], [1]])
-        scores, nothing = np.empty(len(scenes)), np.empty((0, 0))
-        columns = self._sorts, first, last, movements, numbers, nothing, nothing
-        _fill_levels(height, *columns, numbers[:, 4].copy(), scores)
-        return scores
+        count = len(scenes) if pixels and first.any() else 0
+        levels, shares = np.zeros((2, count, (last - first).max()))
+        numbers, scores = np.stack([speed, times, discs, own, blur], axis=1), np.empty(len(scenes))
+        columns = self._sorts, first, last, movements, numbers
+        _fill_levels(height, *columns, levels, shares, blur, scores)
+        pixel_blur = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
+        return torch.from_numpy(blur), pixel_blur if count else None, scores
 
     def _add(self, scenes: list[int]) -> None:
         layouts = [self._scenes[index].layout for index in scenes]
         parts = [_ALIKE if layout is None else layout.shares for layout in layouts]
         ends = self._sorts.shape[1] + np.cumsum([0] + [part.shape[1] for part in parts])
+        self._ends[:, scenes] = ends[:-1], ends[1:]
         self._sorts = np.concatenate([self._sorts, *parts], axis=1)
-        self._ends[:, scenes], self._known[scenes] = (ends[:-1], ends[1:]), True
-        for index in scenes:
-            scene = self._scenes[index]
-            self._height = scene.light.shape[-2]
-            if scene.defocus_map is not None:
-                self._own[index] = [*map(scene.own_blur, self._captures.f_numbers.tolist())]

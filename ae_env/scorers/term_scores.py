@@ -129,10 +129,9 @@ class TermScores:
         names = [] if self.torch_terms is None else self.torch_terms.names(*kinds)
         if self.torch_terms is None or not names:
             return {}
-        if names == self.only_sharpness:  # few states differ in blur
-            blur, pixel_blur, alike = self.captures.blur(scene, prepared)
-            score = Sharpness.of(pixel_blur or blur, scene.light.shape[-2])[alike].numpy()
-            return dict.fromkeys(names, score)
+        if names == self.only_sharpness:
+            *_, scores = self.captures.blur(scene, prepared, np.arange(len(self.states)))
+            return dict.fromkeys(names, scores)
         terms, chunks = [self.torch_terms.parts[name] for name in names], []
         for part in slices(len(self.states), CHUNK if any(map(reads_pixels, terms)) else None):
             captures = self.captures.describe(scene, prepared, part, gain, row_gain)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from ae_env.observation import decode_observation, encode_observation
-from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, PixelBlur, Scorer
+from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, Scorer
 from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop
 from simulator.utils.checks import as_float
@@ -346,17 +346,11 @@ class Sharpness:
     reads_pixels = False
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        blur = captures.blur_px if captures.pixel_blur is None else captures.pixel_blur
-        return self.of(blur, captures.frame_height)
-
-    @staticmethod
-    def of(blur: torch.Tensor | PixelBlur, frame_height: int) -> torch.Tensor:
-        """Scores (B,) of extents (B,), or of those of the pixels, in frames so high."""
-        scale = 64.0 / frame_height
-        if isinstance(blur, PixelBlur):
-            # In order: the rows of a larger batch are longer.
-            return (blur.shares / (1.0 + (blur.levels * scale) ** 2)).cumsum(dim=1)[:, -1]
-        return 1.0 / (1.0 + (blur * scale) ** 2)
+        scale, spread = 64.0 / captures.frame_height, captures.pixel_blur
+        if spread is None:
+            return 1.0 / (1.0 + (captures.blur_px * scale) ** 2)
+        # In order: the rows of a larger batch are longer.
+        return (spread.shares / (1.0 + (spread.levels * scale) ** 2)).cumsum(dim=1)[:, -1]
 
 
 class Balanced(CompositeScorer):

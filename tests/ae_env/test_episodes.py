@@ -22,7 +22,7 @@ from simulator.capture.sensor import clip_and_quantise, exposed_light, frame_nor
 from simulator.noise.noise_level_function import ReadNoise
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from tests.ae_env.environments import assert_equal, assert_same, check_parity, make_env, make_envs
+from tests.ae_env.environments import assert_equal, check_parity, make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
 
@@ -253,6 +253,13 @@ def test_parity_with_sync_vector_env(mode, extra):
     check_parity(11, 9, mode, max_episode_steps=3, **extra)
 
 
+def test_rewards_do_not_depend_on_how_many_there_are() -> None:
+    one, many = make_env(), make_envs(40)
+    many.reset(seed=0)
+    alone = [(one.reset(seed=i), one.step(i)[1])[1] for i in range(40)]
+    np.testing.assert_array_equal(many.step(np.arange(40))[1], alone)
+
+
 def test_delayed_settings_meet_the_light_of_their_frame() -> None:
     """The light of a frame does not wait; `info` and the score are of the settings in force."""
     extra = {"lighting": "sine", "motion": "none", "depth": "far", "max_episode_steps": None}
@@ -267,7 +274,7 @@ def test_delayed_settings_meet_the_light_of_their_frame() -> None:
         np.testing.assert_array_equal(mine[4]["state"], in_force[frame])
         times = [delayed.unwrapped.grid[s].exposure_time for s in in_force[frame]]
         np.testing.assert_array_equal(mine[4]["exposure_time"], times)
-        assert_same(mine, theirs, f"frame {frame}")
+        assert_equal(mine, theirs, f"frame {frame}", rtol=1e-15)
 
 
 def test_modes_are_those_of_gymnasiums_enum_and_frames_become_tensors() -> None:

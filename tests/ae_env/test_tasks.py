@@ -22,7 +22,7 @@ from simulator.camera import get_camera
 from simulator.capture.blurred_frames import Layout
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.radiance.light import WHITE_SIGNAL
-from tests.ae_env.environments import SMALL, assert_same, check_parity, make_env, make_envs
+from tests.ae_env.environments import SMALL, assert_equal, check_parity, make_env, make_envs
 from tests.ae_env.scorer_images import make_scene
 from tests.strategies import log_uniform
 
@@ -224,9 +224,9 @@ def test_it_is_the_other_environment_with_its_defaults():
     """The same frames as `AutoExposure-v0` with these arguments; 96 steps; defaults may change."""
     video = gym.make_vec(VIDEO_ID, num_envs=3, **SMALL)
     plain = make_envs(3, max_episode_steps=96, **VIDEO)
-    assert_same(video.reset(seed=5), plain.reset(seed=5))
+    assert_equal(video.reset(seed=5), plain.reset(seed=5))
     for action in (7, 40, 63):
-        assert_same(video.step(np.full(3, action)), plain.step(np.full(3, action)))
+        assert_equal(video.step(np.full(3, action)), plain.step(np.full(3, action)))
     assert video.unwrapped.max_episode_steps == gym.spec(VIDEO_ID).max_episode_steps == 96
     for kind in (ae_env.AutoExposureVideoEnv, ae_env.AutoExposureVideoVectorEnv):
         shown = inspect.signature(kind).parameters
