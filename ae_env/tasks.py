@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from scipy import ndimage
 
 from ae_env.env import AutoExposureBase, AutoExposureEnv
 from ae_env.episodes.core import FrameBatch, Task
@@ -330,9 +329,10 @@ def move_subject(scene: Scene, rows: int, columns: int) -> Scene:
     layout = scene.layout
     if layout is None or layout.subject is None:
         return scene
+    most, behind = np.array(layout.subject.shape), layout.behind.flatten()
+    rows, columns = np.clip((rows, columns), -most, most).tolist()
     # Nothing of the subject enters from beyond the border.
-    mask = ndimage.shift(layout.subject.float().numpy(), (rows, columns), order=0)
-    subject, behind = torch.from_numpy(mask > 0.0), layout.behind.flatten()
+    subject = torch.nn.functional.pad(layout.subject, (columns, -columns, rows, -rows))
 
     def moved(planes: torch.Tensor) -> torch.Tensor:
         background = planes.flatten(1)[:, behind].reshape(planes.shape)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
@@ -17,7 +16,7 @@ from ae_env.options import RANDOM_LENS, EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
-from simulator.capture.sensor import noise_keys
+from simulator.capture.sensor import noise_keys, normals_above
 from simulator.optics.motion import Movement
 from simulator.optics.vignetting import RANDOM_LENSES, Vignetting, random_lens
 from simulator.utils.checks import check_integer, check_key, did_you_mean
@@ -198,7 +197,7 @@ class Episodes:
         state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
         for i, one in enumerate(chosen):
             state[i] = one.get("state", state[i])
-        discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
+        discs = np.exp(DEFOCUS_SIGMA * normals_above(defocus)) * DEFOCUS_MEDIAN
         discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
         discs = _fixed_or_drawn(self.options.depth, discs)
         own_blur = self._own_blur[scene] * 64.0 / self.options.resolution
@@ -209,13 +208,13 @@ class Episodes:
         if self.options.motion != "random":  # one speed of the whole image
             subject_moves = np.zeros(len(scene), bool)
         median = self._median_speed[scene]
-        shake, subject = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
+        shake, subject = (np.exp(SPEED_SIGMA * normals_above(u)) for u in (speed, subject_speed))
         return {
             "scene": self._shown_at(scene, frame),
             "state": state,
             "speed": _fixed_or_drawn(self.options.motion, shakes * shake * median),
             "direction": 2.0 * math.pi * direction,
-            "turn": TURN_SIGMA * ndtri(turn),
+            "turn": TURN_SIGMA * normals_above(turn),
             "subject_speed": subject_moves * subject * median,
             "subject_direction": 2.0 * math.pi * subject_direction,
             "defocus": discs,

@@ -7,8 +7,9 @@ for the subject. One that was just drawn is rounded alike, so that a cached run 
 from __future__ import annotations
 
 import logging
+import math
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -99,7 +100,7 @@ def bundled_scenes(
     key_of_all = cache_key("scenes", key)
     found = _stored(key_of_all, request.camera, request.resolution)
     if found is not None:
-        return SceneSet(found)
+        return found
     kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
     groups = list(_groups(request, size, kinds))
     return DrawnScenes(f"the bundled scenes ({request.split})", groups, key_of_all)
@@ -116,10 +117,11 @@ class DrawnScenes(SceneSet):
     """Scenes whose names are known, and each of which is drawn when it is first needed.
 
     The first is drawn at once, so that what cannot be drawn is an error here. When the last one is
-    there, all are stored under `key` for the next process. A pickled copy has all of them.
+    there, all are stored under `key` for the next process; without one they are stored already. A
+    pickled copy has all of them.
     """
 
-    def __init__(self, name: str, groups: Sequence[SceneGroup], key: str) -> None:
+    def __init__(self, name: str, groups: Sequence[SceneGroup], key: str = "") -> None:
         self._name, self._groups, self._key = name, groups, key
         self.scene_ids = tuple(one for group in groups for one in group.scene_ids)
         self._scenes = [None] * len(self.scene_ids)
@@ -137,7 +139,7 @@ class DrawnScenes(SceneSet):
         missing = sorted({int(self._group_of[i]) for i in indices if self._scenes[i] is None})
         if not missing:
             return
-        many = len(missing) >= _MANY
+        many = len(missing) >= _MANY and bool(self._key)
         if many:
             logger.log(NOTE, "drawing %s, once for this camera and resolution", self._name)
         with progress_bar("drawing scenes", len(missing) if many else 0) as advance:
@@ -151,7 +153,7 @@ class DrawnScenes(SceneSet):
 
             parallel_ranges(draw_some, len(missing))
         whole = [scene for scene in self._scenes if scene is not None]
-        if len(whole) == len(self):  # which happens once: later calls have none missing
+        if self._key and len(whole) == len(self):  # once: later calls have none missing
             _store(self._key, whole)
 
 
@@ -210,7 +212,7 @@ def add_layout(scene: Scene) -> Scene:
 
 def cached_scenes(
     key: str, make: Callable[[], Iterable[Scene]], camera: CameraProfile, resolution: int | None
-) -> list[Scene]:
+) -> SceneSet:
     """Scenes without noise of `camera`, from the cache where they have been made before.
 
     `key` is of all that they depend on; `make` makes them, all of one size, all with a layout or
@@ -218,7 +220,7 @@ def cached_scenes(
     """
     found = _stored(key, camera, resolution)
     if found is None:
-        found = [_rounded(scene) for scene in make()]
+        found = SceneSet(_rounded(scene) for scene in make())
         _store(key, found)
     return found
 
@@ -250,27 +252,30 @@ def _store(key: str, scenes: Sequence[Scene]) -> None:
     disk_cache().put(key, values | ({"layouts": torch.stack(layouts)} if layouts else {}))
 
 
-def _stored(key: str, camera: CameraProfile, resolution: int | None) -> list[Scene] | None:
+def _stored(key: str, camera: CameraProfile, resolution: int | None) -> SceneSet | None:
     """The scenes in the cache; None if there are none, or they cannot be those asked for."""
     values = disk_cache().get(key)
     if values is None:
         return None
+    side = NATIVE_SIZE if resolution is None else resolution
     try:
-        facts, light = values["facts"], values["light"]
-        side = NATIVE_SIZE if resolution is None else resolution
-        if light.shape != (len(facts), 4, side, side):
-            raise ValueError(f"{len(facts)} scenes of {side} x {side} have light {light.shape}")
-        stored = values.get("layouts")
-        layouts = [None] * len(facts) if stored is None else map(_from_bytes, stored)
-        return [
-            Scene.from_array(
-                own.float(), CameraSettings(*row.pop("reference")), camera, layout=layout, **row
-            )
-            for row, own, layout in zip(facts, light, layouts, strict=True)
-        ]
+        ids, light = [row["scene_id"] for row in values["facts"]], values["light"]
+        if light.shape != (len(ids), 4, side, side) or not light.amax() < math.inf:
+            raise ValueError(f"light of {side} x {side} has the shape {light.shape}, or NaN")
+        draw = partial(_unpacked, values, camera)
+        return DrawnScenes("", [SceneGroup([one], partial(draw, i)) for i, one in enumerate(ids)])
     except (ValueError, KeyError, TypeError) as error:
         logger.warning("the cached scenes are damaged (%s) and are made again", error)
         return None
+
+
+def _unpacked(values: Mapping[str, Any], camera: CameraProfile, index: int) -> list[Scene]:
+    """A scene as it was stored."""
+    facts, light = dict(values["facts"][index]), values["light"][index].float()
+    used = CameraSettings(*facts.pop("reference"))
+    if "layouts" in values:
+        facts["layout"] = _from_bytes(values["layouts"][index])
+    return [Scene.from_array(light, used, camera, **facts)]
 
 
 # -- photographs whose depth was measured ---------------------------------------------------------

@@ -151,7 +151,7 @@ def split_assets(name: str, split: str, places: int | None = None) -> list[Asset
 
 def polyhaven_scenes(
     request: SceneRequest, *, views: int = VIEWS, seed: int = 0, assets: list[Asset] | None = None
-) -> list[Scene]:
+) -> Sequence[Scene]:
     """Views into the panoramas of a split, `views` of each map, one map after the other.
 
     `seed` is of the views' directions, their fields of view and the level of the light; `assets`

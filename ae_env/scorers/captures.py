@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -274,36 +274,24 @@ class SceneCaptures:
         """
         states = np.arange(len(self.states)) if states is None else states
         movements = np.zeros((len(scenes), 4)) if movements is None else movements
+        # Some are shown often.
+        _, first, which = np.unique([*map(id, scenes)], return_index=True, return_inverse=True)
+        few = [scenes[i] for i in first]
         moves = states, speed, defocus, movements
-        found = SceneBlur(scenes, self).of(np.arange(len(scenes)), *moves, pixels=True)
-        return self._captures(scenes, states, gain, row_gain, source_noise, *found[:2])
-
-    def _captures(
-        self,
-        scenes: Sequence[Scene],
-        states: np.ndarray,
-        gain: np.ndarray,
-        row_gain: np.ndarray | None,
-        source_noise: Sequence[NoiseLevelFunction] | None,
-        blur_px: torch.Tensor,
-        pixel_blur: PixelBlur | None,
-    ) -> Captures:
-        """The last four are those of `Captures`."""
-        few = {id(scene): scene for scene in scenes}  # an environment shows some of them often
-        facts = {key: (c.reference.log2_exposure, c.ev100) for key, c in few.items()}
-        references, ev100s = np.array([facts[id(scene)] for scene in scenes]).T
-        ratios = [2.0**stops for stops in (self._log2_exposures[states] - references).tolist()]
-        indices, right = states.tolist(), {k: c.incident_light.right_ev100 for k, c in few.items()}
-        most, likely = max(map(len, right.values()), default=1), None
+        blur_px, pixel_blur, _ = SceneBlur(few, self).of(which, *moves, pixels=True)
+        facts = np.array([(c.reference.log2_exposure, c.ev100) for c in few])[which].T
+        ratios = [2.0**stops for stops in (self._log2_exposures[states] - facts[0]).tolist()]
+        right, indices = [c.incident_light.right_ev100 for c in few], states.tolist()
+        most, likely = max(map(len, right)), None
         if most > 1:
-            each = np.stack([np.broadcast_to(right[id(scene)], most) for scene in scenes])
+            each = np.stack([np.broadcast_to(own, most) for own in right])[which]
             likely = torch.from_numpy(each + np.log2(gain)[:, None])
         return Captures(
             settings=[self.states[state] for state in indices],
             _scenes=scenes,
             ratio=torch.from_numpy(np.array(ratios) * gain),
             nlf=[self._nlf[state] for state in indices],
-            proper_ev=torch.from_numpy(ev100s + np.log2(gain)),
+            proper_ev=torch.from_numpy(facts[1] + np.log2(gain)),
             blur_px=blur_px,
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
             source_noise=source_noise,
@@ -326,23 +314,30 @@ class SceneCaptures:
         For `gain` and `row_gain` see `ScoreTables.table`.
         """
         states = np.arange(len(self.states))[part]
-        blur, pixel_blur, _ = self.blur(scene, prepared, states)
         gains = np.broadcast_to(gain, len(self.states))[part]
-        noise = source_noises(prepared, self.states[part], gains)
-        rows = None if row_gain is None else row_gain[part]
-        scenes = [scene] * len(states)
-        return self._captures(scenes, states, gains, rows, noise, blur, pixel_blur)
+        return self.of(
+            [scene] * len(states),
+            states,
+            **_moves(scene, prepared, len(states)),
+            gain=gains,
+            row_gain=None if row_gain is None else row_gain[part],
+            source_noise=source_noises(prepared, self.states[part], gains),
+        )
 
-    def blur(
-        self, scene: Scene, prepared: PreparedScene, states: np.ndarray
-    ) -> tuple[torch.Tensor, PixelBlur | None, np.ndarray]:
-        """`SceneBlur.of` captures at `states` (B,); see `describe`."""
-        # In steps of a 64-pixel frame, as episodes state it: to the bit as in `of`.
-        defocus = prepared.defocus * 64.0 / scene.light.shape[-2]
-        one = np.zeros(len(states), np.int64)
-        moves = one + prepared.image_speed, one + defocus
-        movements = np.tile(np.array(astuple(prepared.movement)), (len(states), 1))
-        return SceneBlur([scene], self).of(one, states, *moves, movements, pixels=True)
+    def sharpness(self, scene: Scene, prepared: PreparedScene) -> np.ndarray:
+        """Scores (S,) of `Sharpness` at all states; see `describe`."""
+        count = len(self.states)
+        moves = _moves(scene, prepared, count)
+        return SceneBlur([scene], self).of(np.zeros(count, int), np.arange(count), **moves)[2]
+
+
+def _moves(scene: Scene, prepared: PreparedScene, count: int) -> dict[str, Any]:
+    """How `count` captures of a scene that is `prepared` move, as `SceneCaptures.of` takes it."""
+    # In steps of a 64-pixel frame, as episodes state it: to the bit as there.
+    defocus = np.full(count, prepared.defocus * 64.0 / scene.light.shape[-2])
+    movements = np.tile(np.array(astuple(prepared.movement)), (count, 1))
+    speed = np.full(count, prepared.image_speed)
+    return {"speed": speed, "defocus": defocus, "movements": movements}
 
 
 class SceneBlur:

@@ -17,7 +17,6 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from scipy.special import ndtr
 
 from ae_env.observation import PEDESTAL, encode_array
 from ae_env.scenes.scene import Scene
@@ -52,7 +51,8 @@ _FINE = 8
 _FAR = 4.5
 #: The normal distribution up to there, and its values in a standard deviation.
 _PER_DEVIATION = 128
-_NORMAL = ndtr(np.arange(-_FAR * _PER_DEVIATION, _FAR * _PER_DEVIATION + 1) / _PER_DEVIATION)
+_NORMAL = np.arange(-_FAR * _PER_DEVIATION, _FAR * _PER_DEVIATION + 1) / _PER_DEVIATION
+_NORMAL = torch.special.ndtr(torch.from_numpy(_NORMAL)).numpy()
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _PEDESTAL = np.float32(PEDESTAL)
 _SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
@@ -87,9 +87,8 @@ class TermScores:
         #: Whether every part's expectation has one, so that no noise is drawn for it.
         self.closed_form = self.torch_terms is None or self.torch_terms.closed_form
         #: Names of the parts of `torch_terms` that depend on blur, if all are `Sharpness`.
-        self.only_sharpness = [n for n, part in others.items() if depends_on(part) == "blur"]
-        if not all(type(others[name]) is Sharpness for name in self.only_sharpness):
-            self.only_sharpness = []
+        of_blur = [n for n, part in others.items() if depends_on(part) == "blur"]
+        self.only_sharpness = of_blur if all(type(others[n]) is Sharpness for n in of_blur) else []
         self.captures = SceneCaptures(camera, states, noisy=noise)
         noises = [*dict.fromkeys(each := camera.nlfs(states))]
         self._which = np.array([noises.index(nlf) for nlf in each])
@@ -130,8 +129,7 @@ class TermScores:
         if self.torch_terms is None or not names:
             return {}
         if names == self.only_sharpness:
-            *_, scores = self.captures.blur(scene, prepared, np.arange(len(self.states)))
-            return dict.fromkeys(names, scores)
+            return dict.fromkeys(names, self.captures.sharpness(scene, prepared))
         terms, chunks = [self.torch_terms.parts[name] for name in names], []
         for part in slices(len(self.states), CHUNK if any(map(reads_pixels, terms)) else None):
             captures = self.captures.describe(scene, prepared, part, gain, row_gain)

@@ -201,9 +201,8 @@ class CaptureBatch:
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
-        rows, remaining = indices * len(self.states) + states, None
-        if self._any_remaining:  # else all of the source's variance remains
-            remaining = self._remaining_variance[rows]
+        rows = indices * len(self.states) + states
+        remaining = self._remaining_variance[rows] if self._any_remaining else None
         places, plain = self._blurred[rows], np.flatnonzero(~self._blurs[rows])
         if len(plain):
             places[plain] = self._frames.places(self._source[rows[plain]])
@@ -287,8 +286,8 @@ class CaptureBatch:
         box = scene.box_factor
         if box not in self._boxes:
             self._boxes.append(box)
-            own = noise_columns(self.camera, self.states, box)[None]
-            self._targets = np.concatenate([self._targets, own])
+            own = noise_columns(self.camera, self.states, box)
+            self._targets = np.stack([*self._targets, own])
         self._vignetting[index] = vignetting_column(scene, self.states)
         self._in_columns[index] = fits_columns(scene, self._columns)
         if self._in_columns[index]:
