@@ -7,6 +7,8 @@ A run that is finished is not trained again, one of other frames, scenes or sett
     ae-env evaluate --observation statistics \\
         --policy "examples/learners.py:Learnt?weights=runs/learners/dqn-0.safetensors"
 
+`python examples/learners.py meters` scores light meters on the same episodes.
+
 `drl_ae` is written after DRL-AE (Lee et al., Learning to Control Camera Exposure via Reinforcement
 Learning, CVPR 2024): SAC, changes of the exposure as actions, a history of mean intensities and
 settings as state, a curriculum, and randomised domains. It is no reproduction. What differs:
@@ -45,7 +47,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 import ae_env  # noqa: F401  (registers the environments)
 from ae_env.observation import PEDESTAL, SETTINGS_RANGES, decode_settings
-from agents import Policy, PolicyContext
+from agents import Policy, PolicyContext, make_policy
 from agents.evaluation.engine import EvaluationRun, TrainedPolicy
 from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.learning.networks import MeterHistory, with_history
@@ -56,7 +58,8 @@ from simulator.utils.files import data_folder
 CONFIGS = Path(__file__).parents[1] / "configs" / "learners"
 NAMES = ("ppo", "a2c", "dqn", "qrdqn", "sac", "ppo_video", "recurrent_ppo", "drl_ae")
 FRAMES, SEEDS, CHECKPOINTS, EXAM = 98_304, range(5), 10, ("bundled", "test", 32)
-STILL = "ae_env/AutoExposure-v0"
+STILL, MOVING = "ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0"
+METERS = ("average:P", "matrix:P", "average:tuned", "matrix:tuned")
 DELAY = {"iso": 1, "exposure_time": 2, "f_number": 2}
 
 
@@ -314,7 +317,25 @@ def train(name, seed, frames=FRAMES, out="runs/learners", scenes=None, exam=EXAM
     return callback.rows
 
 
+def score_meters():
+    """Scores of light meters; what the tuned ones know, they learn in still training scenes."""
+    scenes = "mixed" if data_folder() else "bundled"
+    options = {"scenes": scenes, "split": "train", "observation": "statistics", "num_envs": 64}
+    still = {"grid": "video", "lighting": "static", "delay": 0}
+    for task, own in ((STILL, {}), (MOVING, still)):
+        exam = Exam(task == MOVING, *EXAM)
+        envs = gym.make_vec(task, autoreset_mode="DISABLED", **options, **own)
+        for name in METERS:
+            policy = make_policy(name, PolicyContext.from_envs(envs))
+            if name.endswith("tuned"):
+                policy.fit(envs)
+            print("moving" if own else "still", name, f"{exam.score(policy):.3f}", flush=True)
+
+
 if __name__ == "__main__":
+    if sys.argv[1:] == ["meters"]:
+        score_meters()
+        sys.exit()
     for name in sys.argv[1:]:
         if name not in NAMES:
             sys.exit(f"usage: python examples/learners.py [LEARNER ...], of {', '.join(NAMES)}")
