@@ -12,11 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, pad
 
 from ae_env.scorers.captures import Captures, Domain
-from ae_env.scorers.measures import by_parts, immerkaer_sigma, luma_of, luminance_of, srgb_decode
+from ae_env.scorers.measures import (
+    by_parts,
+    immerkaer_sigma,
+    luma_of,
+    luminance_of,
+    percentile,
+    srgb_decode,
+)
 from ae_env.scorers.terms import CompositeScorer
 
 # -- signs: one number of the picture for each defect ---------------------------------------------
@@ -122,12 +130,6 @@ def _row_blur(luma: torch.Tensor) -> torch.Tensor:
     return 1.0 - lost / sharp.clamp(min=1e-6)
 
 
-def percentile(rows: torch.Tensor, share: float) -> torch.Tensor:
-    """Nearest-rank percentile (B,) float64 of `rows` (B, N); `share` in [0, 1]."""
-    rank = 1 + round(share * (rows.shape[1] - 1))
-    return rows.kthvalue(rank, dim=1).values.double()
-
-
 # -- severities: signs mapped to [0, 1] -----------------------------------------------------------
 
 #: Fitted maps: signs, and the severity at each; linear in between, constant beyond. Fitted by
@@ -193,11 +195,7 @@ def severity(defect: str, images: torch.Tensor) -> torch.Tensor:
 
 def mapped(name: str, sign: torch.Tensor) -> torch.Tensor:
     """Severity (B,) float64 by the map `name` of `KNOTS`, of signs (B,)."""
-    x, y = (torch.tensor(v, dtype=torch.float64, device=sign.device) for v in _MAPS[name])
-    sign = sign.double().clamp(x[0], x[-1])
-    right = torch.bucketize(sign, x).clamp_(1, len(x) - 1)
-    share = (sign - x[right - 1]) / (x[right] - x[right - 1])
-    return y[right - 1] + share * (y[right] - y[right - 1])
+    return torch.from_numpy(np.interp(sign.double().cpu().numpy(), *_MAPS[name])).to(sign.device)
 
 
 class _Analytic:

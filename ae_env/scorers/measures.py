@@ -39,6 +39,11 @@ def luma_of(images: torch.Tensor) -> torch.Tensor:
     return (red * r).add_(green, alpha=g).add_(blue, alpha=b).clamp_(0.0, 1.0)
 
 
+def luma_codes(images: torch.Tensor) -> np.ndarray:
+    """The same as 8-bit grey pictures (B, H, W) uint8."""
+    return luma_of(images).mul_(255.0).round_().to("cpu", torch.uint8).numpy()
+
+
 def srgb_decode(encoded: torch.Tensor) -> torch.Tensor:
     """sRGB values in [0, 1] to linear light in [0, 1] (IEC 61966-2-1).
 
@@ -96,6 +101,12 @@ def check_luma(luma: torch.Tensor) -> torch.Tensor:
         what = f"{tuple(luma.shape)} {luma.dtype}" if torch.is_tensor(luma) else repr(luma)
         raise ValueError(f"`luma` (={what}) must be a floating point tensor (B, H, W) with pixels")
     return luma
+
+
+def percentile(rows: torch.Tensor, share: float) -> torch.Tensor:
+    """Nearest-rank percentile (B,) float64 of `rows` (B, N); `share` in [0, 1]."""
+    rank = 1 + round(share * (rows.shape[1] - 1))
+    return rows.kthvalue(rank, dim=1).values.double()
 
 
 # -- detail ---------------------------------------------------------------------------------------
@@ -395,10 +406,8 @@ class DynamicRange:
         read = torch.tensor([0.5 * (n.read[1] + n.read[2]) for n in captures.nlf]).double()
         floor = (0.5 * (shot + (shot**2 + 4.0 * read).sqrt())).clamp_(2.0**-40, 1.0)
         green = captures.light[:, 1:3].mean(dim=1).flatten(1)
-        last = green.shape[1] - 1
-        ranks = [1 + round(share * last) for share in self.percentiles]
-        low, high = (green.kthvalue(rank, dim=1).values.double() for rank in ranks)
-        low, high = (end.clamp(max=1.0).maximum(floor) for end in (low, high))
+        ends = (percentile(green, share) for share in self.percentiles)
+        low, high = (end.clamp(max=1.0).maximum(floor) for end in ends)
         return ((high / low).log2() / self.stops).clamp_(0.0, 1.0)
 
 
