@@ -40,7 +40,7 @@ def luma_of(images: torch.Tensor) -> torch.Tensor:
 
 
 def luma_codes(images: torch.Tensor) -> np.ndarray:
-    """The same as 8-bit grey pictures (B, H, W) uint8."""
+    """Luma (B, H, W) of sRGB `images` (B, 3, H, W) in [0, 1] as 8-bit codes."""
     return luma_of(images).mul_(255.0).round_().to("cpu", torch.uint8).numpy()
 
 

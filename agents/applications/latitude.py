@@ -90,7 +90,7 @@ class Latitude:
         interpolated between the values tried.
         """
         share, x = self.curve(axis).share.to_numpy(), self.curve(axis).value.to_numpy()
-        best = int(np.argmax(share)) if axis == "EV" else 0
+        best = int(np.lexsort((np.abs(x), -share))[0]) if axis == "EV" else 0
         if share[best] < LEVEL:
             return {}
         found = {}
