@@ -17,14 +17,7 @@ import torch
 from torch.nn.functional import avg_pool2d, pad
 
 from ae_env.scorers.captures import Captures, Domain
-from ae_env.scorers.measures import (
-    by_parts,
-    immerkaer_sigma,
-    luma_of,
-    luminance_of,
-    percentile,
-    srgb_decode,
-)
+from ae_env.scorers.measures import by_parts, immerkaer_sigma, luma_of, luminance_of, srgb_decode
 from ae_env.scorers.terms import CompositeScorer
 
 # -- signs: one number of the picture for each defect ---------------------------------------------
@@ -128,6 +121,12 @@ def _row_blur(luma: torch.Tensor) -> torch.Tensor:
 
     lost, sharp = by_parts(sums, luma).unbind(dim=1)
     return 1.0 - lost / sharp.clamp(min=1e-6)
+
+
+def percentile(rows: torch.Tensor, share: float) -> torch.Tensor:
+    """Nearest-rank percentile (B,) float64 of `rows` (B, N); `share` in [0, 1]."""
+    rank = 1 + round(share * (rows.shape[1] - 1))
+    return rows.kthvalue(rank, dim=1).values.double()
 
 
 # -- severities: signs mapped to [0, 1] -----------------------------------------------------------

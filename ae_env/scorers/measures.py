@@ -103,12 +103,6 @@ def check_luma(luma: torch.Tensor) -> torch.Tensor:
     return luma
 
 
-def percentile(rows: torch.Tensor, share: float) -> torch.Tensor:
-    """Nearest-rank percentile (B,) float64 of `rows` (B, N); `share` in [0, 1]."""
-    rank = 1 + round(share * (rows.shape[1] - 1))
-    return rows.kthvalue(rank, dim=1).values.double()
-
-
 # -- detail ---------------------------------------------------------------------------------------
 
 #: Grey levels of the histogram.
@@ -406,8 +400,10 @@ class DynamicRange:
         read = torch.tensor([0.5 * (n.read[1] + n.read[2]) for n in captures.nlf]).double()
         floor = (0.5 * (shot + (shot**2 + 4.0 * read).sqrt())).clamp_(2.0**-40, 1.0)
         green = captures.light[:, 1:3].mean(dim=1).flatten(1)
-        ends = (percentile(green, share) for share in self.percentiles)
-        low, high = (end.clamp(max=1.0).maximum(floor) for end in ends)
+        last = green.shape[1] - 1
+        ranks = [1 + round(share * last) for share in self.percentiles]
+        low, high = (green.kthvalue(rank, dim=1).values.double() for rank in ranks)
+        low, high = (end.clamp(max=1.0).maximum(floor) for end in (low, high))
         return ((high / low).log2() / self.stops).clamp_(0.0, 1.0)
 
 
