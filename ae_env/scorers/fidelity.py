@@ -7,14 +7,16 @@ is. `Fidelity` is the judge of agents that were trained on other scorers; nothin
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
 from ae_env.scorers.captures import Captures, DependsOn, Domain
-from ae_env.scorers.measures import luma_of
+from ae_env.scorers.measures import luma_codes
 from ae_env.scorers.terms import developed
+from simulator.utils.checks import import_extra
 
 #: CIEDE2000 difference that brings the colour term to 1/e: plainly another colour.
 COLOUR_SCALE = 10.0
@@ -111,19 +113,8 @@ def distinct_references(captures: Captures) -> tuple[list[int], list[int]]:
 # -- keypoints of OpenCV ---------------------------------------------------------------------------
 
 
-def opencv() -> Any:
-    """The module cv2, or an `ImportError` that names the extra."""
-    try:
-        import cv2
-    except ImportError:
-        raise ImportError(
-            "the scorers keypoints and matches need OpenCV: pip install 'ae-env[cv]'"
-        ) from None
-    return cv2
-
-
-def _luma_bytes(images: torch.Tensor) -> np.ndarray:
-    return luma_of(images).clamp(0.0, 1.0).mul(255.0).round().to("cpu", torch.uint8).numpy()
+#: The module cv2, or an `ImportError` that names the extra.
+opencv = partial(import_extra, "cv2", "cv", "a scorer by keypoints")
 
 
 def _detector(height: int, width: int, most: float = math.inf) -> Any:
@@ -164,7 +155,7 @@ class Keypoints(_OrbScorer):
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         height, width = images.shape[2:]
         orb = _detector(height, width)
-        counts = [len(orb.detect(picture, None)) for picture in _luma_bytes(images)]
+        counts = [len(orb.detect(picture, None)) for picture in luma_codes(images)]
         typical = _inside(height, width) * TYPICAL_PER_1000 / 1000.0
         return 1.0 - torch.exp(-torch.tensor(counts, dtype=torch.float64) / typical)
 
@@ -188,10 +179,10 @@ class Matches(_OrbScorer):
         first, which = distinct_references(captures)
         references = [
             orb.detectAndCompute(picture, None)
-            for picture in _luma_bytes(reference_pictures(captures, first))
+            for picture in luma_codes(reference_pictures(captures, first))
         ]
         scores = []
-        for picture, reference in zip(_luma_bytes(images), which, strict=True):
+        for picture, reference in zip(luma_codes(images), which, strict=True):
             points, descriptors = orb.detectAndCompute(picture, None)
             known, wanted = references[reference]
             if descriptors is None or wanted is None:

@@ -19,7 +19,7 @@ from torch.nn.utils import fuse_conv_bn_eval
 from ae_env.scorers.captures import Captures, DependsOn, Domain
 from ae_env.utils.user_files import UserCodeError
 from simulator.utils.cache import cache_dir
-from simulator.utils.checks import check_integer, check_type
+from simulator.utils.checks import check_integer, check_type, onnx_session
 from simulator.utils.files import read_bounded
 
 
@@ -344,22 +344,11 @@ def _probabilities(outputs: Any, count: int) -> Tensor:
 @lru_cache(maxsize=4)
 def _session(file: str, digest: str) -> Any:
     """The network of a file, read once per content."""
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise ImportError(
-            f"scorer 'classifier' reads {file!r} by ONNX Runtime: pip install 'ae-env[onnx]' "
-            f"({error})"
-        ) from error
     content = read_bounded(Path(file), 2**31)  # ONNX allows no more
     if hashlib.sha256(content).hexdigest() != digest:
         raise ValueError(f"`model` (={file!r}) must not change while it is in use")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime has errors of its own
-        raise ValueError(f"`model` (={file!r}) cannot be read: {error}") from error
+    given, threads = f"`model` (={file!r})", torch.get_num_threads()
+    return onnx_session(content, given, "the scorer classifier", threads)
 
 
 def _input_shape(file: str, digest: str) -> tuple[int | None, int | None]:

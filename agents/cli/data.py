@@ -180,7 +180,9 @@ def score_tables(
 
 
 def latitude(
-    detector: Annotated[str, Argument(help="codes, tags, model.onnx or my_file.py:Name.")],
+    detector: Annotated[
+        str, Argument(help="codes, tags, text, faces, tracks, model.onnx or my_file.py:Name.")
+    ],
     pictures: Annotated[str, Argument(help="A picture, raw or radiance map, a folder, or a glob.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder for results.")] = Path("latitude"),
     size: Annotated[int, Option(help="Longer side of pictures [pixel].", min=36, max=4096)] = 512,

@@ -14,8 +14,8 @@ import pandas as pd
 from agents.policy import Floats
 
 RESAMPLES = 10_000
-#: Coverage of the intervals.
-LEVEL = 0.95
+#: Coverage of the intervals, and the quantiles that are their ends.
+LEVEL, ENDS = 0.95, (0.025, 0.975)
 #: Below this many source groups an interval would promise too much: values only.
 MIN_GROUPS = 15
 RANK_COLUMNS = ("place", "policy", "tier", "normalised_score", "ci95", "to_best", "to_next")
@@ -76,10 +76,8 @@ def difference_interval(
     rng = np.random.default_rng([seed, 1])
     weights = group_weights(groups, resamples, seed)
     totals = _resampled(first, weights, rng) - _resampled(second, weights, rng)
-    statistic = totals / (weights @ span)
-    tail = 50.0 * (1.0 - LEVEL)
-    low, high = np.percentile(statistic, [tail, 100.0 - tail])
-    return Interval(value, float(low), float(high), groups, seeds)
+    low, high = np.quantile(totals / (weights @ span), ENDS).tolist()
+    return Interval(value, low, high, groups, seeds)
 
 
 def mean_rows(scores: Mapping[str, Sequence[float]], among: Sequence[str]) -> list[dict[str, Any]]:
@@ -116,10 +114,9 @@ def rank_agreement(
     value = float(tau(np.full((1, groups), 1.0 / groups))[0])
     if groups < MIN_GROUPS:
         return Interval(value, None, None, groups)
-    tail = 50.0 * (1.0 - LEVEL)
     drawn = tau(group_weights(groups, resamples, seed) / groups)
-    low, high = np.percentile(drawn, [tail, 100.0 - tail])
-    return Interval(value, float(low), float(high), groups)
+    low, high = np.quantile(drawn, ENDS).tolist()
+    return Interval(value, low, high, groups)
 
 
 @lru_cache(maxsize=16)

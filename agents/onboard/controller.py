@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
-from simulator.utils.checks import check_flag, check_integer, check_number, import_extra
+from simulator.utils.checks import check_flag, check_integer, check_number, onnx_session
 from simulator.utils.files import as_path, read_bounded
 
 #: Entry of the file's metadata that holds the description, and the form that it has.
@@ -121,19 +121,13 @@ class Controller:
     """
 
     def __init__(self, path: str | Path, num_cameras: int = 1) -> None:
-        onnxruntime = import_extra("onnxruntime", "onnx", "a Controller")
         given, file = f"`path` (={str(path)!r})", as_path(path)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # the network is small: threads cost more than they bring
         try:
             content = read_bounded(file, 2**30)
-            self._session = onnxruntime.InferenceSession(
-                content, options, providers=["CPUExecutionProvider"]
-            )
-            found = self._session.get_modelmeta().custom_metadata_map
-        except Exception as error:  # ONNX Runtime has errors of its own
-            reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-            raise ValueError(f"{given} cannot be read: {reason}") from error
+        except OSError as error:
+            raise ValueError(f"{given} cannot be read: {error.strerror or error}") from error
+        self._session = onnx_session(content, given, "a Controller")
+        found = self._session.get_modelmeta().custom_metadata_map
         if METADATA not in found:
             raise ValueError(f"{given} must be an export of `ae-env export`")
         try:

