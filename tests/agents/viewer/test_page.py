@@ -512,9 +512,24 @@ def test_policies_in_two_tabs_that_fit_the_width(page, expect, address, tmp_path
 @pytest.mark.slow
 def test_takes_a_raw_and_gives_files_back(page, expect, tmp_path):
     openexr = pytest.importorskip("OpenEXR")
-    (bad := tmp_path / "holiday.dng").write_bytes(b"not a raw at all" * 100)
-    page.locator("input[type=file]").set_input_files(bad)
-    expect(page.locator(".q-notification", has_text="holiday.dng")).to_be_visible()
+    notice, upload = page.locator(".q-notification"), page.locator("input[type=file]")
+    advice = "Choose a DNG, CR2, NEF or another raw of a camera with a Bayer sensor."
+    for name, start, fault in (
+        ("bad.jpg", b"\xff\xd8\xff\xe0", "is a JPEG, not a raw file"),
+        ("holiday.dng", b"not a raw at all", "must be a camera raw .* truncated or damaged"),
+    ):
+        (bad := tmp_path / name).write_bytes(start * 100)
+        with page.expect_request(re.compile("/upload/")) as request:
+            upload.set_input_files(bad)
+        expect(notice.locator(".q-notification__message")).to_have_text(
+            [re.compile(rf"^{name} {fault}\. {advice}$")]  # and no other notice
+        )
+    for form in ({"name": "no file"}, {}):
+        answer = page.request.post(request.value.url, multipart=form)
+        assert (answer.status, answer.text()) == (
+            400,
+            "No file arrived. Choose a DNG, CR2, NEF or another raw.",
+        )
     page.get_by_role("tab", name="Refocus, HDR").click()
     expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
     expect(page.get_by_role("button", name="Fuse a bracket")).to_be_disabled()
@@ -523,6 +538,7 @@ def test_takes_a_raw_and_gives_files_back(page, expect, tmp_path):
     write_dng(tmp_path / "soft.dng", raw)
     page.locator("input[type=file]").set_input_files(tmp_path / "soft.dng")
     page.get_by_text("soft.dng", exact=True).first.wait_for()
+    expect(notice).to_have_count(0)
     page.locator("button[aria-label^='ISO 400, 1/1000 s, f/8']").click()
     page.locator("button.shown[aria-label^='ISO 400, 1/1000 s, f/8']").wait_for()
     back = read_raw(saved(page, "DNG", tmp_path))
