@@ -31,7 +31,7 @@ from agents.cli.show import cameras, film, judge, lightings, policies, scorers, 
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 from simulator import __version__
-from simulator.utils.checks import NOTE, check_word
+from simulator.utils.checks import NOTE, check_word, did_you_mean
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
@@ -214,9 +214,14 @@ def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text}; `ae-env --debug` shows where"
 
 
+#: Rules of errors about a file or folder that is not there.
+_MISSING = ("must name an existing file, folder or glob", "does not exist; give a raw file")
+_MISSING += ("there is no such file",)
+
+
 def _as_typed(text: str) -> str:
     """An error with its option or file as it was typed, and what may have been meant first."""
-    form = r"`([\w-]+)` \(=(.*?)\) (.*?)(?:; did you mean ('[^']*'\?)(.*))?"
+    form = r"`([\w-]+)` \(=(.*?)\):? (.*?)(?:; did you mean ('[^']*'\?)(.*))?"
     found = re.fullmatch(form, text)
     if found is None:
         return text
@@ -224,10 +229,16 @@ def _as_typed(text: str) -> str:
     if meant is not None and rule.startswith("must be "):
         name = "scene" if name == "what" else name
         return f"Unknown {name} {value}. Did you mean {meant} It {rule}{more}"
-    if name == "path":
-        return value.strip("'") + f" {rule}"
-    typed = {f"--{name}", f"-{name[0]}"} & {word.partition("=")[0] for word in sys.argv}
-    return text.replace(f"`{name}`", f"`{min(typed, default=name)}`", 1)
+    plain, words = value.strip("'"), [word.partition("=")[0] for word in sys.argv]
+    option = next((f"`{o}` " for o in (f"--{name}", f"-{name[0]}") if o in words), "")
+    if rule in _MISSING:
+        folder = Path(plain).absolute().parent
+        near = did_you_mean(Path(plain).name, os.listdir(folder) if folder.is_dir() else ())
+        near = near or f" in {folder}: check the name, or give the whole path"
+        return f"{option}{plain}: no such file or folder{near}"
+    if not option and (name == "path" or plain in words):
+        return f"{plain} {rule}"
+    return text.replace(f"`{name}` ", option, 1) if option else text
 
 
 def _version(asked: bool) -> None:

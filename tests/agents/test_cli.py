@@ -147,7 +147,7 @@ print("loaded", *sys.modules)
         (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`--source-aperture`"),
         ((*PLAIN, "--depth", "unknown"), "`--depth` (='unknown') needs networks"),
         (("evaluate", *UNKNOWN), "Unknown policy 'matrx:P'. Did you mean 'matrix:P'? It must"),
-        (("export", "ppo:video"), "`policy` (='ppo:video') must be without a history"),
+        (("export", "ppo:video"), "error ppo:video must be without a history"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
@@ -180,6 +180,14 @@ def test_errors_are_one_line(ae_env, raw: RawImage, dng: Path, arguments, messag
     assert message in error
     left = {path.name for path in folder.iterdir()} - before
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
+
+
+@pytest.mark.parametrize("name", ["view", "hdr", "latitude codes", "score-tables", "film --scenes"])
+def test_a_file_that_is_not_there_is_named_as_typed(ae_env, dng: Path, name: str) -> None:
+    typed = "`--scenes` " * ("--scenes" in name)
+    for file, more in (("IMG_2.dng", "; did you mean 'IMG_1.dng'?"), ("x/y.nef", " in ")):
+        _, _, error = ae_env(*name.split(), file)
+        assert error.startswith(f"error {typed}{file}: no such file or folder{more}")
 
 
 def test_all_mistakes_are_shown_at_once(ae_env, dng: Path) -> None:
