@@ -4,8 +4,6 @@ Help and usage errors come at once: modules of commands import nothing heavy (to
 gymnasium and so `ae_env`); each command imports what it needs when it runs.
 """
 
-from __future__ import annotations
-
 import importlib
 import logging
 import os
@@ -18,10 +16,9 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.markup import escape
 from typer import Argument, Option
-from typer.core import TyperGroup
+from typer.core import TyperArgument, TyperGroup, TyperOption
 
 from agents.cli import console
 from agents.cli.data import cache, latitude, record, scenes, score_tables, warm_up
@@ -108,6 +105,25 @@ def _check_options(name: str, **options: Any) -> None:
 class _Commands(TyperGroup):
     """The commands; errors of options say the value, and all of them are shown at once."""
 
+    def format_help(self, ctx: Any, formatter: object) -> None:
+        """Shows the help; the imports of Typer's own take as long as all of the rest."""
+        from rich.panel import Panel
+        from rich.table import Table
+
+        params: Any = self.get_params(ctx)
+        rows: list[Any] = [("Options", ", ".join(param.opts), param.help) for param in params]
+        for name, command in dict[str, Any](self.commands).items():
+            rows.append((command.rich_help_panel, name, command.get_short_help_str(200)))
+        width, panels = max(len(name) for _, name, _ in rows), dict[str, Table]()
+        for title, name, about in rows:
+            table = panels.setdefault(title, Table.grid(padding=(0, 2)))
+            table.add_row(f"[bold cyan]{name.ljust(width)}", escape(about))
+        show = console.terminal.print
+        show(f"[bold]{escape(self.get_usage(ctx))}\n\n[/]{self.help}\n", highlight=False)
+        for title, table in panels.items():
+            show(Panel(table, title=title, title_align="left", border_style="dim"))
+        show(self.epilog)
+
     def invoke(self, ctx: Any) -> Any:
         words = [*ctx._protected_args, *ctx.args]
         try:
@@ -139,8 +155,8 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="A folder that an output names is made where it is missing. Exit status: 2 for a "
-    "mistake in an option or a file, 1 for a failure while running.",
+    epilog="Missing folders of outputs are made. Exit status: 2 for a mistake in an option or a "
+    "file, 1 for a failure while running.",
 )
 #: Commands by the heading of the help that they stand under.
 _HEADINGS: dict[str, tuple[Callable[..., None], ...]] = {
@@ -171,7 +187,10 @@ def main() -> None:
     An error becomes one line, and exit status 2 where it is about what the user gave (options,
     files), 1 where something failed while running; Ctrl-C gives 130, SIGTERM 143.
     """
-    handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
+    if "_AE_ENV_COMPLETE" in os.environ:  # completion needs no values, whose check loads pydantic
+        for kind in (TyperArgument, TyperOption):
+            kind.process_value = lambda self, ctx, value: value  # type: ignore[method-assign]
+    handler = _Log()
     seen: Any = set()  # scenes that are loaded again have the same to say
     handler.addFilter(lambda r: not (r.getMessage() in seen or seen.add(r.getMessage())))
     logging.addLevelName(NOTE, "NOTE")
@@ -201,6 +220,16 @@ def main() -> None:
         raise
 
 
+class _Log(logging.Handler):
+    """Rich's log, which is loaded with its first line: help has none."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from rich.logging import RichHandler
+
+        how: Any = {"show_time": False, "show_path": False}
+        RichHandler(console=Console(stderr=True), **how).emit(record)
+
+
 def _terminate(*_: Any) -> None:
     """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
     raise SystemExit(_TERMINATED)
@@ -215,7 +244,7 @@ def _one_line(error: Exception) -> str:
 
 
 #: Rules of errors about a file or folder that is not there.
-_MISSING = ("must name an existing file, folder or glob", "does not exist; give a raw file")
+_MISSING: Any = ("must name an existing file, folder or glob", "does not exist; give a raw file")
 _MISSING += ("there is no such file",)
 
 
