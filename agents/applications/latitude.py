@@ -4,8 +4,6 @@ The simulator takes every picture again: darker and brighter at ISO 100, at the 
 more gain, and with more motion blur. What the detector finds in the picture itself is the truth.
 """
 
-from __future__ import annotations
-
 import glob
 import logging
 import math

@@ -1,7 +1,5 @@
 """The page: the bar with the scene's name, the scene picker, files in and out, and its tabs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile

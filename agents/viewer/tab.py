@@ -1,7 +1,5 @@
 """What the tabs of the page share: the scene, work in the background, pictures and charts."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import tempfile

@@ -1,7 +1,5 @@
 """The scenes that the page offers, and what it shows of one: captures, readouts and scores."""
 
-from __future__ import annotations
-
 import io
 import math
 import re
