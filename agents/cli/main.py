@@ -262,11 +262,11 @@ def _as_typed(text: str) -> str:
     option = next((f"`{o}` " for o in (f"--{name}", f"-{name[0]}") if o in words), "")
     if rule in _MISSING:
         folder = Path(plain).absolute().parent
-        near = did_you_mean(Path(plain).name, os.listdir(folder) if folder.is_dir() else ())
+        near = did_you_mean(Path(plain).name, (path.name for path in folder.glob("*")))
         near = near or f" in {folder}: check the name, or give the whole path"
         return f"{option}{plain}: no such file or folder{near}"
     if not option and (name == "path" or plain in words):
-        return f"{plain} {rule}"
+        return plain + text[found.end(2) + 1 :]
     return text.replace(f"`{name}` ", option, 1) if option else text
 
 
