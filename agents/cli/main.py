@@ -105,13 +105,18 @@ def _check_options(name: str, **options: Any) -> None:
 class _Commands(TyperGroup):
     """The commands; errors of options say the value, and all of them are shown at once."""
 
+    def get_params(self, ctx: Any) -> list[Any]:
+        params: list[Any] = super().get_params(ctx)
+        for flag in (param for param in params if param.is_flag):  # whose None loads pydantic
+            flag.default = flag.default or False
+        return params
+
     def format_help(self, ctx: Any, formatter: object) -> None:
         """Shows the help; the imports of Typer's own take as long as all of the rest."""
         from rich.panel import Panel
         from rich.table import Table
 
-        params: Any = self.get_params(ctx)
-        rows: list[Any] = [("Options", ", ".join(param.opts), param.help) for param in params]
+        rows = [("Options", ", ".join(param.opts), param.help) for param in self.get_params(ctx)]
         for name, command in dict[str, Any](self.commands).items():
             rows.append((command.rich_help_panel, name, command.get_short_help_str(200)))
         width, panels = max(len(name) for _, name, _ in rows), dict[str, Table]()
@@ -190,9 +195,8 @@ def main() -> None:
     if "_AE_ENV_COMPLETE" in os.environ:  # completion needs no values, whose check loads pydantic
         for kind in (TyperArgument, TyperOption):
             kind.process_value = lambda self, ctx, value: value  # type: ignore[method-assign]
-    handler = _Log()
-    seen: Any = set()  # scenes that are loaded again have the same to say
-    handler.addFilter(lambda r: not (r.getMessage() in seen or seen.add(r.getMessage())))
+    handler, seen = _Log(), dict[str, object]()  # scenes that are loaded again say the same
+    handler.addFilter(lambda record: seen.setdefault(record.getMessage(), record) is record)
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(level=NOTE, format="%(message)s", handlers=[handler])
     signal.signal(signal.SIGTERM, _terminate)
@@ -226,8 +230,7 @@ class _Log(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from rich.logging import RichHandler
 
-        how: Any = {"show_time": False, "show_path": False}
-        RichHandler(console=Console(stderr=True), **how).emit(record)
+        RichHandler(console=Console(stderr=True), show_time=False, show_path=False).emit(record)
 
 
 def _terminate(*_: Any) -> None:
@@ -244,8 +247,7 @@ def _one_line(error: Exception) -> str:
 
 
 #: Rules of errors about a file or folder that is not there.
-_MISSING: Any = ("must name an existing file, folder or glob", "does not exist; give a raw file")
-_MISSING += ("there is no such file",)
+_MISSING = ("must name an existing file", "does not exist", "there is no such file")
 
 
 def _as_typed(text: str) -> str:
@@ -260,7 +262,7 @@ def _as_typed(text: str) -> str:
         return f"Unknown {name} {value}. Did you mean {meant} It {rule}{more}"
     plain, words = value.strip("'"), [word.partition("=")[0] for word in sys.argv]
     option = next((f"`{o}` " for o in (f"--{name}", f"-{name[0]}") if o in words), "")
-    if rule in _MISSING:
+    if rule.startswith(_MISSING):
         folder = Path(plain).absolute().parent
         near = did_you_mean(Path(plain).name, (path.name for path in folder.glob("*")))
         near = near or f" in {folder}: check the name, or give the whole path"
@@ -285,5 +287,4 @@ def _options(
         bool, Option("--version", help="Show the version.", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    # `main` looks for the option itself: it must know before the arguments are parsed.
-    del debug, version
+    """`main` looks for `debug` itself: it must know before the arguments are parsed."""
