@@ -151,7 +151,7 @@ def _title(
     if speed or not own:
         parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
     if own and scene.layout is not None:
-        parts.append(f"subject {own:.3g}")
+        parts.append(f"subject moves {own:.3g} frame heights/s")
     blur = scene.own_blur(4.0) * 64.0 / scene.light.shape[-2]
     focus = f"its own defocus, {blur:.3g} px of 64 at f/4" if blur else "all in focus"
     drawn = moves["defocus"]

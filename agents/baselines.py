@@ -1,7 +1,5 @@
 """Policies that look at no frame: random, the best constant state, the oracle, a recording."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from contextlib import suppress

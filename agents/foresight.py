@@ -5,8 +5,6 @@ its earlier decisions, expects what the light will be when its decision is in ef
 (`LightTracker`), and asks what each state is worth in that light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

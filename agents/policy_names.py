@@ -1,7 +1,5 @@
 """Names of policies: how ``matrix:P?compensation=-1`` or ``my.py:Mine`` becomes a policy."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

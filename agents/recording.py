@@ -1,7 +1,5 @@
 """Episodes of a policy as a Minari dataset, for offline reinforcement learning and imitation."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -5,8 +5,6 @@ weights reflecting the relative pixel intensity and global gradient", ICIP 2018;
 Laplacian pyramid (T. Mertens, J. Kautz, F. Van Reeth, "Exposure fusion", Pacific Graphics 2007).
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -4,8 +4,6 @@ The simulator takes every picture again: darker and brighter at ISO 100, at the 
 more gain, and with more motion blur. What the detector finds in the picture itself is the truth.
 """
 
-from __future__ import annotations
-
 import glob
 import io
 import logging
@@ -310,7 +308,8 @@ def picture_scenes(what: str, camera: CameraProfile, size: int) -> list[Scene]:
         except ValueError as error:
             faults.append(str(error).replace("`scenes`", "`pictures`"))
     if not found:
-        raise ValueError(f"`pictures` (={what!r}) must have one that can be read: {faults[0]}")
+        rule = f"`pictures` (={what!r}) must have one that can be read: "
+        raise ValueError(rule * (given != [path]) + faults[0])
     if faults:
         count = f"{len(faults)} of {len(given)} pictures are left out"
         logger.warning(f"{count}, as they cannot be read, such as: {faults[0]}")

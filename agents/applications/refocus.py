@@ -5,8 +5,6 @@ unclipped light with little noise; then the sensor records it, with the noise of
 stays in focus, and has nothing blurred before it, keeps its pixels as they were recorded.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

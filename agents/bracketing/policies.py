@@ -4,8 +4,6 @@ A schedule is up to K states, in any order. Its error in a light L follows from 
 frames in closed form up to one integral, so all that fit into the time are rated at once.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 from functools import lru_cache

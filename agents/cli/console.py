@@ -3,8 +3,6 @@
 Help must come at once: no module of a command imports anything heavy, see `main`.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 import inspect

@@ -1,7 +1,5 @@
 """Data: ``ae-env scenes``, ``record``, ``score-tables``, ``cache`` and ``warm-up``."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from contextlib import closing

@@ -1,7 +1,5 @@
 """``ae-env evaluate`` compares policies on the same episodes; ``ae-env stability`` judges loops."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -137,7 +135,7 @@ def stability(
 
 
 def _run(
-    plan: EvaluationPlan,
+    plan: "EvaluationPlan",
     out: Path,
     append: Path | None,
     row: Mapping[str, Any],
@@ -173,7 +171,7 @@ def _run(
 
 def make_plan(
     preset: str | None, env: str | None, policies: Sequence[str], given: Mapping[str, Any]
-) -> EvaluationPlan:
+) -> "EvaluationPlan":
     """The plan that the options describe; `given` are those about episodes, by name."""
     from pydantic import ValidationError
 
@@ -244,7 +242,7 @@ def _arguments(env: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
     return arguments, condition
 
 
-def _check_changes(base: EvaluationPlan, changed: list[str]) -> None:
+def _check_changes(base: "EvaluationPlan", changed: list[str]) -> None:
     """Raises a `ValueError` if a preset does not take one of the options `changed`."""
     if base.hash is not None:
         allowed, what = _OF_BENCHMARKS, "is a fixed benchmark"
@@ -261,7 +259,8 @@ def _check_changes(base: EvaluationPlan, changed: list[str]) -> None:
 
 
 def print_scores(
-    results: EvaluationResult | Mapping[str, EvaluationResult], ranking: pd.DataFrame | None = None
+    results: "EvaluationResult | Mapping[str, EvaluationResult]",
+    ranking: "pd.DataFrame | None" = None,
 ) -> None:
     """Prints the scores of an evaluation, and every source group's where there are few."""
     from agents.report.evaluation import summary

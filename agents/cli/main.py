@@ -4,8 +4,6 @@ Help and usage errors come at once: modules of commands import nothing heavy (to
 gymnasium and so `ae_env`); each command imports what it needs when it runs.
 """
 
-from __future__ import annotations
-
 import importlib
 import logging
 import os
@@ -18,10 +16,9 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.markup import escape
 from typer import Argument, Option
-from typer.core import TyperGroup
+from typer.core import TyperArgument, TyperGroup, TyperOption
 
 from agents.cli import console
 from agents.cli.data import cache, latitude, record, scenes, score_tables, warm_up
@@ -31,7 +28,7 @@ from agents.cli.show import cameras, film, judge, lightings, policies, scorers, 
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 from simulator import __version__
-from simulator.utils.checks import NOTE, check_word
+from simulator.utils.checks import NOTE, check_word, did_you_mean
 
 #: Names of the benchmarks whose results are in docs/results.
 BENCHMARKS = (
@@ -108,6 +105,30 @@ def _check_options(name: str, **options: Any) -> None:
 class _Commands(TyperGroup):
     """The commands; errors of options say the value, and all of them are shown at once."""
 
+    def get_params(self, ctx: Any) -> list[Any]:
+        params: list[Any] = super().get_params(ctx)
+        for flag in (param for param in params if param.is_flag):  # whose None loads pydantic
+            flag.default = flag.default or False
+        return params
+
+    def format_help(self, ctx: Any, formatter: object) -> None:
+        """Shows the help; the imports of Typer's own take as long as all of the rest."""
+        from rich.panel import Panel
+        from rich.table import Table
+
+        rows = [("Options", ", ".join(param.opts), param.help) for param in self.get_params(ctx)]
+        for name, command in dict[str, Any](self.commands).items():
+            rows.append((command.rich_help_panel, name, command.get_short_help_str(200)))
+        width, panels = max(len(name) for _, name, _ in rows), dict[str, Table]()
+        for title, name, about in rows:
+            table = panels.setdefault(title, Table.grid(padding=(0, 2)))
+            table.add_row(f"[bold cyan]{name.ljust(width)}", escape(about))
+        show = console.terminal.print
+        show(f"[bold]{escape(self.get_usage(ctx))}\n\n[/]{self.help}\n", highlight=False)
+        for title, table in panels.items():
+            show(Panel(table, title=title, title_align="left", border_style="dim"))
+        show(self.epilog)
+
     def invoke(self, ctx: Any) -> Any:
         words = [*ctx._protected_args, *ctx.args]
         try:
@@ -139,8 +160,8 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="A folder that an output names is made where it is missing. Exit status: 2 for a "
-    "mistake in an option or a file, 1 for a failure while running.",
+    epilog="Missing folders of outputs are made. Exit status: 2 for a mistake in an option or a "
+    "file, 1 for a failure while running.",
 )
 #: Commands by the heading of the help that they stand under.
 _HEADINGS: dict[str, tuple[Callable[..., None], ...]] = {
@@ -171,9 +192,11 @@ def main() -> None:
     An error becomes one line, and exit status 2 where it is about what the user gave (options,
     files), 1 where something failed while running; Ctrl-C gives 130, SIGTERM 143.
     """
-    handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
-    seen: Any = set()  # scenes that are loaded again have the same to say
-    handler.addFilter(lambda r: not (r.getMessage() in seen or seen.add(r.getMessage())))
+    if "_AE_ENV_COMPLETE" in os.environ:  # completion needs no values, whose check loads pydantic
+        for kind in (TyperArgument, TyperOption):
+            kind.process_value = lambda self, ctx, value: value  # type: ignore[method-assign]
+    handler, seen = _Log(), dict[str, object]()  # scenes that are loaded again say the same
+    handler.addFilter(lambda record: seen.setdefault(record.getMessage(), record) is record)
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(level=NOTE, format="%(message)s", handlers=[handler])
     signal.signal(signal.SIGTERM, _terminate)
@@ -201,6 +224,15 @@ def main() -> None:
         raise
 
 
+class _Log(logging.Handler):
+    """Rich's log, which is loaded with its first line: help has none."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from rich.logging import RichHandler
+
+        RichHandler(console=Console(stderr=True), show_time=False, show_path=False).emit(record)
+
+
 def _terminate(*_: Any) -> None:
     """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
     raise SystemExit(_TERMINATED)
@@ -214,9 +246,13 @@ def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text}; `ae-env --debug` shows where"
 
 
+#: Rules of errors about a file or folder that is not there.
+_MISSING = ("must name an existing file", "does not exist", "there is no such file")
+
+
 def _as_typed(text: str) -> str:
     """An error with its option or file as it was typed, and what may have been meant first."""
-    form = r"`([\w-]+)` \(=(.*?)\) (.*?)(?:; did you mean ('[^']*'\?)(.*))?"
+    form = r"`([\w-]+)` \(=(.*?)\):? (.*?)(?:; did you mean ('[^']*'\?)(.*))?"
     found = re.fullmatch(form, text)
     if found is None:
         return text
@@ -224,10 +260,16 @@ def _as_typed(text: str) -> str:
     if meant is not None and rule.startswith("must be "):
         name = "scene" if name == "what" else name
         return f"Unknown {name} {value}. Did you mean {meant} It {rule}{more}"
-    if name == "path":
-        return value.strip("'") + f" {rule}"
-    typed = {f"--{name}", f"-{name[0]}"} & {word.partition("=")[0] for word in sys.argv}
-    return text.replace(f"`{name}`", f"`{min(typed, default=name)}`", 1)
+    plain, words = value.strip("'"), [word.partition("=")[0] for word in sys.argv]
+    option = next((f"`{o}` " for o in (f"--{name}", f"-{name[0]}") if o in words), "")
+    if rule.startswith(_MISSING):
+        folder = Path(plain).absolute().parent
+        near = did_you_mean(Path(plain).name, (path.name for path in folder.glob("*")))
+        near = near or f" in {folder}: check the name, or give the whole path"
+        return f"{option}{plain}: no such file or folder{near}"
+    if not option and (name == "path" or plain in words):
+        return plain + text[found.end(2) + 1 :]
+    return text.replace(f"`{name}` ", option, 1) if option else text
 
 
 def _version(asked: bool) -> None:
@@ -245,5 +287,4 @@ def _options(
         bool, Option("--version", help="Show the version.", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    # `main` looks for the option itself: it must know before the arguments are parsed.
-    del debug, version
+    """`main` looks for `debug` itself: it must know before the arguments are parsed."""

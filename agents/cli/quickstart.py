@@ -1,7 +1,5 @@
 """``ae-env quickstart``: two agents trained and compared with light meters on unseen scenes."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -109,7 +107,7 @@ def _train(
 
 def _policies(
     environment: dict[str, Any], agents: Mapping[str, Path], device: str
-) -> dict[str, Policy]:
+) -> "dict[str, Policy]":
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
     from agents.rollouts import make_envs

@@ -1,7 +1,5 @@
 """Looking at scenes, episodes and scorers: ``ae-env view``, ``judge``, ``film``, ``scorers``."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from functools import partial
 from pathlib import Path

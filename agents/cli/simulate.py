@@ -1,7 +1,5 @@
 """What becomes of one raw: ``ae-env simulate``, ``sweep``, ``refocus`` and ``hdr``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -94,7 +92,7 @@ def simulate(
     _write(result, out, png)
 
 
-def _remarks(source: RawImage, result: RawImage, *, details: bool) -> Iterator[str]:
+def _remarks(source: "RawImage", result: "RawImage", *, details: bool) -> Iterator[str]:
     """Lines about what the result hides at the ends of its range, and what had to be guessed."""
     from simulator import exposure_ratio
     from simulator.camera import LOW_CLIP
@@ -268,8 +266,8 @@ def refocus(
 
 
 def _lens(
-    source: RawImage, metres: np.ndarray, focus: str | None, focal_length: float | None
-) -> Lens:
+    source: "RawImage", metres: "np.ndarray", focus: str | None, focal_length: float | None
+) -> "Lens":
     """The lens that the options and the file describe."""
     from simulator import Lens
 
@@ -280,7 +278,7 @@ def _lens(
         return Lens(millimetres / 1000.0, _focus_distance(focus, metres))
 
 
-def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
+def _focus_distance(focus: str | None, metres: "np.ndarray") -> float:
     """Distance that the lens is focused at [m]: as given, at a pixel, or in the middle."""
     import numpy as np
 
@@ -342,7 +340,7 @@ def hdr(
 # -- shared by the commands -----------------------------------------------------------------------
 
 
-def make_simulator(weights: str, device: str, cache: bool, depth: str = "far") -> CameraSimulator:
+def make_simulator(weights: str, device: str, cache: bool, depth: str = "far") -> "CameraSimulator":
     """The simulator that the options describe; checks `depth`, which may need networks."""
     from simulator import CameraSimulator
 
@@ -356,7 +354,7 @@ def make_simulator(weights: str, device: str, cache: bool, depth: str = "far") -
     return CameraSimulator(device=device)
 
 
-def _write(raw: RawImage, out: Path, png: Path | None) -> None:
+def _write(raw: "RawImage", out: Path, png: Path | None) -> None:
     """Writes the DNG and, where asked for, the developed picture; prints their names."""
     from simulator import render_srgb, write_dng
 
@@ -367,7 +365,7 @@ def _write(raw: RawImage, out: Path, png: Path | None) -> None:
     print_files(files)
 
 
-def _write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
+def _write_upright(path: Path, raw: "RawImage", srgb: "torch.Tensor") -> Path:
     """Writes `srgb` (3, 2H, 2W) uint8, a picture of `raw`, upright and with square pixels."""
     from simulator.raw.develop import upright_picture
 

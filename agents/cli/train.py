@@ -1,7 +1,5 @@
 """Trainings and their results: ``ae-env train``, ``train-simulator`` and ``export``."""
 
-from __future__ import annotations
-
 import contextlib
 import shlex
 from pathlib import Path
@@ -55,7 +53,7 @@ def train(
     print_line("next: " + shlex.join(["ae-env", "evaluate", *_evaluation(agent, out)]))
 
 
-def _evaluation(agent: AgentConfig, out: Path) -> list[str]:
+def _evaluation(agent: "AgentConfig", out: Path) -> list[str]:
     """Options that evaluate the agent on what it was trained for."""
     if agent.agent == "forecaster":
         return ["--preset", "video", "--policy", f"regression:video?foresight={out}"]

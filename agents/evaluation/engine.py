@@ -4,8 +4,6 @@
 plan by their names, stores every finished part, and shares the work between processes.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Bootstrap intervals over source groups and training seeds, and the ranking that they allow."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

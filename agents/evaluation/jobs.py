@@ -4,8 +4,6 @@ A part's name is a hash of everything that decides its content: the version of t
 plan's entries, the scenes' light, and the files of policies, scorers and lightings of a user's own.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import os

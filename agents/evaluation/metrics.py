@@ -6,8 +6,6 @@ Axes: ``S`` states of the grid, ``T`` frames of an episode, ``E`` episodes; lead
 expected scores q, never those of one noisy capture.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ too bright, noisy where they are dark. It needs no picture, so it trains in minu
 light that repeats itself is foreseen from what came after light like it (`analogues`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

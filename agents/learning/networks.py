@@ -1,7 +1,5 @@
 """What the learnt agents share: features of a frame, values of every state, optimiser steps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Trained agents on disk: safetensors for the numbers, JSON for everything else; no pickle."""
 
-from __future__ import annotations
-
 import hashlib
 import reprlib
 from abc import ABC, abstractmethod

@@ -4,8 +4,6 @@ The image of a static scene does not depend on earlier actions, so the problem i
 bandit: the default discount is 0.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from typing import Any

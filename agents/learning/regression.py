@@ -5,8 +5,6 @@ tables (`train_regression`). Predictions are accumulated over the frames of the 
 each weighted by the network's own confidence.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From a Gymnasium vector environment to Stable-Baselines3's `VecEnv`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, cast
 

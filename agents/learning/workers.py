@@ -1,7 +1,5 @@
 """Jobs in processes of their own, which report their progress."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

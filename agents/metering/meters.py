@@ -6,8 +6,6 @@ EV equals that of the incident light) and adds the EV100 at which the frame was 
 here weigh pixels or zones; those of `search_meters` look for an exposure.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

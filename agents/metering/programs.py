@@ -5,8 +5,6 @@ time, M both and, where it is given, the ISO speed. `StateChooser` ranks the sta
 chosen by hand and by EV; `program_cost` says which of the states of one EV a program prefers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

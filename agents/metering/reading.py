@@ -1,7 +1,5 @@
 """Readings of light meters: of one frame, and what those of several frames say together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass

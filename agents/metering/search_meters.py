@@ -9,8 +9,6 @@ The frame is exposed again at that estimate first: so the steps add up on a grid
 with a delay no step is taken twice.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

@@ -4,8 +4,6 @@ One file is enough: beside the network it holds the exposure states, and what th
 mind between frames.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import sys

@@ -1,7 +1,5 @@
 """From a trained agent to one ONNX file that `agents.onboard.controller.Controller` runs."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """AE-Bench: a fixed plan with the hash of its scenes, and the table that others add to."""
 
-from __future__ import annotations
-
 import datetime
 import io
 import json

@@ -1,7 +1,5 @@
 """Films: episodes of policies side by side, each over a chart of its exposure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tab of episodes: two policies in the same light, frame by frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from functools import partial

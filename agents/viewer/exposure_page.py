@@ -1,7 +1,5 @@
 """The tab of single captures: sliders, the picture, the scores of all states and the readouts."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

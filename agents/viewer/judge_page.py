@@ -1,7 +1,5 @@
 """The page of ``ae-env judge``: two frames of a scene, nothing about them, and one choice."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Mapping
 from time import perf_counter

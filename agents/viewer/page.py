@@ -1,7 +1,5 @@
 """The page: the bar with the scene's name, the scene picker, files in and out, and its tabs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile
@@ -16,8 +14,9 @@ from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 from weakref import WeakMethod
 
-from fastapi import Response
+from fastapi import Request, Response
 from nicegui import app, run, ui
+from nicegui.elements.upload_files import create_file_upload
 
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage, asked_settings
@@ -30,6 +29,7 @@ from simulator.utils.checks import did_you_mean
 #: Largest file that is taken [byte].
 LARGEST_UPLOAD = 300_000_000
 _TOO_LARGE = "A raw may have 300 MB at most."
+_NO_FILE = "No file arrived. Choose a DNG, CR2, NEF or another raw."
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
 #: Tabs by their names in the page's address.
@@ -101,6 +101,19 @@ def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+def _refuse_empty_forms(upload: ui.upload) -> None:
+    """Answers a form without a file with 400 and a sentence: NiceGUI's own route fails at it."""
+    url = upload.props["url"]
+    app.remove_route(url)
+
+    @app.post(url)
+    async def take(request: Request) -> Response:
+        async with request.form() as form:
+            files: list[Any] = [f for f in form.values() if getattr(f, "filename", "")]
+            await upload.handle_uploads([await create_file_upload(file) for file in files])
+        return Response("" if files else _NO_FILE, 200 if files else 400, media_type="text/plain")
+
+
 def style_page() -> None:
     """Gives a page its looks, and what its pictures and its map do in the browser itself."""
     ui.add_css(Path(__file__).with_name("page.css").read_text())
@@ -140,6 +153,7 @@ class Page:
                 on_upload=_weakly(self._take_upload),
                 on_rejected=lambda: complain(_TOO_LARGE),
             ).classes("hidden")
+            _refuse_empty_forms(upload)
             pick = partial(upload.run_method, "pickFiles")
             self._open = ui.button("Open raw", icon="upload", on_click=pick).props("dense")
             self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")

@@ -1,7 +1,5 @@
 """Serves the page to this machine's browser alone."""
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import os

@@ -1,23 +1,26 @@
 """What the tabs of the page share: the scene, work in the background, pictures and charts."""
 
-from __future__ import annotations
-
 import asyncio
+import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from nicegui import run, ui
+from nicegui import ElementFilter, run, ui
 from nicegui.elements.mixins.text_element import TextElement
 
 from agents.viewer.viewed_scene import ViewedScene
+from simulator.raw.read import RawFileError
 
 #: Gives a picture an address for the browser.
 Address = Callable[[bytes], str]
 #: Time after which a spinner shows that work is under way [s].
 _SPINNER_AFTER = 0.3
+#: What to do where a raw cannot be opened.
+_CHOOSE = ". Choose a DNG, CR2, NEF or another raw of a camera with a Bayer sensor."
+_SAY = ". Run ae-env view FILE with --source-iso, --source-shutter and --source-aperture."
 
 
 def new_file(folder: Path, name: str) -> Path:
@@ -72,6 +75,8 @@ def loading(
         else:
             element.props["loading"] = busy
 
+    if isinstance(element, ui.button):  # a new action: an error of the last one is past
+        _dismiss_notices()
     # What is over at once shows no spinner: the page would be drawn for it twice more.
     wait = _SPINNER_AFTER if isinstance(element, ui.spinner) else 0.0
     shown = asyncio.get_running_loop().call_later(wait, show, True)
@@ -85,9 +90,22 @@ def loading(
 
 
 def complain(error: Exception | str) -> None:
-    """Shows an error as a notice."""
+    """Shows an error, without names of arguments, as the page's only notice."""
     text = " ".join(str(error).split()).encode(errors="replace").decode()  # names of files, too
-    ui.notify(text, type="negative", multi_line=True, timeout=0, close_button="Close")
+    text = re.sub(r"`\w+` (?:\(='?(.*?)'?\)|must be given: '(.*?)')", r"\1\2", text).replace(
+        "`", ""
+    )
+    if isinstance(error, RawFileError):
+        text = text.partition(";")[0].replace("not a raw", "not a raw file") + _CHOOSE
+    elif "; pass settings=" in text:
+        text = text.partition(";")[0].replace("_", "-") + _SAY
+    _dismiss_notices()
+    ui.notification(text, type="negative", multi_line=True, timeout=None, close_button="Close")
+
+
+def _dismiss_notices() -> None:
+    for notice in list(ElementFilter(kind=ui.notification)):
+        notice.dismiss()
 
 
 def heading(text: str, level: int) -> TextElement:

@@ -1,9 +1,8 @@
 """The scenes that the page offers, and what it shows of one: captures, readouts and scores."""
 
-from __future__ import annotations
-
 import io
 import math
+import re
 import threading
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
@@ -158,7 +157,9 @@ def _first_readable(what: str, readers: Mapping[str, Callable[[], OpenedScene]])
             read()
             return name
         except (ValueError, OSError) as error:
-            broken.append(f"{name}: {error}")
+            if len(readers) == 1:
+                raise
+            broken.append(f"{name}: {re.sub(r'`path` [(]=.*?[)] ', '', str(error))}")
     if len(broken) > _MOST_NAMED:
         broken[_MOST_NAMED:] = [f"and {len(broken) - _MOST_NAMED} more"]
     named = "; ".join(broken)

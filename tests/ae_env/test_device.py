@@ -3,8 +3,6 @@
 With the same seed both have the same noise; only the order of float32 arithmetic differs.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -11,6 +11,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -132,6 +133,10 @@ print("loaded", *sys.modules)
         assert ("--out" in text) == (name not in NO_OUT)
         assert ("--seed" in text) == (name not in NO_SEED)
     loaded = run.stdout.rpartition("\nloaded ")[2].split()
+    for one in ["--help"], ["hdr", "--nonsense"], []:  # alone, these check no values
+        alone = code.replace(str([*asked, *wrong, []]), str([one]))
+        run = subprocess.run([*command[:2], alone], capture_output=True, text=True, check=True)
+        assert "pydantic" not in run.stdout.rpartition("loaded ")[2].split()
     heavy = {"torch", "numba", "gymnasium", "numpy", "pandas", "matplotlib", "scipy", "nicegui"}
     assert not heavy & set(loaded)
     assert console.TOLERANCE == DEFAULT_TOLERANCE  # which help cannot import
@@ -146,8 +151,13 @@ print("loaded", *sys.modules)
         ),
         (("simulate", "IMG_1.dng", *SIMULATE, "--source-aperture", "-2"), "`--source-aperture`"),
         ((*PLAIN, "--depth", "unknown"), "`--depth` (='unknown') needs networks"),
+        (("view", "IMG_2.dng"), "r IMG_2.dng: no such file or folder; did you mean 'IMG_1.dng'?"),
+        (("score-tables", "x/a.nef"), "error x/a.nef: no such file or folder in "),
+        (("latitude", "codes", "x"), "error x: no such file or folder in "),
+        (("film", "--scenes", "x"), "error `--scenes` x: no such file or folder in "),
+        (("hdr", "IMG_1.dn"), "error IMG_1.dn: no such file or folder; did you mean"),
         (("evaluate", *UNKNOWN), "Unknown policy 'matrx:P'. Did you mean 'matrix:P'? It must"),
-        (("export", "ppo:video"), "`policy` (='ppo:video') must be without a history"),
+        (("export", "ppo:video"), "error ppo:video must be without a history"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
@@ -210,10 +220,7 @@ def test_code_of_the_user_that_fails(ae_env, tmp_path: Path) -> None:
     ],
 )
 def test_failures_while_running(ae_env, dng, monkeypatch, raised, status, message) -> None:
-    def fail(*args: object, **kwargs: object) -> None:
-        raise raised
-
-    monkeypatch.setattr("simulator.write_dng", fail)
+    monkeypatch.setattr("simulator.write_dng", Mock(side_effect=raised))
     code, _, error = ae_env("simulate", dng, *SIMULATE, "--weights", "none")
     assert (code, error.strip().count("\n")) == (status, 0)
     assert message in error

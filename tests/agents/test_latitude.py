@@ -149,11 +149,9 @@ def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path, caplog):
     assert "1 of 2 pictures are left out" in caplog.messages[0]
     for wrong in (f"{tmp_path}/bad.jpg", "nowhere"):
         error = ae_env("latitude", own, wrong, *out)[2]
-        assert ("`pictures` (=" in error, "`scenes`" in error) == (True, False)
-    assert (
-        "'codes', 'tags', 'text', 'faces', 'tracks'"
-        in ae_env("latitude", own + "er", wrong, *out)[2]
-    )
+        assert (wrong in error, "`" in error) == (True, False)
+    error = ae_env("latitude", own + "er", wrong, *out)[2]
+    assert "'codes', 'tags', 'text', 'faces', 'tracks'" in error
     assert (tmp_path / "latitude.csv").read_text().startswith("axis,value,noise,share,low,high")
     with Image.open(tmp_path / "latitude.png") as plot:
         assert plot.width > 300

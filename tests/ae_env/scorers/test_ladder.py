@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -160,12 +161,9 @@ def test_tables_are_stored_and_looked_up_by_the_environment(monkeypatch, tmp_pat
     grid = ExposureGrid((100.0,), (1 / 125, 1 / 15), (4.0,))
     made = ScoreTables(grid, CAMERA, make_scorer("legibility")).table(scene)
 
-    def fail(*_):
-        raise AssertionError("read again")
-
     options = {"scenes": [scene], "split": "all", "grid": grid, "resolution": 128}
     options |= {"scorer": "legibility", "motion": "none", "depth": "far", "reward": "expected"}
-    monkeypatch.setattr(Legibility, "__call__", fail)
+    monkeypatch.setattr(Legibility, "__call__", Mock(side_effect=AssertionError("read again")))
     again = ScoreTables(grid, CAMERA, make_scorer("legibility")).table(scene)
     assert np.array_equal(made.mean, again.mean)
     env = make_env(**options)

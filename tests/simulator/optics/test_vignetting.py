@@ -1,7 +1,5 @@
 """Vignetting: lensfun's model and database, and frames that have it; PRNU and dark current."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
