@@ -3,8 +3,8 @@
 `python examples/leave_one_body_out.py` trains on one body, on all of them, and on all but one, for
 as many frames each, and judges every agent on the bodies of `TESTED`, in views of real places that
 no training has seen. It writes ``docs/results/leave_one_body_out.json`` and the tables of its page,
-in half an hour of one core, and a quarter of an hour more to draw the scenes in the colours of each
-body. A run that was interrupted goes on with the agents in ``runs/leave_one_body_out``.
+in half an hour of one core, and 20 minutes more to draw the scenes in the colours of each body. A
+run that was interrupted goes on with the agents in ``runs/leave_one_body_out``.
 """
 
 import time
@@ -62,12 +62,10 @@ class SideBySide(gym.vector.VectorEnv):
         seen, *others = zip(*found, strict=True)
         return _joined(seen), *map(np.concatenate, others), {}
 
-    def expected_scores(self) -> Any:
-        """(N, S), see `AutoExposureVectorEnv`."""
+    def expected_scores(self) -> Any:  # (N, S)
         return np.concatenate([part.unwrapped.expected_scores() for part in self.parts])
 
-    def right_ev100(self) -> Any:
-        """(N,), see `AutoExposureVectorEnv`."""
+    def right_ev100(self) -> Any:  # (N,)
         return np.concatenate([part.unwrapped.right_ev100() for part in self.parts])
 
 
@@ -76,10 +74,7 @@ def _joined(seen: Sequence[Any]) -> dict[str, Any]:
 
 
 def train(name: str, bodies: Sequence[str], seed: int) -> None:
-    """Trains an agent as ``configs/regression.yaml`` says on fewer frames, unless it is there.
-
-    Its card has the CPU time that it took, without that of making the environments.
-    """
+    """Trains an agent as ``configs/regression.yaml`` says, on fewer frames, unless it is there."""
     out = RUNS / f"{name}-{seed}"
     if out.with_suffix(".json").is_file():
         return
