@@ -62,10 +62,12 @@ class SideBySide(gym.vector.VectorEnv):
         seen, *others = zip(*found, strict=True)
         return _joined(seen), *map(np.concatenate, others), {}
 
-    def expected_scores(self) -> Any:  # (N, S)
+    def expected_scores(self) -> Any:
+        """(N, S), see `AutoExposureVectorEnv`."""
         return np.concatenate([part.unwrapped.expected_scores() for part in self.parts])
 
-    def right_ev100(self) -> Any:  # (N,)
+    def right_ev100(self) -> Any:
+        """(N,), see `AutoExposureVectorEnv`."""
         return np.concatenate([part.unwrapped.right_ev100() for part in self.parts])
 
 
