@@ -75,9 +75,10 @@ class AutoExposure(Task):
         # Some expectation has no closed form.
         self._reads_tables = expected and not terms.closed_form
         self._reads_images = not expected and not terms.closed_form
-        reads_codes = bool(terms.parts) and not expected
         self.outputs = ("signals",) if self._reads_images else ()
-        if reads_codes or "flicker" in options.costs:  # else no code of every sample is made
+        if self._reads_images:  # glibc keeps freed memory from then on: a scorer needs it each step
+            torch.empty(2**25 - 2**16, dtype=torch.uint8)
+        if (terms.parts and not expected) or "flicker" in options.costs:  # else no code is made
             self.outputs += ("codes",)
         torch_parts = {} if terms.torch_terms is None else terms.torch_terms.parts
         # By `Episodes.light_index` and state; and which have been scored.
@@ -102,8 +103,7 @@ class AutoExposure(Task):
         """Scores (B,) by ``score:`` and part, and ``image_mean`` where a cost needs it."""
         columns: dict[str, np.ndarray] = {}
         if not self._reads_tables:
-            scores = self._score(frames)
-            columns = {f"score:{name}": values for name, values in scores.items()}
+            columns = {f"score:{name}": each for name, each in self._score(frames).items()}
         if "flicker" in self.episodes.options.costs:
             flat = frames.outputs["codes"].reshape(len(frames.gains), -1)
             if torch.is_tensor(flat):
