@@ -7,6 +7,7 @@ The detectors need the extras ``tasks``, ``cv`` and ``onnx`` and the packages th
 ``docs/latitude.md`` names.
 """
 
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -98,4 +99,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        sys.exit(__doc__)
     main()

@@ -7,6 +7,7 @@ in 40 minutes of one core, and 20 minutes more to draw the scenes in the colours
 run that was interrupted goes on with the agents in ``runs/leave_one_body_out``.
 """
 
+import sys
 import time
 from collections.abc import Sequence
 from itertools import product
@@ -143,4 +144,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        sys.exit(__doc__)
     main()

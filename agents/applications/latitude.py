@@ -117,6 +117,9 @@ class Latitude:
         said = [f"{LEVEL:.0%} of successes over {high - low:.1f} stops"]
         if "EVlow" in found:
             said[0] += f": {found.pop('EVlow')} to {found.pop('EVhigh')}"
+        else:
+            best, clean = (self.curve("EV", noise=noisy).share.max() for noisy in (True, False))
+            said = [f"never {LEVEL:.0%} of successes: {best:.0%}, {clean:.0%} without noise"]
         if self.left_out:
             said.append(f"{self.left_out} pictures left out: the detector finds nothing in them")
         return [*said, *found.values()]
@@ -391,15 +394,23 @@ def _found(detector: Detector, picture: np.ndarray) -> Any:
     """What the detector finds in a picture: a set of labels, boxes, or points and features."""
     try:
         result = detector(picture)
-        if isinstance(result, tuple) and [np.ndim(part) for part in result] == [2, 2]:
-            return result if len(result[0]) else set()
-        if isinstance(result, np.ndarray) and result.shape[1:] == (4,) and len(result):
-            return result
-        if isinstance(result, list | tuple | set | frozenset | np.ndarray):
-            return set(np.asarray(result).ravel().tolist() if len(result) else ())
-        return set() if result is None or result is False else {result}
+        pair = isinstance(result, tuple) and [np.ndim(part) for part in result] == [2, 2]
+        own = [*result] if isinstance(result, set | frozenset) else result
+        found = np.zeros((1, 1)) if pair else np.asarray(own)
     except Exception as error:
         raise UserCodeError(f"the detector raised {type(error).__name__}: {error}") from error
+    if pair and len(result[0]) == len(result[1]) and np.shape(result[0])[1] == 2:
+        return tuple(map(np.asarray, result)) if len(result[0]) else set()
+    if result is None or found.size == 0 or (found.dtype == bool and not found.any()):
+        return set()
+    if found.ndim < 2 and found.dtype.kind in "biuUS":
+        return set(found.ravel().tolist())
+    if found.ndim == 2 and found.shape[1] == 4 and (found[:, 2:] > found[:, :2]).all():
+        return found
+    rule = "a truth value, labels (integers or words), points (N, 2) and their features (N, F), or "
+    rule += "boxes (N, 4) with right > left and bottom > top"
+    what = type(result).__name__ if pair else f"{found.dtype} {found.shape}"
+    raise UserCodeError(f"the detector returned {what}: it must return {rule}")
 
 
 def _kept(wanted: Any, found: Any) -> list[bool]:

@@ -93,6 +93,24 @@ def detector(name):
     return load_detector(name)
 
 
+@pytest.mark.parametrize("nothing", [np.False_, False, None, [], np.zeros((0, 4)), set()])
+def test_what_is_nothing_to_begin_with_is_no_success(nothing, tmp_path):
+    with pytest.raises(ValueError, match="must find something"):
+        latitude(np.zeros((64, 64, 3), np.uint8), lambda _: nothing, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *(0.7, [0.5, 0.7], np.ones((3, 5)), {"a": 1}, [[1], [1, 2]], np.full((1, 4), np.nan)),
+        *([[9, 9, 5, 5]], (np.ones((5, 2)), np.ones((4, 8))), (np.ones((5, 3)), np.ones((5, 8)))),
+    ],
+)
+def test_results_of_a_wrong_form_are_errors(wrong, tmp_path):
+    with pytest.raises(UserCodeError, match="the detector"):
+        latitude(np.zeros((64, 64, 3), np.uint8), lambda _: wrong, tmp_path)
+
+
 def test_text_is_read_upright_and_turned():
     read, wanted = detector("text"), ["Shutter 1/250 s", "ISO 400"]
     font = ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", 28)
