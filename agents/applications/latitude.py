@@ -33,7 +33,7 @@ from ae_env.utils.user_files import UserCodeError, load_from_file, split_file_na
 from simulator import CameraProfile
 from simulator.raw.develop import develop_inverse
 from simulator.settings import CameraSettings
-from simulator.utils.checks import import_extra, onnx_session
+from simulator.utils.checks import did_you_mean, import_extra, onnx_session
 from simulator.utils.files import RAW_SUFFIXES, open_picture, read_bounded
 
 logger = logging.getLogger(__name__)
@@ -155,7 +155,8 @@ def load_detector(name: str) -> Detector:
     rule, known = f"`detector` (={name!r})", ", ".join(map(repr, BUILT_IN))
     file = split_file_name(name)
     if file is None:
-        raise ValueError(f"{rule} must be {known}, 'model.onnx' or 'my_file.py:Name'")
+        near = did_you_mean(name, BUILT_IN)
+        raise ValueError(f"{rule} must be {known}, 'model.onnx' or 'my_file.py:Name'{near}")
     try:
         found = load_from_file(*file, rule, example="MyDetector")
     except ValueError as error:
@@ -407,10 +408,9 @@ def _found(detector: Detector, picture: np.ndarray) -> Any:
         return set(found.ravel().tolist())
     if found.ndim == 2 and found.shape[1] == 4 and (found[:, 2:] > found[:, :2]).all():
         return found
-    rule = "a truth value, labels (integers or words), points (N, 2) and their features (N, F), or "
-    rule += "boxes (N, 4) with right > left and bottom > top"
+    rule = "a truth value, labels (integers or words), points and features, or boxes (N, 4)"
     what = type(result).__name__ if pair else f"{found.dtype} {found.shape}"
-    raise UserCodeError(f"the detector returned {what}: it must return {rule}")
+    raise UserCodeError(f"the detector returned {what}: not {rule}, right > left, bottom > top")
 
 
 def _kept(wanted: Any, found: Any) -> list[bool]:
