@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import multiprocessing.forkserver
 import os
+import socket
 
 import hypothesis
 import pytest
@@ -74,6 +75,13 @@ def cache_in_tmp(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AE_ENV_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
         yield
+
+
+@pytest.fixture
+def no_network(monkeypatch):
+    """Every connection is refused: nothing may be fetched at run time."""
+    monkeypatch.setattr(socket.socket, "connect", pytest.fail)
+    monkeypatch.setattr(socket, "getaddrinfo", pytest.fail)
 
 
 @pytest.fixture(autouse=True)

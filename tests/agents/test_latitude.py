@@ -14,7 +14,7 @@ from agents.applications import latitude as module
 from agents.applications.latitude import load_detector, measure_latitude, picture_scenes
 from simulator import get_camera
 
-CAMERA = get_camera("nikon_z6")
+CAMERA, pytestmark = get_camera("nikon_z6"), pytest.mark.usefixtures("no_network")
 
 
 def decoded(code):

@@ -22,6 +22,8 @@ from tests.ae_env.scorer_images import CAMERA, make_captures, make_scene
 zxing = pytest.importorskip("zxingcpp", reason="needs the extra tasks")
 needs_opencv = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="needs OpenCV")
 
+pytestmark = pytest.mark.usefixtures("no_network")
+
 
 def plain(size=128, scene_id="grey", **fields):
     """A grey card with more light at the top, as the incident-light exposure records it."""
