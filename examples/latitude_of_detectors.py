@@ -2,7 +2,7 @@
 
 `python examples/latitude_of_detectors.py` measures `ae-env latitude` of `codes`, `tags`, `text`,
 `faces` and `tracks` on pictures that come with scikit-image, and on boards that it draws. It writes
-``docs/results/latitude.json``, the table of its page and its picture, in three minutes on one core.
+``docs/results/latitude.json``, the table of its page and its picture, in two minutes on one core.
 The detectors need the extras ``tasks``, ``cv`` and ``onnx`` and the packages that
 ``docs/latitude.md`` names.
 """

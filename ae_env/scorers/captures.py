@@ -387,8 +387,8 @@ class SceneBlur:
         numbers, scores = np.stack([speed, times, discs, own, blur], axis=1), np.empty(len(scenes))
         columns = self._sorts, first, last, movements, numbers
         _fill_levels(height, *columns, levels, shares, blur, scores)
-        pixel_blur = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares))
-        return torch.from_numpy(blur), pixel_blur if count else None, scores
+        spread = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)) if count else None
+        return torch.from_numpy(blur), spread, scores
 
     def _add(self, scenes: list[int]) -> None:
         layouts = [self._scenes[index].layout for index in scenes]
