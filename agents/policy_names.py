@@ -21,9 +21,8 @@ METERS = (*CLASSIC_METERS, "highlight_weighted", "skewness", "entropy", "shim", 
 #: The programs that nothing has to be learnt for, and all.
 MANUAL_PROGRAMS = ("P", "A", "S", "M")
 PROGRAMS = (*MANUAL_PROGRAMS, "tuned", "tuned_blind")
-#: Agents that come with the package: the training seeds of ``ae-env bench agents``.
+#: Agents that come with the package, a file for each training seed.
 PRETRAINED = Path(__file__).parent / "pretrained"
-PRETRAINED_SEEDS = (0, 1, 2)
 #: Forecasters of light that come with the package, and the word that asks for them.
 FORECASTERS, LEARNT = str(PRETRAINED / "forecaster-*"), "learnt"
 
@@ -54,7 +53,7 @@ _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
         for p in PROGRAMS
     },
     **{
-        name: (WITH_FILE[name.partition(":")[0]][0], {"weights": f"{file}-{PRETRAINED_SEEDS[0]}"})
+        name: (WITH_FILE[name.partition(":")[0]][0], {"weights": f"{file}-0"})
         for name, file in _SHIPPED.items()
     },
 }
@@ -136,7 +135,7 @@ def training_seeds(name: str) -> list[str]:
     base, _ = split_options(name)
     head, _, tail = base.partition(":")
     if (agent := base.removesuffix(":")) in _SHIPPED:
-        files = [f"{_SHIPPED[agent]}-{seed}" for seed in PRETRAINED_SEEDS]
+        files = weight_files(f"{_SHIPPED[agent]}-*")
     elif head in LEARNT_AGENTS and "*" in tail:
         files = weight_files(tail)
         if not files:
