@@ -125,9 +125,8 @@ def is_metering(name: str) -> bool:
 def training_seeds(name: str) -> list[str]:
     """The names under which `make_policy` knows the training seeds of a learnt agent.
 
-    ``"ppo"`` or ``"regression"``, alone or with ``":video"``, stands for all seeds that come with
-    the package, ``"ppo:runs/ppo-*"`` for the files that match (a `ValueError` if none does), any
-    other for itself. Options of the name are those of each.
+    ``"ppo"`` or ``"regression"``, alone or with ``":video"``, stands for all seeds of the package,
+    ``"ppo:runs/ppo-*"`` for the files that match (if none, a `ValueError`), any other for itself.
 
     >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
     (['0', '1', '2'], ['spot:P'])
@@ -251,9 +250,11 @@ def make_policy(
 
 
 def check_policy(name: str) -> None:
-    """Raises a `ValueError` unless there is a policy called `name`; options are not checked."""
-    for one in training_seeds(name):
-        _find(one, split_options(one)[0].removesuffix(":"))
+    """Raises a `ValueError` unless there is a policy called `name` that takes its options."""
+    base, options = split_options(one := training_seeds(name)[0])
+    cls, fixed = _find(one, base.removesuffix(":"))
+    if inspect.isclass(cls):
+        _check_options(one, cls, options, fixed)
 
 
 def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
@@ -291,9 +292,8 @@ def _check_class(name: str, cls: Any, context: PolicyContext) -> None:
     """Raises a `ValueError` unless `cls` is the class of a policy for this task."""
     if not inspect.isclass(cls):
         raise _refusal(name, " must name a class")
-    missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
-    if getattr(cls, "act", None) is Policy.act:
-        missing = ["act"]
+    has = {m: getattr(cls, m, None) for m in ("reset", "act")}
+    missing = [m for m in has if not callable(has[m]) or has[m] is Policy.act]
     if missing:
         text = f": {cls.__name__} is not a policy, it has no {' and '.join(missing)}"
         raise _refusal(name, f"{text}; derive it from agents.Policy")
@@ -309,8 +309,9 @@ def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str
     if any(p.kind is p.VAR_KEYWORD for p in known.values()):
         return
     for option in set(options) - set(known):
-        takes = f"; it takes {', '.join(known) or 'none'}{did_you_mean(option, known)}"
-        raise _refusal(name, f": {cls.__name__} does not take the option {option!r}{takes}")
+        takes = [one for one in known if one not in ("network", "device")]  # a name gives neither
+        text = f"{option!r}; it takes {', '.join(takes) or 'none'}{did_you_mean(option, takes)}"
+        raise _refusal(name, f": {cls.__name__} does not take the option {text}")
 
 
 def _parameters(cls: Any, fixed: dict[str, Any]) -> dict[str, inspect.Parameter]:

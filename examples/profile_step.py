@@ -1,9 +1,10 @@
 """Where the time of a step goes, and what more cores would bring.
 
-`python examples/profile_step.py [SIZE]` steps 64 environments with random actions on one thread. It
-times the sections that threads share (`simulator.utils.compute.parallel_ranges`); all else is the
-interpreter's, on one thread whatever there are. A step on n threads takes at least the rest and an
-n-th of the sections.
+`python examples/profile_step.py [SIZE] [cached]` steps 64 environments with random actions on one
+thread, in motion and out of focus, or neither: `cached`. It times the sections that threads share
+(`simulator.utils.compute.parallel_ranges`); all else is the interpreter's, on one thread whatever
+there are. A step on n threads takes at least the rest and an n-th of the sections. The fused kernel
+of `ae-env bench throughput` runs in turns with the steps.
 """
 
 import gc
@@ -16,6 +17,7 @@ import numpy as np
 import torch
 
 import ae_env  # noqa: F401  (registers the environments)
+from benchmarks.throughput.kernel_limit import KernelLimit
 from simulator.utils import compute
 
 NUM_ENVS, STEPS, ROUNDS = 64, 40, 9
@@ -43,10 +45,13 @@ def timed_sections(spent):
             module.parallel_ranges = timed
 
 
-def main(size=64):
+def main(size=64, cached=False):
     """Measures and prints a table."""
     torch.set_num_threads(1)
     options = {"scenes": "bundled:small", "resolution": size, "autoreset_mode": "SAME_STEP"}
+    options |= {"motion": "none", "depth": "far"} if cached else {}
+    lights = np.random.default_rng(0).random((8, 4, size, size), np.float32)
+    kernel = KernelLimit(lights, NUM_ENVS, noise="bank", threads=1, seed=0)
     envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=NUM_ENVS, **options)
     envs.reset(seed=0)
     actions = np.random.default_rng(0).integers(0, 64, (100 + ROUNDS * STEPS, NUM_ENVS))
@@ -61,15 +66,20 @@ def main(size=64):
         for own in chosen:
             envs.step(own)
         whole = time.perf_counter() - begun
-        rows.append({**spent, "whole": whole})
+        kernel.step()  # its data are in the processor's cache again
+        begun = time.perf_counter()
+        for _ in range(STEPS):
+            kernel.step()
+        rows.append({**spent, "whole": whole, "kernel": time.perf_counter() - begun})
     scale = 1e6 / (STEPS * NUM_ENVS)
     of = {name: scale * np.median([row[name] for row in rows]) for name in rows[0]}
-    whole, rest = of["whole"], of["whole"] - sum(of[name] for name in of if name != "whole")
+    whole, alone = of.pop("whole"), of.pop("kernel")
+    rest = whole - sum(of.values())
     print(f"{NUM_ENVS} environments, {size} x {size}, microseconds a frame, median of {ROUNDS}")
     for name in sorted(of, key=of.get, reverse=True):
-        if name != "whole":
-            print(f"{CALLERS.get(name, name):34} {of[name]:7.1f} {of[name] / whole:5.0%}")
+        print(f"{CALLERS.get(name, name):34} {of[name]:7.1f} {of[name] / whole:5.0%}")
     print(f"{'interpreter and NumPy':34} {rest:7.1f} {rest / whole:5.0%}")
+    print(f"{'the fused kernel alone':34} {alone:7.1f} {whole / alone:5.2f} times less")
     for threads in (1, 2, 8, 16):
         least = rest + (whole - rest) / threads
         print(
@@ -78,7 +88,7 @@ def main(size=64):
 
 
 if __name__ == "__main__":
-    sizes = sys.argv[1:]
+    sizes = [word for word in sys.argv[1:] if word != "cached"]
     if len(sizes) > 1 or not all(size.isdecimal() and int(size) >= 36 for size in sizes):
-        sys.exit("usage: python examples/profile_step.py [SIZE], 36 or more")
-    main(*map(int, sizes))
+        sys.exit("usage: python examples/profile_step.py [SIZE] [cached], 36 or more")
+    main(*map(int, sizes), cached="cached" in sys.argv)
