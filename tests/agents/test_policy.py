@@ -47,10 +47,7 @@ def test_every_listed_name_makes_a_policy(context):
         *(("matrx:P", "'matrix:P'"), ("matrix:Q", "one of matrix:P, .*blind$")),
         *(("recorded", "recorded:FOLDER"), ("mine.py", "class"), ("rpi-agc", "'rpi_agc'")),
         *((f"{n}:X", f"file {n!r}; .{{,60}}$") for n in ("no_such_pkg.mod", "p.png", "a/p.png")),
-        *(
-            ("agents.baselines:Rundom", "'Rundom' .*Random"),
-            ("spot?compensatio=1", "'compensation'"),
-        ),
+        *(("agents.baselines:Rundom", ".*Random"), ("spot?compensatio=1", "'compensation'")),
         *(("spot?damping=1", r"`damping` \(=1\) .* in \[0, 0\.999]"), ("spot:A?iso=100", "`iso`")),
         (f"ppo:{policy_names.PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
         *((f"recorded:{Path(__file__).parent}", "`path`"), ("spot?", "key=value")),  # holds no raw
