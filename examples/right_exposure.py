@@ -1,10 +1,10 @@
-"""How much of what an agent loses does no frame show? The agent, and the same one told what it is.
+"""What agents lose because no frame shows the right exposure: agents, and the same ones told it.
 
 The right exposure is read by a dome at the subject, from light that is mostly out of the picture.
 `python examples/right_exposure.py` runs the agents behind `regression:video?foresight=learnt` in
 views of real places twice: as they are, and told the right exposure of the frame in hand. Nothing
 else differs: frames, forecast of the light, and networks, which were trained to guess it. It writes
-``docs/results/foresight.json`` and the table of its page, in 40 minutes of one core.
+``docs/results/foresight.json`` and the table of its page, in 10 minutes of one core.
 """
 
 import sys
@@ -64,7 +64,7 @@ def run(kind: str) -> Row:
     base, context = first.unwrapped, PolicyContext.from_envs(first)
     views = [i * len(base.scenes) // VIEWS for i in range(VIEWS)]
     groups = [base.scenes[i].group for i in views]
-    files = [w.removeprefix(f"{AGENT[:10]}:") for w in training_seeds(AGENT)[:AGENTS]]
+    files = [w.partition(":")[2] for w in training_seeds(AGENT)[:AGENTS]]
     policies = [p(context, f, foresight="learnt") for p in (RegressionPolicy, Told) for f in files]
     envs: list[Any] = [first, *(gym.make_vec(ENV_ID, **options) for _ in policies[1:])]
     seen = [e.reset(seed=SEED, options={"scene": views})[0] for e in envs]
@@ -93,14 +93,13 @@ def run(kind: str) -> Row:
     error = np.sqrt(group_means(errors.mean(axis=0) / FRAMES, groups))
     row: Row = {"kind": kind, "places": len(span), "gain": gain.value}
     row |= {"gain_ci95": gain.pair, "least": ((told - agent).mean(axis=0) / span).min()}
-    row |= {
-        name: g.mean(axis=0).sum() / span.sum() for name, g in (("agent", agent), ("told", told))
-    }
+    for name, own in (("agent", agent), ("told", told)):
+        row[name] = own.mean(axis=0).sum() / span.sum()
     return row | {"error": np.sqrt(np.square(error).mean()), "worst_error": error.max()}
 
 
 def main() -> None:
-    """Runs every kind of light in validation and test places, and writes what was found."""
+    """Runs every kind of light, and writes what was found."""
     torch.set_num_threads(1)
     meta = result_meta("python examples/right_exposure.py", SEED)
     meta |= {"frames": FRAMES, "views": VIEWS, "training_seeds": AGENTS}
