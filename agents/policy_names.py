@@ -292,9 +292,8 @@ def _check_class(name: str, cls: Any, context: PolicyContext) -> None:
     """Raises a `ValueError` unless `cls` is the class of a policy for this task."""
     if not inspect.isclass(cls):
         raise _refusal(name, " must name a class")
-    has = {m: getattr(cls, m, None) for m in ("reset", "act")}
-    missing = [m for m in has if not callable(has[m]) or has[m] is Policy.act]
-    if missing:
+    own = [(m, getattr(cls, m, None)) for m in ("reset", "act")]
+    if missing := [m for m, found in own if not callable(found) or found is Policy.act]:
         text = f": {cls.__name__} is not a policy, it has no {' and '.join(missing)}"
         raise _refusal(name, f"{text}; derive it from agents.Policy")
     of_frames = cls.__module__.startswith("agents.") and cls.__name__ != "Random"

@@ -89,6 +89,6 @@ def main(size=64, cached=False):
 
 if __name__ == "__main__":
     sizes = [word for word in sys.argv[1:] if word != "cached"]
-    if len(sizes) > 1 or not all(size.isdecimal() and int(size) >= 36 for size in sizes):
-        sys.exit("usage: python examples/profile_step.py [SIZE] [cached], 36 or more")
+    if len(sizes) > 1 or not all(size.isdecimal() and 36 <= int(size) <= 4096 for size in sizes):
+        sys.exit("usage: python examples/profile_step.py [SIZE] [cached], of 36 to 4096")
     main(*map(int, sizes), cached="cached" in sys.argv)

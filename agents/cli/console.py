@@ -21,7 +21,7 @@ from typer import Argument, Option
 from simulator.utils.checks import parse_number
 from simulator.utils.files import printable
 
-terminal = Console()
+terminal = Console(emoji=False)
 
 # -- options of several commands ------------------------------------------------------------------
 

@@ -210,7 +210,7 @@ def main() -> None:
         errors = error.exceptions if isinstance(error, ExceptionGroup) else (error,)
         for one in errors:
             text = escape(_as_typed(_one_line(one)))
-            Console(stderr=True).print(f"[bold red]error[/] {text}", soft_wrap=True)
+            Console(stderr=True, emoji=False).print(f"[bold red]error[/] {text}", soft_wrap=True)
         usage = all(isinstance(e, _USAGE) and not isinstance(e, UserCodeError) for e in errors)
         raise SystemExit(2 if usage else 1) from None
     except SystemExit as stop:
@@ -230,7 +230,8 @@ class _Log(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from rich.logging import RichHandler
 
-        RichHandler(console=Console(stderr=True), show_time=False, show_path=False).emit(record)
+        plain = Console(stderr=True, emoji=False)
+        RichHandler(console=plain, show_time=False, show_path=False).emit(record)
 
 
 def _terminate(*_: Any) -> None:

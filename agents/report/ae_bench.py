@@ -141,7 +141,7 @@ def check_append(
     if plan.task not in _TASKS:
         raise _refusal(table, f"takes no rows of {plan.name}, which is no task of AE-Bench")
     rows, page = _read_own(table, plan), page_of(table)
-    if page == table:
+    if table.suffix.lower() != ".csv":
         raise _refusal(table, "must be a CSV file, such as mine.csv")
     if page.is_file() and _MARK not in page.read_text(encoding="utf-8", errors="replace"):
         raise _refusal(table, f"would replace {page}, which is not a benchmark's page")

@@ -452,7 +452,7 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         (table, ["u/my.py:Mine"], " ", r"`author` .*'my\.py:Mine'"),
         (table, ["u/my.py:Mine", "v/my.py:Mine"], "me", r"`policy` .*'my\.py:Mine'"),
         (table, [], "me", "`append`"),
-        (tmp_path / "a.md", ["random"], "me", "`append`"),
+        *((tmp_path / f"a.{end}", ["random"], "me", "`append` .*CSV") for end in ("md", "txt")),
         (tmp_path / "notes.csv", ["random"], "me", r"`append` .*notes\.md"),
         (_table(tmp_path / "b.csv", plan, hash="0"), ["random"], "me", r"b\.csv .*hash"),
         (_table(tmp_path / "d.csv", plan, score="x"), ["random"], "me", r"d\.csv, line 2: `score`"),
