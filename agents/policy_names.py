@@ -134,13 +134,13 @@ def training_seeds(name: str) -> list[str]:
     base, _ = split_options(name)
     head, _, tail = base.partition(":")
     if (agent := base.removesuffix(":")) in _SHIPPED:
-        files = weight_files(f"{_SHIPPED[agent]}-*")
+        pattern = f"{_SHIPPED[agent]}-*"
     elif head in LEARNT_AGENTS and "*" in tail:
-        files = weight_files(tail)
-        if not files:
-            raise _refusal(name, f": no .safetensors file fits {tail!r}")
+        pattern = tail
     else:
         return [name]
+    if not (files := weight_files(pattern)):
+        raise _refusal(name, f": no .safetensors file fits {pattern!r}")
     return [f"{head}:{file}{name[len(base) :]}" for file in files]
 
 

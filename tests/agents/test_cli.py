@@ -153,7 +153,7 @@ print("loaded", *sys.modules)
         ((*PLAIN, "--depth", "unknown"), "`--depth` (='unknown') needs networks"),
         (("view", "IMG_2.dng"), "r IMG_2.dng: no such file or folder; did you mean 'IMG_1.dng'?"),
         (("score-tables", "x/a.nef"), "error x/a.nef: no such file or folder in "),
-        (("latitude", "codes", "x"), "error x: no such file or folder in "),
+        (("latitude", "codes", ":star:"), "error :star:: no such file or folder in "),
         (("film", "--scenes", "x"), "error `--scenes` x: no such file or folder in "),
         (("hdr", "IMG_1.dn"), "error IMG_1.dn: no such file or folder; did you mean"),
         (("evaluate", *UNKNOWN), "Unknown policy 'matrx:P'. Did you mean 'matrix:P'? It must"),
