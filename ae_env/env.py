@@ -27,7 +27,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
-from ae_env.scorers.captures import Captures, SceneBlur
+from ae_env.scorers.captures import Captures, ShownScenes
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
@@ -36,6 +36,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.motion import Movement
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_seed, check_word
+from simulator.utils.compute import keep_memory
 
 logger = logging.getLogger(__name__)
 
@@ -75,9 +76,9 @@ class AutoExposure(Task):
         # Some expectation has no closed form.
         self._reads_tables = expected and not terms.closed_form
         self._reads_images = not expected and not terms.closed_form
-        self.outputs = ("signals",) if self._reads_images else ()
-        if self._reads_images:  # glibc keeps freed memory from then on: a scorer needs it each step
-            torch.empty(2**25 - 2**16, dtype=torch.uint8)
+        self.outputs = ("images",) if self._reads_images else ()
+        if self._reads_images:
+            keep_memory()
         if (terms.parts and not expected) or "flicker" in options.costs:  # else no code is made
             self.outputs += ("codes",)
         torch_parts = {} if terms.torch_terms is None else terms.torch_terms.parts
@@ -91,7 +92,7 @@ class AutoExposure(Task):
         self._of_light = [n for n in self._known if depends_on(torch_parts[n]) == "light"]
         self._light_scores = np.full((len(episodes.scenes), states, len(self._of_light)), np.nan)
         self._means = np.full((lights, states, 3), np.nan)
-        self._blur = SceneBlur(episodes.scenes, terms.captures)
+        self._shown = ShownScenes(episodes.scenes, terms.captures)
         self._tables: LruCache[ScoreTable] = LruCache(max(TABLES_BYTES, 128 * count * states))
 
     def forget(self, lights: np.ndarray) -> None:
@@ -201,10 +202,8 @@ class AutoExposure(Task):
                 means = self._expected_means(frames, self._transitions, boxes)
             scores |= terms.score(means, captures)
         if self._reads_images and captures is not None:
-            shown = torch.as_tensor(frames.outputs["signals"])
-            linear = episodes.options.observation == "linear"  # the frame is observed, too
-            shown = shown.clamp(0.0, 1.0) if linear else shown.clamp_(0.0, 1.0)
-            scores |= terms.torch_scores(shown, captures, "image")
+            images = torch.as_tensor(frames.outputs["images"])
+            scores |= terms.torch_scores(images, captures, "image")
         return scores
 
     def _known_scores(self, frames: FrameBatch, source_noise: np.ndarray) -> dict[str, np.ndarray]:
@@ -236,7 +235,7 @@ class AutoExposure(Task):
             self._light_scores[scene] = np.stack([*of_light.values()], axis=1)
         found = dict(zip(self._of_light, self._light_scores[scenes, states].T, strict=True))
         if self._terms.only_sharpness:
-            *_, scores = self._blur.of(scenes, states, **self._moves(env_indices))
+            *_, scores = self._shown.blur(scenes, states, **self._moves(env_indices))
             return found | dict.fromkeys(self._terms.only_sharpness, scores)
         described = self._describe(frames, source_noise, new)
         return found | self._terms.torch_scores(None, described, "blur")
@@ -264,8 +263,9 @@ class AutoExposure(Task):
             pairs = source_noise[part].tolist()
             noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
         return self._terms.captures.of(
-            [episodes.scenes[scene] for scene in episodes.scene[env_indices].tolist()],
+            self._shown,
             episodes.state[env_indices],
+            which=episodes.scene[env_indices],
             **self._moves(env_indices),
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],

@@ -40,8 +40,8 @@ from simulator.capture.sensor import Noise, Transitions, single_normals
 CHUNK_SAMPLES = 2**24
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 #: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
-_DTYPES = {"codes": np.uint8, "signals": np.float32, "numbers": np.uint16}
-_OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": "numbers"}
+_DTYPES = {"codes": np.uint8, "linear": np.float32, "images": np.float32, "numbers": np.uint16}
+_OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "linear", "dn": "numbers"}
 
 
 @dataclass
@@ -345,8 +345,6 @@ class EpisodeCore:
         if self.options.sensors:
             columns["sensor_normals"] = single_normals(found.keys, 2)
         columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows))
-        if self.options.observation == "linear":
-            torch.as_tensor(raw).clamp_(-PEDESTAL, 1.0)
         return columns
 
     def _moved(self, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ae_env.grid import ExposureGrid
-from ae_env.observation import encode_observation
+from ae_env.observation import PEDESTAL, encode_observation
 from ae_env.scenes.scene import Scene
 from simulator.camera import LOW_CLIP, CameraProfile
 from simulator.capture.batch import MODULES, FrameStatistics
@@ -62,9 +62,10 @@ class LookupBatch:
         digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
         if "codes" in outputs:
             encode_observation(torch.from_numpy(shown), out=torch.from_numpy(outputs["codes"]))
-        for name, values in (("numbers", digital), ("signals", shown)):
-            if name in outputs:
-                outputs[name][:] = values
+        known = {"numbers": digital, "linear": shown.clip(-PEDESTAL, 1.0)}
+        known["images"] = shown.clip(0.0, 1.0)
+        for name in known.keys() & outputs:
+            outputs[name][:] = known[name]
         count, nothing = len(shown), np.zeros(len(shown))
         return FrameStatistics(
             clipped_low=(shown <= LOW_CLIP).reshape(count, -1).mean(axis=1),

@@ -22,6 +22,7 @@ from simulator.capture.prepared_scene import MAX_IMAGE_SPEED, PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DIAMETERS
 from simulator.optics.motion import ALONG_ROWS, Movement, path_length
+from simulator.radiance.incident_light import LIKELY
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number, check_type
 from simulator.utils.compute import kernel
@@ -251,9 +252,10 @@ class SceneCaptures:
 
     def of(
         self,
-        scenes: Sequence[Scene],
+        scenes: Sequence[Scene] | ShownScenes,
         states: np.ndarray | None = None,
         *,
+        which: np.ndarray | None = None,
         speed: np.ndarray,
         defocus: np.ndarray,
         movements: np.ndarray | None = None,
@@ -264,7 +266,7 @@ class SceneCaptures:
         """Captures of a scene each, all (B,) long.
 
         Args:
-            scenes: Scene of each capture.
+            scenes: Scene of each capture, or scenes of which `which` (B,) has the indices.
             states: (B,) of the grid; None for one capture at each.
             speed, defocus: (B,) each, see `prepare_scene`.
             movements: (B, 4) numbers of each `Movement`, in its order; None for along the rows.
@@ -272,33 +274,30 @@ class SceneCaptures:
             row_gain: (B, H) light of each row relative to that; None where all rows have the same.
             source_noise: See `Captures`.
         """
+        if not isinstance(scenes, ShownScenes):  # some are shown often
+            _, first, which = np.unique([*map(id, scenes)], return_index=True, return_inverse=True)
+            scenes = ShownScenes([scenes[i] for i in first], self)
+        assert which is not None
         states = np.arange(len(self.states)) if states is None else states
-        movements = np.zeros((len(scenes), 4)) if movements is None else movements
-        # Some are shown often.
-        _, first, which = np.unique([*map(id, scenes)], return_index=True, return_inverse=True)
-        few = [scenes[i] for i in first]
+        movements = np.zeros((len(which), 4)) if movements is None else movements
         moves = states, speed, defocus, movements
-        blur_px, pixel_blur, _ = SceneBlur(few, self).of(which, *moves, pixels=True)
-        facts = np.array([(c.reference.log2_exposure, c.ev100) for c in few])[which].T
-        ratios = [2.0**stops for stops in (self._log2_exposures[states] - facts[0]).tolist()]
-        right, indices = [c.incident_light.right_ev100 for c in few], states.tolist()
-        most, likely = max(map(len, right)), None
-        if most > 1:
-            each = np.stack([np.broadcast_to(own, most) for own in right])[which]
-            likely = torch.from_numpy(each + np.log2(gain)[:, None])
+        blur_px, pixel_blur, _ = scenes.blur(which, *moves, pixels=True)
+        reference, proper_ev, likely_ev = scenes.light(which)
+        ratios = [2.0**stops for stops in (self._log2_exposures[states] - reference).tolist()]
+        stops, indices = np.log2(gain), states.tolist()
         return Captures(
             settings=[self.states[state] for state in indices],
-            _scenes=scenes,
+            _scenes=[scenes[scene] for scene in which.tolist()],
             ratio=torch.from_numpy(np.array(ratios) * gain),
             nlf=[self._nlf[state] for state in indices],
-            proper_ev=torch.from_numpy(facts[1] + np.log2(gain)),
+            proper_ev=torch.from_numpy(proper_ev + stops),
             blur_px=blur_px,
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
             source_noise=source_noise,
             noisy=self.noisy,
             prnu=self.camera.prnu,
             pixel_blur=pixel_blur,
-            likely_ev=likely,
+            likely_ev=None if likely_ev is None else torch.from_numpy(likely_ev + stops[:, None]),
         )
 
     def describe(
@@ -328,7 +327,7 @@ class SceneCaptures:
         """Scores (S,) of `Sharpness` at all states; see `describe`."""
         count = len(self.states)
         moves = _moves(scene, prepared, count)
-        return SceneBlur([scene], self).of(np.zeros(count, int), np.arange(count), **moves)[2]
+        return ShownScenes([scene], self).blur(np.zeros(count, int), np.arange(count), **moves)[2]
 
 
 def _moves(scene: Scene, prepared: PreparedScene, count: int) -> dict[str, Any]:
@@ -340,8 +339,8 @@ def _moves(scene: Scene, prepared: PreparedScene, count: int) -> dict[str, Any]:
     return {"speed": speed, "defocus": defocus, "movements": movements}
 
 
-class SceneBlur:
-    """Blur of captures of many scenes; what it takes of a scene becomes columns when it is shown.
+class ShownScenes:
+    """What captures take of many scenes; it becomes columns when a scene is first shown.
 
     `captures` are those of the states.
     """
@@ -351,8 +350,28 @@ class SceneBlur:
         self._own = np.full((len(scenes), len(captures.states)), np.nan)  # of the scenes' own maps
         # `Layout.shares` of scenes, one behind the other, and where those of each are.
         self._sorts, self._ends = _ALIKE, np.zeros((2, len(scenes)), np.int64)
+        # Exposure of the references, EV100 that is right, and all that are likely.
+        self._light = np.full((2, len(scenes)), np.nan)
+        self._likely = np.zeros((len(scenes), LIKELY))
 
-    def of(
+    def __getitem__(self, scene: int) -> Scene:
+        return self._scenes[scene]
+
+    def light(self, scenes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """(B,) log2 of the exposures of the references of `scenes` (B,), and their `ev100`.
+
+        Also (B, K) their `IncidentLight.right_ev100`, None where each has one alone.
+        """
+        if (new := np.isnan(self._light[0, scenes])).any():
+            for index in np.unique(scenes[new]).tolist():
+                scene = self._scenes[index]
+                self._light[:, index] = scene.reference.log2_exposure, scene.ev100
+                self._likely[index] = scene.incident_light.right_ev100
+        reference, ev100 = self._light[:, scenes]
+        likely = self._likely[scenes]
+        return reference, ev100, likely if (likely[:, 0] != likely[:, -1]).any() else None
+
+    def blur(
         self,
         scenes: np.ndarray,
         states: np.ndarray,

@@ -104,8 +104,8 @@ class FrameSource(Protocol):
             frames: (B,) numbers that the noise of one seed differs by.
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None
                 where all rows have the same.
-            outputs: Any of ``codes``, ``numbers`` and ``signals`` of `simulator.capture.sensor`,
-                each (B, 4, H, W), arrays or, where there is a device, tensors on it.
+            outputs: Those of `simulator.capture.sensor.record`, arrays or, where there is a
+                device, tensors on it.
         """
 
     def prepared_scene(self, index: int) -> PreparedScene:

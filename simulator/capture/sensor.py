@@ -58,6 +58,9 @@ _OFF, _BANK, _DRAWN = 0, 1, 2
 _NO_BANK = np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
 _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
+#: Outputs that are signals, and the least one that each shows.
+_LEAST_SIGNALS = {"signals": -_LARGEST, "linear": np.float32(-PEDESTAL), "images": _ZERO}
+_LEAST = tuple(_LEAST_SIGNALS.values())
 _jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundscheck=False)
 
 
@@ -336,14 +339,10 @@ def record(
     noise: Noise = "exact",
     read_noise: Sequence[ReadNoise] | None = None,
     row_gain: np.ndarray | None = None,
-    signals: torch.Tensor | np.ndarray | None = None,
-    codes: np.ndarray | None = None,
-    numbers: np.ndarray | None = None,
     count: bool = False,
+    **outputs: torch.Tensor | np.ndarray,
 ) -> np.ndarray:
     """Records a batch of frames: exposes, adds noise, clips and quantises.
-
-    Every output that is given is filled.
 
     Args:
         transitions: Light and exposures.
@@ -352,10 +351,10 @@ def record(
         noise: How the keys become noise.
         read_noise: Rows and tails of each frame's read noise, for the noise ``"sensor"``.
         row_gain: See `Transitions.in_bands`; None where all rows have the frame's light.
-        signals: (B, 4, H, W) contiguous float32 in [-pedestal, 1], where white is 1.
-        codes: (B, 4, H, W) uint8, companded.
-        numbers: (B, 4, H, W) uint16, digital numbers.
         count: Whether clipped samples are counted.
+        outputs: What to fill, each (B, 4, H, W) and contiguous: ``codes``, uint8, companded;
+            ``numbers``, uint16, digital numbers; and in float32, where black is 0 and white is 1,
+            ``signals``, ``linear``, which are at least -`PEDESTAL`, and ``images``, at least 0.
 
     Returns:
         (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
@@ -365,8 +364,6 @@ def record(
     if row_gain is not None:
         transitions = transitions.in_bands(row_gain)
     transitions = transitions.before_rounding(camera)
-    given = {"signals": signals, "codes": codes, "numbers": numbers}
-    outputs: dict[str, Any] = {name: out for name, out in given.items() if out is not None}
     stepwise = isinstance(transitions.light, torch.Tensor) or not transitions.light[0].is_cpu
     if stepwise or (read_noise is not None and keys is not None):
         kind: Noise = "exact" if noise == "sensor" else noise
@@ -428,8 +425,10 @@ def record_stepwise(
             bright = (numbers - (black - PEDESTAL * span)).clamp_(min=0.0)
             codes = bright.sqrt_().mul_(255.0 / (span * (1.0 + PEDESTAL)).sqrt()).add_(0.5)
             outputs["codes"][part] = codes.to(torch.uint8)
-        if "signals" in outputs:
-            outputs["signals"][part] = numbers.sub_(black).div_(span)
+        signals = numbers.sub_(black).div_(span)
+        for name, least in _LEAST_SIGNALS.items():
+            if name in outputs:
+                outputs[name][part] = signals.clamp(min=float(least))
     return counts.cpu().numpy() if count else np.zeros((len(lights), 2), np.int64)
 
 
@@ -591,9 +590,10 @@ def _as_integers(numbers, out):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _as_signals(numbers, black, span, out):  # type: ignore[no-untyped-def]
+def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-def]
     for j in range(len(out)):
-        out[j] = (numbers[j] - black) / span
+        x = (numbers[j] - black) / span
+        out[j] = x if x > least else least
 
 
 @_jit()
@@ -652,8 +652,9 @@ def _record(  # type: ignore[no-untyped-def]
                 _count(out, low, high, clipped)
             if numbers.size:
                 _as_integers(out, numbers[frame, plane, start:end])
-            if signals.size:
-                _as_signals(out, black, span, signals[frame, plane, start:end])
+            for k in range(len(signals)):
+                if signals[k].size:
+                    _as_signals(out, black, span, _LEAST[k], signals[k][frame, plane, start:end])
         if counts.size:
             counts[unit, 0] = (clipped & (_HIGH - 1)).sum()
             counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
@@ -682,11 +683,11 @@ def _record_fused(
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
     keys = np.zeros(frames, np.uint64) if keys is None else keys
-    kinds = {"codes": np.uint8, "numbers": np.uint16, "signals": np.float32}
-    outputs = [
+    kinds = {"codes": np.uint8, "numbers": np.uint16} | dict.fromkeys(_LEAST_SIGNALS, np.float32)
+    codes, numbers, *signals = (
         given[name].reshape(frames, 4, samples) if name in given else np.empty((0, 4, 0), dtype)
         for name, dtype in kinds.items()
-    ]
+    )
     fixed = (
         samples,
         addresses(light),
@@ -694,7 +695,7 @@ def _record_fused(
         transitions.table,
         (keys, drawn, noise_bank() if drawn == _BANK else _NO_BANK),
         camera.digits,
-        (*outputs, counts),
+        (codes, numbers, tuple(signals), counts),
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     parallel_ranges(lambda first, last: _record(first, last, *fixed), units, least=least)

@@ -34,8 +34,9 @@ FLAT_LUX = 100.0 * LUX_AT_EV0 / DOME_CONSTANT
 LARGEST_GAP = 1.5
 #: Luminance of linear sRGB.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-#: Values of the incident EV100, equally likely, that a posterior is summed over.
-_LIKELY = tuple(NormalDist().inv_cdf((i + 0.5) / 16) for i in range(16))
+#: How many values of the incident EV100, equally likely, a posterior is summed over; and these.
+LIKELY = 16
+_LIKELY = tuple(NormalDist().inv_cdf((i + 0.5) / LIKELY) for i in range(LIKELY))
 #: Zones a side whose mean log luminance the posterior knows, and their pixels a side.
 _ZONES, _ZONE_SIDE = 4, 8
 #: Range of log2 signals that zones are averaged over: noise and lamps count for no more.

@@ -94,7 +94,7 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
         raise ValueError(f"`path` (={str(path)!r}) must end in '.dng'")
     check_type("raw", raw, RawImage)
     head = tiff_head(_image_tags(raw), _exif_tags(raw), 8 * raw.data[0].numel())
-    write_atomically(path, itertools.chain([head], _strip(raw)))
+    write_atomically(path, itertools.chain([head], _strip(raw)), synced=False)
 
 
 def _strip(raw: RawImage) -> Iterator[bytes | memoryview]:

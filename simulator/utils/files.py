@@ -185,12 +185,16 @@ def open_picture(
 
 
 def write_atomically(
-    path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
+    path: str | os.PathLike[str],
+    content: bytes | str | Iterable[bytes | memoryview],
+    *,
+    synced: bool = True,
 ) -> Path:
     """Write bytes, text (as UTF-8), or pieces of bytes whole or not at all; returns `path`.
 
     They are written under a temporary name beside `path`, whose folder is made, and then renamed:
-    after they are on the disk, so that a loss of power leaves the old file or the new one.
+    if `synced` after they are on the disk, so that even a loss of power leaves the old file or the
+    new one.
     """
     path = as_path(path)
     content = printable(content).encode() if isinstance(content, str) else content
@@ -202,7 +206,8 @@ def write_atomically(
         with temporary.open("xb") as stream:
             stream.writelines(pieces)
             stream.flush()
-            os.fsync(stream.fileno())
+            if synced:
+                os.fsync(stream.fileno())
         os.replace(temporary, path)
     except OSError as error:
         if error.errno is None:

@@ -12,7 +12,7 @@ from skimage.color import rgb2xyz
 
 from ae_env.scenes import Scene
 from ae_env.scenes.load import ISO_RANGE, SceneNetworks, simulate_source_raw
-from ae_env.scorers.captures import SceneBlur, SceneCaptures
+from ae_env.scorers.captures import SceneCaptures, ShownScenes
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, exposure_ratio
 from simulator.camera import CameraProfile, get_camera
 from simulator.capture.blurred_frames import Layout
@@ -104,10 +104,10 @@ def test_resized_averages_what_the_networks_found() -> None:
     assert scene.own_blur(4.0) == scene.own_blur(11.0) == pytest.approx(5.0)
     assert array_scene(torch.ones(4, 2, 2)).own_blur(2.0) == 0.0
     states = [CameraSettings(100.0, 1 / 60, f_number) for f_number in (2.0, 4.0)]
-    blur = SceneBlur([scene], SceneCaptures(get_camera("nikon_z6"), states))
+    shown = ShownScenes([scene], SceneCaptures(get_camera("nikon_z6"), states))
     for state, wanted in ((1, 5.0), (0, 10.0), (1, 5.0)):
         one = np.zeros(1, np.int64)
-        found = blur.of(one, one + state, 0.0 * one, 0.0 * one, np.zeros((1, 4)))
+        found = shown.blur(one, one + state, 0.0 * one, 0.0 * one, np.zeros((1, 4)))
         assert found[0].item() == pytest.approx(wanted, rel=0.02)  # effective f-numbers
 
 
