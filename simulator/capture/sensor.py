@@ -428,7 +428,7 @@ def record_stepwise(
         signals = numbers.sub_(black).div_(span)
         for name, least in _LEAST_SIGNALS.items():
             if name in outputs:
-                outputs[name][part] = signals.clamp(min=float(least))
+                outputs[name][part] = signals.clamp(float(least), 1.0)
     return counts.cpu().numpy() if count else np.zeros((len(lights), 2), np.int64)
 
 
@@ -593,6 +593,7 @@ def _as_integers(numbers, out):  # type: ignore[no-untyped-def]
 def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-def]
     for j in range(len(out)):
         x = (numbers[j] - black) / span
+        x = x if x < _ONE else _ONE  # black and span are rounded
         out[j] = x if x > least else least
 
 
