@@ -9,6 +9,7 @@ serve every ISO.
 
 from __future__ import annotations
 
+import copy
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -195,8 +196,8 @@ class NetworkApertureBlur(ApertureBlur):
 class BlurredLight:
     """Blurs a scene's light, each blur when it is first needed, and caches the latest.
 
-    `light` is (4, H, W) as recorded, `nlf` its noise. Wider apertures add the `aperture_blur`. The
-    cache takes `cache_bytes`; the light that was used longest ago goes first.
+    `light` is (4, H, W) as recorded, `nlf` its noise. Wider apertures add the `aperture_blur`. When
+    the cache is full, the light that was used longest ago goes first.
     """
 
     def __init__(
@@ -205,22 +206,16 @@ class BlurredLight:
         nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
-        cache_bytes: int = CACHE_BYTES,
     ) -> None:
         self.light, self.aperture_blur = light, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
-        self._cache: LruCache[Tensor] = LruCache(cache_bytes)
-
-    @property
-    def known(self) -> tuple[NoiseLevelFunction, ApertureBlur | None]:
-        """Its noise and its aperture blur."""
-        return self.residuals.nlf, self.aperture_blur
+        self._cache: LruCache[Tensor] = LruCache(CACHE_BYTES)
 
     def copy(self, cache_bytes: int = CACHE_BYTES) -> BlurredLight:
-        """One of the same light with an empty cache of its own."""
-        copied = BlurredLight(self.light, *self.known, self.statistics, cache_bytes)
-        copied.residuals = self.residuals
+        """One of the same light with an empty cache of its own, of `cache_bytes`."""
+        copied = copy.copy(self)
+        copied._cache = LruCache(cache_bytes)
         return copied
 
     def source(self, origin: Origin) -> Tensor:

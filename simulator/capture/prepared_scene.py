@@ -97,7 +97,8 @@ class PreparedScene:
             cached = None
         if cached is None:  # else the light was checked before
             object.__setattr__(self, "light", check_packed("light", self.light))
-        if cached is None or cached.known != (self.nlf, self.aperture_blur):
+        known = None if cached is None else (cached.residuals.nlf, cached.aperture_blur)
+        if known != (self.nlf, self.aperture_blur):
             statistics = None if cached is None else cached.statistics
             lights = BlurredLight(self.light, self.nlf, self.aperture_blur, statistics)
             object.__setattr__(self, "blurred_light", lights)

@@ -447,8 +447,7 @@ class ResidualStatistics:
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Wiener error (N,) and light (4, N) of blocks, their levels, and how many each has."""
-        rows = _some_rows(self.light)
-        parts = [self.light[:, top:bottom] for top, bottom in rows]
+        parts = _sampled(self.light)
         error = torch.cat([wiener_error(part, self.nlf).flatten() for part in parts])
         block = tuple(min(BLOCK, n) for n in parts[0].shape[-2:])
         means = [F.avg_pool2d(part, block).flatten(1) for part in parts]
@@ -460,14 +459,14 @@ class ResidualStatistics:
         return error.double().cpu().numpy(), values, place, counts
 
 
-def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
-    """First row, and row after the last, of the bands that are sampled."""
+def _sampled(light: torch.Tensor) -> Sequence[torch.Tensor]:
+    """The bands of rows (4, H, W) that are sampled; of a small frame all is one."""
     height, width = light.shape[-2:]
     blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
     if blocks <= _BLOCKS or height < 2 * _WINDOW:
-        return [(0, height)]
+        return [light]
     step = _WINDOW * math.ceil(blocks / _BLOCKS)
-    return [(top, top + _WINDOW) for top in range(0, height - _WINDOW + 1, step)]
+    return [light[:, top : top + _WINDOW] for top in range(0, height - _WINDOW + 1, step)]
 
 
 # -- denoised light ---------------------------------------------------------------------------

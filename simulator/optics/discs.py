@@ -23,7 +23,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from simulator.optics.motion import Taps, has_kernels, motion_kernel, path_blur, streak_share
+from simulator.optics.motion import (
+    Taps,
+    grid_taps,
+    has_kernels,
+    motion_kernel,
+    path_blur,
+    streak_share,
+)
 from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
@@ -58,10 +65,7 @@ _blend_jit = functools.partial(kernel, fastmath={"contract", "nnan", "nsz"})
 
 @_jit()  # every new diameter asks for it
 def coverage(radius):  # type: ignore[no-untyped-def]
-    """Area of a disc of `radius` in the pixels of a quadrant, (r + 1, r + 1) float64.
-
-    Over all four quadrants it sums to 1.
-    """
+    """Area of a disc of `radius` in each pixel, (K, K) float64, K odd, sums to 1."""
     reach = max(math.ceil(radius - 0.5), 0)
     area = np.zeros((reach + 1, reach + 1))
     for i in range(reach + 1):
@@ -72,36 +76,31 @@ def coverage(radius):  # type: ignore[no-untyped-def]
             for j in range(1, reach + 1):
                 area[i, j] += min(chord, j + 0.5) - min(chord, j - 0.5)
     # Loops: numpy's operations on whole arrays compile three times as long.
-    out = np.empty_like(area)
+    quadrant = np.empty_like(area)
     first = lower = inner = 0.0
     for i in range(reach + 1):
         for j in range(reach + 1):
-            out[i, j] = area[i, j] + area[j, i]  # the quadrature treats rows and columns alike
+            both = area[i, j] + area[j, i]  # the quadrature treats rows and columns alike
+            quadrant[i, j] = both
             if i:
-                lower += out[i, j]
+                lower += both
                 if j:
-                    inner += out[i, j]
+                    inner += both
             elif j:
-                first += out[i, j]
-    total = out[0, 0] + 2.0 * (first + lower + inner)
-    for i in range(reach + 1):
-        for j in range(reach + 1):
-            out[i, j] /= total
-    return out
-
-
-def _disc_coverage(radius: float) -> np.ndarray:
-    """Area of a disc of `radius` in each pixel, (K, K), K odd, sums to 1."""
-    rows = coverage(radius)
-    rows = np.concatenate([rows[:0:-1], rows])
-    return np.concatenate([rows[:, :0:-1], rows], axis=1)
+                first += both
+    total = quadrant[0, 0] + 2.0 * (first + lower + inner)
+    disc = np.empty((2 * reach + 1, 2 * reach + 1))
+    for y in range(-reach, reach + 1):
+        for x in range(-reach, reach + 1):
+            disc[reach + y, reach + x] = quadrant[abs(y), abs(x)] / total
+    return disc
 
 
 @functools.cache
 def _radius_table() -> tuple[np.ndarray, np.ndarray]:
     """Second moments per axis of covered discs, and their radii: the inverse is interpolated."""
     radii = np.concatenate([[0.5], 0.5 + np.geomspace(1e-4, 7.5, 700)])
-    profiles = [_disc_coverage(radius).sum(0) for radius in radii]
+    profiles = [coverage(radius).sum(0) for radius in radii]
     moments = np.array([(p * (np.arange(len(p)) - len(p) // 2) ** 2).sum() for p in profiles])
     return np.maximum.accumulate(moments), radii
 
@@ -129,7 +128,7 @@ def disc_kernel(diameter_px: float) -> np.ndarray:
     0.56
     """
     diameter = check_number("diameter_px", diameter_px, 0.0, sys.float_info.max)
-    return _disc_coverage(disc_radius(diameter))
+    return np.asarray(coverage(disc_radius(diameter)))
 
 
 @functools.lru_cache(maxsize=4096)
@@ -184,17 +183,10 @@ def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarr
 @_jit()
 def disc_taps(radius):  # type: ignore[no-untyped-def]
     """Rows, columns and weights of the `Taps` of a disc."""
-    quadrant = coverage(radius)
-    reach, count = len(quadrant) - 1, 0
-    size = ((2 * reach + 1) ** 2 + 7) // 8 * 8
-    rows, columns, weights = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size)
-    for y in range(-reach, reach + 1):
-        for x in range(-reach, reach + 1):
-            if quadrant[abs(y), abs(x)] > 0.0:
-                rows[count], columns[count], weights[count] = y, x, quadrant[abs(y), abs(x)]
-                count += 1
-    count = (count + 7) // 8 * 8
-    return rows[:count], columns[:count], weights[:count].astype(np.float32)
+    disc = coverage(radius)
+    reach = len(disc) // 2
+    rows, columns, weights = grid_taps(disc, -reach, -reach, 0.0)
+    return rows, columns, weights.astype(np.float32)
 
 
 # -- a bank of discs --------------------------------------------------------------------------

@@ -404,17 +404,25 @@ def _rasterised(  # type: ignore[no-untyped-def]
             for over in range(2):
                 share = x[i] - column if over else 1.0 - (x[i] - column)
                 grid[inside, min(max(column + over, left), right) - left] += part * share
-    number = (grid > _LEAST_WEIGHT).sum()
-    size = (number + 7) // 8 * 8
-    rows, columns = np.zeros(size, np.int64), np.zeros(size, np.int64)
-    weights = np.zeros(size)
+    rows, columns, weights = grid_taps(grid, top, left, _LEAST_WEIGHT)
+    return rows, columns, (weights / weights.sum()).astype(np.float32)
+
+
+@_jit()
+def grid_taps(grid, top, left, least):  # type: ignore[no-untyped-def]
+    """Rows, columns and float64 weights of `Taps`: the shares in a grid that are above `least`.
+
+    Its first row and column look `top` rows down and `left` columns to the right.
+    """
+    size = ((grid > least).sum() + 7) // 8 * 8
+    rows, columns, weights = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size)
     k = 0
     for i in range(len(grid)):
         for j in range(grid.shape[1]):
-            if grid[i, j] > _LEAST_WEIGHT:
+            if grid[i, j] > least:
                 rows[k], columns[k], weights[k] = i + top, j + left, grid[i, j]
                 k += 1
-    return rows, columns, (weights / weights.sum()).astype(np.float32)
+    return rows, columns, weights
 
 
 @_jit()
