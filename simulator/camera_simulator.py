@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict, TypeVar, Unpack, cast, get_args
+from typing import Any, Literal, Protocol, TypedDict, TypeVar, Unpack, cast, get_args
 
 import torch
 from torch import nn
@@ -19,7 +19,7 @@ from simulator.capture.blurred_light import (
     NetworkApertureBlur,
 )
 from simulator.capture.plan import SimulationPlan
-from simulator.capture.prepared_scene import HasPrepared, PreparedScene
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
@@ -47,6 +47,16 @@ from simulator.utils.tiles import in_tiles, varying
 Module = TypeVar("Module", bound=nn.Module)
 #: Depth of a scene: it is far or in focus throughout, or it is not known.
 Depth = Literal["far", "unknown"]
+
+
+class HasPrepared(Protocol):
+    """Anything that can be photographed, such as a scene of the environment."""
+
+    @property
+    def prepared(self) -> PreparedScene:
+        """Its light."""
+
+
 #: Sources of a simulation.
 Source = RawImage | PreparedScene | HasPrepared
 #: Reach of the family's networks around a pixel [pixel], a multiple of 8; tiles overlap by it.

@@ -33,8 +33,7 @@ class LookupBatch:
         camera: CameraProfile,
     ) -> None:
         self._scenes, self._prepared = scenes, prepared
-        self._black = np.array(camera.black_level, np.float32)[:, None, None]
-        self._span = np.array(camera.span, np.float32)[:, None, None]
+        self._span, self._black = camera.digits[:2, :, None, None]
         self._white = camera.white_level
 
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:

@@ -26,7 +26,7 @@ from simulator.capture.statistics import DenoisedLight, LightStatistics, Residua
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
 from simulator.optics.discs import HALO, LIGHT_LIMIT, DiscBank, kernel_energy
-from simulator.optics.motion import Path, Taps, path_blur, path_taps
+from simulator.optics.motion import Path, path_blur, path_taps
 from simulator.optics.vignetting import Vignetting
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
@@ -286,19 +286,19 @@ class BlurredLight:
     def with_remaining_noise(self, exposure: Exposure) -> Exposure:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
         left: Tensor | None = None
-        path, layout, defocus_px = exposure.path, exposure.layout, exposure.defocus_px
-        blurs = exposure.motion_px or defocus_px or exposure.subject_path
+        path, motion_px, defocus_px = exposure.path, exposure.motion_px, exposure.defocus_px
+        blurs = motion_px or defocus_px or exposure.subject_path
         if not blurs and exposure.opened_to is None and exposure.vignetting is None:
             return exposure  # nothing averages it
-        if path is None and exposure.motion_px:
-            path = Path(exposure.motion_px)
-        if exposure.is_uniform:
-            energy = kernel_energy(exposure.motion_px, defocus_px)
-        elif layout is None:
-            energy = _uniform_energy(path, defocus_px, *self.light.shape[-2:])
-        else:
-            energy, left = 1.0, _noise_map(layout, path, exposure.subject_path, defocus_px)
+        energy = 1.0
+        if exposure.layout is not None:
+            path = Path(motion_px) if path is None and motion_px else path
+            left = _noise_map(exposure.layout, path, exposure.subject_path, defocus_px)
             left = left.to(self.light.device)
+        elif path is not None:
+            energy = _path_energy(path, defocus_px, *self.light.shape[-2:])
+        else:
+            energy = kernel_energy(motion_px, defocus_px)
         if exposure.opened_to is not None and self.aperture_blur is not None:
             share = self.aperture_blur.remaining_variance(exposure.opened_to)
             if share is not None:
@@ -351,6 +351,6 @@ def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: 
 
 
 @functools.lru_cache(maxsize=4096)
-def _uniform_energy(path: Path | None, defocus_px: float, height: int, width: int) -> float:
-    taps: Taps | None = None if path is None else path_taps(path, height, width)
+def _path_energy(path: Path, defocus_px: float, height: int, width: int) -> float:
+    taps = path_taps(path, height, width)
     return float(discs.remaining_variance(torch.full((1, 1), defocus_px), taps))

@@ -11,7 +11,6 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -118,18 +117,13 @@ class Exposure:
     #: which they run; of the last two those that there are.
     steps: tuple[Step, ...] = field(default=(), compare=False)
 
-    @cached_property
+    @functools.cached_property
     def source_noise(self) -> NoiseLevelFunction:
         """Noise of the source on the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
         exposed = self.source.exposed(self.ratio)
         return exposed if self.energy == 1.0 else exposed.scaled(self.energy)
-
-    @property
-    def is_uniform(self) -> bool:
-        """Whether its blur is a disc and a streak along the rows, the same everywhere."""
-        return self.layout is None and self.path is None
 
     @property
     def left_out(self) -> float:

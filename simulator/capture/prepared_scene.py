@@ -6,7 +6,7 @@ import copy
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import torch
@@ -37,14 +37,6 @@ from simulator.utils.checks import check_number, check_type, check_word
 _TOGETHER_BYTES = 2**26
 #: Fastest image [frame heights per second]: even 1/1000 s smears it over the whole frame.
 MAX_IMAGE_SPEED = 1000.0
-
-
-class HasPrepared(Protocol):
-    """Anything that can be photographed, such as a scene of the environment."""
-
-    @property
-    def prepared(self) -> PreparedScene:
-        """Its light."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -176,8 +176,6 @@ class LightStatistics:
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
         """Error of leaving a source's noise where it exceeds the target's, rather too high."""
-        if source.is_zero:
-            return 0.0
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = noise_numbers(source), noise_numbers(target)

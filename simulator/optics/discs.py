@@ -253,7 +253,7 @@ def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
     for index, knot in enumerate(knots):
         before = knots[index - 1] if index else -1.0
         after = knots[index + 1] if index + 1 < len(knots) else knot + 1.0
-        if before < high and low < after and not (high <= before or low >= after):
+        if before < high and low < after:
             rising = (squared - before) / (knot - before)
             falling = (after - squared) / (after - knot)
             yield index, torch.minimum(rising, falling).clamp(min=0.0)

@@ -173,7 +173,7 @@ def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
     along_rows = _prepared(layout=None, movement=Movement(subject_speed=2.0), image_speed=0.3)
     plain = PreparedScene(SCENE, REFERENCE, Z6, ZERO, image_speed=0.3)
     assert torch.equal(plain.expected(SLOW), along_rows.expected(SLOW))
-    assert along_rows.exposure(SLOW).is_uniform
+    assert along_rows.exposure(SLOW).path is None
 
 
 @pytest.mark.parametrize("defocus", [0.0, 5.0])
@@ -183,7 +183,7 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
     """The variance of blurred white noise, over many draws."""
     scene = _prepared(noisy=True, defocus=defocus, image_speed=speed, movement=movement)
     exposure = scene.exposure(SLOW)
-    if exposure.is_uniform:
+    if exposure.layout is None and exposure.path is None:
         assert exposure.remaining_variance is None
         return
     left, share = exposure.remaining_variance, torch.full((SIZE, SIZE), exposure.energy)
