@@ -6,8 +6,6 @@ from .camera_simulator import CameraSimulator as CameraSimulator
 from .capture.plan import SimulationPlan as SimulationPlan
 from .capture.prepared_scene import PreparedScene as PreparedScene
 from .noise.noise_level_function import NoiseLevelFunction as NoiseLevelFunction
-from .optics.thin_lens import Lens as Lens
-from .optics.thin_lens import defocus as defocus
 from .raw.develop import develop as develop
 from .raw.develop import render_srgb as render_srgb
 from .raw.dng import write_dng as write_dng
@@ -15,6 +13,8 @@ from .raw.image import RawImage as RawImage
 from .raw.noise_estimation import estimate_nlf as estimate_nlf
 from .raw.read import RawFileError as RawFileError
 from .raw.read import read_raw as read_raw
+from .reference.thin_lens import Lens as Lens
+from .reference.thin_lens import defocus as defocus
 from .settings import CameraSettings as CameraSettings
 from .settings import exposure_ratio as exposure_ratio
 from .settings import incident_ev100 as incident_ev100

@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 
 from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage, defocus
-from simulator.optics.thin_lens import SHARP
 from simulator.radiance.reading import read_exr
+from simulator.reference.thin_lens import SHARP
 from simulator.training.scenes import fill_from_nearest
 from simulator.utils.checks import check_number, check_word
 from simulator.utils.files import file_fault, open_picture, refuse_bomb

@@ -1,1 +1,1 @@
-"""Blur: discs, streaks, thin lenses and lamps."""
+"""Blur: discs and streaks; vignetting; lamps."""

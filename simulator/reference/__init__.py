@@ -1,1 +1,1 @@
-"""The reference camera and its sequences: the ground truth."""
+"""The reference camera, its thin lens and its sequences: the ground truth."""

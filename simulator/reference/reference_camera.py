@@ -25,9 +25,9 @@ from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import plane_tensor
 from simulator.optics.flicker_integral import Lamp
 from simulator.optics.motion import motion_blur
-from simulator.optics.thin_lens import Lens, defocus
 from simulator.optics.vignetting import Vignetting
 from simulator.raw.image import check_packed
+from simulator.reference.thin_lens import Lens, defocus
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.checks import check_integer
 

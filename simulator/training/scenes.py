@@ -26,7 +26,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.thin_lens import Lens
 from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
 from simulator.radiance.light import camera_light, mean_anchor, reference_settings, temperature_tint
 from simulator.radiance.maps import AZIMUTHS, EV100_RANGE, assumed_ev100, hash_fraction
@@ -43,6 +42,7 @@ from simulator.radiance.reading import RADIANCE_SUFFIXES, read_radiance
 from simulator.raw.read import read_raw
 from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene, packed_pitch
 from simulator.reference.sequences import ILLUMINANCE
+from simulator.reference.thin_lens import Lens
 from simulator.settings import incident_ev100
 from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_integer, check_word

@@ -14,7 +14,7 @@ from agents.applications.hdr import expose_and_develop, fuse, linear_rgb, write_
 from agents.applications.refocus import read_depth, refocus
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.thin_lens import Lens
+from simulator.reference.thin_lens import Lens
 
 NO_NOISE = NoiseLevelFunction((1e-12,) * 4, (1e-12,) * 4)
 #: Pixel pitch such that packed pixels are 10 um.

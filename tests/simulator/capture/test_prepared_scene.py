@@ -19,8 +19,8 @@ from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.sensor import clip_and_quantise
 from simulator.capture.statistics import DenoisedLight
-from simulator.optics.thin_lens import Lens
 from simulator.raw.image import unpack_mosaic
+from simulator.reference.thin_lens import Lens
 from tests.strategies import SEEDS, USUAL_SETTINGS, cameras, lights, settings_within
 from tests.strategies import prepared as any_prepared
 

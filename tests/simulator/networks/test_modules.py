@@ -18,7 +18,7 @@ from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Stabil
 from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
-from simulator.optics.thin_lens import Lens
+from simulator.reference.thin_lens import Lens
 
 
 def test_it_starts_as_the_plain_ratio() -> None:

@@ -1,7 +1,12 @@
-"""The reference camera against closed forms, and sequences that it photographs."""
+"""The reference camera against closed forms, and sequences that it photographs.
+
+Thin lenses are compared to sums over points of the aperture, each of which sees two planes through
+its own pinhole: nothing there uses the layers that they work with.
+"""
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -13,10 +18,10 @@ from scipy.ndimage import gaussian_filter
 from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
-from simulator.optics.thin_lens import Lens
 from simulator.reference import reference_camera, sequences
 from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Sequence, select_pairs
+from simulator.reference.thin_lens import Lens, defocus
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise
 
@@ -222,6 +227,8 @@ def test_bad_input_is_refused():
     for call, arguments, message in (
         *((scene, (light,), "`light`") for light in (flat(-0.1), torch.zeros(3, 7, 8))),
         *((scene, (flat(0.1), each), "`depth`") for each in (*bad, depth[:, :4])),
+        *((Lens, (0.05, far), "`focus_distance`") for far in (0.05, -1.0, math.nan)),
+        *((Lens, (focal, math.inf), "`focal_length`") for focal in (0.0, math.inf, math.nan)),
         (partial(ReferenceCamera, plain, box_factor=0), (), "`box_factor`"),
         (ReferenceCamera, (replace(plain, nlf_by_iso={}),), "noise calibration"),
         (blind.blurred_light, (scene(flat(0.1), depth + 1), 4.0), "pixel pitch"),
@@ -371,3 +378,104 @@ def test_the_aperture_only_opens_and_seldom_stays():
     assert pairs == sorted(opened | same)
     assert 0 < len(same) <= 0.1 * len(pairs)
     assert {p.sequence for p in same} == {0, 1, 2}
+
+
+# -- the thin lens --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
+@pytest.mark.parametrize("depth", [0.3, 1.0, 2.0, 500.0])
+def test_circle_of_confusion_follows_from_similar_triangles(focus, depth):
+    # The cone from the aperture (diameter f / N) converges at v, the sensor stands at v_focus.
+    v, v_focus = (1.0 / (1.0 / 0.05 - 1.0 / distance) for distance in (depth, focus))
+    expected = (0.05 / 2.8) * (v_focus - v) / v
+    found = Lens(0.05, focus).circle_of_confusion(depth, 2.8)
+    assert found == pytest.approx(expected, rel=1e-12, abs=1e-18)
+
+
+@pytest.mark.parametrize("case", ["step", "ramp", "through_focus", "stairs", "noise", "islands"])
+def test_equal_light_shows_no_seam(case):
+    rng = np.random.default_rng(3)
+    rows, columns = np.mgrid[:48, :40]
+    diameter = {
+        "step": np.where(columns < 20, -7.0, 5.0),
+        "ramp": 1.0 + columns * 0.2,
+        "through_focus": (columns - 20) * 0.3,
+        "stairs": (columns // 8) * 3.0 - 6.0,
+        "noise": rng.uniform(-8.0, 8.0, (48, 40)),
+        "islands": np.where((rows // 6 + columns // 6) % 2 == 0, 0.0, 9.0),
+    }[case]
+    level = torch.tensor([0.2, 3.0])[:, None, None].expand(2, 48, 40)
+    found = defocus(level, torch.from_numpy(diameter))
+    torch.testing.assert_close(found, level.contiguous(), rtol=2e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("row", range(20, 44, 3))
+def test_lamp_on_a_receding_floor_keeps_its_energy(row):
+    # The floor rises through many layers of blur; none of them stands in the way of its neighbour.
+    diameter = torch.linspace(10, 2, 64, dtype=torch.float64)[:, None].expand(64, 48)
+    floor = torch.full((1, 64, 48), 0.2, dtype=torch.float64)
+    lit = floor.clone()
+    lit[0, row, 24] += 100.0
+    gained = float((defocus(lit, diameter) - defocus(floor, diameter)).sum())
+    assert gained == pytest.approx(100.0, rel=0.05)
+
+
+def test_sharp_foreground_is_untouched_by_a_bright_blurred_background():
+    near = np.broadcast_to(np.arange(60) < 30, (40, 60))
+    low, high = np.where(near, 0.01, 50.0), np.where(near, 0.1, 900.0)
+    drawn = np.random.default_rng(0).uniform(low, high, (4, 40, 60))
+    light = torch.from_numpy(drawn.astype(np.float32))
+    found = defocus(light, torch.from_numpy(np.where(near, 0.0, 13.0)))
+    assert torch.equal(found[:, :, :30], light[:, :, :30])
+    assert float(found[:, :, 30:].min()) > 50.0  # nor does the dark foreground spill over
+    # Blur that is too small to see leaves every bit.
+    light = torch.rand(4, 9, 13, generator=torch.Generator().manual_seed(0))
+    ripple = 0.1 * torch.rand(9, 13, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(defocus(light, ripple - 0.05), light)
+
+
+Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def light_of_planes(hides, near, far):
+    """Each plane's texture at its own rows and columns."""
+    nearer = 0.5 + 0.3 * np.sin(near[0] * 0.9) * np.cos(near[1] * 0.7)
+    farther = 3.0 + 1.5 * np.sin(far[0] * 0.25 + 1.0) + 0.5 * np.cos(far[1] * 0.25)
+    return np.where(hides, nearer, farther)
+
+
+def through_an_aperture(shape: Texture, near_blur: float, far_blur: float) -> np.ndarray:
+    """What the sensor gets of two planes: a mean over aperture points and points of a pixel."""
+    grid = (np.arange(20) + 0.5) / 10 - 1
+    aperture = [(a, b) for a in grid for b in grid if a * a + b * b < 1]
+    rows, columns = np.mgrid[:56, :72].astype(float)
+    total = np.zeros(rows.shape)
+    for number, (a, b) in enumerate(aperture):
+        y, x = rows + (number * 0.618) % 1 - 0.5, columns + (number * 0.755) % 1 - 0.5
+        near, far = ((y - blur / 2 * a, x - blur / 2 * b) for blur in (near_blur, far_blur))
+        hides = shape(np.rint(near[0]), np.rint(near[1]))  # the edge of a mask of whole pixels
+        total += light_of_planes(hides, near, far)
+    return total / len(aperture)
+
+
+SHAPES: dict[str, Texture] = {
+    "half": lambda rows, columns: columns < 36,
+    "pole": lambda rows, columns: abs(columns - 36) < 3,
+    "disc": lambda rows, columns: (columns - 36) ** 2 + (rows - 28) ** 2 < 13**2,
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("blurs", [(0, 8), (-8, 0), (4, 10), (-10, -4), (-8, 8), (-8, 4)])
+def test_two_planes_against_rays(shape, blurs):
+    # What is hidden is not in the picture: it can be right only as far as the texture is smooth.
+    rows, columns = np.mgrid[:56, :72]
+    mask = SHAPES[shape](rows, columns)
+    picture = light_of_planes(mask, (rows, columns), (rows, columns))
+    diameter = torch.from_numpy(np.where(mask, *map(float, blurs)))
+    found = defocus(torch.from_numpy(picture)[None], diameter)[0].numpy()
+    expected = through_an_aperture(SHAPES[shape], *blurs)
+    errors = ((image - expected)[10:-10, 10:-10] for image in (found, picture))
+    error, change = map(np.linalg.norm, errors)
+    assert error < 0.15 * change

@@ -5,8 +5,8 @@ import torch
 
 from examples.write_sequences import write_packed_sequence
 from simulator import CameraSettings, RawImage
-from simulator.optics.thin_lens import Lens
 from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.thin_lens import Lens
 from simulator.training.paper_dataset import packed_camera
 
 #: 640 lux is EV100 8: a white card gives 0.663 of sensor white here.
