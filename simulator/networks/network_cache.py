@@ -74,8 +74,7 @@ class NetworkCache:
     def called(self, kind: str, module: nn.Module, *inputs: Tensor) -> Tensor:
         """``module(*inputs)``, of the shape of the first input; see `result`."""
         named = {str(i): tensor for i, tensor in enumerate(inputs)}
-        shape = inputs[0].shape
-        return self.result(kind, [module], named, lambda: module(*inputs), shape=shape)
+        return self.result(kind, [module], named, lambda: module(*inputs), shape=inputs[0].shape)
 
     def _stored(self, key: str, shape: Sequence[int] | None) -> Tensor | None:
         """A result from disk, if there is a plausible one."""
@@ -93,15 +92,14 @@ class NetworkCache:
         marks = [*sums.tolist(), *((t.data_ptr(), _changes(t)) for t in state.values())]
         known = self._fingerprints.get(id(module))
         if known is None or known[0] != marks:
-            known = marks, content_digest(state)
-            self._fingerprints[id(module)] = known
+            known = self._fingerprints[id(module)] = marks, content_digest(state)
         return known[1]
 
 
 def _made(make: Callable[[], Tensor]) -> Tensor:
-    """The result of networks, whose memory goes back to the system."""
+    """The result of networks, whose memory goes back to the system after a large frame."""
     tensor = make()
-    release_memory()
+    release_memory(tensor.shape[-2:].numel())
     return tensor
 
 

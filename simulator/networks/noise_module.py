@@ -274,8 +274,7 @@ class NoiseModule(nn.Module):
         if self.commutes:
             result = self.network(exposed, shot, read)
         else:
-            level = variance_map(exposed, shot, read).sqrt()
-            second = level
+            level = second = variance_map(exposed, shot, read).sqrt()
             if self.preset == "ncs":  # the same sample for every image of this size
                 key = int(noise_keys(_SAMPLE_SEED)[0])
                 sample = torch.from_numpy(frame_normals(key, tuple(exposed.shape[1:])))

@@ -43,6 +43,8 @@ _PACKAGES = ("simulator", "ae_env")
 _FIRST_KERNELS = 12
 #: Options of glibc's mallopt: free memory that is given back, and the size of what is taken apart.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+#: Packed pixels up to which networks' memory is kept: taking it anew is a sixth of a sweep's time.
+_KEPT_PIXELS = 768**2
 #: Ratio of two times above which it is no chance.
 _NOTICEABLE = 1.2
 #: Warnings that kernels are compiled which are not in the cache.
@@ -287,10 +289,11 @@ def keep_memory() -> None:
             ctypes.CDLL(None).mallopt(option, size)
 
 
-def release_memory() -> None:
-    """Gives freed memory back to the system: glibc keeps hundreds of MiB of networks' pieces."""
+def release_memory(pixels: int) -> None:
+    """Gives freed memory back to the system after a large frame; what a small one leaves stays."""
     with suppress(AttributeError, OSError, TypeError):  # no other library has this
-        ctypes.CDLL(None).malloc_trim(0)
+        if pixels > _KEPT_PIXELS:
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def computes_bfloat16(device: torch.device) -> bool:

@@ -173,6 +173,6 @@ def in_tiles(
         if needed is not None:
             part = torch.where(needed[each.inner], part, output[each.inner])
         output[each.inner] = part
-    release_memory()
+    release_memory(height * width)
     assert output is not None
     return output
