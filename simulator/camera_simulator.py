@@ -20,7 +20,7 @@ from simulator.capture.blurred_light import (
 )
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Noise, Transitions, exposed_light, record, sweep_keys
+from simulator.capture.sensor import Transitions, exposed_light, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
@@ -34,6 +34,7 @@ from simulator.networks.noise_module import (
     smoothed,
     variance_map,
 )
+from simulator.noise.generator import Noise
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DISC_REACH
 from simulator.optics.vignetting import Vignetting, get_lens

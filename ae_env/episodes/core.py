@@ -34,7 +34,8 @@ from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.columns import MOVES
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Noise, Transitions, single_normals
+from simulator.capture.sensor import Transitions
+from simulator.noise.generator import Noise, single_normals
 
 #: Samples that are recorded and scored together, at most.
 CHUNK_SAMPLES = 2**24

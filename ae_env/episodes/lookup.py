@@ -14,7 +14,7 @@ from ae_env.scenes.scene import Scene
 from simulator.camera import LOW_CLIP, CameraProfile
 from simulator.capture.batch import MODULES, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import noise_keys
+from simulator.noise.generator import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
 RECORDED, _MODULE = "recorded", len(MODULES)

@@ -16,7 +16,7 @@ from ae_env.options import RANDOM_LENS, EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
-from simulator.capture.sensor import noise_keys, normals_above
+from simulator.noise.generator import noise_keys, normals_above
 from simulator.optics.motion import Movement
 from simulator.optics.vignetting import RANDOM_LENSES, Vignetting, random_lens
 from simulator.utils.checks import check_integer, check_key, did_you_mean

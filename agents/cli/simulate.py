@@ -58,7 +58,7 @@ def simulate(
     """
     from simulator import read_raw
     from simulator.capture.decision import check_tolerance
-    from simulator.capture.sensor import Noise
+    from simulator.noise.generator import Noise
     from simulator.optics.vignetting import get_lens
 
     if ev is not None and shutter is not None:

@@ -36,8 +36,9 @@ from simulator.capture.columns import (
 from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Noise, Transitions, exposure_table, noise_keys, record
+from simulator.capture.sensor import Transitions, exposure_table, record
 from simulator.capture.statistics import BINS, LightStatistics
+from simulator.noise.generator import Noise, noise_keys
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 

@@ -17,15 +17,9 @@ from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.columns import plan_sweep
 from simulator.capture.decision import DEFAULT_TOLERANCE, Exposure, check_tolerance, decide, disc_px
 from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
-from simulator.capture.sensor import (
-    Noise,
-    Transitions,
-    exposed_light,
-    pixel_response,
-    record,
-    sweep_keys,
-)
+from simulator.capture.sensor import Transitions, exposed_light, pixel_response, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight, LightStatistics
+from simulator.noise.generator import Noise
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.optics.vignetting import Vignetting

@@ -15,9 +15,7 @@ negative the source is noisier than the target: nothing is added, and -D is the 
 A blur averages the source's noise: where it leaves only a share r of the variance, the other share
 ``(1 - r) (a shot1 max(x, 0) + a^2 read1)`` is missing, too.
 
-*The noise of a frame* is a function of its key and of nothing else. Drawing 4 x 128 x 128 normals
-takes about 70 microseconds, everything else that a capture needs about 30: hence a bank of normals,
-looked up in hashed pieces.
+*The noise of a frame* is a function of its key and of nothing else (`simulator.noise.generator`).
 
 `record` is the one way from light to frames. On the CPU it is one fused kernel, which works in
 blocks of 256 samples that stay in the first-level cache, vectorised by the compiler. Elsewhere, and
@@ -30,7 +28,7 @@ import functools
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numba
 import numpy as np
@@ -38,15 +36,21 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.decision import PEDESTAL, SIGNAL_LIMIT, Exposure
-from simulator.noise.generator import BLOCK, draw_block, drawn_normals
+from simulator.noise.generator import (
+    BLOCK,
+    Noise,
+    bank_block,
+    batch_normals,
+    draw_block,
+    frame_normals,
+    noise_bank,
+    noise_keys,
+)
 from simulator.noise.noise_level_function import ReadNoise, plane_tensor
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
-#: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
-#: and tails of the camera's read noise (`simulator.noise.noise_level_function`).
-Noise = Literal["exact", "bank", "sensor"]
 #: Blocks of a plane that one thread works on at a time, and samples that are worth a thread.
 _UNIT_BLOCKS, _WORTH_A_THREAD = 256, 4 * 64 * 64 * 4
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
@@ -64,53 +68,6 @@ _LEAST = tuple(_LEAST_SIGNALS.values())
 _jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundscheck=False)
 
 
-# -- keys: 64 bits from a seed and from the numbers that frames differ by ----------------------
-#
-# A chain of splitmix64 (Steele, Lea and Flood 2014) over the seed and the bits of the numbers.
-KEY_STEP = np.uint64(0x9E3779B97F4A7C15)
-_MULTIPLIERS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_SHIFTS = np.uint64(30), np.uint64(27), np.uint64(31)
-
-
-def mixed(words: Any) -> Any:
-    """The finaliser of splitmix64: a bijection of uint64, one or an array of them."""
-    words = (words ^ (words >> _SHIFTS[0])) * _MULTIPLIERS[0]
-    words = (words ^ (words >> _SHIFTS[1])) * _MULTIPLIERS[1]
-    return words ^ (words >> _SHIFTS[2])
-
-
-#: The same inside kernels.
-mixed_word = kernel()(mixed)
-
-
-@kernel()
-def _fold(keys, bits):  # type: ignore[no-untyped-def]
-    for frame in range(len(keys)):
-        key = mixed_word(keys[frame] + KEY_STEP)
-        for number in range(bits.shape[1]):
-            key = mixed_word((key ^ bits[frame, number]) + KEY_STEP)
-        keys[frame] = key
-
-
-def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndarray:
-    """(B,) uint64 keys of B frames, each a function of its seed and numbers and of nothing else.
-
-    `seeds` are (B,) or a single integer, >= 0. The noise of the frames also differs by `numbers`,
-    each (B,) or a single one: the frame of an episode, the settings of a capture.
-    """
-    given = np.asarray(seeds)
-    if given.dtype.kind not in "iu" or (given.dtype.kind == "i" and given.min(initial=0) < 0):
-        raise ValueError(f"`seeds` (={seeds!r}) must be integers >= 0")
-    columns = [np.asarray(number, np.float64) for number in numbers]
-    count = next((len(values) for values in (given, *columns) if values.ndim), 1)
-    keys, folded = np.empty(count, np.uint64), np.empty((count, len(columns)))
-    keys[:] = given
-    for column, values in enumerate(columns):
-        folded[:, column] = values
-    _fold(keys, folded.view(np.uint64))
-    return keys
-
-
 def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
     """(S,) uint64 keys of the noise of a sweep's frames, which differ by their settings.
 
@@ -119,64 +76,6 @@ def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
     seed = check_integer("seed", seed, 0, 2**64 - 1)
     numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)
     return noise_keys(seed, *numbers.reshape(-1, 3).T)
-
-
-# -- the bank ---------------------------------------------------------------------------------
-#
-# It holds the 2**20 quantiles (i + 1/2) / 2**20 of the normal distribution in a fixed random order.
-# A frame reads it in blocks of 256 samples; where each block starts (any multiple of 16) and its
-# sign come from a hash of the frame's key and the block's number. Every start is as likely as any
-# other, so each sample has the bank's distribution exactly, and two samples share a value only by
-# the chance that blocks overlap.
-
-#: Number of different normals.
-BANK_SIZE = 2**20
-#: A block starts at a multiple of this: one cache line of float32.
-STRIDE = 16
-_SHUFFLE_SEED = 20210616
-_SINGLES = np.uint64(0x5851F42D4C957F2D)  # keeps single normals apart from a frame's blocks
-_START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
-
-
-def normals_above(shares: np.ndarray) -> np.ndarray:
-    """(N,) standard normals that are above these shares of all; SciPy's takes 0.2 s to import."""
-    return np.asarray(torch.special.ndtri(torch.from_numpy(shares)))
-
-
-@functools.cache
-def noise_bank() -> np.ndarray:
-    """The bank, read-only: (BANK_SIZE + BLOCK,) float32; the end repeats the beginning."""
-    quantiles = normals_above((np.arange(BANK_SIZE) + 0.5) / BANK_SIZE).astype(np.float32)
-    np.random.default_rng(_SHUFFLE_SEED).shuffle(quantiles)
-    bank = np.concatenate([quantiles, quantiles[:BLOCK]])
-    bank.flags.writeable = False
-    return bank
-
-
-def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
-    """(B, count) float64: `count` standard normals for each key, apart from its frame's noise."""
-    found = np.empty((len(keys), count))
-    _look_up(keys, noise_bank(), found)
-    return found
-
-
-@kernel()
-def _look_up(keys, bank, found):  # type: ignore[no-untyped-def]
-    for i in range(len(keys)):
-        for number in range(found.shape[1]):
-            word = mixed_word((keys[i] ^ _SINGLES) + KEY_STEP * np.uint64(number + 1))
-            value = bank[word & np.uint64(BANK_SIZE - 1)]
-            found[i, number] = -value if word >> np.uint64(63) else value
-
-
-def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
-    """Standard normals of a frame of `shape` (P, H, W), float32.
-
-    They are what `record` adds, as an array: for other devices and for tests.
-    """
-    if noise != "bank":
-        return drawn_normals(key, shape)
-    return _normals(np.array([key], np.uint64), shape, noise, torch.device("cpu"))[0].numpy()
 
 
 @functools.lru_cache(maxsize=8)
@@ -413,7 +312,7 @@ def record_stepwise(
             if read_noise is not None:
                 own = None if share is None else share[0, 0], int(keys[first]), read_noise[first]
                 signal = signal + _read_part(missing[0], transitions.table[first], *own)
-            normals = _normals(keys[part], tuple(light.shape[1:]), noise, device)
+            normals = batch_normals(keys[part], tuple(light.shape[1:]), noise, device)
             signal = missing.sqrt_().mul_(normals).add_(signal)
         numbers = signal.mul_(span).add_(black).round_().clamp_(0.0, camera.white_level)
         if "numbers" in outputs:
@@ -439,37 +338,6 @@ def _stacked(shares: Sequence[torch.Tensor | None], like: torch.Tensor) -> torch
     everything = like.new_ones(like.shape[-2:])
     each = [everything if share is None else share.to(like.device) for share in shares]
     return torch.stack(each)[:, None]
-
-
-def _normals(
-    keys: np.ndarray, shape: tuple[int, ...], noise: Noise, device: torch.device
-) -> torch.Tensor:
-    """`frame_normals` (B, P, H, W) of frames, on any device; drawn ones are drawn on the CPU."""
-    if noise != "bank":
-        each = [drawn_normals(key, shape) for key in keys.tolist()]
-        return torch.from_numpy(np.stack(each)).to(device)
-    planes, samples = shape[0], shape[1] * shape[2]
-    blocks = -(-samples // BLOCK)
-    counters = np.arange(1, planes * blocks + 1, dtype=np.uint64) * KEY_STEP
-    own, turns = (torch.from_numpy(v.view(np.int64)).to(device) for v in (keys, counters))
-    words = _mixed_words(own[:, None] + turns)
-    pieces = _bank_on(device).unfold(0, BLOCK, STRIDE)
-    values = pieces[words & int(_START_BITS)]  # (B, blocks of all planes, 256)
-    values *= torch.where(words < 0, -1.0, 1.0)[..., None]
-    return values.view(len(keys), planes, -1)[..., :samples].reshape(len(keys), *shape)
-
-
-@functools.lru_cache(maxsize=8)
-def _bank_on(device: torch.device) -> torch.Tensor:
-    return torch.tensor(noise_bank(), device=device)
-
-
-def _mixed_words(words: torch.Tensor) -> torch.Tensor:
-    """`mixed` of int64 words: their products wrap, too, and shifts fill in zeros."""
-    for shift, multiplier in zip(_SHIFTS, (*_MULTIPLIERS, np.uint64(1)), strict=True):
-        shifted = (words >> int(shift)) & ((1 << (64 - int(shift))) - 1)
-        words = (words ^ shifted) * int(multiplier.view(np.int64))
-    return words
 
 
 def _read_part(
@@ -598,13 +466,6 @@ def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-de
 
 
 @_jit()
-def _in_bank(key, block):  # type: ignore[no-untyped-def]
-    """Where in the bank a block of a frame starts, and its sign (`frame_normals`)."""
-    word = mixed_word(key + KEY_STEP * np.uint64(block + 1))
-    return np.int64(word & _START_BITS) * STRIDE, -_ONE if word >> np.uint64(63) else _ONE
-
-
-@_jit()
 def _record(  # type: ignore[no-untyped-def]
     first, last, samples, light, remaining_variance, exposure, noise_source, sensor, outputs
 ):
@@ -633,7 +494,7 @@ def _record(  # type: ignore[no-untyped-def]
             size, at, number = end - start, plane * samples + start, plane * blocks + block
             exposed, normals, sign = frame_light[at : at + size], made, _ONE
             if drawn == _BANK:
-                offset, sign = _in_bank(keys[frame], number)
+                offset, sign = bank_block(keys[frame], number)
                 normals = bank[offset : offset + BLOCK]
             elif drawn == _DRAWN:
                 draw_block(keys[frame], number, words, made)

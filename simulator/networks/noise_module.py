@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.capture.sensor import frame_normals, noise_keys
 from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet, padded
+from simulator.noise.generator import frame_normals, noise_keys
 from simulator.utils.checks import check_word
 
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]

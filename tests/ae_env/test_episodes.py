@@ -18,7 +18,8 @@ from ae_env.scenes.load import _LOADED
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from simulator.camera import get_camera
-from simulator.capture.sensor import clip_and_quantise, exposed_light, frame_normals, noise_keys
+from simulator.capture.sensor import clip_and_quantise, exposed_light
+from simulator.noise.generator import frame_normals, noise_keys
 from simulator.noise.noise_level_function import ReadNoise
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene

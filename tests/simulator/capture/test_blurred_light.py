@@ -18,9 +18,10 @@ from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
-from simulator.capture.sensor import Transitions, noise_keys, record
+from simulator.capture.sensor import Transitions, record
 from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule
+from simulator.noise.generator import noise_keys
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
 from simulator.optics.motion import Movement, motion_blur, motion_kernel, path_blur, path_taps
 from simulator.utils.tiles import make_tiles

@@ -19,7 +19,8 @@ from simulator.capture.blurred_light import BlurredLight
 from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, clip_and_quantise, noise_keys, record
+from simulator.capture.sensor import Transitions, clip_and_quantise, record
+from simulator.noise.generator import noise_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise

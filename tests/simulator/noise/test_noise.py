@@ -21,9 +21,9 @@ from simulator.camera_simulator import CameraSimulator
 from simulator.capture import sensor
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import noise_keys, record
+from simulator.capture.sensor import record
 from simulator.noise import noise_level_function as nlfs
-from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, philox
+from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, noise_keys, philox
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
 from simulator.optics.discs import disc_kernel
 from simulator.reference.reference_camera import ReferenceCamera
