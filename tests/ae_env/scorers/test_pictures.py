@@ -395,13 +395,6 @@ def test_any_frame_is_scored(name: str, size: tuple[int, int]) -> None:
     assert torch.equal(scores, make_scorer(name)(images, captures))
 
 
-def test_opencv_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    for name in ("keypoints", "matches"):
-        with pytest.raises(ImportError, match=r"pip install 'ae-env\[cv\]'"):
-            make_scorer(name)
-
-
 # -- learnt: NIMA against Keras with the same random weights, and classifiers from files -----------
 
 #: Mean ratings that Keras 3.15 gives to `pictures_of_keras` with `weights_of_keras`, by

@@ -20,7 +20,7 @@ from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise, record
-from simulator.noise.generator import noise_keys
+from simulator.noise.generator import frame_normals, noise_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from tests.simulator.z6_noise import z6_noise
@@ -263,12 +263,17 @@ def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
         remaining_variance=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
     )
     keys = noise_keys(5, 3)
-    normals = torch.from_numpy(sensor.frame_normals(int(keys[0]), (4, *size), kind))
+    normals = torch.from_numpy(frame_normals(int(keys[0]), (4, *size), kind))
     exact = reference(light, exposure, normals)
-    transitions, frames = Transitions.of([light], [exposure]), torch.empty(2, 4, *size)
-    counts = record(transitions, Z6, keys=keys, noise=kind, signals=frames[:1], count=True)
-    outputs = {"signals": frames[1:]}
-    sensor.record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, outputs)
+    transitions, least = Transitions.of([light], [exposure]), {"linear": -(2.0**-10), "images": 0.0}
+    frames, *shown = (
+        outputs := {n: torch.empty(2, 4, *size) for n in ("signals", *least)}
+    ).values()
+    first, second = ({n: out[i : i + 1] for n, out in outputs.items()} for i in range(2))
+    counts = record(transitions, Z6, keys=keys, noise=kind, count=True, **first)
+    sensor.record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, second)
+    for bounded, low in zip(shown, least.values(), strict=True):
+        assert torch.equal(bounded, frames.clamp(low, 1.0))
     for frame in frames:
         numbers = in_numbers(frame)
         assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 of 14 bits: 0.001

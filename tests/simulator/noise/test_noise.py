@@ -18,10 +18,10 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
-from simulator.capture import sensor
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import record
+from simulator.capture.sensor import Transitions, record, sweep_keys
+from simulator.noise import generator
 from simulator.noise import noise_level_function as nlfs
 from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, noise_keys, philox
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
@@ -187,7 +187,7 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     assert torch.equal(*drawn)
     simulated = CameraSimulator().simulate(scenes[0], BASE, seed=3, noise="sensor").data
     assert torch.equal(simulated, scenes[0].expose([BASE], seed=3, noise="sensor")[0])
-    transitions = sensor.Transitions.of([light], [scenes[0].exposure(BASE)])
+    transitions = Transitions.of([light], [scenes[0].exposure(BASE)])
     signals, numbers = torch.empty(1, 4, 9, 70), np.empty((1, 4, 9, 70), np.uint16)
     given = {"keys": np.array([7], np.uint64), "read_noise": [ReadNoise(ROW, -0.05)]}
     both = {"signals": signals, "numbers": numbers}
@@ -239,7 +239,7 @@ def key_of(seed: int, *numbers: float) -> int:
     return key
 
 
-of_sweep = functools.partial(sensor.sweep_keys, states=[])
+of_sweep = functools.partial(sweep_keys, states=[])
 
 
 def test_keys_are_those_of_splitmix64_and_of_each_setting_of_a_sweep() -> None:
@@ -249,9 +249,9 @@ def test_keys_are_those_of_splitmix64_and_of_each_setting_of_a_sweep() -> None:
     given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
     states = [CameraSettings(*values) for values in given]
     for seed in (7, np.int64(8), MASK):  # the last is the largest
-        keys = sensor.sweep_keys(seed, states)
+        keys = sweep_keys(seed, states)
         assert keys.tolist() == [key_of(int(seed), *values) for values in given]
-    assert len(sensor.sweep_keys(7, [])) == 0
+    assert len(sweep_keys(7, [])) == 0
 
 
 def test_bad_seeds_are_named() -> None:
@@ -263,7 +263,7 @@ def test_bad_seeds_are_named() -> None:
 
 
 def test_the_bank_is_every_quantile_once_in_a_fixed_order() -> None:
-    bank = sensor.noise_bank()
+    bank = generator.noise_bank()
     assert (bank.shape, bank.dtype, bank.flags.writeable) == ((2**20 + 256,), np.float32, False)
     np.testing.assert_array_equal(bank[2**20 :], bank[:256])
     quantiles = stats.norm.ppf((np.arange(2**20) + 0.5) / 2**20)
@@ -273,9 +273,9 @@ def test_the_bank_is_every_quantile_once_in_a_fixed_order() -> None:
 
 @pytest.mark.parametrize("shape", [(2, 3, 200), (4, 1, 1)])
 def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, int]) -> None:
-    key, bank = key_of(5, 2.0), sensor.noise_bank()
+    key, bank = key_of(5, 2.0), generator.noise_bank()
     size, turn = shape[1] * shape[2], 0
-    for plane in sensor.frame_normals(key, shape, "bank").reshape(shape[0], size):
+    for plane in generator.frame_normals(key, shape, "bank").reshape(shape[0], size):
         for start in range(0, size, 256):
             turn += 1
             word = mixed(key + turn * STEP & MASK)
@@ -283,7 +283,7 @@ def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, in
             np.testing.assert_array_equal(plane[start : start + 256], values * (-1) ** (word >> 63))
     words = [mixed((key ^ 0x5851F42D4C957F2D) + turn * STEP & MASK) for turn in (1, 2, 3)]
     expected = [float(bank[word % 2**20]) * (-1) ** (word >> 63) for word in words]
-    assert sensor.single_normals(np.array([key], np.uint64), 3).tolist() == [expected]
+    assert generator.single_normals(np.array([key], np.uint64), 3).tolist() == [expected]
 
 
 @pytest.mark.parametrize(
