@@ -9,11 +9,12 @@ import numpy as np
 import torch
 
 from ae_env.grid import ExposureGrid
-from ae_env.observation import PEDESTAL, encode_observation
+from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from simulator.camera import LOW_CLIP, CameraProfile
 from simulator.capture.batch import MODULES, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.sensor import LEAST_SIGNALS
 from simulator.noise.generator import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
@@ -61,10 +62,10 @@ class LookupBatch:
         digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
         if "codes" in outputs:
             encode_observation(torch.from_numpy(shown), out=torch.from_numpy(outputs["codes"]))
-        known = {"numbers": digital, "linear": shown.clip(-PEDESTAL, 1.0)}
-        known["images"] = shown.clip(0.0, 1.0)
-        for name in known.keys() & outputs:
-            outputs[name][:] = known[name]
+        if "numbers" in outputs:
+            outputs["numbers"][:] = digital
+        for name in LEAST_SIGNALS.keys() & outputs:
+            np.clip(shown, LEAST_SIGNALS[name], 1.0, out=outputs[name])
         count, nothing = len(shown), np.zeros(len(shown))
         return FrameStatistics(
             clipped_low=(shown <= LOW_CLIP).reshape(count, -1).mean(axis=1),

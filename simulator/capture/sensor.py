@@ -63,8 +63,9 @@ _NO_BANK = np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
 _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
 #: Outputs that are signals, and the least one that each shows.
-_LEAST_SIGNALS = {"signals": -_LARGEST, "linear": np.float32(-PEDESTAL), "images": _ZERO}
-_LEAST = tuple(_LEAST_SIGNALS.values())
+LEAST_SIGNALS = {"signals": -_LARGEST, "linear": np.float32(-PEDESTAL), "images": _ZERO}
+_LEAST = tuple(LEAST_SIGNALS.values())
+_KINDS = {"codes": np.uint8, "numbers": np.uint16} | dict.fromkeys(LEAST_SIGNALS, np.float32)
 _jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundscheck=False)
 
 
@@ -258,6 +259,8 @@ def record(
     Returns:
         (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
     """
+    if unknown := outputs.keys() - _KINDS:
+        raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
     if len(transitions.light) == 0:
         return np.zeros((0, 2), np.int64)
     if row_gain is not None:
@@ -325,7 +328,7 @@ def record_stepwise(
             codes = bright.sqrt_().mul_(255.0 / (span * (1.0 + PEDESTAL)).sqrt()).add_(0.5)
             outputs["codes"][part] = codes.to(torch.uint8)
         signals = numbers.sub_(black).div_(span)
-        for name, least in _LEAST_SIGNALS.items():
+        for name, least in LEAST_SIGNALS.items():
             if name in outputs:
                 outputs[name][part] = signals.clamp(float(least), 1.0)
     return counts.cpu().numpy() if count else np.zeros((len(lights), 2), np.int64)
@@ -545,10 +548,9 @@ def _record_fused(
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
     keys = np.zeros(frames, np.uint64) if keys is None else keys
-    kinds = {"codes": np.uint8, "numbers": np.uint16} | dict.fromkeys(_LEAST_SIGNALS, np.float32)
     codes, numbers, *signals = (
         given[name].reshape(frames, 4, samples) if name in given else np.empty((0, 4, 0), dtype)
-        for name, dtype in kinds.items()
+        for name, dtype in _KINDS.items()
     )
     fixed = (
         samples,

@@ -202,8 +202,9 @@ def test_recording_nothing_and_on_other_devices() -> None:
     assert record(Transitions([], sensor.exposure_table([])), Z6).shape == (0, 2)
     light, table = torch.empty(4, 2, 3, device="meta"), sensor.exposure_table([STILL])
     signals, keys = torch.empty(1, 4, 2, 3, device="meta"), np.zeros(1, np.uint64)
-    counts = record(Transitions([light], table), Z6, keys=keys, signals=signals)
-    assert counts.tolist() == [[0, 0]]
+    assert record(Transitions([light], table), Z6, keys=keys, signals=signals).tolist() == [[0, 0]]
+    with pytest.raises(ValueError, match="image"):
+        record(Transitions([light], table), Z6, keys=keys, image=signals)
 
 
 def test_balance_where_there_is_no_noise() -> None:
@@ -272,8 +273,7 @@ def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
     first, second = ({n: out[i : i + 1] for n, out in outputs.items()} for i in range(2))
     counts = record(transitions, Z6, keys=keys, noise=kind, count=True, **first)
     sensor.record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, second)
-    for bounded, low in zip(shown, least.values(), strict=True):
-        assert torch.equal(bounded, frames.clamp(low, 1.0))
+    assert all(map(torch.equal, shown, [frames.clamp(low, 1.0) for low in least.values()]))
     for frame in frames:
         numbers = in_numbers(frame)
         assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 of 14 bits: 0.001
