@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any, Unpack
 
 import gymnasium as gym
@@ -33,7 +32,6 @@ from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES, FrameSource
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.motion import Movement
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_seed, check_word
 from simulator.utils.compute import keep_memory
@@ -44,7 +42,6 @@ Observation = dict[str, np.ndarray]
 #: Memory for score tables [byte]: some eight thousand of 64 states.
 TABLES_BYTES = 2**25
 _FIRST = np.array([0])
-_MOVEMENT = tuple(field.name for field in fields(Movement))
 
 
 class AutoExposure(Task):
@@ -275,9 +272,8 @@ class AutoExposure(Task):
     def _moves(self, env_indices: np.ndarray) -> dict[str, Any]:
         """How the scenes move, as `SceneCaptures.of` takes it."""
         episodes = self.episodes
-        movements = np.stack([getattr(episodes, n)[env_indices] for n in _MOVEMENT], axis=1)
         speed, defocus = episodes.speed[env_indices], episodes.defocus[env_indices]
-        return {"speed": speed, "defocus": defocus, "movements": movements}
+        return {"speed": speed, "defocus": defocus, "movements": episodes.movements[env_indices]}
 
 
 class AutoExposureBase(SpecProperty):

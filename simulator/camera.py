@@ -116,10 +116,11 @@ class CameraProfile:
 
     @functools.cached_property
     def digits(self) -> np.ndarray:
-        """How it digitises a signal: (5, 4) float32, columns are the planes R, G1, G2, B.
+        """How it digitises a signal: (6, 4) float32, columns are the planes R, G1, G2, B.
 
         The rows: digital numbers from black to white, digital number of black, largest one that
-        counts as clipped low, smallest one that counts as clipped high, largest one.
+        counts as clipped low, smallest one that counts as clipped high, largest one, and the
+        variance that rounding adds to a signal.
         """
         span, black = (np.array(v, np.float32)[:, None] for v in (self.span, self.black_level))
         numbers = np.arange(int(self.white_level) + 1, dtype=np.float32)
@@ -127,7 +128,8 @@ class CameraProfile:
         low = (signals <= LOW_CLIP).sum(axis=1) - 1
         high = len(numbers) - (signals >= HIGH_CLIP).sum(axis=1)
         white = np.full(4, self.white_level)
-        table = np.stack([span[:, 0], black[:, 0], low, high, white]).astype(np.float32)
+        rows = span[:, 0], black[:, 0], low, high, white, 1.0 / (12.0 * np.square(span[:, 0]))
+        table = np.stack(rows).astype(np.float32)
         table.flags.writeable = False
         return table
 

@@ -110,7 +110,9 @@ class Episodes:
         self._delays = options.delays if len(set(options.delays)) > 1 else options.delays[:1]
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
         self.speed, self.defocus, self.focus_drive, self.phase = np.zeros((4, count))
-        self.direction, self.turn, self.subject_speed, self.subject_direction = np.zeros((4, count))
+        self.movements = np.zeros((count, 4))  # of each the numbers of its `Movement`, in its order
+        movement = self.movements.T
+        self.direction, self.turn, self.subject_speed, self.subject_direction = movement
         self.begun = np.zeros(count, bool)
         self.light_index, self.previous = np.zeros((2, count), np.int64)
         self.pending = np.zeros((count, max(options.delays) + 1), np.int64)

@@ -209,7 +209,7 @@ class TermScores:
         table = transitions.before_rounding(self.camera).averaged_table()
         source_noise = table[:, 3:] * np.square(box_factors)[:, None, None]
         if not self.noise:
-            codes = np.empty((len(table), *transitions.light[0].shape), np.uint8)
+            codes = np.empty((len(table), *transitions.shape), np.uint8)
             record(transitions, self.camera, row_gain=row_gain, codes=codes)
             return self.measured(codes, states, source_noise)
         shares, which = self._shares_of_frames(states, source_noise)
@@ -222,7 +222,7 @@ class TermScores:
             if key not in numbers:
                 numbers[key] = len(tables)
                 tables.append(self._tabulated(key, table[i, 1:3], shares[which[i]]))
-        height, width = transitions.light[0].shape[-2:]
+        _, height, width = transitions.shape
         rows = np.ones((len(table), 1)) if row_gain is None else row_gain
         fixed = (
             addresses(transitions.light),
@@ -292,7 +292,8 @@ def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarra
     if column is None:
         return np.asarray(part(None, captures).numpy())
     values = means[:, column]
-    return np.asarray(np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0))
+    found = values if column == 2 else np.exp(-values / part.scale)
+    return np.minimum(np.maximum(found, 0.0), 1.0)
 
 
 def _means_by_torch(

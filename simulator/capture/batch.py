@@ -20,6 +20,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.blurred_frames import BLUR
 from simulator.capture.blurred_light import new_frames
 from simulator.capture.columns import (
+    BLURS,
     SCENE,
     blur_column,
     fits_columns,
@@ -48,7 +49,6 @@ _STEPS = (
     *("vignetting", "pixel_response", "noise"),
 )
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
-_BLUR_BITS = np.array([_BIT[name] for name in ("defocus", "motion_blur", "vignetting")])
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -165,6 +165,9 @@ class CaptureBatch:
         # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
         self._modules = np.zeros(count, np.int64)
+        # What is added to these for each blur, and always; see `plan_frames`.
+        always = _BIT["noise"] + bool(camera.prnu) * _BIT["pixel_response"]
+        self._bits = np.array([_BIT[name] for name in BLURS] + [always * (noise is not None)])
         self._blurs = np.zeros(count, bool)  # whether it must be, else the light is the source
         self._blurred = np.zeros(count, np.uintp)  # its place
         # Light (4, H, W) that it starts from; of captures that are not planned in columns,
@@ -239,7 +242,7 @@ class CaptureBatch:
             count=True,
             **outputs,
         )
-        samples = self._source[rows[0]].numel()
+        samples = math.prod(transitions.shape)
         return FrameStatistics(
             clipped_low=counts[:, 0] / samples,
             clipped_high=counts[:, 1] / samples,
@@ -310,17 +313,12 @@ class CaptureBatch:
         if len(others) < len(rows):
             planned = rows[inside]
             self._source[planned] = self._light[indices[inside]]
-            columns = self._blur, self._table, self._predicted_error
-            known = self._scene_columns, self._statistics, self._columns
+            known = self._scene_columns, self._statistics, self._vignetting
+            columns = self._blur, self._table, self._predicted_error, self._modules
             height, own = self._light[indices[0]].shape[-2], indices[inside]
-            plan_frames(*known, self._targets, height, own, planned, gains[inside], *columns)
-            blur = self._blur[planned]
-            darkened = self._vignetting[indices[inside], planned % len(self.states)]
-            self._blur["vignetting"][planned] = darkened
-            runs = np.array([blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0, darkened > 0])
-            added = _BIT["noise"] + bool(self.camera.prnu) * _BIT["pixel_response"]
-            self._modules[planned] = _BLUR_BITS @ runs + (self.noise is not None) * added
-            self._blurs[planned] = runs.any(axis=0)
+            given = self._columns, self._targets, height, self._bits, own, planned, gains[inside]
+            plan_frames(*known, *given, *columns)
+            self._blurs[planned] = self._modules[planned] != self._bits[-1]
             self._excess_variance[planned] = 0.0
         self._gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1

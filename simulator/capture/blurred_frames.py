@@ -168,13 +168,13 @@ class FramesAt(Sequence[torch.Tensor]):
     """Contiguous float32 frames of one shape, known by their `addresses` (B,)."""
 
     def __init__(self, addresses: np.ndarray, shape: tuple[int, ...]) -> None:
-        self.addresses, self._shape = addresses, shape
+        self.addresses, self.shape = addresses, (len(addresses), *shape)
 
     def __len__(self) -> int:
         return len(self.addresses)
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return torch.from_numpy(frame_at(int(self.addresses[index]), self._shape))
+        return torch.from_numpy(frame_at(int(self.addresses[index]), self.shape[1:]))
 
 
 def frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:

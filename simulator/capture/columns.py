@@ -43,6 +43,8 @@ SCENE = np.dtype(
         *LAYOUT,
     ]
 )
+#: The blurs that `plan_frames` decides on.
+BLURS = ("defocus", "motion_blur", "vignetting")
 #: How a scene is out of focus and moves: `PreparedScene.defocus`, `image_speed` and `movement`.
 MOVES = np.dtype([(name, "f8") for name in _MOVES])
 #: All of a state that the exposure of a capture depends on.
@@ -149,17 +151,32 @@ def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
 
 @kernel(fastmath={"contract"})
 def plan_frames(  # type: ignore[no-untyped-def]
-    scenes, statistics, states, targets, height, indices, rows, gains, blurs, table, error
+    scenes,
+    statistics,
+    vignetting,
+    states,
+    targets,
+    height,
+    bits,
+    indices,
+    rows,
+    gains,
+    blurs,
+    table,
+    error,
+    modules,
 ):
-    """Plans `rows` of the columns `blurs`, `table` and `error`, which it fills.
+    """Plans `rows` of the columns `blurs`, `table`, `error` and `modules`, which it fills.
 
     Args:
-        scenes, statistics: `SCENE` and `LightStatistics.columns` of all scenes.
+        scenes, statistics, vignetting: `SCENE`, `LightStatistics.columns` and `vignetting_column`
+            of all scenes.
         states, targets: `STATE`, and (T, S, 2, 4) shot and read noise of their captures.
         height: Of the frames [pixel].
+        bits: (4,) what each of `BLURS` that runs adds to `modules`, and what is always added.
         indices, rows, gains: (K,) scene, row, and light relative to the scene's own.
-        blurs, table, error: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, and (N,) error of the
-            blurs that are left out.
+        blurs, table, error, modules: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, (N,) error of the
+            blurs that are left out, and (N,) sums of `bits`.
     """
     extents, errors, runs = np.zeros(3), np.empty(3), np.empty(3, np.bool_)
     for k in range(len(rows)):
@@ -186,6 +203,10 @@ def plan_frames(  # type: ignore[no-untyped-def]
         blur.motion_px = moved if runs[2] else 0.0
         blur.diameter, blur.sorts = scene.diameter, scene.sorts
         blur.num_sorts, blur.mask, blur.behind = scene.num_sorts, scene.mask, scene.behind
+        blur.vignetting = vignetting[indices[k], at]
+        modules[row] = bits[3] + runs[1] * bits[0] + runs[2] * bits[1]
+        if blur.vignetting:
+            modules[row] += bits[2]
         left_out = 0.0
         for i in range(1, 3):
             if not runs[i]:
@@ -220,9 +241,9 @@ def plan_sweep(
         shares = [None if share is None else share.float().contiguous() for share in left]
         return [e.origin for e in exposures], blurs, exposure_table(exposures), shares
     count, rows, height = len(states), np.arange(len(states)), scene.light.shape[-2]
-    made = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), np.empty(count)
-    targets = noise_columns(scene.camera, states, scene.box_factor)[None]
+    made = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), np.empty(count), 0 * rows
+    targets, bits = noise_columns(scene.camera, states, scene.box_factor)[None], np.zeros(4, int)
     own = np.array([scene_column(scene, 0)], SCENE), statistics_column(scene)[None]
-    plan_frames(*own, columns, targets, height, 0 * rows, rows, gains.astype(float), *made)
-    made[0]["vignetting"] = vignetting_column(scene, states)
+    darkened, given = vignetting_column(scene, states)[None], (columns, targets, height, bits)
+    plan_frames(*own, darkened, *given, 0 * rows, rows, gains.astype(float), *made)
     return [(None, None)] * count, made[0], made[1], None

@@ -25,6 +25,7 @@ where the read noise has rows and tails, the steps run one by one.
 from __future__ import annotations
 
 import functools
+import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,6 +39,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.decision import PEDESTAL, SIGNAL_LIMIT, Exposure
 from simulator.noise.generator import (
     BLOCK,
+    STRIDE,
     Noise,
     bank_block,
     batch_normals,
@@ -49,7 +51,7 @@ from simulator.noise.generator import (
 from simulator.noise.noise_level_function import ReadNoise, plane_tensor
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
-from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges, prefetch
 
 #: Blocks of a plane that one thread works on at a time, and samples that are worth a thread.
 _UNIT_BLOCKS, _WORTH_A_THREAD = 256, 4 * 64 * 64 * 4
@@ -128,7 +130,7 @@ class Transitions:
         by the square of the row's gain, r^2. What the top-up takes away for it has the variance
         times r: exact for shot noise, and off by r (1 - r) of the source's read noise.
         """
-        shares, (height, width) = self.shares(), self.light[0].shape[-2:]
+        shares, (_, height, width) = self.shares(), self.shape
         gains = torch.from_numpy(row_gain).to(self.light[0]).view(-1, height, 1)
         bands = row_gain.max(axis=1) > row_gain.min(axis=1)
         lights: Lights
@@ -161,7 +163,7 @@ class Transitions:
         It is part of the calibrated read noise: the rest of that is what has to be drawn.
         """
         table = self.table.copy()
-        table[:, 2] -= 1.0 / (12.0 * np.square(camera.digits[0]))
+        table[:, 2] -= camera.digits[5]
         return replace(self, table=table)
 
     def averaged_table(self) -> np.ndarray:
@@ -178,6 +180,19 @@ class Transitions:
         """`remaining_variance` as a list, one entry for each frame."""
         known = self.remaining_variance
         return [None] * len(self.light) if known is None else list(known)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(4, H, W) of each light."""
+        known = getattr(self.light, "shape", None)
+        return tuple(self.light[0].shape if known is None else known[1:])
+
+    @property
+    def needs_torch(self) -> bool:
+        """Whether torch has to record the frames: of light in one tensor, or on a device."""
+        if hasattr(self.light, "addresses"):
+            return False
+        return isinstance(self.light, torch.Tensor) or not self.light[0].is_cpu
 
     @property
     def lacks_noise(self) -> bool:
@@ -265,9 +280,8 @@ def record(
         return np.zeros((0, 2), np.int64)
     if row_gain is not None:
         transitions = transitions.in_bands(row_gain)
-    transitions = transitions.before_rounding(camera)
-    stepwise = isinstance(transitions.light, torch.Tensor) or not transitions.light[0].is_cpu
-    if stepwise or (read_noise is not None and keys is not None):
+    if transitions.needs_torch or (read_noise is not None and keys is not None):
+        transitions = transitions.before_rounding(camera)
         kind: Noise = "exact" if noise == "sensor" else noise
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
         return record_stepwise(transitions, camera, keys, kind, tensors, read_noise, count=count)
@@ -481,8 +495,8 @@ def _record(  # type: ignore[no-untyped-def]
     for unit in range(first, last):
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
         ratio, shot, read, source_shot, source_read = exposure[frame, :, plane]
-        span, black, low, high, white = sensor[:, plane]
-        body = span, black, white
+        span, black, low, high, white, rounding = sensor[:, plane]
+        body, read = (span, black, white), read - rounding
         # A light beyond it is white; one of an exposure of 0 has no bound.
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
@@ -499,6 +513,9 @@ def _record(  # type: ignore[no-untyped-def]
             if drawn == _BANK:
                 offset, sign = bank_block(keys[frame], number)
                 normals = bank[offset : offset + BLOCK]
+                coming = bank_block(keys[frame], number + 1)[0]
+                for line in range(coming, coming + BLOCK, STRIDE):
+                    prefetch(bank, line)
             elif drawn == _DRAWN:
                 draw_block(keys[frame], number, words, made)
             if drawn == _OFF:
@@ -539,9 +556,9 @@ def _record_fused(
     given: Mapping[str, np.ndarray],
     count: bool,
 ) -> np.ndarray:
-    """`record` on the CPU, of transitions `before_rounding`."""
+    """`record` on the CPU."""
     light, remaining = transitions.light, transitions.remaining_variance
-    frames, samples = len(light), light[0].numel() // 4
+    frames, samples = len(light), math.prod(transitions.shape[1:])
     blocks = -(-samples // BLOCK)
     pieces = -(-blocks // _UNIT_BLOCKS)
     units = frames * 4 * pieces

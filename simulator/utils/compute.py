@@ -170,6 +170,25 @@ def as_pointer(typing, address):  # type: ignore[no-untyped-def]
     return types.CPointer(types.float32)(types.uintp), generate  # type: ignore[no-untyped-call]
 
 
+@numba.extending.intrinsic
+def prefetch(typing, array, index):  # type: ignore[no-untyped-def]
+    """Asks for the cache line of ``array[index]``, which is read soon, inside a kernel."""
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(array)(context, builder, args[0]).data
+        place = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+        read, near, of_data = (ir.Constant(ir.IntType(32), flag) for flag in (0, 3, 1))
+        given = [place.type, *[read.type] * 3]
+        called = ir.FunctionType(ir.VoidType(), given)
+        builder.call(
+            builder.module.declare_intrinsic("llvm.prefetch", given[:1], called),
+            [place, read, near, of_data],
+        )
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
 #: Samples that `add_shifts` adds to.
 LANES = 64
 
