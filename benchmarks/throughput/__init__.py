@@ -2,10 +2,10 @@
 
     ae-env bench throughput
 
-Parts: environment steps beside a fused kernel, copies of the environment; resets
-beside steps; the first episode after installation; growth of time and memory with pixels; a
-24-megapixel raw through the simulator beside LibRaw. The real files that ``AE_ENV_DATA`` names are
-used where they are.
+Parts: environment steps beside a fused kernel, copies of the environment; resets beside steps; the
+first episode after installation; sweeps beside the paper's networks; growth of time and memory with
+pixels; a 24-megapixel raw through the simulator beside LibRaw. The real files that ``AE_ENV_DATA``
+names are used where they are.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from benchmarks.harness import Part, Report, Row, benchmark, pivot, sections, ta
 from benchmarks.isolated import CORES
 from benchmarks.throughput import frames
 from benchmarks.throughput.steps import measure_cold_start, measure_resets, measure_steps
+from benchmarks.throughput.sweeps import sweep_parts
 
 #: Threads and frame sizes of the steps; the first is drawn.
 STEPS = ((CORES, 64), (CORES, 128), (1, 64), (1, 128))
@@ -30,7 +31,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
         arguments = {"threads": n, "size": size}
         found.append(Part(f"steps {n} {size}", measure_steps, arguments, threads=n))
     found += [Part("resets", measure_resets, threads=1), Part("cold start", measure_cold_start)]
-    return [*found, *frames.growth_parts(quick), *frames.frame_parts(quick)]
+    return [*found, *sweep_parts(quick), *frames.growth_parts(quick), *frames.frame_parts(quick)]
 
 
 _STEPS = """case = {case} | envs = {num_envs} | steps/s = {steps_per_second:,.0f} |
@@ -41,6 +42,8 @@ spread = {spread:.0%}"""
 _COLD = """case = {case} | in all [s] = {total_s:.2f} | import [s] = {import_s:.2f} |
 make [s] = {make_s:.2f} | reset [s] = {reset_s:.2f} | step [s] = {step_s:.2f} |
 processor time [s] = {cpu_s:.2f} | more episodes [s] = {episodes_s:.2f} | spread = {spread:.0%}"""
+_SWEEPS = """size = {size} | scene = {kind} | source = {source} | sweep [ms] = {ms:,.0f} |
+paper's networks [ms] = {paper_ms:,.0f} | times = {times:.0f}"""
 _CURVES = """curve = {curve} | time = {exponents[seconds][0]:.2f} ± {exponents[seconds][1]:.2f} |
 memory = {exponents[mib][0]:.2f} ± {exponents[mib][1]:.2f}"""
 _FRAMES = """case = {case}, {file}, {megapixels:.1f} MP | all [s] = {seconds:.2f} |
@@ -59,6 +62,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     steps, growth = of("steps"), of("growth")
     more = {"resets": of("resets"), "cold_start": of("cold"), "growth": frames.curves(growth)}
     libraw = {row["file"]: row for row in of("libraw")}
+    more["sweeps"] = of("sweep")
     more["full_frame"] = [row | {"libraw": libraw[row["file"]]} for row in of("frame")]
     for row in steps:
         row["title"] = f"{row['size']} x {row['size']}, {row['threads']} thread"
@@ -69,6 +73,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "steps": sections(steps, "{title}", lambda own: table(own, _STEPS)),
         "resets": table(more["resets"], _RESETS),
         "first-episode": table(more["cold_start"], _COLD),
+        "sweeps": table(more["sweeps"], _SWEEPS),
         "growth": f"{table(more['growth'], _CURVES)}\n\n{by_x}",
         "frames": table(more["full_frame"], _FRAMES),
     }

@@ -75,7 +75,7 @@ def all_methods() -> list[Method]:
             paper = simulator("paper", dtype)
             methods += [
                 full("paper", paper, dtype),
-                Method("paper, no repetition", dtype, prepare=partial(_PaperSweep, paper)),
+                Method("paper, no repetition", dtype, prepare=partial(PaperSweep, paper)),
             ]
     return methods
 
@@ -123,7 +123,7 @@ def planned(name: str, tolerance: float, dtype: Dtype = "float32") -> Method:
     return Method(f"{name} {tolerance:g}", dtype, tolerance, prepare=prepare)
 
 
-class _PaperSweep:
+class PaperSweep:
     """The paper's networks as a sensible user would sweep with them.
 
     States of equal exposure ratio share a run of the noise module, and those of equal f-number,
@@ -136,10 +136,12 @@ class _PaperSweep:
         self._denoised: dict[float, Tensor] = {}
 
     def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
+        """See `Method`."""
         return torch.stack([_noisy(self.expected(s), s, self._raw, seed) for s in states])
 
     @torch.no_grad()
     def expected(self, settings: CameraSettings) -> Tensor:
+        """See `Method`."""
         raw, ratio = self._raw, exposure_ratio(self._raw.settings, settings)
         own, source = self._own, self._raw.settings.effective_f_number
         assert own.noise is not None

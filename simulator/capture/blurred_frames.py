@@ -345,20 +345,20 @@ class BlurredFrames:
             else:
                 radii[i] = _radius(diameter)
         own = radii > 0.0
-        cost = 40.0 + 10.0 * radii[own] ** 2
+        cost = 85.0 + 13.0 * radii[own] ** 2
         self._add(blur_discs, indices[own], cost, source[own], to[own], radii[own])
 
     def _blend(
         self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
     ) -> None:
-        self._add(blend_discs, indices, np.full(len(to), 60.0), to, blurs, levels)
+        self._add(blend_discs, indices, np.full(len(to), 200.0), to, blurs, levels)
 
     def _move(
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
         # Sums of taps take as long as these are many; with a subject there are more.
-        taps = 40.0 + 6.0 * np.minimum(blurs["motion_px"], sum(self._shape[1:]))
-        taps *= np.where(blurs["mask"] > 0, 2.0, 1.0)
+        taps = 95.0 + 9.0 * np.minimum(blurs["motion_px"], sum(self._shape[1:]))
+        taps *= np.where(blurs["mask"] > 0, 1.6, 1.0)
         for task, own in (move_along_rows, blurs["streaks"]), (move_along_paths, ~blurs["streaks"]):
             self._add(task, indices[own], taps[own], source[own], to[own], blurs[own])
 
