@@ -43,6 +43,8 @@ from simulator.noise.generator import Noise, noise_keys
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 
+#: Frames that are worth a thread when they are planned.
+_WORTH_A_THREAD = 256
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = (
     *("noise_reduction", "aperture", "defocus", "motion_blur"),
@@ -149,11 +151,13 @@ class CaptureBatch:
         # no noise of its own, and no aperture is opened.
         self._scenes: dict[int, PreparedScene] = {}
         self._known = np.zeros(num_scenes, bool)
-        self._scene_columns, self._widest = np.zeros(num_scenes, SCENE), np.zeros(num_scenes)
-        self._subjects = np.zeros((num_scenes, 2), np.uintp)
-        self._statistics = np.zeros((num_scenes, 4, 4, BINS))
+        self._scene_columns, self._in_columns = np.zeros(num_scenes, SCENE), self._known.copy()
+        # Of scenes at rest, what those that show them in motion share: the light, the largest
+        # defocus, the subject, the vignetting, and the statistics, where they are known.
+        self._light, self._widest = np.empty(num_scenes, object), np.zeros(num_scenes)
+        self._height, self._subjects = 0, np.zeros((num_scenes, 2), np.uintp)
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
-        self._in_columns, self._light = np.zeros(num_scenes, bool), np.empty(num_scenes, object)
+        self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
         # Row of the blurred light that each scene has at present.
         self._blurred_row = np.full(num_scenes, -1)
         # Planned captures as columns, by scene and state: all that a frame depends on, except for
@@ -170,7 +174,7 @@ class CaptureBatch:
         self._bits = np.array([_BIT[name] for name in BLURS] + [always * (noise is not None)])
         self._blurs = np.zeros(count, bool)  # whether it must be, else the light is the source
         self._blurred = np.zeros(count, np.uintp)  # its place
-        # Light (4, H, W) that it starts from; of captures that are not planned in columns,
+        # Of captures that are not planned in columns, the light (4, H, W) that they start from,
         # `Exposure.remaining_variance` and the exposure.
         self._source, self._remaining_variance, self._exposure = np.empty((3, count), object)
         self._any_remaining = False
@@ -183,13 +187,12 @@ class CaptureBatch:
     def forget(self, indices: np.ndarray) -> None:
         """See `FrameSource`; the memory is used again."""
         count, objects = len(self.states), (self._source, self._remaining_variance, self._exposure)
+        self._gain.reshape(-1, count)[indices] = np.nan
+        for column in objects if self._any_remaining else ():
+            column.reshape(-1, count)[indices] = None
         for index in indices.tolist():
-            rows = slice(index * count, (index + 1) * count)
-            self._gain[rows] = np.nan
-            for column in objects[: 3 if self._any_remaining else 1]:
-                column[rows] = None
             self._scenes.pop(index, None)
-        self._known[indices] = False
+        self._known[indices] = self._counted[indices] = False
         self._frames.release(indices)
         self._blurred_row[indices] = -1
 
@@ -209,7 +212,7 @@ class CaptureBatch:
         remaining = self._remaining_variance[rows] if self._any_remaining else None
         places, plain = self._blurred[rows], np.flatnonzero(~self._blurs[rows])
         if len(plain):
-            places[plain] = self._frames.places(self._source[rows[plain]])
+            places[plain] = self._places(indices[plain], rows[plain])
         found = Transitions(self._frames.at(places), self._table[rows], remaining)
         if not self.camera.prnu or self.noise is None:
             return found
@@ -276,9 +279,9 @@ class CaptureBatch:
             new, rest = indices[inside], rest[inside]
             own = self._scene_columns[rest], moves[inside], self._subjects[rest]
             self._scene_columns[new] = moved_columns(*own)
-            self._light[new], self._vignetting[new] = self._light[rest], self._vignetting[rest]
-            for index, scene in zip(new.tolist(), rest.tolist(), strict=True):
-                self._statistics[index] = self._scenes[scene].statistics.columns
+            for index in np.unique(rest[~self._counted[rest]]).tolist():
+                self._statistics[index] = self._scenes[index].statistics.columns
+                self._counted[index] = True
             self._in_columns[new] = self._known[new] = True
             indices = indices[~inside]
         for index in indices.tolist():
@@ -286,7 +289,7 @@ class CaptureBatch:
 
     def _add_alone(self, index: int) -> None:
         scene = self.prepared_scene(index)
-        self._light[index] = scene.light.contiguous()
+        self._light[index], self._height = scene.light.contiguous(), scene.light.shape[-2]
         box = scene.box_factor
         if box not in self._boxes:
             self._boxes.append(box)
@@ -295,8 +298,9 @@ class CaptureBatch:
         self._vignetting[index] = vignetting_column(scene, self.states)
         self._in_columns[index] = fits_columns(scene, self._columns)
         if self._in_columns[index]:
-            self._scene_columns[index] = scene_column(scene, self._boxes.index(box))
-            self._statistics[index] = statistics_column(scene)
+            self._scene_columns[index] = scene_column(scene, self._boxes.index(box), index)
+            self._statistics[index] = found = statistics_column(scene)
+            self._counted[index] = found.any()
             self._widest[index] = widest_defocus(scene, self._columns)
             self._subjects[index] = subject_column(scene)
         self._known[index] = True
@@ -312,12 +316,15 @@ class CaptureBatch:
             self._plan_alone(self._scenes[indices[i]], int(rows[i]), float(gains[i]))
         if len(others) < len(rows):
             planned = rows[inside]
-            self._source[planned] = self._light[indices[inside]]
             known = self._scene_columns, self._statistics, self._vignetting
             columns = self._blur, self._table, self._predicted_error, self._modules
-            height, own = self._light[indices[0]].shape[-2], indices[inside]
-            given = self._columns, self._targets, height, self._bits, own, planned, gains[inside]
-            plan_frames(*known, *given, *columns)
+            fixed = *known, self._columns, self._targets, self._height, self._bits
+            given = indices[inside], planned, gains[inside]
+            parallel_ranges(
+                lambda first, last: plan_frames(first, last, *fixed, *given, *columns),
+                len(planned),
+                least=_WORTH_A_THREAD,
+            )
             self._blurs[planned] = self._modules[planned] != self._bits[-1]
             self._excess_variance[planned] = 0.0
         self._gain[rows] = gains  # last: what is interrupted stays unknown
@@ -357,7 +364,7 @@ class CaptureBatch:
                 parallel_ranges(lambda a, b: [*map(self._open, opens[a:b])], len(opens))
                 # Light that was opened before may have had the same address.
                 self._frames.release(np.array(opens) // len(self.states))
-            light = self._frames.places(self._source[rows])
+            light = self._places(indices, rows)
             made = self._frames.make(indices, self._slots[states], self._blur[rows], light)
             self._blurred[rows] = made
             for row in alone.tolist():
@@ -366,6 +373,17 @@ class CaptureBatch:
             self.forget(indices)
             raise
         self._blurred_row[indices] = rows
+
+    def _places(self, indices: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Places of the light that `rows` (K,) of scenes `indices` start from."""
+        inside, places = self._in_columns[indices], np.empty(len(rows), np.uintp)
+        if inside.any():
+            shown = self._scene_columns["rest"][indices[inside]]
+            rest, which = np.unique(shown, return_inverse=True)
+            places[inside] = self._frames.places(self._light[rest])[which]
+        if not inside.all():
+            places[~inside] = self._frames.places(self._source[rows[~inside]])
+        return places
 
     def _open(self, row: int) -> None:
         """Opens the aperture; the scene caches its result."""

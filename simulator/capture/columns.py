@@ -39,6 +39,7 @@ SCENE = np.dtype(
     [
         *((n, "f8") for n in ("log2_reference", "gain", "tolerance", *_MOVES)),
         ("targets", "i8"),  # which noise of the camera its captures have
+        ("rest", "i8"),  # the scene that it shows at rest or in motion
         ("streaks", "?"),  # whether the whole frame moves along the rows
         *LAYOUT,
     ]
@@ -83,7 +84,7 @@ def statistics_column(scene: PreparedScene) -> np.ndarray:
     return np.zeros((4, 4, BINS))
 
 
-def scene_column(scene: PreparedScene, targets: int) -> tuple[Any, ...]:
+def scene_column(scene: PreparedScene, targets: int, rest: int) -> tuple[Any, ...]:
     """The `SCENE` of a scene."""
     movement, layout = scene.movement, scene.layout
     apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0
@@ -92,7 +93,7 @@ def scene_column(scene: PreparedScene, targets: int) -> tuple[Any, ...]:
         *(scene.reference.log2_exposure, scene.gain, scene.tolerance),
         *(scene.defocus, scene.image_speed, movement.direction, movement.turn),
         *(own, movement.subject_direction),
-        *(targets, movement.along_rows and not apart),
+        *(targets, rest, movement.along_rows and not apart),
         *_addresses(layout, apart),
     )
 
@@ -151,6 +152,8 @@ def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
 
 @kernel(fastmath={"contract"})
 def plan_frames(  # type: ignore[no-untyped-def]
+    first,
+    last,
     scenes,
     statistics,
     vignetting,
@@ -169,8 +172,9 @@ def plan_frames(  # type: ignore[no-untyped-def]
     """Plans `rows` of the columns `blurs`, `table`, `error` and `modules`, which it fills.
 
     Args:
-        scenes, statistics, vignetting: `SCENE`, `LightStatistics.columns` and `vignetting_column`
-            of all scenes.
+        first, last: Frames to plan.
+        scenes, statistics, vignetting: `SCENE` of all scenes, `LightStatistics.columns` and
+            `vignetting_column` of those at rest.
         states, targets: `STATE`, and (T, S, 2, 4) shot and read noise of their captures.
         height: Of the frames [pixel].
         bits: (4,) what each of `BLURS` that runs adds to `modules`, and what is always added.
@@ -179,7 +183,7 @@ def plan_frames(  # type: ignore[no-untyped-def]
             blurs that are left out, and (N,) sums of `bits`.
     """
     extents, errors, runs = np.zeros(3), np.empty(3), np.empty(3, np.bool_)
-    for k in range(len(rows)):
+    for k in range(first, last):
         row, at = rows[k], rows[k] % len(states)
         scene, state, blur = scenes[indices[k]], states[at], blurs[row]
         target, time = targets[scene.targets, at], state.time
@@ -196,14 +200,14 @@ def plan_frames(  # type: ignore[no-untyped-def]
         extents[1], extents[2] = scene.defocus * 4.0 / state.f_number, moved
         disc = line = math.inf
         if scene.tolerance > 0.0 and extents[1] + moved > 0.0:
-            disc, line = curvature(statistics[indices[k]], ratio, target)
+            disc, line = curvature(statistics[scene.rest], ratio, target)
             line = line if scene.streaks else STREAK_TO_DISC * disc
         weigh_blurs(extents, disc, line, 0.0, scene.tolerance, errors, runs)
         blur.defocus_px = extents[1] if runs[1] else 0.0
         blur.motion_px = moved if runs[2] else 0.0
         blur.diameter, blur.sorts = scene.diameter, scene.sorts
         blur.num_sorts, blur.mask, blur.behind = scene.num_sorts, scene.mask, scene.behind
-        blur.vignetting = vignetting[indices[k], at]
+        blur.vignetting = vignetting[scene.rest, at]
         modules[row] = bits[3] + runs[1] * bits[0] + runs[2] * bits[1]
         if blur.vignetting:
             modules[row] += bits[2]
@@ -243,7 +247,7 @@ def plan_sweep(
     count, rows, height = len(states), np.arange(len(states)), scene.light.shape[-2]
     made = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), np.empty(count), 0 * rows
     targets, bits = noise_columns(scene.camera, states, scene.box_factor)[None], np.zeros(4, int)
-    own = np.array([scene_column(scene, 0)], SCENE), statistics_column(scene)[None]
+    own = np.array([scene_column(scene, 0, 0)], SCENE), statistics_column(scene)[None]
     darkened, given = vignetting_column(scene, states)[None], (columns, targets, height, bits)
-    plan_frames(*own, darkened, *given, 0 * rows, rows, gains.astype(float), *made)
+    plan_frames(0, count, *own, darkened, *given, 0 * rows, rows, gains.astype(float), *made)
     return [(None, None)] * count, made[0], made[1], None
