@@ -1,10 +1,10 @@
 """Where the time of a step goes, and what more cores would bring.
 
-`python examples/profile_step.py [SIZE] [cached]` steps 64 environments with random actions on one
-thread, in motion and out of focus, or neither: `cached`. It times the sections that threads share
-(`simulator.utils.compute.parallel_ranges`); all else is the interpreter's, on one thread whatever
-there are. A step on n threads takes at least the rest and an n-th of the sections. The fused kernel
-of `ae-env bench throughput` runs in turns with the steps.
+`python examples/profile_step.py [SIZE [ENVIRONMENTS]] [cached]` steps environments (64 by default)
+with random actions on one thread, in motion and out of focus, or neither: `cached`. It times the
+sections that threads share (`simulator.utils.compute.parallel_ranges`); all else is the
+interpreter's, on one thread whatever there are. A step on n threads takes at least the rest and an
+n-th of the sections. The fused kernel of `ae-env bench throughput` runs in turns with the steps.
 """
 
 import gc
@@ -20,8 +20,9 @@ import ae_env  # noqa: F401  (registers the environments)
 from benchmarks.throughput.kernel_limit import KernelLimit
 from simulator.utils import compute
 
-NUM_ENVS, STEPS, ROUNDS = 64, 40, 9
+STEPS, ROUNDS = 40, 9
 CALLERS = {
+    "_plan": "plans of large batches",
     "_run": "blur: discs, blends, motion",
     "_record_fused": "exposure, noise, clip, codes",
     "measured": "histograms of codes for the score",
@@ -38,23 +39,24 @@ def timed_sections(spent):
         try:
             original(task, count, **options)
         finally:
-            spent[name] += time.perf_counter() - begun
+            if count >= 2 * options.get("least", 1):  # else one thread has it all
+                spent[name] += time.perf_counter() - begun
 
     for module in list(sys.modules.values()):
         if getattr(module, "parallel_ranges", None) is original:
             module.parallel_ranges = timed
 
 
-def main(size=64, cached=False):
+def main(size=64, num_envs=64, *, cached=False):
     """Measures and prints a table."""
     torch.set_num_threads(1)
     options = {"scenes": "bundled:small", "resolution": size, "autoreset_mode": "SAME_STEP"}
     options |= {"motion": "none", "depth": "far"} if cached else {}
     lights = np.random.default_rng(0).random((8, 4, size, size), np.float32)
-    kernel = KernelLimit(lights, NUM_ENVS, noise="bank", threads=1, seed=0)
-    envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=NUM_ENVS, **options)
+    kernel = KernelLimit(lights, num_envs, noise="bank", threads=1, seed=0)
+    envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **options)
     envs.reset(seed=0)
-    actions = np.random.default_rng(0).integers(0, 64, (100 + ROUNDS * STEPS, NUM_ENVS))
+    actions = np.random.default_rng(0).integers(0, 64, (100 + ROUNDS * STEPS, num_envs))
     for chosen in actions[:100]:
         envs.step(chosen)
     rows, spent = [], defaultdict(float)
@@ -71,11 +73,11 @@ def main(size=64, cached=False):
         for _ in range(STEPS):
             kernel.step()
         rows.append({**spent, "whole": whole, "kernel": time.perf_counter() - begun})
-    scale = 1e6 / (STEPS * NUM_ENVS)
+    scale = 1e6 / (STEPS * num_envs)
     of = {name: scale * np.median([row[name] for row in rows]) for name in rows[0]}
     whole, alone = of.pop("whole"), of.pop("kernel")
     rest = whole - sum(of.values())
-    print(f"{NUM_ENVS} environments, {size} x {size}, microseconds a frame, median of {ROUNDS}")
+    print(f"{num_envs} environments, {size} x {size}, microseconds a frame, median of {ROUNDS}")
     for name in sorted(of, key=of.get, reverse=True):
         print(f"{CALLERS.get(name, name):34} {of[name]:7.1f} {of[name] / whole:5.0%}")
     print(f"{'interpreter and NumPy':34} {rest:7.1f} {rest / whole:5.0%}")
@@ -89,6 +91,9 @@ def main(size=64, cached=False):
 
 if __name__ == "__main__":
     sizes = [word for word in sys.argv[1:] if word != "cached"]
-    if len(sizes) > 1 or not all(size.isdecimal() and 36 <= int(size) <= 4096 for size in sizes):
-        sys.exit("usage: python examples/profile_step.py [SIZE] [cached], of 36 to 4096")
+    known = all(size.isdecimal() for size in sizes)
+    if len(sizes) > 2 or not known or not all(36 <= int(size) <= 4096 for size in sizes):
+        sys.exit(
+            "usage: python examples/profile_step.py [SIZE [ENVIRONMENTS]] [cached], of 36 to 4096"
+        )
     main(*map(int, sizes), cached="cached" in sys.argv)
