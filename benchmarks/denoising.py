@@ -61,11 +61,10 @@ def sources() -> list[DetailPicture]:
 def cases(number: int, picture: DetailPicture, seed: int) -> list[tuple[Row, Any, Tensor, Tensor]]:
     """Facts, noise, light up to white and record of a crop of `picture`, the `number`-th source."""
     rng = np.random.default_rng([zlib.crc32(picture.name.encode()), seed])
-    mosaic = picture.light.shape[0] == 4
-    side = SIZE if mosaic else 2 * SIZE
+    side = SIZE * picture.photosites
     top, left = (int(rng.integers(n - side + 1)) for n in picture.light.shape[1:])
     light = picture.light[:, top : top + side, left : left + side]
-    if not mosaic:
+    if picture.photosites == 2:
         light = sample_mosaic(lens_blur(light))
     white = max(float(light.quantile(0.99)), 1e-9)
     camera = get_camera(CAMERAS[number % len(CAMERAS)])

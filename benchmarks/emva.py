@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy.stats import t as student
 
-from benchmarks.harness import Part, Report, Row, benchmark, panels, real_files, table
+from benchmarks.harness import Part, Report, Row, benchmark, panels, real_files, sections, table
 from simulator import CameraProfile, CameraSettings, CameraSimulator, get_camera
 from simulator.camera_files import FITTED, FlatFields, pair_moments, read_flat_fields
 from simulator.capture.prepared_scene import PreparedScene
@@ -166,9 +166,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         x, y, style = row[kind]["signal"], row[kind]["variance"], {"c": colour, "marker": marker}
         drawn.append({"panel": row["camera"], "x": x, "y": y, "label": kind, "style": style})
     figure = panels(drawn, 5.0, xlabel="signal [DN]", ylabel="temporal variance [DN²]")
-    blocks = [f"### {row['camera']}\n\n{table(quantities(row), _TABLE)}" for row in rows]
+    blocks = sections(rows, "{camera}", lambda own: table(quantities(own[0]), _TABLE))
     judged = [steps(row, *e) for row in rows for e in ((0.05, 0.35), (0.35, 0.7), (0.7, 0.95))]
-    tables = {"quantities": "\n\n".join(blocks), "steps": table(judged, _STEPS)}
+    tables = {"quantities": blocks, "steps": table(judged, _STEPS)}
     return Report(rows, tables, figures={"emva.png": figure})
 
 

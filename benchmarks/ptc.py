@@ -24,6 +24,7 @@ from scipy.stats import t as student
 
 from benchmarks.harness import Part, Report, Row, benchmark, panels, pivot, table
 from simulator import CameraProfile, CameraSettings, CameraSimulator, get_camera, list_cameras
+from simulator.camera_files import FITTED
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
@@ -33,8 +34,6 @@ PATHS = ("reference camera", "transition engine")
 SIZE = 128
 #: Signals of the ladder: 21 steps to just above white, and darkness.
 LADDER = (0.0, *np.linspace(0.05, 1.05, 21))
-#: Up to this share of the saturation K is fitted (EMVA 1288).
-FITTED = 0.7
 _WHITE_TIME = 1 / 64  # exposure time [s] that the ladder's 1 stands for
 QUANTITIES = ("gain", "dark", "row")
 _COVERAGE = """{case} | K [DN/e-] = {gain} of {all} | dark noise [DN] = {dark} of {all} |

@@ -27,6 +27,7 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from benchmarks import harness
+from benchmarks.fidelity.models import equal_exposure
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, ssim, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
@@ -107,7 +108,7 @@ def best_ev(seed: int) -> list[Row]:
     Of equal exposures it is the nearest to the incident light's; None where all are equal.
     """
     best: dict[str, list[float]] = {}
-    for _, name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
+    for name, scores in _small(seed, [(100.0, offset) for offset in OFFSETS]):
         equal = OFFSETS[scores >= scores.max() - _EQUAL]
         nearest = float(equal[np.argmin(np.abs(equal))])
         best.setdefault(name, []).extend([nearest] * int(np.ptp(scores) >= _EQUAL))
@@ -125,7 +126,7 @@ def gain(seed: int) -> list[Row]:
     """
     found: dict[str, list[np.ndarray]] = {}
     states = [(100.0, 0.0), (100.0 * 2.0**STOPS, 0.0)]
-    for _, name, scores in _small(seed, states, native=True):
+    for name, scores in _small(seed, states, native=True):
         found.setdefault(name, []).append(scores.astype(np.float64))
     rows = []
     for name, pairs in found.items():
@@ -139,8 +140,8 @@ def gain(seed: int) -> list[Row]:
 
 def _small(
     seed: int, taken: list[tuple[float, float]], *, native: bool = False
-) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Scene, scorer and scores (S,) of noisy captures without blur of the small test scenes.
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Scorer and scores (S,) of noisy captures without blur of the small test scenes.
 
     `taken`: ISOs, and exposures above the incident light's [EV]; `native`: pixels are the sensor's.
     """
@@ -148,15 +149,12 @@ def _small(
     camera = options.make_camera()
     for number, scene in enumerate(options.load_scenes()):
         scene = replace(scene, box_factor=1) if native else scene
-        at_one_second = [CameraSettings(iso, 1.0, F_NUMBER) for iso, _ in taken]
-        states = [
-            replace(s, exposure_time=2.0 ** (-s.log2_exposure - scene.ev100 + ev))
-            for s, (_, ev) in zip(at_one_second, taken, strict=True)
-        ]
+        rights = [(iso, reference_settings(scene.ev100 - ev)) for iso, ev in taken]
+        states = [equal_exposure(right, iso, F_NUMBER) for iso, right in rights]
         captures = _described(scene, states, camera)
         images = prepare_scene(scene, camera).expose(states, seed=seed + number).clamp_(0.0, 1.0)
         for name, scorer in available()[0].items():
-            yield scene.scene_id, name, scorer(images, captures).numpy()
+            yield name, scorer(images, captures).numpy()
 
 
 # -- good and bad captures ------------------------------------------------------------------------

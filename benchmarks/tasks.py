@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ae_env.observation import decode_observation, encode_array
-from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scenes.ladder import RUNGS
 from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from ae_env.scorers.detection import Legibility
@@ -33,6 +33,7 @@ from agents.learning.training import load_config, train_agent
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
 from benchmarks.agents import changed_config, context_of
+from benchmarks.fidelity.models import equal_exposure
 from benchmarks.harness import Part, Report, Row, benchmark, interval, table
 from benchmarks.isolated import ROOT
 from simulator import get_camera
@@ -72,8 +73,7 @@ def views(count: int, seed: int, resolution: int = 128) -> list[Scene]:
 
 def state(scene: Scene, ev: float, iso: float) -> CameraSettings:
     """So much brighter than the right exposure; at f/1.4, that nights take no days."""
-    base = CameraSettings(iso, 1.0, 1.4)
-    return replace(base, exposure_time=2.0 ** (ev - scene.ev100 - base.log2_exposure))
+    return equal_exposure(reference_settings(scene.ev100 - ev), iso, 1.4)
 
 
 def curves(seed: int, quick: bool) -> list[Row]:
