@@ -139,10 +139,6 @@ class _Steps(_GridActions):
 
 
 class _Apex(_GridActions):
-    def _set_up(self, env: Any) -> None:
-        super()._set_up(env)
-        self._apex = self._grid.apex
-
     def _space(self) -> gym.Space[Any]:
         return gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
@@ -156,9 +152,10 @@ class _Apex(_GridActions):
             raise ValueError(
                 f"`action` (={actions!r}) must be finite numbers of shape {self._shape}"
             )
-        low, high = self._apex.min(axis=0), self._apex.max(axis=0)
+        apex = self._grid.apex
+        low, high = apex.min(axis=0), apex.max(axis=0)
         wanted = low + 0.5 * (np.clip(values.astype(np.float64), -1.0, 1.0) + 1.0) * (high - low)
-        distance = ((wanted[..., None, :] - self._apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
+        distance = ((wanted[..., None, :] - apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
         distance = np.where(self._inner.action_masks(), distance, np.inf)
         return np.argmin(distance, axis=-1).astype(np.int64)
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ae_env.lighting.base import FlickerLighting, Lighting, RollingShutter
+from simulator.radiance.procedural import log_uniform
 from simulator.utils.checks import check_word
 
 #: Frames that are drawn; after the last one the light stays.
@@ -24,14 +25,14 @@ Generator = np.random.Generator
 
 def ramps(rng: Generator) -> np.ndarray:
     """The light goes 3 to 6 stops up or down at 0.3 to 1.5 stops a frame, rests, and comes back."""
-    speed, stops = _log_uniform(rng, 0.3, 1.5), rng.choice((-1, 1)) * rng.uniform(3.0, 6.0)
+    speed, stops = log_uniform(rng, 0.3, 1.5), rng.choice((-1, 1)) * rng.uniform(3.0, 6.0)
     there = np.linspace(0.0, stops, int(np.ceil(abs(stops) / speed)) + 1)
     return _repeated(rng, lambda: (there, _rest(rng, 12, stops), there[::-1], _rest(rng, 12)))
 
 
 def sines(rng: Generator) -> np.ndarray:
     """The light swings by 1.5 to 3.5 stops with a period of 7 to 18 frames."""
-    stops, period = rng.uniform(1.5, 3.5), _log_uniform(rng, 7.0, 18.0)
+    stops, period = rng.uniform(1.5, 3.5), log_uniform(rng, 7.0, 18.0)
     wave: np.ndarray = stops * np.sin(2.0 * np.pi * (np.arange(FRAMES) / period + rng.random()))
     return wave
 
@@ -60,7 +61,7 @@ def steps(rng: Generator) -> np.ndarray:
 def drifts(rng: Generator) -> np.ndarray:
     """The light drifts: its rate is a random walk that tends to nothing, as does its level."""
     rate, level, found = 0.0, 0.0, np.empty(FRAMES)
-    push = _log_uniform(rng, 0.08, 0.3)
+    push = log_uniform(rng, 0.08, 0.3)
     for frame, normal in enumerate(rng.standard_normal(FRAMES)):
         rate = np.clip(0.95 * rate + push * normal - 0.02 * level, -1.5, 1.5)
         level = np.clip(level + rate, -6.0, 6.0)
@@ -70,7 +71,7 @@ def drifts(rng: Generator) -> np.ndarray:
 
 def shadows(rng: Generator) -> np.ndarray:
     """Passing shadows 3 to 5 stops deep, as of trees along a road: about evenly spaced, soft."""
-    depth, period = -rng.uniform(3.0, 5.0), _log_uniform(rng, 7.0, 16.0)
+    depth, period = -rng.uniform(3.0, 5.0), log_uniform(rng, 7.0, 16.0)
     width, edge = rng.uniform(0.3, 0.6), rng.uniform(0.2, 0.4)
     spacing = period * rng.uniform(0.85, 1.15, int(2 * FRAMES / period) + 2)
     turn = np.interp(np.arange(FRAMES), np.cumsum(spacing), np.arange(len(spacing)))
@@ -82,7 +83,7 @@ def shadows(rng: Generator) -> np.ndarray:
 def clouds(rng: Generator) -> np.ndarray:
     """Broken clouds, filmed quickly: up to 5 stops darker, thicker and thinner at any pace."""
     times = np.arange(FRAMES)[:, None]
-    periods = np.array([_log_uniform(rng, 7.0, 30.0) for _ in range(6)])
+    periods = np.array([log_uniform(rng, 7.0, 30.0) for _ in range(6)])
     waves = np.sin(2.0 * np.pi * (times / periods + rng.random(6))) * rng.random(6)
     cover = 1.0 / (1.0 + np.exp(-2.0 * (waves.sum(axis=1) - rng.uniform(-1.0, 1.0))))
     light: np.ndarray = -rng.uniform(3.0, 5.0) * cover
@@ -104,7 +105,7 @@ def pans(rng: Generator) -> np.ndarray:
     """A camera that turns quickly in a real place, to and fro: the mean light of what it sees."""
     places = read_pans()
     turn = np.array(places[sorted(places)[rng.integers(len(places))]])
-    speed = _log_uniform(rng, 2.0, 6.0)
+    speed = log_uniform(rng, 2.0, 6.0)
     swing = rng.uniform(20.0, 70.0)  # of 72 directions
     there = np.abs((np.arange(FRAMES) * speed / swing) % 2.0 - 1.0) * swing
     at = there + rng.uniform(0.0, len(turn))
@@ -217,7 +218,3 @@ def _repeated(rng: Generator, part: Callable[[], Sequence[Any]]) -> np.ndarray:
         parts += part()
     found: np.ndarray = np.concatenate(parts)[:FRAMES].astype(np.float64)
     return found
-
-
-def _log_uniform(rng: Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

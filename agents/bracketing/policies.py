@@ -399,7 +399,7 @@ def run_brackets(
     """
     name = name or policy.name
     names = ("quality", "log_error", "unseen", "frames", "time_left")
-    found: dict[str, list[NDArray[Any]]] = {key: [] for key in (*names, "group", "seconds")}
+    found: list[dict[str, NDArray[Any]]] = []
     episodes = RolloutPlan.of_each_scene(scenes_of(envs), count=count, seed=seed, most=most)
     for batch in episodes.batches(envs):
         with errors_of(name, "reset"):
@@ -407,7 +407,7 @@ def run_brackets(
         observations, info, masks = batch.observations, batch.info, batch.action_masks
         base: Any = envs.unwrapped
         running = np.ones(envs.num_envs, bool)
-        last = {key: np.array(info[key], np.float64) for key in names}
+        last: dict[str, NDArray[Any]] = {key: np.array(info[key], np.float64) for key in names}
         seconds, decisions = 0.0, 0
         while running.any():
             begun = perf_counter()
@@ -422,8 +422,6 @@ def run_brackets(
             if running.any() and ended.any():  # the others go on with episodes that do not count
                 observations, _ = base.reset(options={"reset_mask": ended})
             masks = base.action_masks()
-        for key in names:
-            found[key].append(last[key][batch.valid])
-        found["group"].append(batch.groups[batch.valid])
-        found["seconds"].append(np.full(int(batch.valid.sum()), seconds / decisions))
-    return {key: np.concatenate(parts) for key, parts in found.items()}
+        last |= {"group": batch.groups, "seconds": np.full(envs.num_envs, seconds / decisions)}
+        found.append({key: values[batch.valid] for key, values in last.items()})
+    return {key: np.concatenate([one[key] for one in found]) for key in found[0]}

@@ -444,7 +444,7 @@ def run_batch(
         policy.reset(envs.num_envs, seed=batch.seed)
     observations, info, masks = batch.observations, batch.info, batch.action_masks
     start = np.array(info["state"], dtype=np.int64)[batch.valid]
-    seen: dict[str, list[NDArray[Any]]] = {}
+    seen: list[Arrays] = []
     seconds = []
     for frame in range(frames):
         told = info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}
@@ -461,10 +461,9 @@ def run_batch(
             "clipped_high": np.array(info["clipped_high"], dtype=np.float64),
             "clipped_low": np.array(info["clipped_low"], dtype=np.float64),
         }
-        for key, value in shown.items():
-            seen.setdefault(key, []).append(value)
+        seen.append({key: values[batch.valid] for key, values in shown.items()})
     return {
-        **{key: np.stack(values, axis=1)[batch.valid] for key, values in seen.items()},
+        **{key: np.stack([frame[key] for frame in seen], axis=1) for key in seen[0]},
         "start_states": start,
         "seconds": np.array(seconds),
     }

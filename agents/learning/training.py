@@ -188,8 +188,7 @@ class LearningCurve:
     def __init__(self, path: Path) -> None:
         self.path = path
         old = load_curve(path) if path.is_file() else {}
-        rows = zip(*old.values(), strict=True)
-        self._rows = [dict(zip(old, row, strict=True)) for row in rows]
+        self._rows: list[Any] = pd.DataFrame(old).to_dict("records")
         self._recent: list[dict[str, float]] = []
 
     def __call__(self, done: int, total: int, values: dict[str, float]) -> None:

@@ -52,10 +52,7 @@ class ApertureModule(nn.Module):
         super().__init__()
         check_word("preset", preset, get_args(AperturePreset))
         self.preset = preset
-        if preset == "compact":
-            self.network: nn.Module = DefocusMap()
-        else:
-            self.network = AttentionUNet(preset)
+        self.network: nn.Module = DefocusMap() if preset == "compact" else AttentionUNet(preset)
 
     def forward(
         self, image: Tensor, deviation: Tensor, f_source: Tensor, f_target: Tensor

@@ -237,11 +237,9 @@ class DetailCrops:
         self, pictures: Sequence[DetailPicture], cameras: Sequence[CameraProfile], seed: int = 0
     ) -> None:
         self.cameras, self.seed = list(cameras), seed
-        kinds: dict[str, list[DetailPicture]] = {}
-        for picture in pictures:
-            kinds.setdefault(picture.kind, []).append(picture)
-        self.kinds = [kinds[name] for name in sorted(kinds)]
-        weights = np.array([_WEIGHTS.get(name, 1.0) for name in sorted(kinds)])
+        names = sorted({picture.kind for picture in pictures})
+        self.kinds = [[p for p in pictures if p.kind == name] for name in names]
+        weights = np.array([_WEIGHTS.get(name, 1.0) for name in names])
         self._shares = weights / weights.sum()
         self.pairs = list(pictures)
         #: Side of the largest crop that there is [packed pixel].
