@@ -76,23 +76,16 @@ def coverage(radius):  # type: ignore[no-untyped-def]
             for j in range(1, reach + 1):
                 area[i, j] += min(chord, j + 0.5) - min(chord, j - 0.5)
     # Loops: numpy's operations on whole arrays compile three times as long.
-    quadrant = np.empty_like(area)
-    first = lower = inner = 0.0
+    total = 0.0
     for i in range(reach + 1):
         for j in range(reach + 1):
             both = area[i, j] + area[j, i]  # the quadrature treats rows and columns alike
-            quadrant[i, j] = both
-            if i:
-                lower += both
-                if j:
-                    inner += both
-            elif j:
-                first += both
-    total = quadrant[0, 0] + 2.0 * (first + lower + inner)
+            total += (2.0 if i else 1.0) * (2.0 if j else 1.0) * both
     disc = np.empty((2 * reach + 1, 2 * reach + 1))
     for y in range(-reach, reach + 1):
         for x in range(-reach, reach + 1):
-            disc[reach + y, reach + x] = quadrant[abs(y), abs(x)] / total
+            i, j = abs(y), abs(x)
+            disc[reach + y, reach + x] = (area[i, j] + area[j, i]) / total
     return disc
 
 
