@@ -33,8 +33,7 @@ def ramps(rng: Generator) -> np.ndarray:
 def sines(rng: Generator) -> np.ndarray:
     """The light swings by 1.5 to 3.5 stops with a period of 7 to 18 frames."""
     stops, period = rng.uniform(1.5, 3.5), log_uniform(rng, 7.0, 18.0)
-    wave: np.ndarray = stops * np.sin(2.0 * np.pi * (np.arange(FRAMES) / period + rng.random()))
-    return wave
+    return stops * np.sin(2.0 * np.pi * (np.arange(FRAMES) / period + rng.random()))
 
 
 def tunnels(rng: Generator) -> np.ndarray:
@@ -216,5 +215,4 @@ def _repeated(rng: Generator, part: Callable[[], Sequence[Any]]) -> np.ndarray:
     parts: list[Any] = [_rest(rng, 24)]
     while sum(map(len, parts)) < FRAMES:
         parts += part()
-    found: np.ndarray = np.concatenate(parts)[:FRAMES].astype(np.float64)
-    return found
+    return np.concatenate(parts)[:FRAMES].astype(np.float64)

@@ -367,8 +367,7 @@ class ScoreRegression:
         moment[:, 0] += SHRINKAGE * prior
         diagonal = np.arange(1, d + 1)
         gram[:, diagonal, diagonal] += RIDGE * gram[:, :1, 0] + 1e-9
-        solution: Floats = np.linalg.solve(gram, moment)[:, 0]
-        return solution
+        return np.linalg.solve(gram, moment)[:, 0]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the regression as a safetensors file."""

@@ -284,8 +284,7 @@ class ReferenceFrames:
         stops = np.abs(np.diff(np.log2(np.maximum(both, 1e-6)), axis=0)[0])
         known = shown.any(axis=1)
         middle = np.nanmedian(np.where(known[:, None] & ~shown, np.nan, stops), axis=1)
-        changed: Bools = apart | known & (middle > _TOLERANCE_EV)
-        return changed
+        return apart | known & (middle > _TOLERANCE_EV)
 
 
 class ZoneMatcher:

@@ -87,8 +87,7 @@ def bounded(ev100: float | np.ndarray, reflected_ev100: float | None) -> float |
     if reflected_ev100 is None:
         return ev100
     gap = np.clip(ev100 - reflected_ev100, -LARGEST_GAP, LARGEST_GAP)
-    found: float | np.ndarray = reflected_ev100 + gap
-    return found
+    return reflected_ev100 + gap
 
 
 @dataclass(frozen=True)
