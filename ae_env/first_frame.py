@@ -5,8 +5,6 @@ cached, a first frame takes half as long again without the other. Run as a progr
 compiles; nothing waits for it, so where it comes too late a kernel is compiled twice.
 """
 
-from __future__ import annotations
-
 import atexit
 import multiprocessing
 import os

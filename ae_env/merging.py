@@ -1,7 +1,5 @@
 """Several exposures of a scene merged into one estimate of its light, and how good that is."""
 
-from __future__ import annotations
-
 import torch
 
 #: A sample at or above this share of white may be clipped: nothing is known of its light.

@@ -1,7 +1,5 @@
 """Registration with Gymnasium, and the parts of it that both environments need."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures for people: one capture with its settings and score, and all states of a scene."""
 
-from __future__ import annotations
-
 import io
 import itertools
 from collections.abc import Iterable, Mapping, Sequence

@@ -2,8 +2,6 @@
 frames late, and `ae_env/ExposureBracket-v0`, in which a few frames are merged into one.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

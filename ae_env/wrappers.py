@@ -15,8 +15,6 @@ union over the other controls. So where a scene forbids states (`Scene.allowed`)
 allowed positions may still be a forbidden state; the environment photographs it all the same.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import gymnasium as gym

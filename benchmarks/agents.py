@@ -5,8 +5,6 @@ stopped. Trainings run side by side and show their own progress, so this one is 
 `benchmarks.harness.benchmark`.
 """
 
-from __future__ import annotations
-
 import json
 from ast import literal_eval
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ every body and every lens sees the same. The best state of one of them is then j
 table of another.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from typing import Any

@@ -4,8 +4,6 @@ Every policy takes the same episodes of `ExposureBracket-v0` on scenes that noth
 trained on. The last row knows what no camera does: the light of the scene and the speed.
 """
 
-from __future__ import annotations
-
 from contextlib import closing
 from functools import partial
 from itertools import product

@@ -1,7 +1,5 @@
 """`ae-env score-tables` on Ray beside one process: raws per second, and what starting costs."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

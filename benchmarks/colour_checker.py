@@ -4,8 +4,6 @@ Every patch is averaged on the packed raw, brought to the chart's exposure by on
 (linear tone) and compared with the chart's published colour: CIE dE2000, D50, 2 degree observer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from typing import Any

@@ -4,8 +4,6 @@ Runs of `examples/learners.py` that are not in ``runs/learners``, or are there w
 settings, are trained first.
 """
 
-from __future__ import annotations
-
 import runpy
 from functools import partial
 from typing import Any

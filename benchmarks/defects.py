@@ -4,8 +4,6 @@ The maps from what a defect leaves in the picture to its severity are fitted on 
 tested on test scenes; the constants that `ae_env/scorers/defects.py` holds are printed.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ reference camera. The gain is that of the PSNR over the noisy input. One thread.
 maps go the whole way of a user's raw, the estimate of what is clipped included.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable

@@ -6,8 +6,6 @@ of the frames. A simulated camera is made of gain, responsivity, dark signal, da
 dark current. The package `emva1288` (LGPL) stands beside them where it is installed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

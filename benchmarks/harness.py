@@ -5,8 +5,6 @@ A benchmark is a module or a folder whose function `run`, which `benchmark` make
 disk until the whole run is done, so that a run that was stopped continues.
 """
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

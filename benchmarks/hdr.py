@@ -1,7 +1,5 @@
 """HDR from one raw of a radiance map, against the map's own light, fused alike."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

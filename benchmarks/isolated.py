@@ -1,7 +1,5 @@
 """Tasks in a process of their own: their peak memory is theirs, and so are their threads."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Exported agents beside themselves in torch: size, time; smaller frames; the firmware guide."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -7,8 +7,6 @@ given), and every method is measured on pairs of real captures of the others. Pu
 of another split of the authors' data.
 """
 
-from __future__ import annotations
-
 import time
 import zlib
 from collections.abc import Callable, Iterator

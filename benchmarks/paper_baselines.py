@@ -8,8 +8,6 @@ Both take ``parameters``: log2(ISO / 100), log2(exposure time / s) and log2(f-nu
 source, then of the target. Both predict the target raw itself, not a residual.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import partial

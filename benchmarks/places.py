@@ -6,8 +6,6 @@ exposure. ``curve`` trains the regression agent on 5 to all training places, and
 thing or another: trainings lie under ``runs/bench_places``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import replace

@@ -10,8 +10,6 @@ Measured are the green planes of pairs of flat fields at a ladder of exposure ti
   share that the noise of single pixels has in it. (EMVA 1288 has no temporal row noise.)
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from time import perf_counter

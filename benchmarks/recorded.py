@@ -9,8 +9,6 @@ reference camera takes of held-out radiance maps, and the real brackets of ``bor
 whose exposure ratios are measured, too. The alternative is the same capture, scaled and clipped.
 """
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from collections.abc import Iterator

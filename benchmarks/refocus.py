@@ -1,7 +1,5 @@
 """Shallow depth of field from one raw at f/11, against a thin lens that is opened for real."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

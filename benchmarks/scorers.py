@@ -6,8 +6,6 @@
 exposed for its incident light. Each pixel carries the noise of one sensor pixel.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -5,8 +5,6 @@ under ``runs/bench_tasks``), and policies that were made for the score `balanced
 and by each task, in unseen views of real places.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterable
 from dataclasses import replace

@@ -5,8 +5,6 @@ motion, the noise of the target's ISO, clip, whole digital numbers) and develope
 drawn for a picture is a function of its seed alone, whatever the batch or the worker.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import operator

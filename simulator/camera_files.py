@@ -19,8 +19,6 @@ own; the noise of flat fields is measured:
   grows with the square of the signal. The dark current is the slope of the dark mean over time.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Light that every episode draws anew: which change it is, how large and how fast."""
 
-from __future__ import annotations
-
 import csv
 import functools
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ A cached scene has float16 light, and a byte a pixel for its layout: defocus in 
 for the subject. One that was just drawn is rounded alike, so that a cached run equals a fresh one.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import zlib

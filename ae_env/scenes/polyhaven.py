@@ -10,8 +10,6 @@ the most. The incident light is what a meter with a dome then reads where the ma
 against the view (`simulator.radiance.incident_light`).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import zlib

@@ -7,8 +7,6 @@ the picture, its sign, and a monotone map from the sign to the severity that was
 bundled training scenes. How far to trust them: docs/results/defects.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

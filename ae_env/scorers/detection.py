@@ -4,8 +4,6 @@ The codes are those of a ladder (``scenes="NAME?codes"``), whose texts and place
 code is looked for where it is, and counts when its text is right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any

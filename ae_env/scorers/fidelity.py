@@ -4,8 +4,6 @@ That picture is without noise and blur, exposed for the incident light and devel
 is. `Fidelity` is the judge of agents that were trained on other scorers; nothing is trained on it.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

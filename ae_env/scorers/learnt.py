@@ -1,7 +1,5 @@
 """Scorers that are networks of others: NIMA, a user's own classifier, the metrics of pyiqa."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

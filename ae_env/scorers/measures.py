@@ -5,8 +5,6 @@ float64 or, of each pixel, (B, H, W). None of the exposure scorers knows the inc
 want every scene middle grey.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

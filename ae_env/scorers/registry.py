@@ -12,8 +12,6 @@
 | `learnt.py` | `nima_aesthetic`, `nima_technical`, `classifier`, ``pyiqa:METRIC`` |
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import math

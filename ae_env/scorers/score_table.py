@@ -5,8 +5,6 @@ that have it in closed form (to the first order those that are measured on frame
 `ae_env.scorers.terms`) use it; other parts are averaged over common noise seeds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

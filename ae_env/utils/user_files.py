@@ -1,7 +1,5 @@
 """A user's files: code by ``path/to/file.py:Name``, and presets of ``configs/``."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import inspect

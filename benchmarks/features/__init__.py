@@ -3,8 +3,6 @@
 Detectors are judged on pairs that the reference camera takes of held-out scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product

@@ -1,7 +1,5 @@
 """A small detector of local features, the pictures that it learns from, and its training."""
 
-from __future__ import annotations
-
 import functools
 import time
 import zlib

@@ -5,8 +5,6 @@ where ``runs/simulator`` does not hold them. One thread: what the networks are c
 one.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from benchmarks.fidelity import defocus, pairs, pictures

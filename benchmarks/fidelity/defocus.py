@@ -8,8 +8,6 @@ f/8 and opened to f/4. The change is that of the noise-free light against the sa
 ``depth="far"``, root mean square in units of the source's noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

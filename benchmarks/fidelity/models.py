@@ -1,7 +1,5 @@
 """The trained networks that are measured, how they are asked, and held-out scenes."""
 
-from __future__ import annotations
-
 import functools
 import subprocess
 import sys

@@ -4,8 +4,6 @@ An estimate is what a method makes of the source before the output's noise is ad
 with the noisy target, as the paper does, and with the target's noise-free mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 

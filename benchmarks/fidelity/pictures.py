@@ -3,8 +3,6 @@
 The three situations that the paper shows: low light, high light, and a close shot out of focus.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -8,8 +8,6 @@ Trained agents lie under ``runs/bench_transfer``, and are known by their configu
 folder after a change of the code that they depend on.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Agents trained in each world, and judged on held-out scenes in the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

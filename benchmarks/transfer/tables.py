@@ -4,8 +4,6 @@ Each held-out scene is photographed once; a simulator makes the light of every s
 and the scorer rates them. The true table is of the scene's own light.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing

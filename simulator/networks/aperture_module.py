@@ -1,7 +1,5 @@
 """Aperture module: the blur that a wider aperture adds."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """Exposure module: the linear change of brightness, corrected for the errors of a body."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Results of networks, cached so that no network runs twice for one result."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, get_args
 

@@ -5,8 +5,6 @@
 lists the differences. Both variants take maps of any size, down to 1 x 1.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Literal, get_args

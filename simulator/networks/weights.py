@@ -1,7 +1,5 @@
 """Trained modules on disk: safetensors for the numbers, JSON for the model card; no pickle."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import reprlib

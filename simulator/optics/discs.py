@@ -9,8 +9,6 @@ and in the *squared* diameter (second moments add, so that is where blur is line
 diameters and any f-number for the cost of a gather.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import operator

@@ -6,8 +6,6 @@ missed between two samples. On a rolling shutter each row has an exposure of its
 `row_light` gives: bands.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

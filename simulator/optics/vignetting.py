@@ -4,8 +4,6 @@ The model is lensfun's ``pa``: of the light in the centre, ``C(r) = 1 + k1 r^2 +
 is left at a distance r from it; r is 1 in the corners. The coefficients depend on the f-number.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass, field

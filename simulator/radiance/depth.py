@@ -8,8 +8,6 @@ Depth is drawn as the signed circle of confusion at f/11, because that is what d
 such a scene can teach about defocus, and then converted to metres for a lens of 50 mm.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from dataclasses import dataclass

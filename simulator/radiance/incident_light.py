@@ -13,8 +13,6 @@ is, or is lit from behind before a void.
 Where nothing was read there is an `IncidentPosterior`, from what a camera knows of its frame.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The scale and the colours of light: from linear sRGB to a camera's planes at known settings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 A radiance map is linear but relative: nothing in it says how many lux it shows.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 

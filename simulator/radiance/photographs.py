@@ -3,8 +3,6 @@
 Only files inside scikit-image's wheel are used: nothing is downloaded, nothing redistributed.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass

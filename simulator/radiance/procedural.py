@@ -10,8 +10,6 @@ Sizes distributed as ``r**-3`` make the image scale invariant, with a power spec
 2001; Alvarez, Gousseau and Morel 1999).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

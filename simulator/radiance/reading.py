@@ -4,8 +4,6 @@ OpenCV and OpenEXR decode the pixels. What a file says beside them is followed o
 orientation, primaries, parts and layers, windows, environment maps, the aspect of the pixels.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -4,8 +4,6 @@ The tags stand here by their names in TIFF 6.0, EXIF 2.3 and the DNG specificati
 one uncompressed strip: the only layout that every raw developer in use reads.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

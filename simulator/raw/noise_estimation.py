@@ -7,8 +7,6 @@ paper finds smooth regions by an edge map and takes the median absolute deviatio
 quantile of block variances, which withstands texture in most of a level's blocks.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -8,8 +8,6 @@ receding floor keeps its energy and no seam opens between layers. Where the shar
 aperture, it sees past an edge, and the surface behind it is continued under the nearer one.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import dataclass

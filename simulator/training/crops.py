@@ -1,7 +1,5 @@
 """Pairs of captures, and crops for the noise stage, as batches: a step always gives the same."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

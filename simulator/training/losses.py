@@ -1,7 +1,5 @@
 """Losses of the stages: one number per batch to minimise, and values worth a plot."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

@@ -8,8 +8,6 @@ The stages of the training, their order and their losses are the paper's: exposu
 aperture on the output of the stages before. The target is the capture itself, with its noise.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Mapping, Sequence

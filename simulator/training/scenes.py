@@ -5,8 +5,6 @@ and raws of a folder of real files (see docs/networks.md) are cut out at it and 
 same place, subject or photographer's series is in one split only (`detail_split`).
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import logging

@@ -1,7 +1,5 @@
 """Results that are kept: the most recently used in memory, and files between runs."""
 
-from __future__ import annotations
-
 import functools
 import glob
 import hashlib

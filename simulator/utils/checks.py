@@ -1,7 +1,5 @@
 """Checks of arguments: an error names the argument, its value and the rule."""
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import math

@@ -1,7 +1,5 @@
 """YAML files, turned into validated configurations."""
 
-from __future__ import annotations
-
 import os
 import reprlib
 from collections.abc import Iterable, Iterator

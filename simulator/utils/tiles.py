@@ -4,8 +4,6 @@ Where a network is needed for some pixels only, the tiles shrink to those: the f
 and again, and a half without such a pixel costs nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import EllipsisType
