@@ -1,7 +1,5 @@
 """`ae_env/AutoExposure-v0`: what its frames are worth, and the environment of one episode."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from typing import Any, Unpack

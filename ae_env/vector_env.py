@@ -1,7 +1,5 @@
 """`ae_env/AutoExposure-v0`, many episodes side by side in one process."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace

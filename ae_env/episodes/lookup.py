@@ -1,7 +1,5 @@
 """Recorded frames in place of simulated ones: what an environment on recorded grids runs on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

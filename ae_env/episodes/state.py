@@ -1,7 +1,5 @@
 """Running episodes: how they are drawn, what their scenes are like, and where each is now."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields

@@ -7,8 +7,6 @@ for the means, and for scores to the first order in their noise, which a frame o
 samples averages. All other parts of a scorer are torch's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ capture; `Highlights`, `Shadows` and `Noise` are measured on the frame that was 
 constants were frozen before any agent was trained.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

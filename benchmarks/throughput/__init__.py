@@ -8,8 +8,6 @@ pixels; a 24-megapixel raw through the simulator beside LibRaw. The real files t
 names are used where they are.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import pandas as pd

@@ -6,8 +6,6 @@ DNG of this library's making whose private note has been blanked, so that it is 
 camera's.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import tempfile

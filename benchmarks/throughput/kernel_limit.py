@@ -5,8 +5,6 @@ scene, no blur, no score, no info. Nothing of the library is in it but what draw
 nothing else at hand draws them as fast (torch's generator takes three times as long).
 """
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
 

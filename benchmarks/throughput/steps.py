@@ -1,7 +1,5 @@
 """Environment steps per second beside the kernel limit; resets; the first episode of all."""
 
-from __future__ import annotations
-
 import json
 import os
 import statistics

@@ -1,7 +1,5 @@
 """Sweeps of all 64 states beside one with the paper's networks, which repeats nothing either."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Iterator
 from functools import partial

@@ -6,8 +6,6 @@ Work against precision: every scene is photographed twice; each pair of a scene 
 a round in which all methods take their turn, in another order each time.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any

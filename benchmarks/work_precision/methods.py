@@ -4,8 +4,6 @@
 expose the result as often as asked. *Transition* methods begin with the raw for every target.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial

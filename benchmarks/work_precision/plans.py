@@ -13,8 +13,6 @@ Scenes are photographed by a reference camera without hidden errors, so that wha
 simulator and not one body. The simulator is not told their depth.
 """
 
-from __future__ import annotations
-
 import functools
 import zlib
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ state is first used, and cached as a row of columns; blurred light, as long as i
 batch of frames is then one call of `simulator.capture.sensor.record`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

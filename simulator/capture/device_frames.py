@@ -4,8 +4,6 @@ What is blurred, and how, is planned in the same columns. All frames (N, 4, H, W
 the place of a frame is its number in it, from 1 on.
 """
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Drawing 4 x 128 x 128 normals takes about 70 microseconds, everything else that 
 about 30: hence the bank, which is read in hashed pieces.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable
