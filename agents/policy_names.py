@@ -336,5 +336,6 @@ def _known(base: str, head: str) -> str:
 
 def _refusal(policy: Any, text: str) -> ValueError:
     for agent, file in _SHIPPED.items() if isinstance(policy, str) else ():
-        policy = re.sub(rf"^\w+:{re.escape(file)}-\d+", agent, policy)  # without the path
+        own = rf"{agent.partition(':')[0]}:{re.escape(file)}-\d+(?=\?|$)"
+        policy = re.sub(f"^{own}", agent, policy)  # without the path
     return ValueError(f"`policy` (={policy!r}){text}")

@@ -97,7 +97,7 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
                 "the same name, as `ae-env train` writes them"
             )
     tensors, card = read_pair(path)
-    found = card.get("kind"), card.get("format")
+    found = card.get("kind", card.get("preset")), card.get("format")  # else the simulator's
     if found != (kind, FORMAT_VERSION):
         wanted = f"a {kind} agent of format {FORMAT_VERSION}"
         got = " of format ".join(map(reprlib.repr, found))

@@ -204,5 +204,5 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
     wrong += [] if "sha256" in card else ["sha256"]
     if wrong:
         rule = f"the .json must be a model card of {known}, with the hash `sha256`"
-        got = reprlib.repr(card.get(wrong[0]))
+        got = reprlib.repr(card.get("kind", card.get(wrong[0])))  # an agent's card has a kind
         raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {got}")

@@ -17,7 +17,7 @@ from agents.evaluation.jobs import named_content
 from agents.foresight import POINTS, Foresight, TrendTracker
 from agents.metering.reading import Reading
 from agents.policy import PolicyContext
-from agents.policy_names import make_policy, training_seeds
+from agents.policy_names import PRETRAINED, make_policy, training_seeds
 from agents.rollouts import make_envs
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
@@ -49,7 +49,9 @@ def test_every_listed_name_makes_a_policy(context):
         *((f"{n}:X", f"file {n!r}; .{{,60}}$") for n in ("no_such_pkg.mod", "p.png", "a/p.png")),
         *(("agents.baselines:Rundom", ".*Random"), ("spot?compensatio=1", "'compensation'")),
         *(("spot?damping=1", r"`damping` \(=1\) .* in \[0, 0\.999]"), ("spot:A?iso=100", "`iso`")),
-        (f"ppo:{policy_names.PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
+        (f"ppo:{PRETRAINED}/video-regression-0", r"='ppo:/.* a ppo agent .*got 'regression'"),
+        (f"ppo:{PRETRAINED}/../../simulator/pretrained/nano", "='ppo:/.* a ppo .*got 'nano'"),
+        (f"ppo:{PRETRAINED}/ppo-1?nothing=1", r"\(='ppo\?nothing=1'\).*'nothing'"),
         *((f"recorded:{Path(__file__).parent}", "`path`"), ("spot?", "key=value")),  # holds no raw
         *(("regression?network=1", "`network`"), (f"spot?iso={'1' * 4096}", "YAML scalar")),
         *(("spot?foresight=trend&damping=.1", "`damping`"), ("spot?iso=1&iso=1", "'iso'.* twice")),

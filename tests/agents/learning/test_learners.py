@@ -233,7 +233,6 @@ def test_weights_that_are_not_finite_replace_none(agent: Path, context, network)
         (".json", {"width": 9}, r"[^\n]*weight[^\n]*\Z"),
         *((".json", {"training": {"training": {"history": h}}}, "history") for h in (10**9, -1)),
         (".json", {"context": {"observation": "uint8", "resolution": [4]}}, "resolution = "),
-        (".json", {"kind": "ppo"}, "'ppo'"),
     ],
 )
 def test_damaged_and_wrong_files(agent, context, suffix, content, message):

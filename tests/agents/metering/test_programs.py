@@ -497,10 +497,7 @@ def test_a_tuning_file_decides(context, photograph, tmp_path, agc):
     ("agc", "message"),
     [
         ({**CORNER, "y_target": [0, 0.2, 0, 0.3]}, r"own.json'\): rpi.agc.y_target"),
-        (
-            {**CORNER, "exposure_modes": {"a": {"gain": [1]}}},
-            r"modes.a.shutter: Field req",
-        ),
+        ({**CORNER, "exposure_modes": {"a": {"gain": [1]}}}, r"modes.a.shutter: Field req"),
         ({"channels": [{**CORNER, "speed": 2}]}, r"rpi.agc.channels.0.speed \(=2\)"),
         ({**CORNER, "metering_modes": {"a": {"weights": [1] * 16}}}, "a.weights .* 15 or 225"),
         *[(None, "must have an entry 'rpi.agc'"), ({"channels": []}, "one of 'channels' if")],

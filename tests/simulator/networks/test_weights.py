@@ -69,10 +69,10 @@ def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
 @pytest.mark.parametrize(
     ("card", "message"),
     [
-        ("{", "is damaged"),
-        ("[" * 10**6, "net-0.5.json is damaged"),
+        *(("{", "is damaged"), ("[" * 10**6, "net-0.5.json is damaged")),
         ("[]", "must hold a JSON object"),
         ('{"format": [1]}', r"model card of .*2.*got \[1\]"),
+        ({"format": 1, "kind": "ppo"}, "model card of .* got 'ppo'"),
         ({"residual": {n: [10**400] for n in ("wiener_error", "bias", "variance")}}, "`residual`"),
         *(({"preset": p}, re.escape(f"got {p!r}")) for p in ("huge", None, ["compact"])),
     ],
