@@ -192,23 +192,24 @@ def write_atomically(
 ) -> Path:
     """Write bytes, text (as UTF-8), or pieces of bytes whole or not at all; returns `path`.
 
-    They are written under a temporary name beside `path`, whose folder is made, and then renamed:
-    if `synced` after they are on the disk, so that even a loss of power leaves the old file or the
-    new one.
+    They are written under a temporary name beside `path` (of a link: the file that it leads to),
+    whose folder is made, and then renamed: if `synced` after they are on the disk, so that even a
+    loss of power leaves the old file or the new one.
     """
     path = as_path(path)
+    target = Path(os.path.realpath(path))
     content = printable(content).encode() if isinstance(content, str) else content
     pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
-    start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
-    temporary = path.parent / f".{start}.{os.urandom(4).hex()}.tmp"
+    start = target.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
+    temporary = target.parent / f".{start}.{os.urandom(4).hex()}.tmp"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as stream:
             stream.writelines(pieces)
             stream.flush()
             if synced:
                 os.fsync(stream.fileno())
-        os.replace(temporary, path)
+        os.replace(temporary, target)
     except OSError as error:
         if error.errno is None:
             raise

@@ -41,6 +41,9 @@ def test_content_comes_back(tmp_path, content, name):
     assert deep.read_bytes() == (content.encode() if isinstance(content, str) else content)
     write_atomically(deep, (memoryview(b"ab" * i) for i in range(3)))
     assert deep.read_bytes() == b"ababab"
+    (link := tmp_path / "link").symlink_to(deep.relative_to(tmp_path))
+    assert write_atomically(link, "through a link") == link
+    assert (link.is_symlink(), deep.read_text()) == (True, "through a link")
     assert list(deep.parent.iterdir()) == [deep]
 
 
