@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
-from typer import Argument, Option
+from typer import Argument, BadParameter, Option
 
 from simulator.utils.checks import parse_number
 from simulator.utils.files import printable
@@ -25,13 +25,22 @@ terminal = Console(emoji=False)
 
 # -- options of several commands ------------------------------------------------------------------
 
+
+def each_once(names: list[str] | None) -> list[str] | None:
+    """`names` of policies, of which none may be given twice."""
+    twice = [name for name, count in collections.Counter(names or ()).items() if count > 1]
+    if twice:
+        raise BadParameter(f"{twice[0]!r} is given twice")
+    return names
+
+
 _INT64_MAX = 2**63 - 1
 Seed = Annotated[int, Option(help="Seed of everything random.", min=0, max=_INT64_MAX)]
 OwnSeed = Annotated[int | None, Option(help="In place of the YAML's.", min=0, max=_INT64_MAX)]
 OnError = Annotated[str, Option(help="At a file of --scenes that cannot be read: stop, or skip.")]
 Trust = Annotated[bool, Option("--trust", help="Let the YAML file name Python code, and run it.")]
 Device = Annotated[str, Option(help="Torch device: auto, cpu, cuda.")]
-Policies = Annotated[list[str] | None, Option(help="A policy; give the option several times.")]
+Policies = Annotated[list[str] | None, Option(help="Give once per policy.", callback=each_once)]
 Raw = Annotated[Path, Argument(help="Any Bayer raw that LibRaw reads.")]
 Folder = Annotated[Path, Option(help="Folder for the results.")]
 OutDng = Annotated[Path, Option("--out", "-o", help="DNG to write.")]

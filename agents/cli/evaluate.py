@@ -103,6 +103,7 @@ def stability(
         list[str],
         Argument(
             metavar="POLICY...",
+            callback=console.each_once,
             help="Any policy that sees frames, or a law proportional:K, such as "
             "'proportional:0.5?dead_zone=0.1&slew=1', with anchored=true as libcamera counts.",
         ),
@@ -118,13 +119,12 @@ def stability(
     from agents.evaluation.stability import check_controller, judge_stability
     from agents.report.evaluation import write_stability
 
-    names = list(dict.fromkeys(policy))
-    for name in names:
+    for name in policy:
         check_controller(name)
     console.make_folder(out)
     with console.progress_bars() as progress:
         found = []
-        for name in names:
+        for name in policy:
             with progress(name) as task:
                 found.append(judge_stability(name, seed, frames, task))
     files = write_stability(found, out, command=console.command_line(), seed=seed)
@@ -208,7 +208,7 @@ def make_plan(
     elif env is not None or "scenes" in given or "split" in given:
         entries["scene_ids"] = []  # those are of the preset's own scenes
     if policies:
-        entries["policies"] = list(dict.fromkeys(policies))
+        entries["policies"] = policies
     if "frames" in given:
         entries["frames"] = given["frames"]
     if condition:  # in place of the base's
