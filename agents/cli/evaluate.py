@@ -142,12 +142,14 @@ def _run(
     workers: int | None,
     device: str,
 ) -> None:
+    from agents.evaluation.engine import check_policies
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.jobs import Jobs
     from agents.evaluation.result import overall_ranking
     from agents.report.ae_bench import append_rows, bench_rows, check_append, check_hash
     from agents.report.evaluation import write_report
 
+    check_policies(plan, device)  # reading scenes may take minutes
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
     with Jobs(plan, out / "parts", scenes, device=device) as run:

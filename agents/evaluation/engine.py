@@ -50,6 +50,7 @@ from agents.rollouts import (
     fitting_arguments,
     make_envs,
 )
+from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer, check_number
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
@@ -379,6 +380,18 @@ class EvaluationRun:
 
 
 # -- one policy ----------------------------------------------------------------------------------
+
+
+def check_policies(plan: EvaluationPlan, device: str) -> None:
+    """Raises where a policy of `plan` cannot be made, before scenes that need no files are read."""
+    options, reference = plan.options(), CameraSettings(100.0, 1 / 64, 8.0)
+    if options.recorded is not None or options.in_sequences:  # files have the grid or the frames
+        return
+    light = np.full((4, options.resolution, options.resolution), 0.1, np.float32)
+    grey = Scene.from_array(light, reference, options.make_camera(), scene_id="grey")
+    with EvaluationRun(plan, [grey], device=device) as run:
+        for trained in run.trained:
+            run.make(trained, next(iter(plan.all_conditions.values())))
 
 
 def fit_policies(

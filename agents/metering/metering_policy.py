@@ -57,7 +57,7 @@ class MeteringPolicy(Policy):
         damping: Share of the distance to the metered EV that remains after a frame, in [0, 0.999].
         shutter_cap: Longest exposure time that may be used [s].
         iso_cap: Highest ISO speed that may be used.
-        f_number: Aperture that A and M keep; None: f/8.
+        f_number: Aperture that A and M keep, in the grid's range; None: f/8.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
         weights: File of a tuned program, as `save` writes it.
@@ -105,6 +105,11 @@ class MeteringPolicy(Policy):
         check_used(program, weights=weights, **by_hand)
         given = {name: value for name, value in by_hand.items() if value is not None}
         self.options = ProgramOptions(compensation, damping, shutter_cap, iso_cap=iso_cap, **given)
+        for name in given:
+            value, values = getattr(self.options, name), getattr(context.grid, f"{name}s")
+            if not 0.9 * values[0] < value < 1.1 * values[-1]:  # nominal values are rounded
+                rule = f"must be in the grid's {values[0]:g} to {values[-1]:g}"
+                raise ValueError(f"`{name}` (={value:g}) {rule}")
         self.meter = make_meter(meter, context.camera)
         self.region = Region(roi, mask, context.observation_space["raw"].shape)
         self.needs_subject = self.region.of_subject

@@ -155,6 +155,7 @@ print("loaded", *sys.modules)
         (("hdr", "IMG_1.dn"), "error IMG_1.dn: no such file or folder; did you mean"),
         (("evaluate", *UNKNOWN), "Unknown policy 'matrx:P'. Did you mean 'matrix:P'? It must"),
         (("export", "ppo:video"), "error ppo:video must be without a history"),
+        (("evaluate", "--policy", "spot:A?f_number=16", *UNKNOWN[2:]), "in the grid's 4 to 11"),
         (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
         (("evaluate", "--policy", "own.py:Counts"), "`own.py:Counts` (='two')"),
         (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),

@@ -75,7 +75,7 @@ def test_options_in_a_name(context):
     assert make_policy("spot?compensation=1", context).program == "P"
     assert make_policy("spot?compensation=+2/3", context).options.compensation == 2 / 3
     assert make_policy("rpi_agc:M?iso=400&mode=long", context).options.iso == 400.0
-    assert make_policy("average:A", context, f_number=4).options.f_number == 4.0
+    assert make_policy("average:A", context, f_number=3.8).options.f_number == 3.8
     found = policy_names.split_options("spot?a=1e9999999&b=-inf&c=1 / 2&d=1/0&e=1e-3")[1]
     assert found == {"a": np.inf, "b": -np.inf, "c": 0.5, "d": "1/0", "e": 0.001}
     assert training_seeds("ppo:?a=1") == training_seeds("ppo?a=1")
