@@ -285,6 +285,8 @@ def _tracks() -> Detector:
         raise ImportError(f"{error}: {_INSTALL} {PACKAGES['tracks']}") from error
 
     def find(picture: np.ndarray) -> tuple[np.ndarray, ...]:
+        if min(picture.shape[:2]) < _STRIDE:  # the network divides by zero
+            return ()
         found = network.detectAndCompute(_planes(picture), top_k=_MOST_POINTS)[0]
         return tuple(found[name].cpu().numpy() for name in ("keypoints", "descriptors"))
 

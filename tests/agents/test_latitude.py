@@ -141,6 +141,7 @@ def test_points_are_found_again_where_the_picture_moved_to():
     assert all(module._kept((places, features), (places, features)))
     assert np.mean(module._kept((places + np.array([32, 0]), features), moved)) > 0.8
     assert np.mean(module._kept((places, features), moved)) < 0.05
+    assert [len(find(picture[:side])) for side in (31, 32)] == [0, 2]
 
 
 def test_boxes_count_where_they_overlap_by_half():
