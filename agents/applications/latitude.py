@@ -31,6 +31,7 @@ from ae_env.scorers.learnt import Classifier
 from ae_env.scorers.terms import developed
 from ae_env.utils.user_files import UserCodeError, load_from_file, split_file_name
 from simulator import CameraProfile
+from simulator.radiance.reading import RADIANCE_SUFFIXES
 from simulator.raw.develop import develop_inverse
 from simulator.settings import CameraSettings
 from simulator.utils.checks import did_you_mean, import_extra, onnx_session
@@ -298,7 +299,7 @@ BUILT_IN = {"codes": _codes, "tags": _tags, "text": _text, "faces": _faces, "tra
 
 
 def picture_scenes(what: str, camera: CameraProfile, size: int) -> list[Scene]:
-    """Scenes of a file, folder or glob of pictures, or else of raws and radiance maps.
+    """Scenes of a file, folder or glob of raws and radiance maps, or else of pictures.
 
     Pictures are averaged until their longer side has at most `size` pixels; their white is the
     sensor's. Of raws the central square counts, and the networks take the noise out. Those that
@@ -306,8 +307,11 @@ def picture_scenes(what: str, camera: CameraProfile, size: int) -> list[Scene]:
     """
     path = Path(what).expanduser()
     files = sorted(path.iterdir()) if path.is_dir() else [Path(f) for f in sorted(glob.glob(what))]
-    of_kind = ([f for f in files if f.suffix.lower() in k] for k in (_ENDINGS, RAW_SUFFIXES))
-    found, faults, given = list[Scene](), list[str](), next(filter(None, of_kind), [path])
+    kinds = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES), _ENDINGS
+    raws, pictures = ([f for f in files if f.suffix.lower() in kind] for kind in kinds)
+    found, faults, given = list[Scene](), list[str](), raws or pictures or [path]
+    if raws and pictures:
+        logger.warning(f"{len(pictures)} developed pictures are left out: raws are beside them")
     for file in given:
         try:
             found += _scenes_of(file, camera, size)

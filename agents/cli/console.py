@@ -28,8 +28,7 @@ terminal = Console(emoji=False)
 
 def each_once(names: list[str] | None) -> list[str] | None:
     """`names` of policies, of which none may be given twice."""
-    twice = [name for name, count in collections.Counter(names or ()).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in collections.Counter(names).items() if count > 1]:
         raise BadParameter(f"{twice[0]!r} is given twice")
     return names
 

@@ -12,7 +12,7 @@ from skimage.feature import Cascade
 from ae_env.utils.user_files import UserCodeError
 from agents.applications import latitude as module
 from agents.applications.latitude import load_detector, measure_latitude, picture_scenes
-from simulator import get_camera
+from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 CAMERA, pytestmark = get_camera("nikon_z6"), pytest.mark.usefixtures("no_network")
 
@@ -79,8 +79,6 @@ def test_things_that_are_not_found_to_begin_with_do_not_count(tmp_path):
     assert set(counted.rows.trials) == {2}
     dark = counted.curve("EV").iloc[0]
     assert (dark.share, round(dark.low, 4), round(dark.high, 4)) == (0.5, 0.0945, 0.9055)  # Wilson
-    with pytest.raises(ValueError, match="at least one"):
-        latitude(picture, lambda p: [], tmp_path)
     with pytest.raises(UserCodeError, match="ZeroDivisionError"):
         latitude(picture, lambda p: 1 / 0, tmp_path)
     with pytest.raises(ValueError, match=r"`detector` \(='nothing'\)"):
@@ -174,3 +172,7 @@ def test_the_command_writes_a_table_and_a_plot(ae_env, tmp_path, caplog):
     assert (tmp_path / "latitude.csv").read_text().startswith("axis,value,noise,share,low,high")
     with Image.open(tmp_path / "latitude.png") as plot:
         assert plot.width > 300
+    light = np.full((4, 40, 40), 0.1, np.float32)
+    write_dng(tmp_path / "pair.dng", RawImage(light, CameraSettings(100, 1 / 64, 8), CAMERA))
+    assert [one.scene_id for one in picture_scenes(str(tmp_path), CAMERA, 36)] == ["pair"]
+    assert caplog.messages[-1].startswith("3 developed pictures are left out")

@@ -72,7 +72,6 @@ def test_options_in_a_name(context):
     assert policy.name == name
     assert (policy.options.compensation, policy.options.damping) == (-1.0, 0.5)
     assert policy.options.shutter_cap == pytest.approx(1 / 60)
-    assert make_policy("spot?compensation=1", context).program == "P"
     assert make_policy("spot?compensation=+2/3", context).options.compensation == 2 / 3
     assert make_policy("rpi_agc:M?iso=400&mode=long", context).options.iso == 400.0
     assert make_policy("average:A", context, f_number=3.8).options.f_number == 3.8

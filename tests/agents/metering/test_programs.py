@@ -304,10 +304,8 @@ def test_of_equal_states_some_programs_keep_the_last(context, photograph, tmp_pa
 
 def test_only_a_reading_of_highlights_is_a_ceiling(context, photograph):
     """Grey at 0.12 of white: at 0.9 where it is 2.9 EV darker; no choice is brighter than that."""
-    for name, metered, is_ceiling in (
-        ("average", 0.0, False),
-        ("highlight_weighted", math.log2(0.12 / 0.9), True),
-    ):
+    cases = ("average", 0.0, False), ("highlight_weighted", math.log2(0.12 / 0.9), True)
+    for name, metered, is_ceiling in cases:
         policy, over = make_policy(f"{name}:P", context), []
         for ev in np.arange(6.0, 13.0, 0.5):
             policy.reset(1)
