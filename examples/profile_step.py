@@ -74,7 +74,8 @@ def main(size=64, num_envs=64, *, cached=False):
             kernel.step()
         rows.append({**spent, "whole": whole, "kernel": time.perf_counter() - begun})
     scale = 1e6 / (STEPS * num_envs)
-    of = {name: scale * np.median([row[name] for row in rows]) for name in rows[0]}
+    names = {name for row in rows for name in row}
+    of = {name: scale * np.median([row.get(name, 0.0) for row in rows]) for name in names}
     whole, alone = of.pop("whole"), of.pop("kernel")
     rest = whole - sum(of.values())
     print(f"{num_envs} environments, {size} x {size}, microseconds a frame, median of {ROUNDS}")
@@ -90,10 +91,14 @@ def main(size=64, num_envs=64, *, cached=False):
 
 
 if __name__ == "__main__":
-    sizes = [word for word in sys.argv[1:] if word != "cached"]
-    known = all(size.isdecimal() for size in sizes)
-    if len(sizes) > 2 or not known or not all(36 <= int(size) <= 4096 for size in sizes):
+    numbers = [word for word in sys.argv[1:] if word != "cached"]
+    known = len(numbers) <= 2 and all(number.isdecimal() for number in numbers)
+    given = dict(zip(("size", "num_envs"), map(int, numbers), strict=False)) if known else {}
+    if not known or not (
+        36 <= given.get("size", 64) <= 256 and 1 <= given.get("num_envs", 64) <= 2**16
+    ):
         sys.exit(
-            "usage: python examples/profile_step.py [SIZE [ENVIRONMENTS]] [cached], of 36 to 4096"
+            "usage: python examples/profile_step.py [SIZE [ENVIRONMENTS]] [cached]\n"
+            "SIZE is 36 to 256, ENVIRONMENTS 1 to 65536"
         )
-    main(*map(int, sizes), cached="cached" in sys.argv)
+    main(**given, cached="cached" in sys.argv)

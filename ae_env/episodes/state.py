@@ -292,7 +292,7 @@ class Episodes:
             moves = self.speed[env_indices] > 0.0
             moves |= self.subject_speed[env_indices] > 0.0
             moves |= self.defocus[env_indices] > 0.0
-            apart = moves | self._has_map[scenes] | (self.options.lens == RANDOM_LENS)
+            apart = moves | self._has_map[scenes] | (self.options.lens is not None)
             own = np.where(apart, own, scenes)
         self.light_index[env_indices] = own
 

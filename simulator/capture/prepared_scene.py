@@ -258,6 +258,8 @@ class PreparedScene:
         states = list(states) if isinstance(states, Iterable) else states
         if not isinstance(states, list) or not all(isinstance(s, CameraSettings) for s in states):
             raise ValueError(f"`states` (={states!r}) must be several CameraSettings")
+        _check_light("gain", gain, (len(states),))
+        _check_light("row_gain", row_gain, (len(states), self.light.shape[-2]))
         frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed raises before any work
         read_noise: list[ReadNoise] | None = None
@@ -328,3 +330,11 @@ class PreparedScene:
         """
         for settings in states:
             yield self.expose([settings], seed=seed, noise=noise)[0]
+
+
+def _check_light(name: str, light: Any, shape: tuple[int, ...]) -> None:
+    if light is None:
+        return
+    known = isinstance(light, np.ndarray) and light.shape == shape and light.dtype.kind in "fiu"
+    if not known or not (np.isfinite(light) & (light >= 0.0)).all():
+        raise ValueError(f"`{name}` (={light!r}) must be an array {shape} of finite numbers >= 0")

@@ -203,6 +203,8 @@ def write_atomically(
     start = target.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
     temporary = target.parent / f".{start}.{os.urandom(4).hex()}.tmp"
     try:
+        if target.is_symlink():  # links that lead to each other
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as stream:
             stream.writelines(pieces)

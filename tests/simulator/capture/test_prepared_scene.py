@@ -216,6 +216,10 @@ def test_light_of_each_state_and_of_each_row() -> None:
     np.testing.assert_allclose(found[:, 0, [0, -1], 0], wanted, atol=1.001 * rounding)
     (clean,) = source.expose([LOW], noise=None)
     assert torch.equal(clean, clip_and_quantise(source.expected(LOW), source.camera))
+    for name in ("gain", "row_gain"):
+        for wrong in (np.ones(3), np.full(2, -1.0), np.full((2, SIDE), math.nan), 2.0):
+            with pytest.raises(ValueError, match=rf"(?s)`{name}` .* must be an array \(2,"):
+                source.expose([LOW, HIGH], **{name: wrong})
     frames = source.expose([LOW, HIGH], gain=gain, row_gain=rows)
     for state, frame in enumerate(frames):
         halves = frame[:, :64].mean(), frame[:, 64:].mean()

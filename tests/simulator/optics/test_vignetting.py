@@ -149,21 +149,24 @@ def test_the_reference_camera_has_the_same_lens():
 
 
 def frames(device=None, **arguments):
-    options = {"noise": False, "observation": "linear", **arguments}
-    envs = make_envs(3, device=device, **options)
-    yield envs.reset(seed=5)[0]["raw"]
+    """Frames of one scene in three environments, each at an aperture of its own, and these."""
+    envs = make_envs(3, device=device, noise=False, observation="linear", **arguments)
+    envs.reset(seed=5, options={"scene": 0})
     for state in (0, 21, 42, 63):
-        yield envs.step(np.full(3, state))[0]["raw"]
+        observation, *_, info = envs.step(np.array([state, 21, 63]))
+        stops = np.round(2.0 * np.log2(info["f_number"]))  # f/5.6 is 4 times the root of 2
+        yield np.asarray(observation["raw"]), 2.0 ** (stops / 2.0)[:, None, None, None]
 
 
 @pytest.mark.parametrize(
     "arguments", [{}, {"lighting": "sine"}, {"motion": "none", "depth": "far"}, {"device": "cpu"}]
 )
 def test_frames_of_the_environment_are_darkened(arguments):
-    lens = Vignetting("one for all f-numbers", (1.0,), ((-0.75, 0.0, 0.0),))
-    for plain, dark in zip(frames(**arguments), frames(lens=lens, **arguments), strict=True):
-        plain, dark = np.asarray(plain), np.asarray(dark)
-        wanted = plain * (1 - 0.75 * squared_radius(*plain.shape[-2:]))
+    known = tuple(2.0 ** (stops / 2.0) for stops in range(4, 8))
+    lens = Vignetting("3 / f in the corners", known, tuple((-3.0 / f, 0.0, 0.0) for f in known))
+    pairs = zip(frames(**arguments), frames(lens=lens, **arguments), strict=True)
+    for (plain, f_numbers), (dark, _) in pairs:
+        wanted = plain * (1.0 - 3.0 / f_numbers * squared_radius(*plain.shape[-2:]))
         seen = plain < 0.999
         np.testing.assert_allclose(dark[seen], wanted[seen], atol=2e-4, rtol=1e-3)
 

@@ -45,6 +45,9 @@ def test_content_comes_back(tmp_path, content, name):
     assert write_atomically(link, "through a link") == link
     assert (link.is_symlink(), deep.read_text()) == (True, "through a link")
     assert list(deep.parent.iterdir()) == [deep]
+    (loop := tmp_path / "loop").symlink_to(loop)
+    with pytest.raises(OSError, match=r"`path` .* cannot be written"):
+        write_atomically(loop, "nowhere")
 
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left")])
