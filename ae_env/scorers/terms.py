@@ -236,8 +236,12 @@ class Brightness:
         error = captures.proper_ev[:, None] if likely is None else likely  # (B, K)
         error = error - captures.ev100[:, None]
         if captures.row_gain is not None:
-            error = (error[:, :, None] + captures.row_gain.log2()[:, None]).flatten(1)  # (B, K * H)
-        return torch.exp(1.0 - torch.sqrt(1.0 + error**2)).mean(dim=1)
+            error = error[:, :, None] + captures.row_gain.log2()[:, None]  # (B, K, H)
+        scores = torch.exp(1.0 - torch.sqrt(1.0 + error**2))
+        while scores.ndim > 1:  # rows and lights that are alike have themselves as their mean
+            first = scores[..., :1]
+            scores = (first + (scores - first).mean(dim=-1, keepdim=True))[..., 0]
+        return scores
 
 
 class Banding:

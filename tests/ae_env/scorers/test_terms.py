@@ -133,6 +133,10 @@ def test_bands_by_hand() -> None:
     errors = [1 + math.log2(1.2), 1 + math.log2(0.8)]
     wanted = sum(math.exp(1 - math.sqrt(1 + e * e)) for e in errors) / 2
     assert make_scorer("brightness")(None, captures).item() == pytest.approx(wanted)
+    for stops in range(20):  # beside frames that flicker, the rows of one that does not are alike
+        near = replace(captures, proper_ev=captures.ev100 + 0.1 * stops)
+        pair = [replace(near, row_gain=gains) for gains in (None, torch.ones_like(rows))]
+        assert torch.equal(*(make_scorer("brightness")(None, one) for one in pair))
     dark = replace(captures, row_gain=torch.tensor([[1.0, 0.0]]).double())  # between pulses
     assert 0.0 < make_scorer("banding")(None, dark).item() < 1e-4
 
