@@ -1,7 +1,7 @@
 """`TermScores`: the scores of frames, and of what is known of captures without a frame.
 
 `Highlights`, `Shadows` and `Noise` are means over the samples of functions of the recorded value.
-They are evaluated from the histogram of a frame's codes. Their expectation over the noise of a
+They are evaluated by looking up what each code of a frame adds. Their expectation over the noise of a
 light is a mean over the light of smooth functions, which are tabulated once for each noise: exact
 for the means, and for scores to the first order in their noise, which a frame of thousands of
 samples averages. All other parts of a scorer are torch's.
@@ -35,7 +35,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, record
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, load_alone, parallel_ranges
 
 #: Memory for tabulated expectations [byte].
 _BYTES = 2**25
@@ -55,6 +55,8 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _PEDESTAL = np.float32(PEDESTAL)
 _SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
 _BLOCK = 256
+#: What `_packed` counts as 1, and halves of its words.
+_WHOLE, _HALF_WORD, _LOW_HALF = 2.0**24 - 1.0, np.uint64(32), np.uint64(2**32 - 1)
 #: Column of the means for each term; and the terms that need none.
 _COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
 _WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
@@ -93,6 +95,7 @@ class TermScores:
         self._shot_read = np.array([[n.shot, n.read] for n in noises])[self._which]  # (S, 2, 4)
         self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
         self._dark = Shadows().shares(_SIGNALS).numpy()
+        self._packed = _packed(self._shares, self._dark)
         self._edges = _code_edges(camera)
         # Up to light beyond white that even the most noise does not bring back.
         shot, read = (max(max(getattr(n, name)) for n in noises) for name in ("shot", "read"))
@@ -184,9 +187,10 @@ class TermScores:
         flat = codes.reshape(len(codes), 4, -1)
         if isinstance(flat, torch.Tensor):
             return _means_by_torch(flat, shares, which, self._dark)
+        packed = self._packed if shares is self._shares else _packed(shares, self._dark)
         means = np.empty((len(codes), 3))
         least = max(1, _WORTH_A_THREAD // flat[0].size)
-        fixed = (flat, shares, which, self._dark, means)
+        fixed = (flat, packed, which, means)
         parallel_ranges(lambda a, b: measure_codes(a, b, *fixed), len(codes), least=least)
         return means
 
@@ -306,46 +310,40 @@ def _means_by_torch(
     return np.asarray(means.cpu().double().numpy())
 
 
+def _packed(shares: np.ndarray, dark: np.ndarray) -> np.ndarray:
+    """(K, 4, 256) uint64 of what each code adds, as fractions of `_WHOLE`: `dark`, then `shares`.
+
+    One addition serves both, and the sum of a block's samples fits their 32 bits each.
+    """
+    both = [np.rint(share.astype(np.float64) * _WHOLE).astype(np.uint64) for share in (dark, shares)]
+    return (both[0] << np.uint64(32)) + both[1]
+
+
 @_jit
-def measure_codes(  # type: ignore[no-untyped-def]
-    first, last, codes, shares, which, dark, means
-):
+def measure_codes(first, last, codes, packed, which, means):  # type: ignore[no-untyped-def]
     """Means (B, 3) float64 of frames (B, 4, N) uint8, from the `first` to before the `last`.
 
-    A sample adds to the share of blocked ones what `dark` (256,) says of its code, and to `noise`
-    what `shares` (K, 4, 256) say, of which frame b has those at ``which[b]``.
+    A sample adds to the share of blocked ones and to `noise` what `packed` (K, 4, 256) has for its
+    code, of which frame b has those at ``which[b]``.
     """
     size = codes.shape[2]
-    # Four histograms: a sample need not wait for that of the sample before.
-    counts = np.empty((4, 256), np.int32)
-    whole = size // 4 * 4
     for frame in range(first, last):
-        blown, planes, blocked, clean = 0, 0, 0.0, 0.0
+        blocked, clean, blown = np.uint64(0), np.uint64(0), 0
         for plane in range(4):
-            samples = codes[frame, plane]
-            counts[:] = 0
-            for i in range(0, whole, 4):
-                counts[0, samples[i]] += 1
-                counts[1, samples[i + 1]] += 1
-                counts[2, samples[i + 2]] += 1
-                counts[3, samples[i + 3]] += 1
-            for i in range(whole, size):
-                counts[0, samples[i]] += 1
-            for code in range(256):
-                count = counts[0, code] + counts[1, code] + counts[2, code] + counts[3, code]
-                blocked += count * np.float64(dark[code])
-                clean += count * np.float64(shares[which[frame], plane, code])
-            white = counts[0, 255] + counts[1, 255] + counts[2, 255] + counts[3, 255]
-            blown, planes = blown + white, planes + (white > 0)
-        if planes > 1:  # else no pixel was counted twice
-            blown = 0
-            red, green, other, blue = codes[frame]
-            for i in range(size):
-                brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
-                blown += brightest == 255
+            table = packed[which[frame], plane]
+            for start in range(0, size, _BLOCK):
+                total = np.uint64(0)
+                for code in codes[frame, plane, start : start + _BLOCK]:
+                    total += load_alone(table, code)  # type: ignore[call-arg]
+                blocked += total >> _HALF_WORD
+                clean += total & _LOW_HALF
+        red, green, other, blue = codes[frame]
+        for i in range(size):
+            brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
+            blown += brightest == 255
         means[frame, 0] = blown / size
-        means[frame, 1] = blocked / (4 * size)
-        means[frame, 2] = clean / (4 * size)
+        means[frame, 1] = blocked / (_WHOLE * 4 * size)
+        means[frame, 2] = clean / (_WHOLE * 4 * size)
 
 
 @_jit

@@ -189,6 +189,20 @@ def prefetch(typing, array, index):  # type: ignore[no-untyped-def]
     return types.void(array, types.intp), generate
 
 
+@numba.extending.intrinsic
+def load_alone(typing, array, index):  # type: ignore[no-untyped-def]
+    """``array[index]``, inside a kernel, not as a part of a vector that is put together.
+
+    The compiler would do that in sums of what a table has at random places, which takes longer.
+    """
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(array)(context, builder, args[0]).data
+        return builder.load_atomic(builder.gep(data, [args[1]]), "monotonic", array.dtype.bitwidth // 8)
+
+    return array.dtype(array, types.intp), generate
+
+
 #: Samples that `add_shifts` adds to.
 LANES = 64
 
