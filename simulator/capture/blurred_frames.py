@@ -399,6 +399,10 @@ def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
             parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
         threads = min(threads, count * parts)
     order = different[np.argsort(-cost[different], kind="stable")]
+    # Dealt out in turns, there and back: threads have costly scenes and cheap ones alike, lest all
+    # that is said too low of one kind be one thread's.
+    turn = np.arange(len(order)) % (2 * threads)
+    order = order[np.argsort(np.minimum(turn, 2 * threads - 1 - turn), kind="stable")]
     costs, place = np.repeat(cost[order], parts), np.empty(len(cost), np.int64)
     place[order] = np.arange(len(order))
     # A unit belongs to the thread in whose share of the cost its middle is.
