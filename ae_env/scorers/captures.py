@@ -209,26 +209,27 @@ def source_noises(
 
 @kernel()
 def _fill_levels(  # type: ignore[no-untyped-def]
-    height, sorts, first, last, movements, numbers, levels, shares, blur, sharpness
+    height, sorts, first, last, movements, speeds, times, discs, own, levels, shares, blur, sharpness
 ):
     """`PixelBlur` of captures, where `levels` and `shares` have memory for it.
 
     Each has the columns `first` to before `last` of `sorts`, which are `Layout.shares`. `blur`
-    (B,) become the root mean squares over the pixels, `sharpness` the means of `Sharpness`.
+    (B,), that of pixels which are all alike, become the root mean squares over the pixels,
+    `sharpness` the means of `Sharpness`.
     """
-    for i in range(len(numbers)):
-        speed, time, disc, own = numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3]
+    for i in range(len(blur)):
+        time, disc = times[i], discs[i]
         direction, turn, angle = movements[i, 0], movements[i, 1] * time, movements[i, 3]
-        drift, extent = movements[i, 2] * time, speed * time
+        drift, extent = movements[i, 2] * time, speeds[i] * time
         x, y = drift * math.cos(angle), drift * math.sin(angle)
-        rest = (extent * height) ** 2 + own * own
-        apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + own * own
+        rest = (extent * height) ** 2 + own[i] ** 2
+        apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + own[i] ** 2
         squares = sharp = 0.0
         for sort in range(first[i], last[i]):
             circle = min(disc * sorts[0, sort], _WIDEST)  # as in the frame
             moved = apart if sorts[1, sort] > 0.0 and drift > 0.0 else rest
             alike = sorts[0, sort] < 0.0
-            level = numbers[i, 4] if alike else math.sqrt(circle * circle + moved)
+            level = blur[i] if alike else math.sqrt(circle * circle + moved)
             squares += sorts[2, sort] * level**2
             sharp += sorts[2, sort] / (1.0 + (level * (64.0 / height)) ** 2)
             if levels.size:
@@ -291,7 +292,7 @@ class SceneCaptures:
             ratio=torch.from_numpy(np.array(ratios) * gain),
             nlf=[self._nlf[state] for state in indices],
             proper_ev=torch.from_numpy(proper_ev + stops),
-            blur_px=blur_px,
+            blur_px=torch.from_numpy(blur_px),
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
             source_noise=source_noise,
             noisy=self.noisy,
@@ -380,7 +381,7 @@ class ShownScenes:
         movements: np.ndarray,
         *,
         pixels: bool = False,
-    ) -> tuple[torch.Tensor, PixelBlur | None, np.ndarray]:
+    ) -> tuple[np.ndarray, PixelBlur | None, np.ndarray]:
         """Blur of captures of `scenes` (B,), by their indices; see `SceneCaptures.of`.
 
         Returns:
@@ -403,11 +404,10 @@ class ShownScenes:
         first, last = np.where(apart, self._ends[:, scenes], [[0], [1]])
         count = len(scenes) if pixels and first.any() else 0
         levels, shares = np.zeros((2, count, (last - first).max()))
-        numbers, scores = np.stack([speed, times, discs, own, blur], axis=1), np.empty(len(scenes))
-        columns = self._sorts, first, last, movements, numbers
-        _fill_levels(height, *columns, levels, shares, blur, scores)
+        columns, scores = (first, last, movements, speed, times, discs, own), np.empty(len(scenes))
+        _fill_levels(height, self._sorts, *columns, levels, shares, blur, scores)
         spread = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)) if count else None
-        return torch.from_numpy(blur), spread, scores
+        return blur, spread, scores
 
     def _add(self, scenes: list[int]) -> None:
         layouts = [self._scenes[index].layout for index in scenes]

@@ -203,12 +203,13 @@ class BlurredFrames:
         self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
+        self._bytes = 0  # of all slabs
         self._passes = list[Pass]()  # that are still to run
 
     @property
     def is_full(self) -> bool:
         """Whether the memory exceeds its limit."""
-        return sum(slab.nbytes for slab in self._slabs) > self._most_bytes
+        return self._bytes > self._most_bytes
 
     def places(self, lights: Sequence[torch.Tensor]) -> np.ndarray:
         """(B,) places of lights (4, H, W) of scenes, contiguous float32."""
@@ -240,6 +241,7 @@ class BlurredFrames:
         spare = min(_SLAB, self._most_bytes // 4) // math.prod(self._shape)
         slab = torch.empty(max(count, spare), *self._shape)
         self._slabs.append(slab)
+        self._bytes += slab.nbytes
         return (slab.data_ptr() + np.arange(len(slab)) * slab[0].nbytes).astype(np.uintp)
 
     def release(self, indices: np.ndarray) -> None:
