@@ -209,14 +209,15 @@ def source_noises(
 
 @kernel()
 def _fill_levels(  # type: ignore[no-untyped-def]
-    height, sorts, first, last, movements, speeds, times, discs, own, levels, shares, blur, sharpness
+    height, sorts, columns, movements, levels, shares, blur, sharpness
 ):
     """`PixelBlur` of captures, where `levels` and `shares` have memory for it.
 
     Each has the columns `first` to before `last` of `sorts`, which are `Layout.shares`. `blur`
-    (B,), that of pixels which are all alike, become the root mean squares over the pixels,
-    `sharpness` the means of `Sharpness`.
+    (B,), of pixels that are all alike, becomes the root mean squares over the pixels, `sharpness`
+    the means of `Sharpness`.
     """
+    first, last, speeds, times, discs, own = columns
     for i in range(len(blur)):
         time, disc = times[i], discs[i]
         direction, turn, angle = movements[i, 0], movements[i, 1] * time, movements[i, 3]
@@ -404,8 +405,8 @@ class ShownScenes:
         first, last = np.where(apart, self._ends[:, scenes], [[0], [1]])
         count = len(scenes) if pixels and first.any() else 0
         levels, shares = np.zeros((2, count, (last - first).max()))
-        columns, scores = (first, last, movements, speed, times, discs, own), np.empty(len(scenes))
-        _fill_levels(height, self._sorts, *columns, levels, shares, blur, scores)
+        columns, scores = (first, last, speed, times, discs, own), np.empty(len(scenes))
+        _fill_levels(height, self._sorts, columns, movements, levels, shares, blur, scores)
         spread = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)) if count else None
         return blur, spread, scores
 

@@ -1,10 +1,10 @@
 """`TermScores`: the scores of frames, and of what is known of captures without a frame.
 
 `Highlights`, `Shadows` and `Noise` are means over the samples of functions of the recorded value.
-They are evaluated by looking up what each code of a frame adds. Their expectation over the noise of a
-light is a mean over the light of smooth functions, which are tabulated once for each noise: exact
-for the means, and for scores to the first order in their noise, which a frame of thousands of
-samples averages. All other parts of a scorer are torch's.
+What each code of a frame adds is looked up. Their expectation over the noise of a light is a mean
+over the light of smooth functions, which are tabulated once for each noise: exact for the means,
+and for scores to the first order in their noise, which a frame of thousands of samples averages.
+All other parts of a scorer are torch's.
 """
 
 import math
@@ -55,7 +55,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _PEDESTAL = np.float32(PEDESTAL)
 _SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
 _BLOCK = 256
-#: What `_packed` counts as 1, and halves of its words.
+#: What `_packed` counts as 1, and how its words are split.
 _WHOLE, _HALF_WORD, _LOW_HALF = 2.0**24 - 1.0, np.uint64(32), np.uint64(2**32 - 1)
 #: Column of the means for each term; and the terms that need none.
 _COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
@@ -218,12 +218,10 @@ class TermScores:
         # What the noise shares depend on, too.
         kinds = np.stack([self._which[states], box_factors], axis=1)
         keys = [table[i, 1:].tobytes() + kinds[i].tobytes() for i in range(len(table))]
-        numbers: dict[bytes, int] = {}
-        tables: list[np.ndarray] = []
+        tables: dict[bytes, np.ndarray] = {}
         for i, key in enumerate(keys):
-            if key not in numbers:
-                numbers[key] = len(tables)
-                tables.append(self._tabulated(key, table[i, 1:3], shares[which[i]]))
+            if key not in tables:
+                tables[key] = self._tabulated(key, table[i, 1:3], shares[which[i]])
         _, height, width = transitions.shape
         rows = np.ones((len(table), 1)) if row_gain is None else row_gain
         fixed = (
@@ -233,7 +231,7 @@ class TermScores:
             table[:, 0].astype(np.float32),
             rows.astype(np.float32),
             self._size,
-            np.array([tables[numbers[key]].ctypes.data for key in keys], np.uintp),
+            np.array([tables[key].ctypes.data for key in keys], np.uintp),
         )
         means = np.empty((len(table), 3))
         least = max(1, _WORTH_A_THREAD // (4 * height * width))
@@ -311,12 +309,12 @@ def _means_by_torch(
 
 
 def _packed(shares: np.ndarray, dark: np.ndarray) -> np.ndarray:
-    """(K, 4, 256) uint64 of what each code adds, as fractions of `_WHOLE`: `dark`, then `shares`.
+    """(K, 4, 256) uint64 of what each code adds: `dark` and, in the lower half, `shares`.
 
-    One addition serves both, and the sum of a block's samples fits their 32 bits each.
+    One sum serves both: with 24 bits each, the halves hold that of a block.
     """
-    both = [np.rint(share.astype(np.float64) * _WHOLE).astype(np.uint64) for share in (dark, shares)]
-    return (both[0] << np.uint64(32)) + both[1]
+    first, second = (np.rint(_WHOLE * np.float64(x)).astype(np.uint64) for x in (dark, shares))
+    return (first << _HALF_WORD) + second
 
 
 @_jit

@@ -379,7 +379,7 @@ class CaptureBatch:
         if inside.any():
             shown = self._scene_columns["rest"][indices[inside]]
             rest = np.flatnonzero(np.bincount(shown))  # once each; `np.unique` would sort
-            self._place[rest] = self._frames.places(self._light[rest])
+            self._place[rest] = self._frames.places(self._light[rest].tolist())
             places[inside] = self._place[shown]
         if not inside.all():
             places[~inside] = self._frames.places(self._source[rows[~inside]])

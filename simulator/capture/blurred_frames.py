@@ -203,7 +203,7 @@ class BlurredFrames:
         self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
-        self._bytes = 0  # of all slabs
+        self._bytes = 0  # of all memory
         self._passes = list[Pass]()  # that are still to run
 
     @property
@@ -278,25 +278,16 @@ class BlurredFrames:
         if new.any():
             self._focus(indices[new], slots[new], blurs[new], source[new])
         light = np.where(behind_lens, self._lens[indices, slots], source)
-        moves = blurs["motion_px"] > 0.0
-        if moves.any():
-            some, source = indices[moves], light[moves]
-            self._give_memory(some)
-            light[moves] = self._moved[some]
-            self._move(some, blurs[moves], source, light[moves])
-        darkened = blurs["vignetting"] > 0
-        if darkened.any():
-            some, source = indices[darkened], light[darkened]
-            self._give_memory(some)
-            light[darkened] = self._moved[some]
-            self._darken(some, blurs["vignetting"][darkened], source, light[darkened])
+        # What changes by motion, or by the lens, has memory of its own.
+        for name, write in ("motion_px", self._move), ("vignetting", self._darken):
+            if (own := blurs[name] > 0).any():
+                some, source = indices[own], light[own]
+                lacking = some[self._moved[some] == 0]
+                self._moved[lacking] = self._take(len(lacking))
+                light[own] = self._moved[some]
+                write(some, blurs[own], source, light[own])
         _run(self._passes, self._shape)
         return light
-
-    def _give_memory(self, indices: np.ndarray) -> None:
-        """Gives the scenes `indices` memory for light of their own, which motion or lens change."""
-        lacking = indices[self._moved[indices] == 0]
-        self._moved[lacking] = self._take(len(lacking))
 
     def _focus(
         self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
@@ -365,10 +356,10 @@ class BlurredFrames:
             self._add(task, indices[own], taps[own], source[own], to[own], blurs[own])
 
     def _darken(
-        self, indices: np.ndarray, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray
+        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
-        """Writes the light of the places `source`, times the maps at `vignetting`, to `to`."""
-        self._add(darken, indices, np.full(len(to), 20.0), source, to, vignetting)
+        left = np.ascontiguousarray(blurs["vignetting"])
+        self._add(darken, indices, np.full(len(to), 20.0), source, to, left)
 
     def _add(self, task: Any, scenes: np.ndarray, cost: np.ndarray, *columns: np.ndarray) -> None:
         if len(scenes):
@@ -401,8 +392,7 @@ def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
             parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
         threads = min(threads, count * parts)
     order = different[np.argsort(-cost[different], kind="stable")]
-    # Dealt out in turns, there and back: threads have costly scenes and cheap ones alike, lest all
-    # that is said too low of one kind be one thread's.
+    # Dealt out in turns, there and back: each thread has costly scenes and cheap ones.
     turn = np.arange(len(order)) % (2 * threads)
     order = order[np.argsort(np.minimum(turn, 2 * threads - 1 - turn), kind="stable")]
     costs, place = np.repeat(cost[order], parts), np.empty(len(cost), np.int64)

@@ -36,11 +36,6 @@ class DeviceFrames(BlurredFrames):
         self._known: dict[int, tuple[weakref.ref[Tensor], int]] = {}
         self._masks = np.zeros(num_scenes, np.uintp)  # addresses that layouts have theirs from
 
-    @property
-    def is_full(self) -> bool:
-        """Whether the memory exceeds its limit."""
-        return self._frames.nbytes > self._most_bytes
-
     def places(self, lights: Sequence[Tensor]) -> np.ndarray:
         """(B,) places of lights (4, H, W) of scenes, which are copied when they are new."""
         self._shape = tuple(lights[0].shape)
@@ -82,6 +77,7 @@ class DeviceFrames(BlurredFrames):
         begin = len(old)
         spare = max(begin // 2, min(_FRAMES, _SAMPLES // math.prod(self._shape)))
         self._frames = old.new_empty(begin + max(lacking, spare), *self._shape)
+        self._bytes = self._frames.nbytes
         if begin:
             self._frames[:begin] = old
         added = np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
@@ -168,10 +164,10 @@ class DeviceFrames(BlurredFrames):
             self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
 
     def _darken(
-        self, indices: np.ndarray, vignetting: np.ndarray, source: np.ndarray, to: np.ndarray
+        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
-        for address in np.unique(vignetting).tolist():
-            same = vignetting == address
+        for address in np.unique(blurs["vignetting"]).tolist():
+            same = blurs["vignetting"] == address
             left = torch.from_numpy(frame_at(address, self._shape[1:])).to(self._frames)
             self._frames[self._numbers(to[same])] = self._frames[self._numbers(source[same])] * left
 

@@ -190,17 +190,17 @@ def prefetch(typing, array, index):  # type: ignore[no-untyped-def]
 
 
 @numba.extending.intrinsic
-def load_alone(typing, array, index):  # type: ignore[no-untyped-def]
-    """``array[index]``, inside a kernel, not as a part of a vector that is put together.
+def load_alone(typing, words, index):  # type: ignore[no-untyped-def]
+    """``words[index]`` of uint64, inside a kernel, not as a part of a vector.
 
-    The compiler would do that in sums of what a table has at random places, which takes longer.
+    The compiler would put vectors together from a table, which takes longer than single sums.
     """
 
     def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(array)(context, builder, args[0]).data
-        return builder.load_atomic(builder.gep(data, [args[1]]), "monotonic", array.dtype.bitwidth // 8)
+        data = context.make_array(words)(context, builder, args[0]).data
+        return builder.load_atomic(builder.gep(data, [args[1]]), "monotonic", 8)
 
-    return array.dtype(array, types.intp), generate
+    return types.uint64(words, types.intp), generate
 
 
 #: Samples that `add_shifts` adds to.
