@@ -131,8 +131,7 @@ class ExposureBracket(Task):
     """Merges the frames of an episode, and rewards what each adds to the quality.
 
     See `ExposureBracketEnv`, which has the limits. What else a task is given is not used. The
-    action `stop`, behind those of the states, ends an episode. A `ValueError` if the scenes are
-    recorded.
+    action `stop`, behind those of the states, ends an episode. A `ValueError` if scenes are recorded.
     """
 
     outputs = ("numbers",)

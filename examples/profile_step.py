@@ -25,7 +25,7 @@ CALLERS = {
     "_plan": "plans of large batches",
     "_run": "blur: discs, blends, motion",
     "_record_fused": "exposure, noise, clip, codes",
-    "measured": "histograms of codes for the score",
+    "measured": "what codes add to the score",
 }
 
 

@@ -323,14 +323,12 @@ def simulate_source_raw(
 
     The reference camera takes the raw as an average meter would have it, at an ISO drawn between
     100 and 6400: noise, white highlights and all. Captures are simulated from it by the neural
-    simulator, as in the paper. A `ValueError` if the scene carries noise, or is too dark for a
-    meter.
+    simulator, as in the paper. A `ValueError` if the scene carries noise, or is too dark to meter.
 
     Args:
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
         iso, iso_range: ISO of the raw; drawn by default from the range, log-uniformly.
-        ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
-            default.
+        ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; else drawn.
     """
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")

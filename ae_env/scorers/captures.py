@@ -69,35 +69,65 @@ class PixelBlur(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Captures:
-    """The facts about a batch of B captures besides their pixels."""
+    """The facts about a batch of B captures besides their pixels, worked out when they are read."""
 
     settings: Sequence[CameraSettings]  #: of each capture, B long
-    _scenes: Sequence[Scene]  # of each capture, B long
-    ratio: torch.Tensor  #: (B,) float64, exposure ratio from that reference to the capture
     nlf: Sequence[NoiseLevelFunction]  #: of a native sensor pixel at the settings, B long
-    #: (B,) float64, EV100 of the right exposure: that of the incident light, or the mean of what is
-    #: likely where this is unknown.
-    proper_ev: torch.Tensor
-    #: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the root mean
-    #: square over the pixels, where they differ.
-    blur_px: torch.Tensor
+    _shown: ShownScenes
+    _which: np.ndarray  # (B,) scene of each capture among those
+    _states: np.ndarray  # (B,) of the grid
+    _moves: tuple[np.ndarray, ...]  # speed, defocus and movements, see `SceneCaptures.of`
+    _gain: np.ndarray  # (B,) light relative to the scenes' own
     #: (B, H) float64, light of each row relative to the frame's mean, which is in `ratio` and
-    #: `proper_ev`: the bands of flickering light. None where every row of every capture has the
-    #: same.
+    #: `proper_ev`: the bands of flickering light. None where all rows have the same.
     row_gain: torch.Tensor | None = None
     #: Noise that the source of each capture has, of a native pixel, B long; None where all come
     #: from light without noise.
     source_noise: Sequence[NoiseLevelFunction] | None = None
     noisy: bool = True  #: whether the captures have noise
     prnu: float = 0.0  #: `CameraProfile.prnu`, of native pixels
-    #: How many pixels have which extent of blur; None where all have `blur_px`.
-    pixel_blur: PixelBlur | None = None
-    #: (B, K) float64, EV100s that are equally likely the right one; None where the incident light
-    #: of all is known.
-    likely_ev: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.settings)
+
+    @cached_property
+    def _scenes(self) -> Sequence[Scene]:
+        return [self._shown[scene] for scene in self._which.tolist()]
+
+    @cached_property
+    def _light(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        return self._shown.light(self._which)
+
+    @cached_property
+    def _blur(self) -> tuple[np.ndarray, PixelBlur | None, np.ndarray]:
+        return self._shown.blur(self._which, self._states, *self._moves, pixels=True)
+
+    @cached_property
+    def ratio(self) -> torch.Tensor:
+        """(B,) float64, exposure ratio from the scene's reference settings to the capture."""
+        stops = [s.log2_exposure for s in self.settings] - self._light[0]
+        return torch.from_numpy(np.array([2.0**s for s in stops.tolist()]) * self._gain)
+
+    @cached_property
+    def proper_ev(self) -> torch.Tensor:
+        """(B,) float64, EV100 of the right exposure; the mean of `likely_ev` if it is unknown."""
+        return torch.from_numpy(self._light[1] + np.log2(self._gain))
+
+    @cached_property
+    def likely_ev(self) -> torch.Tensor | None:
+        """(B, K) float64, EV100s that are equally likely right; None where all light is known."""
+        likely = self._light[2]
+        return None if likely is None else torch.from_numpy(likely + np.log2(self._gain)[:, None])
+
+    @cached_property
+    def blur_px(self) -> torch.Tensor:
+        """(B,) float64, extent of all blur [pixel of the frame]; root mean square over pixels."""
+        return torch.from_numpy(self._blur[0])
+
+    @property
+    def pixel_blur(self) -> PixelBlur | None:
+        """How many pixels have which extent of blur; None where all have `blur_px`."""
+        return self._blur[1]
 
     @cached_property
     def scene_light(self) -> torch.Tensor:
@@ -160,7 +190,7 @@ class Captures:
     @property
     def frame_height(self) -> int:
         """Height of the packed frame [pixel]."""
-        return self._scenes[0].light.shape[-2]
+        return self._shown[self._which.item(0)].light.shape[-2]
 
 
 def prepare_scene(
@@ -249,8 +279,8 @@ class SceneCaptures:
     ) -> None:
         self.camera, self.states, self.noisy = camera, list(states), noisy
         self._nlf = camera.nlfs(states)
-        numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
-        self.times, self.f_numbers, self._log2_exposures = np.array(numbers).T
+        numbers = [(s.exposure_time, s.effective_f_number) for s in states]
+        self.times, self.f_numbers = np.array(numbers).T
 
     def of(
         self,
@@ -282,25 +312,10 @@ class SceneCaptures:
         assert which is not None
         states = np.arange(len(self.states)) if states is None else states
         movements = np.zeros((len(which), 4)) if movements is None else movements
-        moves = states, speed, defocus, movements
-        blur_px, pixel_blur, _ = scenes.blur(which, *moves, pixels=True)
-        reference, proper_ev, likely_ev = scenes.light(which)
-        ratios = [2.0**stops for stops in (self._log2_exposures[states] - reference).tolist()]
-        stops, indices = np.log2(gain), states.tolist()
-        return Captures(
-            settings=[self.states[state] for state in indices],
-            _scenes=[scenes[scene] for scene in which.tolist()],
-            ratio=torch.from_numpy(np.array(ratios) * gain),
-            nlf=[self._nlf[state] for state in indices],
-            proper_ev=torch.from_numpy(proper_ev + stops),
-            blur_px=torch.from_numpy(blur_px),
-            row_gain=None if row_gain is None else torch.from_numpy(row_gain),
-            source_noise=source_noise,
-            noisy=self.noisy,
-            prnu=self.camera.prnu,
-            pixel_blur=pixel_blur,
-            likely_ev=None if likely_ev is None else torch.from_numpy(likely_ev + stops[:, None]),
-        )
+        rows, indices = None if row_gain is None else torch.from_numpy(row_gain), states.tolist()
+        settings, nlf = [self.states[i] for i in indices], [self._nlf[i] for i in indices]
+        own = scenes, which, states, (speed, defocus, movements), gain
+        return Captures(settings, nlf, *own, rows, source_noise, self.noisy, self.camera.prnu)
 
     def describe(
         self,

@@ -320,9 +320,7 @@ class BlurredFrames:
         made = self._take(len(frame))
         self._levels[indices[frame], level] = made
         self._blur(indices[frame], np.array(DIAMETERS)[level], source[frame], made)
-        # Levels without a share are read too, times 0: any image does.
-        levels = self._levels[indices]
-        levels[:, 0] = source
+        levels = self._levels[indices]  # those without a share are read, too, times 0
         return np.where(levels == 0, source[:, None], levels)
 
     # Each writes frames of scenes to the places `to` (K,): behind one disc, behind discs of the

@@ -1,7 +1,6 @@
 """Captures in columns: how each is exposed, in a batch of scenes or in a sweep of one.
 
-`plan_frames` is `simulator.capture.decision.decide` for scenes without noise of their own, many at
-a time.
+`plan_frames` is `simulator.capture.decision.decide` for many scenes without noise of their own.
 """
 
 from __future__ import annotations

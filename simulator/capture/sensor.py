@@ -309,8 +309,7 @@ def record_stepwise(
 ) -> np.ndarray:
     """`record` on any device by torch operations: the reference of the fused kernel.
 
-    The `transitions` are `before_rounding`. Frames in one tensor are recorded together, others one
-    by one.
+    The `transitions` are `before_rounding`. Frames in one tensor go together, others singly.
     """
     lights, device = transitions.light, transitions.light[0].device
     span, black, low, high = (plane_tensor(row, device) for row in camera.digits[:4])

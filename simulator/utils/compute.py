@@ -191,9 +191,9 @@ def prefetch(typing, array, index):  # type: ignore[no-untyped-def]
 
 @numba.extending.intrinsic
 def load_alone(typing, words, index):  # type: ignore[no-untyped-def]
-    """``words[index]`` of uint64, inside a kernel, not as a part of a vector.
+    """``words[index]`` of uint64, inside a kernel, by itself.
 
-    The compiler would put vectors together from a table, which takes longer than single sums.
+    Compilers make vectors of what a table has at several places, which takes longer.
     """
 
     def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]

@@ -213,7 +213,7 @@ def test_scores_are_shares_and_the_oracle_has_the_highest(light, reference, grid
 
 #: The fields and the properties worked out from them that a scorer could write to.
 TENSORS = [f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type)]
-TENSORS += [name for name, value in vars(Captures).items() if isinstance(value, cached_property)]
+TENSORS += [n for n, v in vars(Captures).items() if isinstance(v, cached_property) and n[0] != "_"]
 
 
 def test_a_mapping_is_the_weighted_mean_and_callables_see_the_view_they_ask_for() -> None:
