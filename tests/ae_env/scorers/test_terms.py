@@ -127,15 +127,17 @@ def test_bands_by_hand() -> None:
     assert make_scorer("banding")(None, captures).item() == 1.0
     spread = 0.5 * math.log2(1.2 / 0.8)
     rows = torch.tensor([1.2, 0.8], dtype=torch.float64).repeat_interleave(20)[None]
-    captures = replace(captures, row_gain=rows, proper_ev=captures.ev100 + 1.0)
+    captures = replace(captures, row_gain=rows)
+    vars(captures)["proper_ev"] = captures.ev100 + 1.0
     found = make_scorer("banding")(None, captures).item()
     assert found == pytest.approx(1 / (1 + (spread / 0.1) ** 2))
     errors = [1 + math.log2(1.2), 1 + math.log2(0.8)]
     wanted = sum(math.exp(1 - math.sqrt(1 + e * e)) for e in errors) / 2
     assert make_scorer("brightness")(None, captures).item() == pytest.approx(wanted)
     for stops in range(20):  # beside frames that flicker, the rows of one that does not are alike
-        near = replace(captures, proper_ev=captures.ev100 + 0.1 * stops)
-        pair = [replace(near, row_gain=gains) for gains in (None, torch.ones_like(rows))]
+        pair = [replace(captures, row_gain=gains) for gains in (None, torch.ones_like(rows))]
+        for one in pair:
+            vars(one)["proper_ev"] = captures.ev100 + 0.1 * stops
         assert torch.equal(*(make_scorer("brightness")(None, one) for one in pair))
     dark = replace(captures, row_gain=torch.tensor([[1.0, 0.0]]).double())  # between pulses
     assert 0.0 < make_scorer("banding")(None, dark).item() < 1e-4
