@@ -5,6 +5,9 @@ with random actions on one thread, in motion and out of focus, or neither: `cach
 sections that threads share (`simulator.utils.compute.parallel_ranges`); all else is the
 interpreter's, on one thread whatever there are. A step on n threads takes at least the rest and an
 n-th of the sections. The fused kernel of `ae-env bench throughput` runs in turns with the steps.
+
+Then steps on one thread and on two take turns; and, if `cached`, steps, its torch scorer, and steps
+with that.
 """
 
 import gc
@@ -18,6 +21,7 @@ import torch
 
 import ae_env  # noqa: F401  (registers the environments)
 from benchmarks.throughput.kernel_limit import KernelLimit
+from benchmarks.throughput.steps import LiveScore
 from simulator.utils import compute
 
 STEPS, ROUNDS = 40, 9
@@ -45,6 +49,19 @@ def timed_sections(spent):
     for module in list(sys.modules.values()):
         if getattr(module, "parallel_ranges", None) is original:
             module.parallel_ranges = timed
+
+
+def in_turns(*calls):
+    """(rounds, calls) seconds of `STEPS` calls of each, after one that is not timed."""
+    rounds = np.empty((ROUNDS, len(calls)))
+    for row in rounds:
+        for i, call in enumerate(calls):
+            call()
+            begun = time.perf_counter()
+            for _ in range(STEPS):
+                call()
+            row[i] = time.perf_counter() - begun
+    return rounds
 
 
 def main(size=64, num_envs=64, *, cached=False):
@@ -88,6 +105,23 @@ def main(size=64, num_envs=64, *, cached=False):
         print(
             f"{f'step on {threads} threads, at least':34} {least:7.1f} {whole / least:5.2f} times"
         )
+    rng = np.random.default_rng(1)
+
+    def step(own=envs, threads=1):
+        torch.set_num_threads(threads)
+        own.step(rng.integers(0, 64, num_envs))
+
+    one, two = in_turns(step, lambda: step(threads=2)).T
+    print(f"{'step on 2 threads, in turns':34} {scale * np.median(two):7.1f}", end="")
+    print(f" {np.median(one / two):5.2f} times")
+    if cached:
+        options |= {"scorer": f"{LiveScore.__module__}:{LiveScore.__name__}"}
+        scored = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **options)
+        scored.reset(seed=0)
+        images, scorer = torch.rand(num_envs, 4, size, size), LiveScore()
+        alone, live, both = in_turns(step, lambda: scorer(images, None), lambda: step(scored)).T
+        print(f"{'with a torch scorer, in turns':34} {scale * np.median(both):7.1f}", end="")
+        print(f" {np.median(both / (alone + live)):5.2f} times step and scorer")
 
 
 if __name__ == "__main__":
