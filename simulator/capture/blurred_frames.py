@@ -227,8 +227,7 @@ class BlurredFrames:
 
     def _take(self, count: int) -> np.ndarray:
         """Places of memory for `count` frames."""
-        lacking = count - len(self._free)
-        if lacking > 0:
+        if (lacking := count - len(self._free)) > 0:
             self._give_back(self._more(lacking))
         taken, self._free = self._free[:count], self._free[count:]
         return taken
@@ -308,17 +307,18 @@ class BlurredFrames:
         self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray
     ) -> np.ndarray:
         """(K, 13) places of the light of scenes behind the discs that their blend needs."""
-        stale = np.unique(indices[self._levels_source[indices] != source])
+        stale = np.flatnonzero(np.bincount(indices[self._levels_source[indices] != source]))
         self._give_back(self._levels[stale])
         self._levels[stale] = 0
         self._levels_source[indices] = source
         needed = np.zeros((len(indices), len(DIAMETERS)), bool)
         mark_needed(blurs, _KNOTS, needed)
         frame, level = np.nonzero(needed & (self._levels[indices] == 0))
-        _, first = np.unique(indices[frame] * len(DIAMETERS) + level, return_index=True)
-        frame, level = frame[first], level[first]
-        made = self._take(len(frame))
-        self._levels[indices[frame], level] = made
+        numbers = np.arange(1, len(frame) + 1)  # of frames with the same disc one makes it
+        self._levels[indices[frame], level] = numbers
+        latest = self._levels[indices[frame], level] == numbers
+        frame, level = frame[latest], level[latest]
+        self._levels[indices[frame], level] = made = self._take(len(frame))
         self._blur(indices[frame], np.array(DIAMETERS)[level], source[frame], made)
         levels = self._levels[indices]  # those without a share are read, too, times 0
         return np.where(levels == 0, source[:, None], levels)
