@@ -380,7 +380,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     Each episode photographs one scene. An action picks one of the exposure states of a grid; the
     camera simulator turns the scene's light into the raw that the camera would have recorded there,
     with the noise, the blur and the clipping of these settings; a scorer rates it. The image may
-    move and be out of focus: a shorter exposure or a smaller aperture helps, at the price of noise.
+    move and be out of focus: only a shorter exposure or smaller aperture helps, at a price of noise.
 
     In light that stays, without delay, this is a contextual bandit: an action changes the next
     frame and nothing else, two frames tell nearly all that an episode tells, and a discount of 0 is

@@ -6,8 +6,8 @@ sections that threads share (`simulator.utils.compute.parallel_ranges`); all els
 interpreter's, on one thread whatever there are. A step on n threads takes at least the rest and an
 n-th of the sections. The fused kernel of `ae-env bench throughput` runs in turns with the steps.
 
-Then steps on one thread and on two take turns; and, if `cached`, steps, its torch scorer, and steps
-with that.
+Then steps on one thread and on two take turns. With `cached`, so do steps, the benchmark's torch
+scorer on frames of its own (`LiveScore`), and steps with that scorer.
 """
 
 import gc
@@ -112,16 +112,18 @@ def main(size=64, num_envs=64, *, cached=False):
         own.step(rng.integers(0, 64, num_envs))
 
     one, two = in_turns(step, lambda: step(threads=2)).T
-    print(f"{'step on 2 threads, in turns':34} {scale * np.median(two):7.1f}", end="")
-    print(f" {np.median(one / two):5.2f} times")
+    print(f"{'in turns: step on one thread':34} {scale * np.median(one):7.1f}")
+    print(f"{'step on 2 threads':34} {scale * np.median(two):7.1f}", end="")
+    print(f" {np.median(one / two):5.2f} times as fast")
     if cached:
         options |= {"scorer": f"{LiveScore.__module__}:{LiveScore.__name__}"}
         scored = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **options)
         scored.reset(seed=0)
         images, scorer = torch.rand(num_envs, 4, size, size), LiveScore()
         alone, live, both = in_turns(step, lambda: scorer(images, None), lambda: step(scored)).T
-        print(f"{'with a torch scorer, in turns':34} {scale * np.median(both):7.1f}", end="")
-        print(f" {np.median(both / (alone + live)):5.2f} times step and scorer")
+        print(f"{'in turns: step, then torch scorer':34} {scale * np.median(alone + live):7.1f}")
+        print(f"{'step with torch scorer':34} {scale * np.median(both):7.1f}", end="")
+        print(f" {np.median(both / (alone + live)):5.2f} times as long")
 
 
 if __name__ == "__main__":

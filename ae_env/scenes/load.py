@@ -328,7 +328,7 @@ def simulate_source_raw(
     Args:
         seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
         iso, iso_range: ISO of the raw; drawn by default from the range, log-uniformly.
-        ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; else drawn.
+        ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn if None.
     """
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")

@@ -193,7 +193,7 @@ def asset_views(
 ) -> Iterator[Scene]:
     """The views of one map, of `size` packed pixels a side; see `polyhaven_scenes`.
 
-    `read` is the light meter: the illuminance in a panorama where it points at azimuth and pitch.
+    `read` is the light meter: the illuminance in a panorama where it points, by azimuth and pitch.
 
     The light is sampled at the pitch of the photosites, 2 x `size` a side. Where a map has fewer
     pixels in a view, it is smooth at that pitch; averaged to half of them or less it is not.

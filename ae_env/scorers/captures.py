@@ -6,10 +6,10 @@ Captures are described for any batch of frames, or for every state of a scene at
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ from simulator.utils.compute import kernel
 #: In place of `Layout.shares` where all pixels have the same blur.
 _ALIKE = np.array([[-1.0], [0.0], [1.0]])
 _WIDEST = DIAMETERS[-1]
+Fact = TypeVar("Fact")
 ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
 #: Input that decides a score: ``"image"``, the recorded image with its noise; ``"light"``, the
@@ -67,6 +68,11 @@ class PixelBlur(NamedTuple):
     shares: torch.Tensor  # shares of the pixels that have them; they sum to 1
 
 
+def _fact(work_out: Callable[[Any], Fact]) -> cached_property[Fact]:
+    """A property that is worked out once: tensors that count writes, whatever the scorer's mode."""
+    return cached_property(torch.inference_mode(False)(work_out))
+
+
 @dataclass(frozen=True, eq=False)
 class Captures:
     """The facts about a batch of B captures besides their pixels, worked out when they are read."""
@@ -75,9 +81,9 @@ class Captures:
     nlf: Sequence[NoiseLevelFunction]  #: of a native sensor pixel at the settings, B long
     _shown: ShownScenes
     _which: np.ndarray  # (B,) scene of each capture among those
-    _states: np.ndarray  # (B,) of the grid
-    _moves: tuple[np.ndarray, ...]  # speed, defocus and movements, see `SceneCaptures.of`
+    _log2_exposure: np.ndarray  # (B,) of the settings
     _gain: np.ndarray  # (B,) light relative to the scenes' own
+    _moves: Sequence[np.ndarray]  # see `ShownScenes.blur`
     #: (B, H) float64, light of each row relative to the frame's mean, which is in `ratio` and
     #: `proper_ev`: the bands of flickering light. None where all rows have the same.
     row_gain: torch.Tensor | None = None
@@ -90,6 +96,11 @@ class Captures:
     def __len__(self) -> int:
         return len(self.settings)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and pickles, which have the scenes of the captures, but no others."""
+        known = {name: getattr(self, name) for name in ("_scenes", "_light", "_blur")}
+        return {**vars(self), **known, "_shown": None}
+
     @cached_property
     def _scenes(self) -> Sequence[Scene]:
         return [self._shown[scene] for scene in self._which.tolist()]
@@ -98,28 +109,28 @@ class Captures:
     def _light(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         return self._shown.light(self._which)
 
-    @cached_property
+    @_fact
     def _blur(self) -> tuple[np.ndarray, PixelBlur | None, np.ndarray]:
-        return self._shown.blur(self._which, self._states, *self._moves, pixels=True)
+        return self._shown.blur(self._which, *self._moves, pixels=True)
 
-    @cached_property
+    @_fact
     def ratio(self) -> torch.Tensor:
         """(B,) float64, exposure ratio from the scene's reference settings to the capture."""
-        stops = [s.log2_exposure for s in self.settings] - self._light[0]
-        return torch.from_numpy(np.array([2.0**s for s in stops.tolist()]) * self._gain)
+        stops = (self._log2_exposure - self._light[0]).tolist()
+        return torch.from_numpy(np.array([2.0**stop for stop in stops]) * self._gain)
 
-    @cached_property
+    @_fact
     def proper_ev(self) -> torch.Tensor:
         """(B,) float64, EV100 of the right exposure; the mean of `likely_ev` if it is unknown."""
         return torch.from_numpy(self._light[1] + np.log2(self._gain))
 
-    @cached_property
+    @_fact
     def likely_ev(self) -> torch.Tensor | None:
         """(B, K) float64, EV100s that are equally likely right; None where all light is known."""
         likely = self._light[2]
         return None if likely is None else torch.from_numpy(likely + np.log2(self._gain)[:, None])
 
-    @cached_property
+    @_fact
     def blur_px(self) -> torch.Tensor:
         """(B,) float64, extent of all blur [pixel of the frame]; root mean square over pixels."""
         return torch.from_numpy(self._blur[0])
@@ -129,7 +140,7 @@ class Captures:
         """How many pixels have which extent of blur; None where all have `blur_px`."""
         return self._blur[1]
 
-    @cached_property
+    @_fact
     def scene_light(self) -> torch.Tensor:
         """(B, 4, H, W) linear light of the scenes at their reference settings, a copy."""
         first, count = self._scenes[0], len(self._scenes)
@@ -147,7 +158,7 @@ class Captures:
         """The codes that are drawn into the scene of each capture, B long."""
         return [scene.ladder for scene in self._scenes]
 
-    @cached_property
+    @_fact
     def white_balance(self) -> torch.Tensor:
         """(B, 3) gains of R, G, B."""
         return torch.tensor([scene.white_balance for scene in self._scenes])
@@ -157,7 +168,7 @@ class Captures:
         """XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where unknown."""
         return [scene.camera.colour_matrix for scene in self._scenes]
 
-    @cached_property
+    @_fact
     def light(self) -> torch.Tensor:
         """(B, 4, H, W) noise-free signal at the settings, before blur and clip; white is 1."""
         light = self.scene_light * self.ratio.to(self.scene_light.dtype)[:, None, None, None]
@@ -182,7 +193,7 @@ class Captures:
                 variance = variance.maximum(signal * shot + read)
         return variance + (self.prnu * signal).square() if self.prnu else variance
 
-    @cached_property
+    @_fact
     def ev100(self) -> torch.Tensor:
         """(B,) float64, EV100 of the settings, with the effective f-numbers."""
         return torch.tensor([-s.log2_exposure for s in self.settings], dtype=torch.float64)
@@ -190,7 +201,7 @@ class Captures:
     @property
     def frame_height(self) -> int:
         """Height of the packed frame [pixel]."""
-        return self._shown[self._which.item(0)].light.shape[-2]
+        return self._scenes[0].light.shape[-2]
 
 
 def prepare_scene(
@@ -279,8 +290,8 @@ class SceneCaptures:
     ) -> None:
         self.camera, self.states, self.noisy = camera, list(states), noisy
         self._nlf = camera.nlfs(states)
-        numbers = [(s.exposure_time, s.effective_f_number) for s in states]
-        self.times, self.f_numbers = np.array(numbers).T
+        numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
+        self.times, self.f_numbers, self._log2_exposures = np.array(numbers).T
 
     def of(
         self,
@@ -314,8 +325,11 @@ class SceneCaptures:
         movements = np.zeros((len(which), 4)) if movements is None else movements
         rows, indices = None if row_gain is None else torch.from_numpy(row_gain), states.tolist()
         settings, nlf = [self.states[i] for i in indices], [self._nlf[i] for i in indices]
-        own = scenes, which, states, (speed, defocus, movements), gain
-        return Captures(settings, nlf, *own, rows, source_noise, self.noisy, self.camera.prnu)
+        # Copies: facts that are worked out later must not depend on what the caller does meanwhile.
+        moves = [*map(np.array, (states, speed, defocus, movements))]
+        own = np.array(which), self._log2_exposures[states], np.array(gain), moves
+        more = rows, source_noise, self.noisy, self.camera.prnu
+        return Captures(settings, nlf, scenes, *own, *more)
 
     def describe(
         self,

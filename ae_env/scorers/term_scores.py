@@ -358,7 +358,7 @@ def expect_codes(dark, clean, edges, shot, read, out):  # type: ignore[no-untype
 
     `dark` and `clean` (256,) are the functions, `edges` (256,) the signals from which each code or
     one above is recorded; `shot` and `read` are the noise that is added. `out` (3, G) gets, at
-    `_FINE` values of light a code, the probability of the last code, and both expectations.
+    `_FINE` values of light from code to code, the last one's probability and both expectations.
     """
     unit, start, last, count = (1.0 + PEDESTAL) / 255.0**2, 0, 0, out.shape[1]
     i = 0

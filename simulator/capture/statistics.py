@@ -80,7 +80,7 @@ def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyp
     """Adds each pixel of some rows of light (P, H, W) to the bin of its light, by `edges` (P, B-1).
 
     `bins` (P, B, 6), where what is known of a bin lies together: number, light of at least 0,
-    square of the Laplacian and of the second difference along the row; least and most light, >= 0.
+    squares of the Laplacian, of the second difference along the row; least and most light, >= 0.
     """
     _, height, width = light.shape
     indices = np.empty(width, np.uint32)

@@ -387,7 +387,7 @@ def read_black_level(
     that of all pixels whatever the tile, and values beyond those of the tile count for nothing.
 
     `tags` are those of the directory that describes the mosaic, which begins with the order `cfa`
-    at row and column `origin` of the file's array. None where the file says none, or nonsense.
+    at row and column `origin` of the file's array. None where the file has none or impossible ones.
     """
     values = numbers(tags, "BlackLevel")
     corner, tile = numbers(tags, "ActiveArea")[:2] or (0, 0), numbers(tags, "BlackLevelRepeatDim")

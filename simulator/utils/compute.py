@@ -191,9 +191,9 @@ def prefetch(typing, array, index):  # type: ignore[no-untyped-def]
 
 @numba.extending.intrinsic
 def load_alone(typing, words, index):  # type: ignore[no-untyped-def]
-    """``words[index]`` of uint64, inside a kernel, by itself.
+    """``words[index]`` of uint64, inside a kernel, loaded by itself.
 
-    Compilers make vectors of what a table has at several places, which takes longer.
+    Else the compiler loads several words of a table into one vector, which takes longer.
     """
 
     def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]

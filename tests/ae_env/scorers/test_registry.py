@@ -288,7 +288,8 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
 def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
     def write(images, captures):
-        getattr(captures, name)[0] *= 0.5
+        with torch.inference_mode(depends_on == "light"):
+            getattr(captures, name)[0] *= 0.5
         return torch.zeros(len(captures))
 
     lighting = "flicker" if name == "row_gain" else "static"
