@@ -98,8 +98,8 @@ class Captures:
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies and pickles, which have the scenes of the captures, but no others."""
-        known = {name: getattr(self, name) for name in ("_scenes", "_light", "_blur")}
-        return {**vars(self), **known, "_shown": None}
+        shown = ShownScenes(self._scenes, self._shown.captures)
+        return {**vars(self), "_shown": shown, "_which": np.arange(len(self))}
 
     @cached_property
     def _scenes(self) -> Sequence[Scene]:
@@ -377,7 +377,7 @@ class ShownScenes:
     """
 
     def __init__(self, scenes: Sequence[Scene], captures: SceneCaptures) -> None:
-        self._scenes, self._captures = scenes, captures
+        self._scenes, self.captures = scenes, captures
         self._own = np.full((len(scenes), len(captures.states)), np.nan)  # of the scenes' own maps
         # `Layout.shares` of scenes, one behind the other, and where those of each are.
         self._sorts, self._ends = _ALIKE, np.zeros((2, len(scenes)), np.int64)
@@ -418,7 +418,7 @@ class ShownScenes:
             `Captures.blur_px`; `Captures.pixel_blur`, None unless asked for by `pixels`; and the
             scores (B,) of `Sharpness`.
         """
-        times, f_numbers = self._captures.times[states], self._captures.f_numbers[states]
+        times, f_numbers = self.captures.times[states], self.captures.f_numbers[states]
         height = self._scenes[scenes.item(0)].light.shape[-2]
         own = self._own[scenes, states]
         if (new := np.isnan(own)).any():
