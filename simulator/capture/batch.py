@@ -153,7 +153,6 @@ class CaptureBatch:
         # Of scenes at rest, what those that show them in motion share: the light, the largest
         # defocus, the subject, the vignetting, and the statistics, where they are known.
         self._light, self._widest = np.empty(num_scenes, object), np.zeros(num_scenes)
-        self._place = np.zeros(num_scenes, np.uintp)
         self._height, self._subjects = 0, np.zeros((num_scenes, 2), np.uintp)
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
@@ -379,8 +378,8 @@ class CaptureBatch:
         if inside.any():
             shown = self._scene_columns["rest"][indices[inside]]
             rest = np.flatnonzero(np.bincount(shown))  # once each; `np.unique` would sort
-            self._place[rest] = self._frames.places(self._light[rest].tolist())
-            places[inside] = self._place[shown]
+            found = self._frames.places(self._light[rest].tolist())
+            places[inside] = found[np.searchsorted(rest, shown)]
         if not inside.all():
             places[~inside] = self._frames.places(self._source[rows[~inside]])
         return places

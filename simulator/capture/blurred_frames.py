@@ -314,10 +314,10 @@ class BlurredFrames:
         needed = np.zeros((len(indices), len(DIAMETERS)), bool)
         mark_needed(blurs, _KNOTS, needed)
         frame, level = np.nonzero(needed & (self._levels[indices] == 0))
-        numbers = np.arange(1, len(frame) + 1)  # of frames with the same disc one makes it
-        self._levels[indices[frame], level] = numbers
-        latest = self._levels[indices[frame], level] == numbers
-        frame, level = frame[latest], level[latest]
+        keys, numbers = indices[frame] * len(DIAMETERS) + level, np.arange(len(frame))
+        maker = np.empty(self._levels.size, np.intp)
+        maker[keys] = numbers  # of frames with the same disc one makes it
+        frame, level = (column[maker[keys] == numbers] for column in (frame, level))
         self._levels[indices[frame], level] = made = self._take(len(frame))
         self._blur(indices[frame], np.array(DIAMETERS)[level], source[frame], made)
         levels = self._levels[indices]  # those without a share are read, too, times 0
