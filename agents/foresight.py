@@ -5,8 +5,8 @@ its earlier decisions, expects what the light will be when its decision is in ef
 (`LightTracker`), and asks what each state is worth in that light.
 """
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -139,3 +139,17 @@ class Foresight:
     def record_action(self, states: Ints) -> None:
         """Remember the decision after the frame in hand, ``(N,)`` states."""
         self._actions = [*self._actions[1:], states]
+
+
+def make_foresight(
+    name: str, context: PolicyContext, num_envs: int, forecasters: Sequence[Any]
+) -> Foresight | None:
+    """The foresight called `name`, by `forecasters` or else a trend; None of ``"none"``."""
+    if name == "none":
+        return None
+    if forecasters:
+        from agents.learning.forecaster import LearntTracker  # imports torch's networks
+
+        return Foresight(context, LearntTracker(num_envs, forecasters))
+    ev100 = context.grid.ev100
+    return Foresight(context, TrendTracker(num_envs, (float(ev100.min()), float(ev100.max()))))

@@ -19,8 +19,8 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
-from agents.foresight import Foresight, LightTracker, TrendTracker
-from agents.learning.forecaster import LearntTracker, LightForecaster, load_forecasters
+from agents.foresight import make_foresight
+from agents.learning.forecaster import LightForecaster, load_forecasters
 from agents.learning.networks import (
     UNWATCHED,
     ExposureFeatures,
@@ -156,13 +156,8 @@ class RegressionPolicy(NetworkPolicy):
         self._weighted = np.zeros((num_envs, len(self.context.grid)))
         self._precision = np.zeros_like(self._weighted)
         self._light, self._frames = np.zeros(num_envs), np.zeros(num_envs)
-        self._foresight: Foresight | None = None
-        if self.foresight != "none":
-            ev100 = self.context.grid.ev100
-            tracker: LightTracker = TrendTracker(num_envs, (ev100.min(), ev100.max()))
-            if self._forecasters:
-                tracker = LearntTracker(num_envs, self._forecasters)
-            self._foresight = Foresight(self.context, tracker)
+        given = self.foresight, self.context, num_envs, self._forecasters
+        self._foresight = make_foresight(*given)
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Best state (N,) after this frame and those before it in the same light."""

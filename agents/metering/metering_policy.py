@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
-from agents.foresight import Foresight, LightTracker, TrendTracker
+from agents.foresight import make_foresight
 from agents.metering.meters import make_meter
 from agents.metering.programs import ProgramOptions, StateChooser, check_used, program_cost
 from agents.metering.reading import EVTracker, ReferenceFrames, Region, read_part
@@ -129,14 +129,8 @@ class MeteringPolicy(Policy):
         ev_range = (float(ev100.min()), float(ev100.max()))
         options = self.options
         self._tracker = EVTracker(num_envs, ev_range, options.damping, options.compensation)
-        self._foresight: Foresight | None = None
-        if self.foresight != "none":
-            tracker: LightTracker = TrendTracker(num_envs, ev_range)
-            if self._forecasters:
-                from agents.learning.forecaster import LearntTracker
-
-                tracker = LearntTracker(num_envs, self._forecasters)
-            self._foresight = Foresight(self.context, tracker)
+        given = self.foresight, self.context, num_envs, self._forecasters
+        self._foresight = make_foresight(*given)
         searches = self._meter_name in SEARCH_METERS
         self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))

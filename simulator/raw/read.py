@@ -202,7 +202,7 @@ def _read(
     _check_structure(directories, known_kind, path.stat().st_size)
     own = read_own_record(directories)
     with ExitStack() as opened:
-        decoded = None if own is None else _decode_own_dng(path, directories, own)
+        decoded = None if own is None else _decode_own_dng(path, directories)
         if decoded is None:
             decoded = _decode_with_libraw(path, directories, make, opened)
         stated = decoded.exposure
@@ -441,9 +441,7 @@ class _Decoded:
     origin: tuple[int, int] = (0, 0)  # row and column of the file's array where it begins
 
 
-def _decode_own_dng(
-    path: Path, directories: Sequence[Directory], own: OwnRecord
-) -> _Decoded | None:
+def _decode_own_dng(path: Path, directories: Sequence[Directory]) -> _Decoded | None:
     """A DNG of `write_dng`; None if another program has changed the layout of its pixels.
 
     LibRaw refuses DNGs of less than about 22 pixels a side, and takes a frame of 32 x 32 that says
