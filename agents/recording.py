@@ -79,7 +79,9 @@ def record_dataset(
             for i in range(episodes):
                 report(i, episodes)
                 content = _record_episode(env, policy, name, seed + i)
-                _check_room(folder, content)
+                size = sum(np.asarray(value).nbytes for value in content["observations"].values())
+                with tempfile.TemporaryFile(dir=folder) as file:  # HDF5 crashes on a full disk
+                    file.write(bytes(2 * size + 2**20))  # chunks not full, and what describes them
                 yield minari.data_collector.EpisodeBuffer(id=i, **content)
             report(episodes, episodes)
 
@@ -149,13 +151,6 @@ def _reserved(dataset_id: str) -> Iterator[Path]:
             raise ValueError(f"`out` (={dataset_id!r}) is there already: {rule}")
         folder.mkdir()
         yield folder
-
-
-def _check_room(folder: Path, content: Mapping[str, Any]) -> None:
-    """Raises an `OSError` where an episode has no room in `folder`: HDF5 crashes on a full disk."""
-    size = sum(np.asarray(value).nbytes for value in content["observations"].values())
-    with tempfile.TemporaryFile(dir=folder) as file:
-        file.write(bytes(2 * size + 2**20))  # chunks that are not full, and what describes them
 
 
 @contextmanager

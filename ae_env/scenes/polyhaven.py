@@ -148,19 +148,18 @@ def split_assets(name: str, split: str, places: int | None = None) -> list[Asset
 
 
 def polyhaven_scenes(
-    request: SceneRequest, *, views: int = VIEWS, seed: int = 0, assets: list[Asset] | None = None
+    request: SceneRequest, *, views: int = VIEWS, assets: list[Asset] | None = None
 ) -> Sequence[Scene]:
     """Views into the panoramas of a split, `views` of each map, one map after the other.
 
-    `seed` is of the views' directions, their fields of view and the level of the light; `assets`
-    are by default all of the split.
+    `assets` are by default all of the split.
     """
     assets = split_assets("polyhaven", request.split) if assets is None else assets
     camera, plain = request.camera, request.resize is Scene.resized
     resolution = request.resolution if plain else None
     crop: Crop = request.crop if plain else "box"
     key = {"polyhaven": [a.sha256 for a in assets], "version": _VERSION, "views": views}
-    key |= {"seed": seed, "camera": camera.name, "colour_matrix": camera.colour_matrix}
+    key |= {"seed": 0, "camera": camera.name, "colour_matrix": camera.colour_matrix}
     key |= {"resolution": resolution, "crop": crop, "wanted": request.resolution}
     # Kinds and levels of light may be edited without the files.
     key |= {"kinds": [[a.kind, *ILLUMINANCE[a.kind]] for a in assets]}
@@ -169,7 +168,7 @@ def polyhaven_scenes(
     def make() -> Iterator[Scene]:
         logger.info("cutting %d views from each of %d panoramas", views, len(assets))
         for asset in assets:
-            for scene in asset_views(asset, camera, size=size, views=views, seed=seed):
+            for scene in asset_views(asset, camera, size=size, views=views):
                 yield add_layout(scene).resized(resolution, crop)
 
     side = size if resolution is None else resolution
@@ -188,7 +187,6 @@ def asset_views(
     *,
     size: int,
     views: int = VIEWS,
-    seed: int = 0,
     read: Callable[[np.ndarray, float, float], float] = dome_lux,
 ) -> Iterator[Scene]:
     """The views of one map, of `size` packed pixels a side; see `polyhaven_scenes`.
@@ -204,7 +202,7 @@ def asset_views(
     height, width = (n // _CELL for n in panorama.shape[1:])
     cells = panorama[:, : height * _CELL, : width * _CELL]
     seen = cells.reshape(3, height, _CELL, width, _CELL).mean(axis=(2, 4))
-    rng = np.random.default_rng([zlib.crc32(asset.name.encode()), seed])
+    rng = np.random.default_rng([zlib.crc32(asset.name.encode()), 0])
     low, high = np.log(ILLUMINANCE[asset.kind])
     turned = [(a, p) for p in _TURNED for a in range(0, 360, 30)]
     most = max(receptor_reading(seen, *direction, dome=False) for direction in turned)

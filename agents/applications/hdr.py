@@ -158,7 +158,9 @@ def fuse(pictures: Sequence[Tensor] | Callable[[], Iterator[Tensor]]) -> Tensor:
         share = (weight / total).cpu().numpy()
         share = gaussian_filter(share, SMOOTHING, mode="nearest", truncate=3.0)
         weights = _gaussian_pyramid(torch.from_numpy(share).to(picture.device)[None])
-        details = _laplacian_pyramid(picture)
+        levels = _gaussian_pyramid(picture)
+        pairs = itertools.pairwise(levels)  # of a Laplacian pyramid
+        details = [*(fine - _expand(coarse, fine.shape[-2:]) for fine, coarse in pairs), levels[-1]]
         blended = [w * d for w, d in zip(weights, details, strict=True)]
         fused = blended if not fused else [f.add_(b) for f, b in zip(fused, blended, strict=True)]
     result = fused[-1]
@@ -207,9 +209,3 @@ def _gaussian_pyramid(image: Tensor) -> list[Tensor]:
     while len(levels) < depth and min(levels[-1].shape[-2:]) > 1:
         levels.append(_reduce(levels[-1]))
     return levels
-
-
-def _laplacian_pyramid(image: Tensor) -> list[Tensor]:
-    levels = _gaussian_pyramid(image)
-    pairs = itertools.pairwise(levels)
-    return [*(fine - _expand(coarse, fine.shape[-2:]) for fine, coarse in pairs), levels[-1]]

@@ -199,7 +199,8 @@ def main() -> None:
     handler.addFilter(lambda record: seen.setdefault(record.getMessage(), record) is record)
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(level=NOTE, format="%(message)s", handlers=[handler])
-    signal.signal(signal.SIGTERM, _terminate)
+    # As Ctrl-C ends a command: a training writes its checkpoint first.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(_TERMINATED))
     try:
         app(prog_name="ae-env")
     except Exception as error:  # whatever it is, the user gets one line; --debug shows the rest
@@ -232,11 +233,6 @@ class _Log(logging.Handler):
 
         plain = Console(stderr=True, emoji=False)
         RichHandler(console=plain, show_time=False, show_path=False).emit(record)
-
-
-def _terminate(*_: Any) -> None:
-    """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
-    raise SystemExit(_TERMINATED)
 
 
 def _one_line(error: Exception) -> str:

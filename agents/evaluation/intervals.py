@@ -93,9 +93,7 @@ def mean_rows(scores: Mapping[str, Sequence[float]], among: Sequence[str]) -> li
     return rows
 
 
-def rank_agreement(
-    first: Floats, second: Floats, *, resamples: int = RESAMPLES, seed: int = 0
-) -> Interval:
+def rank_agreement(first: Floats, second: Floats) -> Interval:
     """Kendall's tau-b of the rankings of P policies by two measures, with its interval.
 
     A ranking is by the mean over all groups. Both measures, ``(P, G)``, are of the same groups,
@@ -112,7 +110,7 @@ def rank_agreement(
     value = float(tau(np.full((1, groups), 1.0 / groups))[0])
     if groups < MIN_GROUPS:
         return Interval(value, None, None, groups)
-    drawn = tau(group_weights(groups, resamples, seed) / groups)
+    drawn = tau(group_weights(groups, RESAMPLES, 0) / groups)
     low, high = np.quantile(drawn, ENDS).tolist()
     return Interval(value, low, high, groups)
 

@@ -366,7 +366,9 @@ def stability_rows(found: Stability) -> pd.DataFrame:
         own = found.cases[(found.cases.fault == fault) & (found.cases.delay == delay)]
         still = own.settling.notna()
         row: dict[str, Any] = {"policy": found.name, "fault": fault, "delay": delay}
-        row["gain_margin"] = _margin(still.groupby(own.gain).all())
+        settles = still.groupby(own.gain).all()
+        kept = settles[np.logical_and.accumulate(settles.to_numpy(bool))]
+        row["gain_margin"] = float(kept.index[-1]) if len(kept) else np.nan
         row["analytic"] = np.nan
         if isinstance(law, Proportional) and not law.dead_zone and fault == "none":
             row["analytic"] = np.log2(gain_limit(law, delay) / law.gain)
@@ -380,9 +382,3 @@ def stability_rows(found: Stability) -> pd.DataFrame:
         row |= {"pulses": (pulsing > 0.0).mean(), "pulse": pulsing.max()}
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _margin(settles: pd.Series[bool]) -> float:
-    """The last value of the index before any that does not settle, NaN where there is none."""
-    kept = settles[np.logical_and.accumulate(settles.to_numpy(bool))]
-    return float(kept.index[-1]) if len(kept) else np.nan

@@ -180,7 +180,13 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
                     f".safetensors file with its .json; there is no {file}{_hint(str(name), known)}"
                 )
     tensors, card = read_pair(path)
-    _check_card(card, name)
+    wanted: dict[str, list[Any]] = {"format": [FORMAT_VERSION], "preset": list(BUILDERS)}
+    wrong = [entry for entry, values in wanted.items() if card.get(entry) not in values]
+    wrong += [] if "sha256" in card else ["sha256"]
+    if wrong:
+        rule = f"the .json must be a model card of {wanted}, with the hash `sha256`"
+        got = reprlib.repr(card.get("kind", card.get(wrong[0])))  # an agent's card has a kind
+        raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {got}")
     modules = build_modules(card["preset"])
     load_into(modules, tensors, f"`weights` (={str(name)!r})")
     if "noise" in modules and card.get("residual") is not None:
@@ -196,13 +202,3 @@ def _hint(name: str, known: list[str]) -> str:
         program = "ae-env" if name in BUILDERS else "python -m benchmarks.paper_baselines"
         return f"; train it: {program} train-simulator configs/simulator/{name}.yaml"
     return did_you_mean(name, known)
-
-
-def _check_card(card: dict[str, Any], name: str | Path) -> None:
-    known: dict[str, list[Any]] = {"format": [FORMAT_VERSION], "preset": list(BUILDERS)}
-    wrong = [entry for entry, values in known.items() if card.get(entry) not in values]
-    wrong += [] if "sha256" in card else ["sha256"]
-    if wrong:
-        rule = f"the .json must be a model card of {known}, with the hash `sha256`"
-        got = reprlib.repr(card.get("kind", card.get(wrong[0])))  # an agent's card has a kind
-        raise ValueError(f"`weights` (={str(name)!r}): {rule}; got {got}")

@@ -98,17 +98,11 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
-def _cells(image: np.ndarray) -> np.ndarray:
-    """Means of cells of `_STEP` x `_STEP` pixels, four of which make a block."""
+def _quarters(image: np.ndarray) -> list[np.ndarray]:
+    """Means of the four quarters, `_STEP` x `_STEP` pixels, of each block."""
     height, width = (n // _STEP for n in image.shape)
     rows = image[: height * _STEP].reshape(height, _STEP, -1).sum(axis=1)
-    cells = rows[:, : width * _STEP].reshape(height, width, _STEP).sum(axis=2)
-    return np.asarray(cells / _STEP**2)
-
-
-def _quarters(image: np.ndarray) -> list[np.ndarray]:
-    """Means of the four quarters of each block."""
-    cells = _cells(image)
+    cells = rows[:, : width * _STEP].reshape(height, width, _STEP).sum(axis=2) / _STEP**2
     return [cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]]
 
 
