@@ -79,14 +79,13 @@ def raws(split: Split, camera: CameraProfile, resolution: int) -> list[Scene]:
     return scenes
 
 
-def best_compensations(context: PolicyContext, seed: int, episodes: int) -> dict[str, float]:
-    """The compensation [EV] at which each of `COMPENSATED` scores best in the training places."""
-    names = {(m, c): f"{m}?compensation={c:g}" for m in COMPENSATED for c in COMPENSATIONS}
-    policies = {name: make_policy(name, context) for name in names.values()}
+def compensated(context: PolicyContext, seed: int) -> list[str]:
+    """`COMPENSATED`, each at the compensation that scores best in the training places."""
+    names = [[f"{m}?compensation={c:g}" for c in COMPENSATIONS] for m in COMPENSATED]
+    policies = {name: make_policy(name, context) for own in names for name in own}
     places = {"scenes": "polyhaven", "split": "train", "resolution": 64}
-    result = evaluate(policies, places, episodes_per_scene=episodes, seed=seed)
-    score = {key: result.normalised(name) for key, name in names.items()}
-    return {m: float(max(COMPENSATIONS, key=lambda c: score[m, c])) for m in COMPENSATED}
+    result = evaluate(policies, places, episodes_per_scene=2, seed=seed)
+    return [max(own, key=result.normalised) for own in names]
 
 
 def context_of(options: dict[str, Any]) -> PolicyContext:
@@ -140,8 +139,7 @@ def _comparators(
     names = ["random", "best_fixed", *(meters[:1] if quick else meters)]
     with progress_bars() as progress, progress("light meters learn their programs") as task:
         if not quick:
-            found = best_compensations(context, seed, episodes=2)
-            names += [f"{name}?compensation={c:g}" for name, c in found.items()]
+            names += compensated(context, seed)
         policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
         fit_policies(policies, environment, seed=seed, progress=task)
     return policies

@@ -29,7 +29,7 @@ from agents.evaluation.intervals import rank, score_interval
 from agents.learning.networks import StateHead
 from agents.learning.training import load_config, train_agent
 from agents.policy_names import make_policy, training_seeds
-from benchmarks.agents import CONFIGS, best_compensations, changed_config, context_of
+from benchmarks.agents import CONFIGS, changed_config, compensated, context_of
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, side_by_side, table
 from benchmarks.isolated import ROOT
 from simulator import develop, exposure_ratio, get_camera
@@ -123,8 +123,7 @@ def _policies(seed: int, quick: bool) -> dict[str, Any]:
     """Meters and agents, all of which learnt under the dome."""
     context, names = context_of({"resolution": RESOLUTION}), list(METERS[: 1 if quick else None])
     if not quick:
-        found = best_compensations(context, seed, episodes=2)
-        names += [f"{name}?compensation={stops:g}" for name, stops in found.items()]
+        names += compensated(context, seed)
     policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
     fit_policies(policies, load_config(CONFIGS["regression"]).environment, seed=seed)
     for agent in CONFIGS:

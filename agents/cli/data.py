@@ -107,15 +107,6 @@ def record(
     print_line(f'read it with: minari.load_dataset("{out}")')
 
 
-Engine = Annotated[
-    str,
-    Option(
-        help="local: this process; ray: a Ray on this machine; or a cluster's address, such as "
-        "ray://head:10001 or auto."
-    ),
-]
-
-
 @console.takes_source
 def score_tables(
     what: Annotated[
@@ -124,7 +115,13 @@ def score_tables(
     out: Annotated[Path, Option("--out", "-o", help="Folder for the shards.")] = Path(
         "score_tables"
     ),
-    on: Engine = "local",
+    on: Annotated[
+        str,
+        Option(
+            help="local: this process; ray: a Ray on this machine; or a cluster's address, such as "
+            "ray://head:10001 or auto."
+        ),
+    ] = "local",
     workers: Annotated[int, Option(help="Processes on Ray.", min=1)] = 2,
     per_shard: Annotated[int, Option(help="Files of a shard.", min=1)] = 16,
     resolution: Annotated[int, Option(help="Packed pixels a side.", min=1)] = 64,
