@@ -289,7 +289,6 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _check_class(name: str, cls: Any, context: PolicyContext) -> None:
-    """Raises a `ValueError` unless `cls` is the class of a policy for this task."""
     if not inspect.isclass(cls):
         raise _refusal(name, " must name a class")
     own = [(m, getattr(cls, m, None)) for m in ("reset", "act")]
@@ -303,7 +302,6 @@ def _check_class(name: str, cls: Any, context: PolicyContext) -> None:
 
 
 def _check_options(name: str, cls: Any, options: dict[str, Any], fixed: dict[str, Any]) -> None:
-    """Raises a `ValueError` if `cls` does not take one of the `options`."""
     known = _parameters(cls, fixed)
     if any(p.kind is p.VAR_KEYWORD for p in known.values()):
         return

@@ -69,9 +69,6 @@ GROUPS: dict[str, Callable[[Case], bool]] = {
 }
 
 
-# -- measuring ------------------------------------------------------------------------------------
-
-
 def parts(
     seed: int, quick: bool, folder: Path | None = None, weights: Path | None = None
 ) -> list[Part]:
@@ -164,9 +161,6 @@ def _methods(
         return {name: image.cpu() for name, image in images.items()}
 
     return estimate
-
-
-# -- report ---------------------------------------------------------------------------------------
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:

@@ -180,9 +180,6 @@ def curve(variant: str, seed: int, quick: bool) -> Row:
     return row
 
 
-# -- pictures -------------------------------------------------------------------------------------
-
-
 def pictures(seed: int) -> tuple[Figure, Figure]:
     """The oracle's frames of some views, and the receptors where they disagree most of these."""
     count = VIEWS * len(split_assets("polyhaven", "test"))
@@ -235,9 +232,6 @@ def receptor_figure(view: Scene, place: Place) -> Figure:
     for name, title in titles.items():
         axes[name].set_title(title, fontsize=9)
     return figure
-
-
-# -- report ---------------------------------------------------------------------------------------
 
 
 def parts(seed: int, quick: bool, part: str | None = None) -> list[Part]:

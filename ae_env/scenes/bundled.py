@@ -268,7 +268,6 @@ def _stored(key: str, camera: CameraProfile, resolution: int | None) -> SceneSet
 
 
 def _unpacked(values: Mapping[str, Any], camera: CameraProfile, index: int) -> list[Scene]:
-    """A scene as it was stored."""
     facts, light = dict(values["facts"][index]), values["light"][index].float()
     used = CameraSettings(*facts.pop("reference"))
     if "layouts" in values:

@@ -474,7 +474,6 @@ def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[S
 
 
 def _check_training_groups(spec: str | Path, split: str, count: int, most: str = "") -> None:
-    """Raises a `ValueError` if `spec` has too few source groups to train on."""
     if split == "train" and count < FEWEST_GROUPS_TO_SPLIT:
         raise ValueError(
             f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that "

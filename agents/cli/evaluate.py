@@ -245,7 +245,6 @@ def _arguments(env: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _check_changes(base: "EvaluationPlan", changed: list[str]) -> None:
-    """Raises a `ValueError` if a preset does not take one of the options `changed`."""
     if base.hash is not None:
         allowed, what = _OF_BENCHMARKS, "is a fixed benchmark"
     elif base.budgets:
@@ -255,9 +254,6 @@ def _check_changes(base: "EvaluationPlan", changed: list[str]) -> None:
     refused = [f"--{name}" for name in changed if name not in allowed]
     if refused:
         raise ValueError(f"`preset` (={base.name!r}) {what}: it does not take {', '.join(refused)}")
-
-
-# -- results on the terminal ----------------------------------------------------------------------
 
 
 def print_scores(

@@ -91,7 +91,6 @@ _TAKES = {"folder": ("emva", "paper", "recorded"), "part": tuple(_PARTS), "weigh
 
 
 def _check_options(name: str, **options: Any) -> None:
-    """Raises a `ValueError` if a benchmark takes no such option, or not its value."""
     for option, value in options.items():
         if name not in _TAKES[option]:
             rule = f"is for {' and '.join(_TAKES[option])} only"

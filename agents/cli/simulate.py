@@ -268,7 +268,6 @@ def refocus(
 def _lens(
     source: "RawImage", metres: "np.ndarray", focus: str | None, focal_length: float | None
 ) -> "Lens":
-    """The lens that the options and the file describe."""
     from simulator import Lens
 
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length

@@ -133,9 +133,6 @@ def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Flo
     return (sums * drawn).sum(axis=1)
 
 
-# -- ranking --------------------------------------------------------------------------------------
-
-
 def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLES) -> pd.DataFrame:
     """Policies from the best to the worst, with the differences that are significant.
 

@@ -201,7 +201,6 @@ class Jobs(EvaluationRun):
         return found
 
     def _finished(self, condition: Condition) -> EvaluationResult:
-        """The result of a condition, from the finished parts."""
         tracks = {}
         for trained in self.trained:
             stored = self._stored(self.policy_key(trained, condition))

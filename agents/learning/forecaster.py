@@ -203,9 +203,6 @@ def load_forecasters(
     return [load_forecaster(file, device) for file in files]
 
 
-# -- training -------------------------------------------------------------------------------------
-
-
 def train_forecaster(training: ForecasterTraining, session: Session = UNWATCHED) -> LightForecaster:
     """Trains a forecaster on light of the training kinds."""
     with torch.random.fork_rng(devices=[]):

@@ -203,9 +203,6 @@ class RegressionPolicy(NetworkPolicy):
         self._asked[done] = -1
 
 
-# -- training --------------------------------------------------------------------------------------
-
-
 class RegressionTraining(Configuration):
     """Hyperparameters of the regression agent."""
 

@@ -141,7 +141,6 @@ def _wide(frame: pd.DataFrame, form: str) -> str:
 
 
 def _aligned(frame: pd.DataFrame) -> str:
-    """A frame of texts as Markdown."""
     align = ["left", *["right"] * (frame.shape[1] - 1)] if len(frame) else None
     return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
 
@@ -320,7 +319,6 @@ def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int)
 def _report(
     results: Results, rows: pd.DataFrame, meta: Mapping[str, Any], order: Sequence[str], **more: Any
 ) -> str:
-    """``report.md`` of an evaluation of frames."""
     static = static_condition(results)
     result = results[static]
     by = rows.replace({"condition": {"all": static}})

@@ -314,7 +314,6 @@ class ExposurePage(Tab):
         await self._refresh()
 
     async def _point(self, event: Any) -> None:
-        """Reads the sample below the pointer."""
         if self._shown is not None and self._picture is not None:
             viewed, view, _ = self._shown
             text = viewed.photosite(view, self._picture.capture, *event.args)

@@ -122,8 +122,6 @@ def _photographed(
         yield Case(scene.group, scene.depth is not None, raw, target, float(blur.max()))
 
 
-# -- methods --------------------------------------------------------------------------------------
-
 #: Name, preset, and whether w and b are those of the trained body.
 Method = tuple[str, str, bool]
 
@@ -183,8 +181,6 @@ def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
     sums = pd.Series(values - values.mean()).groupby(subjects).sum()
     return float(len(sums) * sums.var()) ** 0.5 / len(values) if len(sums) > 1 else None
 
-
-# -- report ---------------------------------------------------------------------------------------
 
 _COUNTS = "camera = {camera} | pairs = {pairs} | source groups = {source_groups}"
 _PAPER = "noisy = {noisy_db:.2f} / {noisy_ssim:.3f} | mean = {mean_db:.2f} / {mean_ssim:.3f}"
