@@ -9,13 +9,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ae_env.scenes.folder import find_files
+from ae_env.scenes.folder import find_files, is_raw
 from agents.policy import Bools, Floats, Ints, Observations, Policy, PolicyContext, masked_argmax
 from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
-from simulator.utils.files import RAW_SUFFIXES
 
 #: What oracles know, and the entry of ``info`` that holds it.
 ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}
@@ -135,7 +134,7 @@ def _raw_files(path: str | os.PathLike[str]) -> list[Path]:
     raws, folder = [], Path(path).expanduser()
     if os.fspath(path) and folder.exists():
         with suppress(ValueError):  # no file of any known kind
-            raws = [file for file in find_files(folder)[1] if file.suffix.lower() in RAW_SUFFIXES]
+            raws = [file for file in find_files(folder)[1] if is_raw(file)]
     if not raws:
         given = os.fspath(path)
         raise ValueError(f"`path` (={given!r}) must be a folder of raws: 'recorded:FOLDER'")

@@ -30,6 +30,7 @@ from simulator.radiance.reading import read_radiance
 from simulator.reference.reference_camera import ReferenceCamera, lens_blur, sample_mosaic
 from simulator.training.crops import DetailPicture
 from simulator.training.scenes import FURTHER_MAPS, Split, detail_pictures, radiance_files
+from simulator.utils.checks import import_extra
 from simulator.utils.files import data_folder
 
 #: Sources are photographed by both cameras in turn.
@@ -197,10 +198,7 @@ def non_local_means(stable: np.ndarray) -> np.ndarray:
 
 def bm3d_planes(stable: np.ndarray) -> np.ndarray:
     """BM3D; its authors' package is free for non-commercial use only."""
-    try:
-        import bm3d
-    except ImportError:
-        raise ImportError("comparing with BM3D needs: pip install 'ae-env[bench]'") from None
+    bm3d = import_extra("bm3d", "bench", "comparing with BM3D")
     mixed = np.tensordot(_HADAMARD, stable, axes=1).transpose(1, 2, 0)
     smooth = bm3d.bm3d(mixed, [1.0] * 4).transpose(2, 0, 1)
     return np.tensordot(_HADAMARD.T, smooth, axes=1)
