@@ -1,4 +1,4 @@
-"""Other people's training code runs every task unchanged, and reads recorded episodes."""
+"""Training code of others and of `examples` runs the tasks, and recorded episodes are read."""
 
 import runpy
 from dataclasses import asdict
@@ -13,10 +13,14 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from ae_env import UserCodeError
+from ae_env.observation import encode_settings
 from ae_env.registration import TASKS
-from agents import Policy, PolicyContext, make_policy
+from ae_env.wrappers import VectorContinuousActions
+from agents import Policy, PolicyContext, evaluate, make_policy
 from agents.recording import record_dataset
 from agents.rollouts import fitting_arguments, training_arguments
+from agents.rollouts import make_envs as envs_of
+from examples import learners
 from tests.ae_env.environments import SMALL, make_envs
 from tests.ae_env.scene_files import GRID, write_raws
 
@@ -190,3 +194,57 @@ def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(ae_env, tmp_p
     policies = ("--policy", "best_fixed", "--policy", "average", "--policy", "oracle")
     code, out, _ = ae_env("evaluate", *policies, *options, "--frames", "2", "--out", "out")
     assert (code, "best_fixed" in out) == (0, True)
+
+
+# -- learners of `examples/learners.py`: each is judged from its file as it was --------------------
+
+LEARNERS = Path(learners.__file__)
+
+
+@pytest.mark.parametrize("name", learners.NAMES)
+def test_a_learner_trains_and_its_file_is_judged_alike(name: str, tmp_path: Path) -> None:
+    off_policy = name in ("dqn", "qrdqn", "sac", "drl_ae")
+    changed = {"learning_starts": 64} if off_policy else {}
+    moving = learners.load(name)[0]["task"] != learners.STILL
+    exam = ("bundled:small", "test", 2 if moving else None)
+    given = {"out": tmp_path, "scenes": "bundled:small", "exam": exam, **changed}
+    if name == "a2c":  # a run of other settings is trained anew
+        learners.train(name, 1, 1_024, **given, learning_rate=0.1)
+    rows = learners.train(name, 1, 1_024, **given)
+    assert learners.train(name, 1, 1_024, **given) == rows  # read: the seconds are the same
+    assert rows[-1]["frames"] == 1_024
+    assert rows[-1]["wall_seconds"] > 0.0
+    test = {"scenes": "bundled:small", "split": "test", "observation": "statistics"}
+    test |= {"grid": "video", "delay": learners.DELAY} if moving else {}
+    context = PolicyContext.from_envs(envs_of(test, num_envs=1, frames=1))
+    weights = tmp_path / f"{name}-1.safetensors"
+    policy = make_policy(f"{LEARNERS}:Learnt?weights={weights}", context)
+    if moving:  # without the tables of its light once more, which take longest
+        again = learners.EXAMS[moving, *exam].score(policy)
+    else:
+        again = evaluate({"it": policy}, test).normalised("it")
+    assert again == pytest.approx(rows[-1]["score"], abs=1e-6)
+
+
+def test_actions_as_the_wrapper_has_them_and_changes_of_them() -> None:
+    """A change of zero keeps the settings; of 4 stops of time, the nearest of the grid is."""
+    envs = make_envs(num_envs=64)
+    wrapper, grid = VectorContinuousActions(envs), envs.unwrapped.grid
+    actions = np.random.default_rng(0).uniform(-1.2, 1.2, (64, 3)).astype(np.float32)
+    envs.reset(seed=0)
+    wanted = wrapper.actions(actions)
+    np.testing.assert_array_equal(learners.ApexActions(grid, 64).states(actions), wanted)
+    changes = learners.ApexActions(grid, 64, stops=4.0)
+    changes.begin({"settings": encode_settings(grid.apex)})
+    np.testing.assert_array_equal(changes.states(np.zeros((64, 3))), np.arange(64))
+    states = changes.states(np.tile([0.0, 1.0, 0.0], (64, 1)))
+    shorter = {1 / 2: 1 / 15, 1 / 15: 0.008, 0.008: 0.001, 0.001: 0.001}  # the nearest to 1/16
+    for state, before in zip(states.tolist(), grid.states, strict=True):
+        wanted = before.iso, shorter[before.exposure_time], before.f_number
+        assert (grid[state].iso, grid[state].exposure_time, grid[state].f_number) == wanted
+
+
+def test_missing_weights_are_named() -> None:
+    context = PolicyContext.from_envs(make_envs(1))
+    with pytest.raises(ValueError, match=r"`weights` \(=.none\.safetensors.\)"):
+        make_policy(f"{LEARNERS}:Learnt?weights=none.safetensors", context)
