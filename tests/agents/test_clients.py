@@ -1,6 +1,5 @@
 """Training code of others and of `examples` runs the tasks, and recorded episodes are read."""
 
-import runpy
 from dataclasses import asdict
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from agents import Policy, PolicyContext, evaluate, make_policy
 from agents.recording import record_dataset
 from agents.rollouts import fitting_arguments, training_arguments
 from agents.rollouts import make_envs as envs_of
-from examples import learners
+from examples import learners, ppo_on_device, recurrent_ppo
 from tests.ae_env.environments import SMALL, make_envs
 from tests.ae_env.scene_files import GRID, write_raws
 
@@ -79,10 +78,8 @@ def test_torchrl(task: str) -> None:
 
 def test_ppo_on_one_device() -> None:
     """Whatever a GPU would run runs on the CPU, and the updates change the network."""
-    program = Path(__file__).parents[2] / "examples" / "ppo_on_device.py"
-    train = runpy.run_path(str(program))["train"]
-    first, second = (train("cpu", updates, num_envs=2, steps=2) for updates in (0, 1))
-    before, after = (torch.nn.utils.parameters_to_vector(n.parameters()) for n in (first, second))
+    trained = (ppo_on_device.train("cpu", updates, num_envs=2, steps=2) for updates in (0, 1))
+    before, after = (torch.nn.utils.parameters_to_vector(n.parameters()) for n in trained)
     assert torch.isfinite(after).all()
     assert not torch.equal(before, after)
 
@@ -91,12 +88,11 @@ def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     """It trains, its weights come back, and a reset forgets the episode."""
     make_vec, few = gym.make_vec, {**SMALL, "num_envs": 8}
     monkeypatch.setattr(gym, "make_vec", lambda task, **given: make_vec(task, **given | few))
-    program = Path(__file__).parents[2] / "examples" / "recurrent_ppo.py"
     weights = tmp_path / "recurrent.safetensors"
-    runpy.run_path(str(program))["train"](weights, frames=128)
+    recurrent_ppo.train(weights, frames=128)
     envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")
     context = PolicyContext.from_envs(envs)
-    policy = make_policy(f"{program}:RecurrentAgent?weights={weights}", context)
+    policy = make_policy(f"{recurrent_ppo.__file__}:RecurrentAgent?weights={weights}", context)
     memories = []
     for _ in range(2):
         policy.reset(8)
@@ -198,8 +194,6 @@ def test_a_fitted_policy_is_recorded_and_judged_on_a_recorded_grid(ae_env, tmp_p
 
 # -- learners of `examples/learners.py`: each is judged from its file as it was --------------------
 
-LEARNERS = Path(learners.__file__)
-
 
 @pytest.mark.parametrize("name", learners.NAMES)
 def test_a_learner_trains_and_its_file_is_judged_alike(name: str, tmp_path: Path) -> None:
@@ -218,7 +212,7 @@ def test_a_learner_trains_and_its_file_is_judged_alike(name: str, tmp_path: Path
     test |= {"grid": "video", "delay": learners.DELAY} if moving else {}
     context = PolicyContext.from_envs(envs_of(test, num_envs=1, frames=1))
     weights = tmp_path / f"{name}-1.safetensors"
-    policy = make_policy(f"{LEARNERS}:Learnt?weights={weights}", context)
+    policy = make_policy(f"{learners.__file__}:Learnt?weights={weights}", context)
     if moving:  # without the tables of its light once more, which take longest
         again = learners.EXAMS[moving, *exam].score(policy)
     else:
@@ -247,4 +241,4 @@ def test_actions_as_the_wrapper_has_them_and_changes_of_them() -> None:
 def test_missing_weights_are_named() -> None:
     context = PolicyContext.from_envs(make_envs(1))
     with pytest.raises(ValueError, match=r"`weights` \(=.none\.safetensors.\)"):
-        make_policy(f"{LEARNERS}:Learnt?weights=none.safetensors", context)
+        make_policy(f"{learners.__file__}:Learnt?weights=none.safetensors", context)

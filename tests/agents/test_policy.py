@@ -19,6 +19,7 @@ from agents.metering.reading import Reading
 from agents.policy import PolicyContext
 from agents.policy_names import PRETRAINED, make_policy, training_seeds
 from agents.rollouts import make_envs
+from examples import my_policy
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 
@@ -328,11 +329,9 @@ def test_a_meter_with_foresight_is_ahead_of_a_ramp(context, photograph, name, lo
     assert low < context.grid.ev100[asked[11 + 3]] - (14.0 - 11 - 3) < high
 
 
-def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "judge.md").read_text(encoding="utf-8")
-    file = tmp_path / "my_policy.py"
-    file.write_text(page.partition("```python\n")[2].partition("```")[0])
-    policy = make_policy(f"{file}:HalfGrey", context)
+def test_the_policy_of_the_page_exposes_a_card_and_obeys_masks(context, photograph):
+    """The example, which `docs/judge.md` prints: `test_docs` compares them."""
+    policy = make_policy(f"{my_policy.__file__}:HalfGrey", context)
     states, masks = np.array([0, 63]), np.ones((2, 64), bool)
     for _ in range(6):
         states = policy.act(photograph(np.ones((64, 64)), 9.0, states))

@@ -3,7 +3,6 @@
 import functools
 import json
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +17,7 @@ from ae_env.scenes import load_scenes
 from agents import PolicyContext, make_policy
 from agents.onboard.controller import Controller, ExposureState
 from agents.onboard.export import export_agent
+from examples import picamera2_ae, simulated_camera
 from simulator.camera import get_camera
 from tests.ae_env.environments import make_envs
 
@@ -79,17 +79,13 @@ def test_frames_and_settings_are_encoded_as_the_environment_does(exported):
 @pytest.mark.parametrize("left_justified", [False, True])  # as on a Raspberry Pi 5
 def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported, left_justified):
     """After each jump of 5 EV it settles, at the aperture that it has, where little is clipped."""
-    loop, simulated = (
-        SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / f"{name}.py")))
-        for name in ("picamera2_ae", "simulated_camera")
-    )
     body = get_camera("nikon_z6")
     scenes = load_scenes("bundled:small", "test", camera=body, resolution=64)
     scene = next(scene for scene in scenes if scene.kind == "indoor")
     gains = [2.0 ** (5 * (i >= 20) - 5 * (i >= 40)) for i in range(60)]
     options = {"gains": gains, "dropped": (5, 6, 21, 43), "left_justified": left_justified}
-    camera = simulated.SimulatedCamera(scene, body, 4.0, delay=2, **options)
-    steps = list(loop.run(camera, Controller(exported[1]), 56, 4.0))
+    camera = simulated_camera.SimulatedCamera(scene, body, 4.0, delay=2, **options)
+    steps = list(picamera2_ae.run(camera, Controller(exported[1]), 56, 4.0))
     assert {(decision.state.f_number, decision.held) for _, decision in steps} == {(4.0, False)}
     for last, frame in ((17, 19), (36, 39), (55, 59)):  # the last that came through of each light
         (taken, _), (before, _) = steps[last], steps[last - 3]
@@ -102,18 +98,17 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported, left_justi
 
 
 def test_order_and_padding_of_a_raw_stream_are_those_of_its_configuration() -> None:
-    example = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "picamera2_ae.py")))
     mosaic = np.array([[1, 2, 5, 6], [3, 4, 7, 8]])
     for order, bits, planes in (("BGGR", 10, (4, 3, 2, 1)), ("GBRG", 8, (3, 4, 1, 2))):
         black, raw = 2**bits // 16, {"format": f"S{order}{bits}", "size": (4, 2)}
         samples = (black * mosaic).astype(np.uint8 if bits == 8 else np.uint16)
         array = np.pad(samples.view(np.uint8), ((0, 0), (0, 4)))  # the stride is longer
-        found = example.planes_of(array, raw, [4096] * 4)
+        found = picamera2_ae.planes_of(array, raw, [4096] * 4)
         wanted = [black * np.array([[v - 1, v + 3]]) / (2**bits - 1 - black) for v in planes]
         np.testing.assert_allclose(found, wanted)
     for form, words in (("SRGGB12_CSI2P", "SRGGB12_CSI2P"), ("SRGGB16", "2 rows of 9")):
         with pytest.raises(ValueError, match=words):
-            example.planes_of(array, {"format": form, "size": (9, 2)}, [4096] * 4)
+            picamera2_ae.planes_of(array, {"format": form, "size": (9, 2)}, [4096] * 4)
 
 
 def test_a_bad_reading_holds_the_last_state_and_is_forgotten(exported):
