@@ -419,7 +419,7 @@ def central(settings: CameraSettings, seed: int) -> torch.Tensor:
 REAL = {"motion": 0.3, "depth": 1.0, "lighting": "step", "noise": "exact", "source": "raw"}
 
 
-@pytest.mark.parametrize(("name", "value"), [*REAL.items(), ("noise", False)])
+@pytest.mark.parametrize(("name", "value"), [*REAL.items(), ("noise", False), ("lens", "random")])
 def test_nothing_of_real_captures_can_be_simulated(raws, name, value):
     with pytest.raises(ValueError, match=rf"`{name}` .* must be .* for recorded"):
         make_env(**arguments(raws, **{name: value}))

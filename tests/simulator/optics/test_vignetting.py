@@ -13,7 +13,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.optics.vignetting import Vignetting, get_lens, random_lens
 from simulator.reference.reference_camera import ReferenceCamera
-from tests.ae_env.environments import SMALL, make_env, make_envs
+from tests.ae_env.environments import make_env, make_envs
 
 Z6 = get_camera("nikon_z6")
 CANON = "lensfun:Canon EF 24-70mm f/2.8L II USM"
@@ -186,11 +186,6 @@ def test_each_episode_draws_a_lens_and_its_scores_know_it():
     env.reset(seed=1), plain.reset(seed=1)
     tables = [e.unwrapped.core.score_table(0).mean for e in (env, plain)]
     assert not np.allclose(*tables)
-
-
-def test_recorded_scenes_have_their_own_lens(tmp_path):
-    with pytest.raises(ValueError, match="lens"):
-        make_env(**(SMALL | {"scenes": f"recorded:{tmp_path}", "lens": "random"}))
 
 
 #: 10,000 electrons at white and ISO 100, 5 electrons of read noise, 800 a second in the dark.
