@@ -15,7 +15,7 @@ import torch
 
 from ae_env.lighting.moving import read_pans
 from ae_env.scenes import bundled, polyhaven
-from ae_env.scenes.load import _LOADED, load_scenes
+from ae_env.scenes.load import load_scenes
 from ae_env.scenes.polyhaven import Asset, list_assets
 from ae_env.scenes.scene import SceneRequest
 from examples.depth_scenes import depth_scenes
@@ -26,7 +26,7 @@ from simulator.radiance.maps import perspective
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, KINDS, LeafStyle, dead_leaves
 from simulator.radiance.reading import read_radiance
-from simulator.utils.cache import disk_cache
+from simulator.utils.cache import LruCache, disk_cache
 from tests.ae_env.environments import make_env
 from tests.ae_env.scene_files import write_hdr
 from tests.ae_env.scorer_images import make_scene
@@ -194,16 +194,9 @@ def test_layouts_depend_on_the_name_alone() -> None:
     assert front.layout.defocus.shape == front.layout.subject.shape == front.light.shape[1:]
 
 
-@pytest.fixture
-def empty_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    _LOADED.clear()
-    yield
-    _LOADED.clear()
-
-
-@pytest.mark.usefixtures("empty_cache")
 def test_drawn_one_by_one_they_are_those_drawn_together(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    monkeypatch.setattr("ae_env.scenes.load._LOADED", LruCache(2**30))
     together = load_scenes("bundled:photograph", "test", camera=CAMERA, resolution=36)
     request, part = SceneRequest("test", CAMERA, 36), "photograph"
     loaded = bundled.bundled_scenes(request, part=part)

@@ -248,11 +248,6 @@ def save_networks(folder, *, even):
     return str(folder / "tiny.safetensors"), modules.eval()
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return save_networks(tmp_path_factory.mktemp("weights"), even=True)[0]
-
-
 def noisy_scene() -> Scene:
     rng = np.random.default_rng(0)
     nlf = CAMERA.nlf(NOISY.iso)
@@ -275,8 +270,9 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path):
         make_env(scenes=[noisy_scene()], resolution=40, simulator=str(damaged))
 
 
-def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
+def test_opening_grows_the_scenes_own_defocus(tmp_path) -> None:
     """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
+    weights, _ = save_networks(tmp_path, even=True)
     light = torch.zeros(4, 80, 80)
     light[:, 40:42, 40:42] = 0.9  # a point, without noise, taken at f/8
     reference = CameraSettings(100, 1 / 125, 8)

@@ -27,11 +27,6 @@ TASK = {"task": "ae_env/ExposureBracket-v0", "autoreset_mode": "DISABLED"}
 make_envs = functools.partial(environments.make_envs, **TASK)
 
 
-@pytest.fixture(scope="module")
-def context() -> PolicyContext:
-    return PolicyContext.from_envs(make_envs(4))
-
-
 def test_every_schedule_that_fits_is_there_once() -> None:
     """By hand, each pair and each single state whose time is at most 0.3 s."""
     schedules = Schedules(GRID, CAMERA, LIMITS)
@@ -151,7 +146,8 @@ def test_the_agent_that_ships_is_ahead_of_the_schedule_on_unseen_scenes() -> Non
     assert ours > theirs
 
 
-def test_mistakes_are_named(context: PolicyContext) -> None:
+def test_mistakes_are_named() -> None:
+    context = PolicyContext.from_envs(make_envs(4))
     other = PolicyContext(context.grid, context.camera, context.observation_space)
     statistics = PolicyContext.from_envs(make_envs(4, observation="statistics"))
     for name, where, message in (

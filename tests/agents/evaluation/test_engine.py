@@ -34,20 +34,13 @@ def few() -> dict:
     return {**OPTIONS, "scenes": plan_scenes(EvaluationPlan(environment=OPTIONS, max_scenes=8))}
 
 
-@pytest.fixture(scope="module")
-def result(small, few):
+def test_the_batch_size_changes_nothing_and_a_plan_is_the_same(small, few, tmp_path):
     policies = {n: make_policy(n, small) for n in ("random", "oracle", "matrix:P")}
     policies["random*3"] = [make_policy("random", small) for _ in range(3)]
-    calls = []
-    sizes = {"episodes_per_scene": 2, "frames": 3, "batch": 7}
-    found = evaluate(policies, few, **sizes, progress=lambda *a: calls.append(a))
+    calls, sizes = [], {"episodes_per_scene": 2, "frames": 3}
+    result = evaluate(policies, few, **sizes, batch=7, progress=lambda *a: calls.append(a))
     assert calls[-1][0] == calls[-1][1]
-    return found
-
-
-def test_the_batch_size_changes_nothing_and_a_plan_is_the_same(small, few, result, tmp_path):
-    policies = {"matrix:P": make_policy("matrix:P", small)}
-    again = evaluate(policies, few, episodes_per_scene=2, frames=3, batch=32)
+    again = evaluate({"matrix:P": policies["matrix:P"]}, few, **sizes, batch=32)
     entries = {"starts": ("random",), "seeds": (0, 1), "frames": 3, "policies": ("matrix:P",)}
     plan = EvaluationPlan(environment=OPTIONS, max_scenes=8, **entries)
     for other in (again, run_plan(plan, tmp_path)["static"]):

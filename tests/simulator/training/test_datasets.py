@@ -31,12 +31,6 @@ SPLITS = ("train", "validation", "test")
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
-@pytest.fixture(scope="module")
-def scenes() -> dict[str, list[ReferenceScene]]:
-    numbers = zip(SPLITS, (28, 4, 4), strict=True)
-    return {split: reference_scenes(split, CAMERA, number=n, size=48) for split, n in numbers}
-
-
 def blur(scene: ReferenceScene) -> np.ndarray:
     """Circle of confusion at f/11 [packed pixels of 11.88 um] by the thin-lens formula."""
     f, s, z = scene.lens.focal_length, scene.lens.focus_distance, scene.depth.double().numpy()
@@ -51,7 +45,9 @@ def assert_no_group_is_shared(made: dict[str, list]) -> None:
     assert len(set(names)) == len(names)
 
 
-def test_splits_are_apart_and_scenes_the_same_however_many(scenes):
+def test_splits_are_apart_and_scenes_the_same_however_many():
+    numbers = zip(SPLITS, (28, 4, 4), strict=True)
+    scenes = {split: reference_scenes(split, CAMERA, number=n, size=48) for split, n in numbers}
     assert_no_group_is_shared(scenes)
     fewer = reference_scenes("validation", CAMERA, number=2, size=48)[:2]
     for scene, again in zip(scenes["validation"], fewer, strict=False):
@@ -280,8 +276,7 @@ def nikon_row(path, **changes):
     return [*(dict(zip(NIKON, values, strict=True)) | changes).values()]
 
 
-@pytest.fixture
-def nikon(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
+def test_the_authors_nikon_files_and_a_partial_copy_of_them(tmp_path, caplog):
     """Two sequences with one table above them, paths beginning where the script ran."""
     rng, root, mosaics = np.random.default_rng(0), tmp_path / "Nikon", {}
     for name in ("scene_001/DSC_0001", "scene_001/DSC_0002", "scene_002/DSC_0001"):
@@ -290,11 +285,6 @@ def nikon(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
         author_file(root / f"{name}.npy", mosaics[name], 1008, 15520)
     rows = (nikon_row(f"./ProcessedData/Nikon/{name}.jpg") for name in mosaics)
     author_table(root / "camera_params.csv", NIKON, *rows)
-    return root, mosaics
-
-
-def test_the_authors_nikon_files_and_a_partial_copy_of_them(nikon, caplog):
-    root, mosaics = nikon
     sequences = read_dataset(root)
     assert [(s.name, len(s.captures)) for s in sequences] == [("scene_001", 2), ("scene_002", 1)]
     raw = sequences[0].captures[1].read()
