@@ -42,15 +42,13 @@ USUAL_SETTINGS = settings_within((50, 409_600), (1 / 8000, 30), (1, 32))
 
 
 @st.composite
-def cameras(draw: st.DrawFn, *, noise: bool = True) -> CameraProfile:
+def cameras(draw: st.DrawFn) -> CameraProfile:
     """Bodies of any CFA order, levels and depth, calibrated at one ISO."""
     white = draw(st.integers(1, 2**16 - 1))
     quarters = st.integers(0, 4 * white - 1).map(lambda number: number / 4)
     black = draw(st.one_of(quarters.map(lambda b: (b,) * 4), st.tuples(*[quarters] * 4)))
-    nlf = NoiseLevelFunction.zero()
-    if noise:
-        ranges = (1e-6, 1e-2), (1e-9, 1e-3)  # of shot and read noise
-        nlf = NoiseLevelFunction(*(draw(st.tuples(*[log_uniform(*r)] * 4)) for r in ranges))
+    ranges = (1e-6, 1e-2), (1e-9, 1e-3)  # of shot and read noise
+    nlf = NoiseLevelFunction(*(draw(st.tuples(*[log_uniform(*r)] * 4)) for r in ranges))
     order = draw(st.sampled_from(list(BayerPattern)))
     depth = white.bit_length()
     return CameraProfile("drawn", order, black, white, depth, nlf_by_iso={100.0: nlf})

@@ -15,7 +15,7 @@ from simulator import get_camera
 from simulator.networks import aperture_module, noise_module
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import SIZES, Denoiser, NoiseModule, Stabiliser
-from simulator.networks.unet import AttentionUNet, SkipAttention, UNet, instance_norm
+from simulator.networks.unet import AttentionUNet, SkipAttention, UNet
 from simulator.networks.weights import BUILDERS, build_modules
 from simulator.optics.discs import disc_blur
 from simulator.reference.thin_lens import Lens
@@ -346,13 +346,6 @@ def test_against_a_transcription() -> None:
     upsampled = F.interpolate(level(F.max_pool2d(fine, 2)), scale_factor=2, mode="bilinear")
     expected = convolved(level(torch.cat([upsampled, fine], dim=1)))
     torch.testing.assert_close(net(image), expected, rtol=1e-10, atol=1e-12)
-
-
-def test_instance_norm_is_torchs() -> None:
-    x, scale, shift = normal(2, 3, 5, 7) * 0.3 + 2.0, normal(3, seed=1), normal(3, seed=2)
-    ours = instance_norm(x, scale.expand(2, -1), shift.expand(2, -1))
-    theirs = F.instance_norm(x, weight=scale, bias=shift, eps=1e-5)
-    torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
 def test_channel_attention_needs_only_the_f_numbers() -> None:

@@ -383,16 +383,6 @@ def test_the_aperture_only_opens_and_seldom_stays():
 # -- the thin lens --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
-@pytest.mark.parametrize("depth", [0.3, 1.0, 2.0, 500.0])
-def test_circle_of_confusion_follows_from_similar_triangles(focus, depth):
-    # The cone from the aperture (diameter f / N) converges at v, the sensor stands at v_focus.
-    v, v_focus = (1.0 / (1.0 / 0.05 - 1.0 / distance) for distance in (depth, focus))
-    expected = (0.05 / 2.8) * (v_focus - v) / v
-    found = Lens(0.05, focus).circle_of_confusion(depth, 2.8)
-    assert found == pytest.approx(expected, rel=1e-12, abs=1e-18)
-
-
 @pytest.mark.parametrize("case", ["step", "ramp", "through_focus", "stairs", "noise", "islands"])
 def test_equal_light_shows_no_seam(case):
     rng = np.random.default_rng(3)
