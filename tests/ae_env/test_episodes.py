@@ -247,7 +247,7 @@ BANDED["lighting"] = {"kind": "flicker", "frequency": 500, "duty": 0.2}
     ("mode", "extra"),
     [
         *((mode.name, RICH) for mode in AutoresetMode),
-        *(("SAME_STEP", extra) for extra in ({"noise": "exact"}, BANDED)),
+        *(("SAME_STEP", extra) for extra in (BANDED, {"noise": "exact"}, {"with_subject": True})),
     ],
 )
 def test_parity_with_sync_vector_env(mode, extra):
