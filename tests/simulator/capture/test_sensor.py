@@ -44,22 +44,6 @@ def exposure_of(settings: CameraSettings) -> float:
     return settings.iso * settings.exposure_time * AREA[settings.f_number]
 
 
-def patches(levels: np.ndarray) -> torch.Tensor:
-    """(4, L * ROWS, COLUMNS): one flat patch per level; `levels` is (L,) or (4, L)."""
-    levels = np.broadcast_to(levels, (4, np.shape(levels)[-1]))
-    flat = np.repeat(levels, ROWS, axis=1)[:, :, None].repeat(COLUMNS, axis=2)
-    return torch.from_numpy(flat.astype(np.float32))
-
-
-def numbers_of(capture: torch.Tensor, levels: int) -> np.ndarray:
-    """Digital numbers (4, L, pixels), asserted to lie on the camera's integer lattice."""
-    numbers = capture.double().numpy() * SPAN + BLACK
-    assert np.abs(numbers - np.rint(numbers)).max() < 2e-3  # float32 near 15520
-    assert numbers.min() >= -2e-3
-    assert numbers.max() <= WHITE + 2e-3
-    return np.rint(numbers).reshape(4, levels, ROWS * COLUMNS)
-
-
 def recorded_moments(mean: float, variance: float) -> tuple[float, float, float]:
     """Mean, variance and fourth central moment [DN] of Gaussian light on an integer sensor.
 
@@ -101,11 +85,16 @@ def test_noise_free_source_over_all_states() -> None:
     samples, expected = [], []
     for state in STATES:
         ratio = exposure_of(state) / exposure_of(reference)
-        light = patches(levels / ratio)
+        light = np.repeat(levels / ratio, ROWS).astype(np.float32)  # a flat patch of each
+        light = torch.from_numpy(light)[:, None].repeat(4, 1, COLUMNS)
         prepared = PreparedScene(light, reference, Z6, ZERO)
         capture, excess = prepared.capture(state, seed=1)
         assert excess == 0.0
-        samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
+        numbers = capture.double().numpy() * SPAN + BLACK
+        assert np.abs(numbers - np.rint(numbers)).max() < 2e-3  # float32 near 15520
+        assert numbers.min() >= -2e-3
+        assert numbers.max() <= WHITE + 2e-3
+        samples.append(np.rint(numbers).reshape(-1, ROWS * COLUMNS))
         shot, read = z6_noise(state.iso)[..., None]
         variance = read + shot * levels - 1.0 / (12.0 * Z6.span[0] ** 2)  # what rounding adds
         for row in variance:

@@ -3,7 +3,6 @@
 import importlib.util
 import math
 import sys
-from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 
@@ -32,26 +31,13 @@ PATHS = [
 ]
 
 
-def _velocity(path: Path) -> np.ndarray:
-    """Of x and y in 2000 parts of the exposure, (2, 2000)."""
-    angle = path.direction + path.turn * (np.arange(2000) + 0.5) / 2000
-    x, y = path.extent * np.cos(angle), path.extent * np.sin(angle)
-    return np.stack([x + path.drift_x, y + path.drift_y])
-
-
-def _dense(taps: motion.Taps) -> np.ndarray:
-    """The taps as an odd kernel that `scipy.ndimage.correlate` takes."""
-    reach = int(max(np.abs(taps.rows).max(), np.abs(taps.columns).max()))
-    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
-    np.add.at(kernel, (taps.rows + reach, taps.columns + reach), taps.weights.astype(float))
-    return kernel
-
-
 @pytest.mark.parametrize("path", PATHS)
 def test_taps_have_the_moments_of_the_path(path: Path) -> None:
     taps = path_taps(path, 200, 200)
     weights = taps.weights.astype(float)
-    velocity = _velocity(path)
+    angle = path.direction + path.turn * (np.arange(2000) + 0.5) / 2000  # in parts of the exposure
+    x, y = path.extent * np.cos(angle), path.extent * np.sin(angle)
+    velocity = np.stack([x + path.drift_x, y + path.drift_y])
     assert path.length == pytest.approx(np.hypot(*velocity).mean(), rel=2e-3)
     variances = (np.cumsum(velocity, axis=1) / 2000).var(axis=1)
     assert weights.sum() == pytest.approx(1.0, abs=1e-6)
@@ -76,7 +62,10 @@ def test_blur_is_a_sum_of_shifts(path: Path, size: tuple[int, int]) -> None:
     """By SciPy, whose ``nearest`` replicates the border; shifts may leave the frame."""
     light = torch.rand(3, *size, generator=torch.Generator().manual_seed(1))
     blurred = path_blur(light, path_taps(path, *size))
-    kernel = _dense(path_taps(path, 100, 100))
+    taps = path_taps(path, 100, 100)
+    reach = int(max(np.abs(taps.rows).max(), np.abs(taps.columns).max()))
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    np.add.at(kernel, (taps.rows + reach, taps.columns + reach), taps.weights.astype(float))
     for plane, found in zip(light.double().numpy(), blurred, strict=True):
         wanted = correlate(plane, kernel, mode="nearest")
         np.testing.assert_allclose(found, wanted, atol=1e-5)
@@ -90,10 +79,6 @@ STARTS = (0.0, 0.0013, 0.00499999, 3.7)
 LATER = (3600.123, 86_400.7, -1e6 / 3)
 
 
-def integral(light: Callable[[float], float], begin: float, end: float) -> float:
-    return quad(light, begin, end, epsabs=0, epsrel=1e-12, limit=500)[0]
-
-
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("frequency", [100.0, 120.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0])
@@ -103,8 +88,8 @@ def test_mains_light_is_its_integral(time, frequency, depth):
 
     lamp = MainsLamp(frequency, depth, phase=0.2)
     for start in STARTS:
-        expected = integral(light, start, start + time) / time
-        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
+        whole, _ = quad(light, start, start + time, epsabs=0, epsrel=1e-12, limit=500)
+        assert lamp.mean_light(start, time) == pytest.approx(whole / time, rel=1e-9)
 
 
 def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction) -> Fraction:

@@ -393,22 +393,14 @@ def test_a_real_raw_looks_as_libraw_shows_it(data_dir):
     assert np.quantile(np.abs(difference), 0.999) < 1.5
 
 
-PATTERNS = [p.value for p in BayerPattern]
-
-
-def pack(mosaic: np.ndarray, pattern: str) -> torch.Tensor:
-    """(2H, 2W) float mosaic to (1, 4, H, W), by the letters of the pattern alone."""
-    red, blue = pattern.index("R"), pattern.index("B")
-    tiles = [mosaic[i // 2 :: 2, i % 2 :: 2] for i in (red, red ^ 1, blue ^ 1, blue)]
-    return torch.from_numpy(np.stack(tiles))[None]
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 5e-7)])
 @pytest.mark.parametrize("size", [(4, 4), (4, 10), (6, 4), (22, 34)])
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", [p.value for p in BayerPattern])
 def test_malvar_equals_colour_demosaicing_of_a_mirrored_mosaic(pattern, size, dtype, tolerance):
     mosaic = np.random.default_rng(1).random(size)
-    packed = pack(mosaic, pattern).to(dtype)
+    red, blue = pattern.index("R"), pattern.index("B")  # packed by the letters alone
+    tiles = [mosaic[i // 2 :: 2, i % 2 :: 2] for i in (red, red ^ 1, blue ^ 1, blue)]
+    packed = torch.from_numpy(np.stack(tiles))[None].to(dtype)
     ours = developing.demosaic_malvar(packed, pattern)
     assert ours.dtype == dtype
     batch = developing.demosaic_malvar(torch.cat([packed.flip(3), packed]), pattern)

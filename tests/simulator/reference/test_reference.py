@@ -45,17 +45,14 @@ def flat(level: float, size: int = 8) -> torch.Tensor:
     return torch.full((4, size, size), level)
 
 
-def diameter_px(depth: float, stop: float, pitch: float = 10e-6) -> float:
-    """Similar triangles with f = 50 mm, focused at 2 m, on a grid of `pitch` metres."""
-    image, focus = 1 / (1 / 0.05 - 1 / depth), 1 / (1 / 0.05 - 1 / 2.0)
-    return 0.05 / stop * abs(focus - image) / image / pitch
-
-
 @pytest.mark.parametrize("depth", [1.2, 1.5, 4.0])
 def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth):
     camera, light = ReferenceCamera(sensor(1e-4, 1e-7)), torch.zeros(4, 41, 41)
     light[:, 20, 20] = 1e4
-    shot, expected = scene(light, torch.full((41, 41), depth)), diameter_px(depth, 4.0)
+    shot = scene(light, torch.full((41, 41), depth))
+    # Similar triangles with f = 50 mm, focused at 2 m, on a grid of 10 um.
+    image, focus = 1 / (1 / 0.05 - 1 / depth), 1 / (1 / 0.05 - 1 / 2.0)
+    expected = 0.05 / 4.0 * abs(focus - image) / image / 10e-6
     np.testing.assert_allclose(camera.blur_diameter(shot, 4.0), expected, rtol=1e-5)
     spread = camera.blurred_light(shot, 4.0).double().numpy() / 1e4
     np.testing.assert_allclose(spread.sum((1, 2)), 1.0, rtol=1e-5)
