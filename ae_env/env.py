@@ -86,32 +86,29 @@ class AutoExposure(Task):
         # Of the parts that depend on a scene's light alone; NaN where they are not known.
         self._of_light = [n for n in self._known if depends_on(torch_parts[n]) == "light"]
         self._light_scores = np.full((len(episodes.scenes), states, len(self._of_light)), np.nan)
-        self._means = np.full((lights, states, 3), np.nan)
+        self._means = options.placed(np.zeros((lights, states, 3) if expected else 0))
+        self._expected = np.zeros((lights, states), bool)  # whether these means are known
         self._shown = ShownScenes(episodes.scenes, terms.captures)
         self._tables: LruCache[ScoreTable] = LruCache(max(TABLES_BYTES, 128 * count * states))
 
     def forget(self, lights: np.ndarray) -> None:
         """Makes the scores under these `Episodes.light_index` unknown."""
-        self._scored[lights] = False
-        self._means[lights] = np.nan
+        self._scored[lights] = self._expected[lights] = False
 
-    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
+    def measure(self, frames: FrameBatch) -> dict[str, Any]:
         """Scores (B,) by ``score:`` and part, and ``image_mean`` where a cost needs it."""
-        columns: dict[str, np.ndarray] = {}
+        columns: dict[str, Any] = {}
         if not self._reads_tables:
             columns = {f"score:{name}": each for name, each in self._score(frames).items()}
         if "flicker" in self.episodes.options.costs:
             flat = frames.outputs["codes"].reshape(len(frames.gains), -1)
-            if torch.is_tensor(flat):
-                total = flat.sum(dim=1, dtype=torch.int64).cpu().numpy()
-            else:
-                total = flat.sum(axis=1, dtype=np.int64)
-            columns["image_mean"] = total / (255.0 * flat.shape[1])
+            integers: Any = torch.int64 if torch.is_tensor(flat) else np.int64
+            columns["image_mean"] = flat.sum(1, dtype=integers) / (255.0 * flat.shape[1])
         return columns
 
     def reward(
-        self, env_indices: np.ndarray, columns: dict[str, np.ndarray]
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        self, env_indices: np.ndarray, columns: dict[str, Any]
+    ) -> tuple[dict[str, Any], Any]:
         """Terms of the reward by name, and the reward (B,): the score minus weighted costs.
 
         Takes the scores and the image means out of `columns`, and adds the oracle's.
@@ -123,28 +120,28 @@ class AutoExposure(Task):
         if self._reads_tables:  # the expectation takes captures to work out
             pairs = list(zip(tables, states.tolist(), strict=True))
             terms = {n: np.array([t.parts[n][s] for t, s in pairs]) for n in self.scorer.parts}
-            terms["score"] = np.array([table.mean[state] for table, state in pairs])
+            terms["score"] = options.placed(np.array([table.mean[state] for table, state in pairs]))
         else:
-            terms = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
+            terms = {n: options.placed(columns.pop(f"score:{n}")) for n in self.scorer.parts}
             terms["score"] = self.scorer.totals(terms)
-        reward = terms["score"].copy()
+        reward = 1.0 * terms["score"]
         for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
             terms[name] = cost
-            reward -= options.costs[name] * cost
+            reward -= options.costs[name] * options.placed(cost)
         if options.with_oracle:
             best = np.array([t.mean[t.oracle] for t in tables])
             columns["oracle_state"] = np.array([t.oracle for t in tables])
             columns["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
         return terms, reward
 
-    def _costs(self, env_indices: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
+    def _costs(self, env_indices: np.ndarray, means: Any) -> dict[str, Any]:
         """(B,) each; 0 in the first frame of an episode."""
         episodes, costs = self.episodes, self.episodes.options.costs
-        found: dict[str, np.ndarray] = {}
+        found: dict[str, Any] = {}
         first = episodes.previous[env_indices] < 0
         if means is not None:
-            change = np.abs(means - episodes.image_mean[env_indices])
-            found["flicker"] = np.where(first, 0.0, change)
+            found["flicker"] = abs(means - episodes.image_mean[env_indices])
+            found["flicker"][np.flatnonzero(first)] = 0.0
             episodes.image_mean[env_indices] = means
         if "switch" in costs:
             now = episodes.grid.controls(episodes.state[env_indices])
@@ -176,16 +173,16 @@ class AutoExposure(Task):
             self._tables.put(key, table, table.nbytes)
         return table
 
-    def _score(self, frames: FrameBatch) -> dict[str, np.ndarray]:
+    def _score(self, frames: FrameBatch) -> dict[str, Any]:
         """Scores (B,) of the captures by part."""
         episodes, terms = self.episodes, self._terms
         boxes = episodes.box_factor[episodes.scene[frames.env_indices]]
         source_noise = frames.statistics.source_noise * np.square(boxes)[:, None, None]
         captures: Captures | None = None
         if self._reads_images or not episodes.static or terms.reads_captures:
-            captures = self._describe(frames, source_noise)
+            captures = self._describe(frames, source_noise, device=episodes.options.torch_device)
         if episodes.static:
-            scores = self._known_scores(frames, source_noise)
+            scores: dict[str, Any] = self._known_scores(frames, source_noise)
         else:
             assert captures is not None
             scores = terms.torch_scores(None, captures, "light", "blur")
@@ -237,20 +234,21 @@ class AutoExposure(Task):
 
     def _expected_means(
         self, frames: FrameBatch, transitions: FindTransitions, boxes: np.ndarray
-    ) -> np.ndarray:
+    ) -> Any:
         """`TermScores.expected` of the captures; in static light, cached."""
         episodes, env_indices = self.episodes, frames.env_indices
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
-        missing = np.isnan(self._means[lights, states, 0]) | (not episodes.static)
+        missing = ~self._expected[lights, states] | (not episodes.static)
         if missing.any():
             exposed = transitions(lights[missing], states[missing])
             some = None if frames.rows is None else frames.rows[missing]
             found = self._terms.expected(exposed, states[missing], boxes[missing], some)
             self._means[lights[missing], states[missing]] = found
+            self._expected[lights[missing], states[missing]] = True
         return self._means[lights, states]
 
     def _describe(
-        self, frames: FrameBatch, source_noise: np.ndarray, part: Any = slice(None)
+        self, frames: FrameBatch, source_noise: np.ndarray, part: Any = slice(None), **where: Any
     ) -> Captures:
         episodes, env_indices = self.episodes, frames.env_indices[part]
         noises, rows = None, frames.rows
@@ -265,6 +263,7 @@ class AutoExposure(Task):
             gain=frames.gains[part],
             row_gain=None if rows is None else rows[part],
             source_noise=noises,
+            **where,
         )
 
     def _moves(self, env_indices: np.ndarray) -> dict[str, Any]:
@@ -365,8 +364,8 @@ class AutoExposureBase(SpecProperty):
                 torch.as_tensor(self._last.raw[i]).cpu().numpy(),
                 self.scene(i),
                 self.camera,
-                self.grid[info["state"].item(i)],
-                scores.item(i),
+                self.grid[int(info["state"][i])],
+                float(scores[i]),
             )
             for i in range(num_envs)
         )

@@ -72,6 +72,23 @@ def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def tensor_statistics(codes: torch.Tensor) -> dict[str, torch.Tensor]:
+    """`frame_statistics` of codes on any device; means are off by rounding."""
+    import torch
+
+    lights = decode_observation(np.arange(256, dtype=np.uint8))
+    means = torch.from_numpy(lights).to(codes.device)[codes.long()]
+    for size, zones in zip(codes.shape[:1:-1], ZONES[::-1], strict=True):  # columns, then rows
+        inside = np.repeat(np.eye(zones), np.diff(np.arange(zones + 1) * size // zones), axis=1)
+        shares = inside / inside.sum(axis=1, keepdims=True)
+        means = (means @ torch.from_numpy(shares.T).to(means)).mT
+    flat = codes.flatten(1).long()
+    counts = flat.new_zeros(len(flat), 256).scatter_add_(1, flat, torch.ones_like(flat))
+    shares = counts.float() / flat.shape[1]
+    found = {"raw": encode_observation(means), "clipped": shares[:, [255, 0]]}
+    return found | {"histogram": shares.view(len(flat), HISTOGRAM_BINS, -1).sum(dim=2)}
+
+
 def decode_observation(raw: np.ndarray) -> np.ndarray:
     """Signal of the codes `raw`, float32 in [-1/1024, 1]: the inverse of `encode_observation`.
 

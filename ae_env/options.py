@@ -192,6 +192,14 @@ class EnvOptions:
         """Where torch makes the frames; None where compiled loops make them."""
         return None if self.device is None else check_device(self.device)
 
+    def placed(self, values: Any) -> Any:
+        """Numbers as they leave the environment: with a device tensors on it, floats in float32."""
+        if self.torch_device is None:
+            return values
+        tensor = torch.as_tensor(values)
+        dtype = torch.float32 if tensor.is_floating_point() else tensor.dtype
+        return tensor.to(self.torch_device, dtype)
+
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
         """Options from a mapping; a `ValueError` for an unknown one proposes the nearest name."""

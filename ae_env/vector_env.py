@@ -39,8 +39,8 @@ class AutoExposureVectorEnv(
             values (``"SameStep"``), too.
         max_episode_steps: Steps after which an episode is truncated; None for never.
 
-    All other arguments are those of `AutoExposureEnv`. With a `device`, observations, rewards
-    (float32) and flags are torch tensors on it, and actions may be; the info stays NumPy's.
+    All other arguments are those of `AutoExposureEnv`. With a `device`, observations, rewards,
+    flags and info are torch tensors on it, floats in float32; actions may be.
     """
 
     @takes_env_arguments()
@@ -156,16 +156,8 @@ class AutoExposureVectorEnv(
             self._done = done
             infos = self._vector_info(frames.info, self._all)
             observation = self._shown(frames)
-        flags = frames.reward, terminated, truncated
-        return observation, *(self._on_device(values) for values in flags), infos
-
-    def _on_device(self, values: np.ndarray) -> Any:
-        """Rewards or flags, as tensors where the environment has a device."""
-        device = self.core.options.torch_device
-        if device is None:
-            return values
-        single = values.astype(np.float32) if values.dtype.kind == "f" else values
-        return torch.from_numpy(single).to(device)
+        placed = self.core.options.placed
+        return observation, frames.reward, placed(terminated), placed(truncated), infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture (H, W, 3) uint8 per environment, as `AutoExposureEnv.render` draws it.
@@ -222,9 +214,12 @@ class AutoExposureVectorEnv(
         info: dict[str, Any] = {}
         masks = np.zeros((len(columns), self.num_envs), dtype=bool)
         masks[:, env_indices] = True
+        masks = self.core.options.placed(masks)
         for mask, (name, values) in zip(masks, columns.items(), strict=True):
             if len(env_indices) < self.num_envs:
-                some, values = values, np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
+                made: Any = torch.zeros if torch.is_tensor(values) else np.zeros
+                some, shape = values, (self.num_envs, *values.shape[1:])
+                values = self.core.options.placed(made(shape, dtype=some.dtype))
                 values[env_indices] = some
             info[name], info[f"_{name}"] = values, mask
         return info

@@ -25,6 +25,7 @@ from ae_env.observation import (
     encode_sensors,
     encode_settings,
     frame_statistics,
+    tensor_statistics,
 )
 from ae_env.options import RANDOM_LENS, EnvOptions
 from ae_env.scenes.scene import Scene
@@ -49,12 +50,13 @@ _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "linear", "dn": "
 class Frames:
     """Observations, info and rewards of n episodes after a reset or a step."""
 
-    #: Arrays by name, n long; new ones every time. Tensors where the environment has a device.
+    #: Arrays by name, n long; new ones every time. Where the environment has a device, all are
+    #: tensors on it, with floats in float32.
     observation: dict[str, Any]
     #: Columns of numbers by name, n long. ``scene_id`` and ``modules`` are indices into
     #: `EpisodeCore.scene_ids` and `AutoExposureBase.module_names`.
     info: dict[str, Any]
-    reward: np.ndarray  # (n,) float64
+    reward: Any  # (n,) float64, or a float32 tensor
     raw: Any  # (n, 4, R, R) the whole frames, also where less of them is observed
 
 
@@ -117,13 +119,13 @@ class Task:
         """What is observed beside the latest frame, (B, ...) by name."""
         return {}
 
-    def measure(self, frames: FrameBatch) -> dict[str, np.ndarray]:
+    def measure(self, frames: FrameBatch) -> dict[str, Any]:
         """Columns (B,) that `reward` takes, from the frames just recorded."""
         raise NotImplementedError
 
     def reward(
-        self, env_indices: np.ndarray, columns: dict[str, np.ndarray]
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        self, env_indices: np.ndarray, columns: dict[str, Any]
+    ) -> tuple[dict[str, Any], Any]:
         """Terms of the reward by name, and the reward (B,); `columns` become those of the info."""
         raise NotImplementedError
 
@@ -267,7 +269,7 @@ class EpisodeCore:
         raw, columns = self._capture(env_indices)
         shown = {"raw": raw}
         if options.observation == "statistics":
-            shown = frame_statistics(torch.as_tensor(raw).cpu().numpy())
+            shown = (frame_statistics if options.device is None else tensor_statistics)(raw)
         observation = shown | {"settings": self._settings[states]}
         if options.sensors:
             speed, focus_drive = episodes.speed[env_indices], episodes.focus_drive[env_indices]
@@ -275,8 +277,6 @@ class EpisodeCore:
             observation["sensors"] = encode_sensors(speed, focus_drive, normals)
         terms, reward = self.task.reward(env_indices, columns)
         observation |= self.task.observation(env_indices)
-        if (device := options.torch_device) is not None:
-            observation = {n: torch.as_tensor(v, device=device) for n, v in observation.items()}
         info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
         info |= zip(_STATE_INFO, self._state_info[:, states], strict=True)
         info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
@@ -286,7 +286,8 @@ class EpisodeCore:
                 layout = self.scenes[scene].layout
                 if layout is not None and layout.subject is not None:
                     mask[:] = layout.subject.numpy()
-        return Frames(observation, info, reward, raw)
+        shown, info = ({n: options.placed(v) for n, v in d.items()} for d in (observation, info))
+        return Frames(shown, info, reward, raw)
 
     def _memory(self, count: int, name: str) -> Any:
         """Memory for `count` frames of an output of `FrameSource.record`."""
@@ -295,7 +296,7 @@ class EpisodeCore:
             return np.empty(shape, _DTYPES[name])
         return torch.empty(shape, dtype=getattr(torch, np.dtype(_DTYPES[name]).name), device=device)
 
-    def _capture(self, env_indices: np.ndarray) -> tuple[Any, dict[str, np.ndarray]]:
+    def _capture(self, env_indices: np.ndarray) -> tuple[Any, dict[str, Any]]:
         """Frames (B, 4, R, R) as they are observed, and columns of the info and of the task."""
         options, episodes = self.options, self.episodes
         size = options.resolution
@@ -313,11 +314,13 @@ class EpisodeCore:
             chunks.append(self._capture_chunk(env_indices[part], gains[part], some, raw[part]))
         if len(chunks) == 1:
             return raw, chunks[0]
-        return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
+        each = {name: [chunk[name] for chunk in chunks] for name in chunks[0]}
+        join: dict[bool, Any] = {True: torch.cat, False: np.concatenate}
+        return raw, {n: join[torch.is_tensor(values[0])](values) for n, values in each.items()}
 
     def _capture_chunk(
         self, env_indices: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: Any
-    ) -> dict[str, np.ndarray]:
+    ) -> dict[str, Any]:
         """Columns of the episodes of `env_indices`; their observations are written to `raw`."""
         episodes = self.episodes
         outputs: dict[str, Any] = {_OUTPUTS[self.options.observation]: raw}

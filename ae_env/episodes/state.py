@@ -89,7 +89,7 @@ class Episodes:
         previous: (n,) int64, state in the frame before; -1 in the first.
         pending: (n, longest delay + 1) int64, actions that are not wholly in effect yet and the
             last that is, the oldest first.
-        image_mean: (n,) float64, mean code of the latest frame / 255, where a cost needs it.
+        image_mean: (n,) mean code of the latest frame / 255, where a cost needs it.
 
     The others, (n,) each, are those of `Episode`.
     """
@@ -114,7 +114,7 @@ class Episodes:
         self.begun = np.zeros(count, bool)
         self.light_index, self.previous = np.zeros((2, count), np.int64)
         self.pending = np.zeros((count, max(options.delays) + 1), np.int64)
-        self.image_mean = np.full(count, np.nan)
+        self.image_mean = options.placed(np.full(count, np.nan))
         self._learn_about_scenes()
         # The states that a scene allows come first in its row, in order.
         self._starts = np.argsort(~self.allowed, axis=1, kind="stable")

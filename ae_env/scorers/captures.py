@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
-from functools import cached_property
+from functools import cached_property, wraps
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -30,6 +30,7 @@ from simulator.utils.compute import kernel
 #: In place of `Layout.shares` where all pixels have the same blur.
 _ALIKE = np.array([[-1.0], [0.0], [1.0]])
 _WIDEST = DIAMETERS[-1]
+_CPU = torch.device("cpu")
 Fact = TypeVar("Fact")
 ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
@@ -70,7 +71,13 @@ class PixelBlur(NamedTuple):
 
 def _fact(work_out: Callable[[Any], Fact]) -> cached_property[Fact]:
     """A property that is worked out once: tensors that count writes, whatever the scorer's mode."""
-    return cached_property(torch.inference_mode(False)(work_out))
+
+    @wraps(work_out)
+    def placed(captures: Any) -> Any:
+        found = work_out(captures)
+        return found.to(captures.device) if torch.is_tensor(found) else found
+
+    return cached_property(torch.inference_mode(False)(placed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +99,7 @@ class Captures:
     source_noise: Sequence[NoiseLevelFunction] | None = None
     noisy: bool = True  #: whether the captures have noise
     prnu: float = 0.0  #: `CameraProfile.prnu`, of native pixels
+    device: torch.device = _CPU  #: where all tensors are, and the images
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -138,7 +146,8 @@ class Captures:
     @property
     def pixel_blur(self) -> PixelBlur | None:
         """How many pixels have which extent of blur; None where all have `blur_px`."""
-        return self._blur[1]
+        spread = self._blur[1]
+        return spread and PixelBlur(*(values.to(self.device) for values in spread))
 
     @_fact
     def scene_light(self) -> torch.Tensor:
@@ -305,6 +314,7 @@ class SceneCaptures:
         gain: np.ndarray,
         row_gain: np.ndarray | None = None,
         source_noise: Sequence[NoiseLevelFunction] | None = None,
+        device: torch.device | None = None,
     ) -> Captures:
         """Captures of a scene each, all (B,) long.
 
@@ -315,7 +325,7 @@ class SceneCaptures:
             movements: (B, 4) numbers of each `Movement`, in its order; None for along the rows.
             gain: (B,) light relative to the scenes' own.
             row_gain: (B, H) light of each row relative to that; None where all rows have the same.
-            source_noise: See `Captures`.
+            source_noise, device: See `Captures`.
         """
         if not isinstance(scenes, ShownScenes):  # some are shown often
             _, first, which = np.unique([*map(id, scenes)], return_index=True, return_inverse=True)
@@ -323,12 +333,13 @@ class SceneCaptures:
         assert which is not None
         states = np.arange(len(self.states)) if states is None else states
         movements = np.zeros((len(which), 4)) if movements is None else movements
-        rows, indices = None if row_gain is None else torch.from_numpy(row_gain), states.tolist()
+        device, indices = device or _CPU, states.tolist()
+        rows = None if row_gain is None else torch.from_numpy(row_gain).to(device)
         settings, nlf = [self.states[i] for i in indices], [self._nlf[i] for i in indices]
         # Copies: facts that are worked out later must not depend on what the caller does meanwhile.
         moves = [*map(np.array, (states, speed, defocus, movements))]
         own = np.array(which), self._log2_exposures[states], np.array(gain), moves
-        more = rows, source_noise, self.noisy, self.camera.prnu
+        more: Any = rows, source_noise, self.noisy, self.camera.prnu, device
         return Captures(settings, nlf, scenes, *own, *more)
 
     def describe(

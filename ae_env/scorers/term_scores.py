@@ -9,7 +9,6 @@ All other parts of a scorer are torch's.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numba
@@ -107,12 +106,15 @@ class TermScores:
 
     def torch_scores(
         self, images: torch.Tensor | None, captures: Captures, *kinds: DependsOn
-    ) -> dict[str, np.ndarray]:
-        """Scores (B,) of `torch_terms` that depend on `kinds`, as of `score_parts`."""
+    ) -> dict[str, Any]:
+        """Scores (B,) of `torch_terms` that depend on `kinds`, as of `score_parts`.
+
+        They are arrays, or tensors on another device than the CPU.
+        """
         if self.torch_terms is None:
             return {}
         scores = self.torch_terms.score_parts(images, captures, kinds)
-        return {name: values.numpy() for name, values in scores.items()}
+        return {n: values.numpy() if values.is_cpu else values for n, values in scores.items()}
 
     def closed_form_terms(
         self,
@@ -157,8 +159,8 @@ class TermScores:
         shares: np.ndarray = Noise().shares(_SIGNALS, torch.from_numpy(variance).float()).numpy()
         return shares
 
-    def score(self, means: np.ndarray, captures: Captures | None) -> dict[str, np.ndarray]:
-        """Scores (B,) float64 by part, from the `means` (B, 3) of `measured` or `expected`."""
+    def score(self, means: Any, captures: Captures | None) -> dict[str, Any]:
+        """Scores (B,) by part, from the `means` (B, 3) of `measured` or `expected`."""
         return {name: _score(part, means, captures) for name, part in self.parts.items()}
 
     def _shares_of_frames(
@@ -175,11 +177,11 @@ class TermScores:
 
     def measured(
         self, codes: np.ndarray | torch.Tensor, states: np.ndarray, source_noise: np.ndarray
-    ) -> np.ndarray:
+    ) -> Any:
         """Means (B, 3) of recorded frames: shares of blown and of blocked samples, and `noise`.
 
         Args:
-            codes: (B, 4, H, W) uint8 of the frames; where they are a tensor, its device counts.
+            codes: (B, 4, H, W) uint8 of the frames; a tensor on any device gives one on it.
             states: (B,) at which they were taken.
             source_noise: (B, 2, 4) shot and read noise of the sources, of a native pixel.
         """
@@ -200,18 +202,19 @@ class TermScores:
         states: np.ndarray,
         box_factors: np.ndarray,
         row_gain: np.ndarray | None = None,
-    ) -> np.ndarray:
+    ) -> Any:
         """Expectation (B, 3) of `measured` over the noise that the transitions (B,) add.
 
         `box_factors` (B,) sensor pixels per side are averaged into one of the frame; `row_gain`
         (B, H) is the light of each row relative to the frame's.
         """
-        if isinstance(transitions.light, torch.Tensor):  # looked at on the CPU
-            transitions = replace(transitions, light=list(transitions.light.cpu()))
+        light = transitions.light
         table = transitions.before_rounding(self.camera).averaged_table()
         source_noise = table[:, 3:] * np.square(box_factors)[:, None, None]
         if not self.noise:
-            codes = np.empty((len(table), *transitions.shape), np.uint8)
+            codes: Any = np.empty((len(table), *transitions.shape), np.uint8)
+            if isinstance(light, torch.Tensor):
+                codes = torch.empty(codes.shape, dtype=torch.uint8, device=light.device)
             record(transitions, self.camera, row_gain=row_gain, codes=codes)
             return self.measured(codes, states, source_noise)
         shares, which = self._shares_of_frames(states, source_noise)
@@ -224,8 +227,11 @@ class TermScores:
                 tables[key] = self._tabulated(key, table[i, 1:3], shares[which[i]])
         _, height, width = transitions.shape
         rows = np.ones((len(table), 1)) if row_gain is None else row_gain
+        if isinstance(light, torch.Tensor):
+            own = [[*tables].index(key) for key in keys]
+            return _expected_by_torch(light, table[:, 0], rows, [*tables.values()], own)
         fixed = (
-            addresses(transitions.light),
+            addresses(light),
             1 if row_gain is None else height,
             height * width if row_gain is None else width,
             table[:, 0].astype(np.float32),
@@ -284,28 +290,52 @@ def _has_pixels(part: Any) -> bool:
     return type(part) in _COLUMNS
 
 
-def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarray:
+def _score(part: Any, means: Any, captures: Captures | None) -> Any:
     if isinstance(part, CompositeScorer):
         scores = {name: _score(inner, means, captures) for name, inner in part.parts.items()}
         return part.totals(scores)
-    column = _COLUMNS.get(type(part))
+    column, placed = _COLUMNS.get(type(part)), isinstance(means, torch.Tensor)
     if column is None:
-        return np.asarray(part(None, captures).numpy())
-    values = means[:, column]
-    found = values if column == 2 else np.exp(-values / part.scale)
-    return np.minimum(np.maximum(found, 0.0), 1.0)
+        scores = part(None, captures)
+        return scores.to(means) if placed else np.asarray(scores.numpy())
+    values, exp = means[:, column], torch.exp if placed else np.exp
+    return (values if column == 2 else exp(-values / part.scale)).clip(0.0, 1.0)
 
 
 def _means_by_torch(
     codes: torch.Tensor, shares: np.ndarray, which: np.ndarray, dark: np.ndarray
-) -> np.ndarray:
+) -> torch.Tensor:
     """`measure_codes` by torch operations on any device."""
     to, index = codes.device, codes.long()
     own = torch.from_numpy(shares).to(to)[torch.from_numpy(which).to(to)]  # (B, 4, 256)
     blocked = torch.from_numpy(dark).to(to)[index].mean(dim=(1, 2))
     clean, blown = own.gather(2, index).mean(dim=(1, 2)), (codes == 255).any(dim=1)
-    means = torch.stack([blown.float().mean(dim=1), blocked, clean], dim=1)
-    return np.asarray(means.cpu().double().numpy())
+    return torch.stack([blown.float().mean(dim=1), blocked, clean], dim=1)
+
+
+def _expected_by_torch(
+    light: torch.Tensor,
+    ratio: np.ndarray,
+    row_gain: np.ndarray,
+    tables: Sequence[np.ndarray],
+    which: Sequence[int],
+) -> torch.Tensor:
+    """`expect_means` by torch operations on the device of `light` (B, 4, H, W).
+
+    `tables` are (4, 3, G), of which frame b has ``which[b]``.
+    """
+    to, size = light.device, tables[0].shape[-1]
+    factors = ratio[:, :, None] * row_gain[:, None]  # (B, 4, H or 1)
+    signal = light * torch.from_numpy(factors.astype(np.float32)).to(to)[..., None]
+    place = signal.add_(PEDESTAL).clamp_(min=0.0).sqrt_().mul_(float(_SCALE)).flatten(2)
+    place = place.clamp_(max=size - 1.001)
+    index = place.long()
+    share, values = place - index, torch.from_numpy(np.concatenate(tables).ravel()).to(to)
+    first = 4 * torch.tensor(which, device=to)[:, None] + torch.arange(4, device=to)  # (B, 4)
+    starts = [index + ((3 * first + function) * size)[..., None] for function in range(3)]
+    above, blocked, clean = (torch.lerp(values[i], values[i + 1], share) for i in starts)
+    blown = (1.0 - (1.0 - above).prod(dim=1)).mean(dim=1)
+    return torch.stack([blown, blocked.mean(dim=(1, 2)), clean.mean(dim=(1, 2))], dim=1)
 
 
 def _packed(shares: np.ndarray, dark: np.ndarray) -> np.ndarray:

@@ -113,18 +113,21 @@ class CompositeScorer:
         # Rounding may leave [0, 1].
         return total.clip(0.0, 1.0) if torch.is_tensor(total) else np.clip(total, 0.0, 1.0)
 
-    def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
-        """`combine` of arrays `scores` of one shape; a `UserCodeError` if one is not in [0, 1].
+    def totals(self, scores: Mapping[str, Any]) -> Any:
+        """`combine` of arrays or tensors `scores`; a `UserCodeError` if one is not in [0, 1].
 
         It is checked because a user's class may override it.
         """
-        totals = np.asarray(self.combine(scores), np.float64)
-        if not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
+        placed, totals = any(map(torch.is_tensor, scores.values())), self.combine(scores)
+        totals = totals if placed else np.asarray(totals, np.float64)
+        # For tensors on a device it has to be waited.
+        checked = not placed or is_own(self)
+        if checked and not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
             found = _describe_range(totals)
             raise UserCodeError(
                 f"scorer {type(self).__name__!r}: `combine` returned {found}: rule is [0, 1]"
             )
-        return np.minimum(np.maximum(totals, 0.0), 1.0)
+        return totals.clip(0.0, 1.0)
 
 
 def developed(
@@ -164,7 +167,8 @@ def scores_of(
     or changes `captures`.
     """
     if not is_own(scorer):
-        return _checked(name, scorer(images, captures), len(captures))
+        wait = captures.device.type == "cpu"
+        return _checked(name, scorer(images, captures), captures, wait=wait)
     before, begin = _versions(captures), time.perf_counter()
     try:
         scores = scorer(images, captures)
@@ -178,7 +182,7 @@ def scores_of(
             f"scorer {name!r} changed its `captures` in place: it must work on copies, because "
             "other scorers get the same ones"
         )
-    return _checked(name, scores, len(captures))
+    return _checked(name, scores, captures)
 
 
 def is_own(scorer: Any) -> bool:
@@ -195,15 +199,19 @@ def _versions(captures: Captures) -> dict[str, int]:
     return {name: version for name, version in counted.items() if version}
 
 
-def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
-    """`scores` on the CPU as float64, clipped to [0, 1] where rounding left it."""
+def _checked(name: str, scores: Any, captures: Captures, *, wait: bool = True) -> torch.Tensor:
+    """`scores` as float64 where the captures are, clipped to [0, 1] where rounding left it.
+
+    Their range is checked unless that would make the CPU `wait`.
+    """
+    count = len(captures)
     if not isinstance(scores, torch.Tensor) or scores.shape != (count,) or scores.is_complex():
         found = type(scores).__name__
         if isinstance(scores, torch.Tensor):
             found = f"{tuple(scores.shape)} {scores.dtype}"
         raise UserCodeError(f"scorer {name!r} returned {found}: it must return a tensor ({count},)")
-    found64: torch.Tensor = scores.detach().to("cpu", torch.float64)
-    low, high = (float(value) for value in found64.aminmax()) if count else (0.0, 1.0)
+    found64: torch.Tensor = scores.detach().to(captures.device, torch.float64)
+    low, high = (float(value) for value in found64.aminmax()) if count and wait else (0.0, 1.0)
     if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # NaN is not
         raise UserCodeError(f"scorer {name!r} returned {_describe_range(found64)}: rule is [0, 1]")
     return found64.clamp(0.0, 1.0)

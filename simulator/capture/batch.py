@@ -58,10 +58,10 @@ MODULES = tuple(
 
 @dataclass
 class FrameStatistics:
-    """Statistics of a batch of frames, (B,) each."""
+    """Statistics of a batch of frames, (B,) each; of frames on a device, what is counted stays."""
 
-    clipped_low: np.ndarray  # share of the samples that are clipped low: at most 2**-10 of white
-    clipped_high: np.ndarray  # share of the samples that are clipped high: at white
+    clipped_low: Any  # share of the samples that are clipped low: at most 2**-10 of white
+    clipped_high: Any  # share of the samples that are clipped high: at white
     #: Mean over the pixels of the noise variance beyond the target's, relative to it; in flickering
     #: light, that of the frame's mean light.
     excess_variance: np.ndarray

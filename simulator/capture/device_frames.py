@@ -104,7 +104,7 @@ class DeviceFrames(BlurredFrames):
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
             knots = _KNOTS.to(maps.device)
             squared = (maps[:, 0].flatten(1) * scale[:, None]).square_()
-            squared = squared.clamp_(max=float(knots[-1]))
+            squared = squared.clamp_(max=DIAMETERS[-1] ** 2)
             below = torch.searchsorted(knots, squared, right=True).sub_(1).clamp_(0, len(knots) - 2)
             share = (squared - knots[below]) / (knots[below + 1] - knots[below])  # (K, H W)
             numbers = self._numbers(levels[part])

@@ -256,7 +256,7 @@ def record(
     row_gain: np.ndarray | None = None,
     count: bool = False,
     **outputs: torch.Tensor | np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray | torch.Tensor:
     """Records a batch of frames: exposes, adds noise, clips and quantises.
 
     Args:
@@ -272,7 +272,8 @@ def record(
             ``signals``, ``linear``, which are at least -`PEDESTAL`, and ``images``, at least 0.
 
     Returns:
-        (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
+        (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`. A
+        tensor on the device of the light where `Transitions.needs_torch`.
     """
     if unknown := outputs.keys() - _KINDS:
         raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
@@ -284,7 +285,8 @@ def record(
         transitions = transitions.before_rounding(camera)
         kind: Noise = "exact" if noise == "sensor" else noise
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
-        return record_stepwise(transitions, camera, keys, kind, tensors, read_noise, count=count)
+        counts = record_stepwise(transitions, camera, keys, kind, tensors, read_noise, count=count)
+        return counts if transitions.needs_torch else counts.numpy()
     arrays = {name: np.asarray(out) for name, out in outputs.items()}
     return _record_fused(transitions, camera, keys, noise, arrays, count)
 
@@ -306,7 +308,7 @@ def record_stepwise(
     read_noise: Sequence[ReadNoise] | None = None,
     *,
     count: bool = False,
-) -> np.ndarray:
+) -> torch.Tensor:
     """`record` on any device by torch operations: the reference of the fused kernel.
 
     The `transitions` are `before_rounding`. Frames in one tensor go together, others singly.
@@ -344,7 +346,7 @@ def record_stepwise(
         for name, least in LEAST_SIGNALS.items():
             if name in outputs:
                 outputs[name][part] = signals.clamp(float(least), 1.0)
-    return counts.cpu().numpy() if count else np.zeros((len(lights), 2), np.int64)
+    return counts
 
 
 def _stacked(shares: Sequence[torch.Tensor | None], like: torch.Tensor) -> torch.Tensor | None:
