@@ -121,7 +121,7 @@ class CompositeScorer:
         placed, totals = any(map(torch.is_tensor, scores.values())), self.combine(scores)
         totals = totals if placed else np.asarray(totals, np.float64)
         # For tensors on a device it has to be waited.
-        checked = not placed or is_own(self)
+        checked = not placed or not type(self).__module__.startswith("ae_env.")
         if checked and not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
             found = _describe_range(totals)
             raise UserCodeError(

@@ -18,9 +18,10 @@ from simulator.optics.discs import DIAMETERS, LIGHT_LIMIT, disc_blur
 from simulator.optics.motion import motion_blur, taps_of
 from simulator.utils.compute import kernel
 
-#: Taps that are summed together, samples that are read or added to the memory at once, and frames
-#: that are added at once, at least; samples of a frame that is moved along the rows alone.
-_TOGETHER, _SAMPLES, _FRAMES, _ALONE = 8, 2**25, 64, 2**20
+#: Samples that are read or added to the memory at once, on a GPU and elsewhere; frames that are
+#: added at once, at least; taps of a frame that are read together, at least where there is memory
+#: for all frames; samples of a frame that is moved along the rows alone.
+_SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**25}, 64, 8, 2**20
 _KNOTS = torch.tensor(DIAMETERS).square()
 
 
@@ -32,6 +33,7 @@ class DeviceFrames(BlurredFrames):
     ) -> None:
         super().__init__(num_scenes, num_apertures, most_bytes)
         self._frames = torch.empty(0, device=device)
+        self._samples = _SAMPLES.get(device.type, _SAMPLES[""])
         # The lights of scenes by `id`, as long as they exist, and their places.
         self._known: dict[int, tuple[weakref.ref[Tensor], int]] = {}
         self._masks = np.zeros(num_scenes, np.uintp)  # addresses that layouts have theirs from
@@ -75,13 +77,18 @@ class DeviceFrames(BlurredFrames):
         if lacking <= 0:
             return freed
         begin = len(old)
-        spare = max(begin // 2, min(_FRAMES, _SAMPLES // math.prod(self._shape)))
+        spare = max(begin // 2, min(_FRAMES, self._samples // math.prod(self._shape)))
         self._frames = old.new_empty(begin + max(lacking, spare), *self._shape)
         self._bytes = self._frames.nbytes
         if begin:
             self._frames[:begin] = old
         added = np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
         return np.concatenate([freed, added])
+
+    def _parts(self, chosen: np.ndarray, samples: int) -> list[np.ndarray]:
+        """`chosen` in parts of frames that need so many `samples` each at once."""
+        size = max(1, self._samples // samples)
+        return [chosen[i : i + size] for i in range(0, len(chosen), size)]
 
     # -- passes -------------------------------------------------------------------------------
 
@@ -99,7 +106,7 @@ class DeviceFrames(BlurredFrames):
     def _blend(
         self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
     ) -> None:
-        for part in _parts(np.arange(len(to)), 2 * math.prod(self._shape)):
+        for part in self._parts(np.arange(len(to)), 2 * math.prod(self._shape)):
             maps = self._layout_frames(indices[part], blurs[part])
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
             knots = _KNOTS.to(maps.device)
@@ -147,18 +154,18 @@ class DeviceFrames(BlurredFrames):
         for i in np.flatnonzero(alone).tolist():
             moved = motion_blur(self._clamped(source[[i]]), float(blurs["motion_px"][i]))
             self._frames[self._numbers(to[[i]])] = moved
-        for part in _parts(np.flatnonzero(~apart & ~alone), _TOGETHER * samples):
+        for part in self._parts(np.flatnonzero(~apart & ~alone), _TOGETHER * samples):
             light = self._clamped(source[part])
-            moved = moved_sums(light, *tap_columns(blurs[part], False, *plane))
+            moved = moved_sums(light, self._samples, *tap_columns(blurs[part], False, *plane))
             self._frames[self._numbers(to[part])] = moved
-        for part in _parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
+        for part in self._parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
             # See `simulator.optics.motion.blur_apart`.
             light = self._clamped(source[part])
             maps = self._layout_frames(indices[part], blurs[part])
             mask, behind = maps[:, 1:2], maps[:, 2:3].long().flatten(2)
             back = light.flatten(2).gather(2, behind.expand(-1, light.shape[1], -1)).view_as(light)
-            back = moved_sums(back, *tap_columns(blurs[part], False, *plane))
-            own = tap_columns(blurs[part], True, *plane)
+            back = moved_sums(back, self._samples, *tap_columns(blurs[part], False, *plane))
+            own = self._samples, *tap_columns(blurs[part], True, *plane)
             front = moved_sums(torch.cat([light * mask, mask], dim=1), *own)
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
             self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
@@ -170,12 +177,6 @@ class DeviceFrames(BlurredFrames):
             same = blurs["vignetting"] == address
             left = torch.from_numpy(frame_at(address, self._shape[1:])).to(self._frames)
             self._frames[self._numbers(to[same])] = self._frames[self._numbers(source[same])] * left
-
-
-def _parts(chosen: np.ndarray, samples: int) -> list[np.ndarray]:
-    """`chosen` in parts of frames that need so many `samples` each at once."""
-    size = max(1, _SAMPLES // samples)
-    return [chosen[i : i + size] for i in range(0, len(chosen), size)]
 
 
 @kernel()
@@ -210,26 +211,37 @@ def _longer(values, size):  # type: ignore[no-untyped-def]
 
 
 def moved_sums(
-    images: Tensor, ends: np.ndarray, rows: np.ndarray, columns: np.ndarray, weights: np.ndarray
+    images: Tensor,
+    samples: int,
+    ends: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    weights: np.ndarray,
 ) -> Tensor:
-    """Sums of shifts of `images` (K, C, H, W) by the taps of each; the borders are replicated."""
-    height, width = images.shape[-2:]
+    """Sums of shifts of `images` (K, C, H, W) by the taps of each; the borders are replicated.
+
+    So many `samples` are read at once as are stated. The taps are those of `tap_columns`.
+    """
+    (height, width), to = images.shape[-2:], images.device
     counts = np.diff(ends)
     order = np.argsort(-counts, kind="stable")  # those with the most taps first
-    to = images.device
-    taps = [torch.from_numpy(values).to(to) for values in (rows, columns, weights)]
-    first, own = torch.from_numpy(ends[order]).to(to), torch.from_numpy(order).to(to)
+    given = rows, columns, weights, ends[order], counts[order], order
+    down, right, weight, first, count, own = (torch.from_numpy(v).to(to) for v in given)
+    down = (down[:, None] + torch.arange(height, device=to)).clamp_(0, height - 1) * width
+    right = (right[:, None] + torch.arange(width, device=to)).clamp_(0, width - 1)
     light, total = images.flatten(2)[own], torch.zeros_like(images).flatten(2)
-    y, x = torch.arange(height, device=to)[:, None], torch.arange(width, device=to)
-    eight = torch.arange(_TOGETHER, device=to)
-    for done in range(0, int(counts.max(initial=0)), _TOGETHER):
+    done, most = 0, int(counts.max(initial=0))
+    while done < most:
         active = int((counts > done).sum())
-        down, right, weight = (values[first[:active, None] + done + eight] for values in taps)
-        looks_at = (y + down[..., None, None]).clamp_(0, height - 1) * width
-        looks_at = looks_at + (x + right[..., None, None]).clamp_(0, width - 1)  # (K, 8, H, W)
-        places = looks_at.flatten(1)[:, None].expand(-1, images.shape[1], -1)
-        read = light[:active].gather(2, places).view(*places.shape[:2], _TOGETHER, -1)
-        total[:active] += (read * weight[:, None, :, None]).sum(dim=2)
+        end = min(most, done + max(1, samples // (active * images[0].numel())))
+        steps = torch.arange(done, end, device=to)
+        taps = (first[:active, None] + steps).clamp_(max=len(weight) - 1)
+        looks_at = (down[taps][..., None] + right[taps][:, :, None]).flatten(1)  # (K, taps H W)
+        read = light[:active].gather(2, looks_at[:, None].expand(-1, images.shape[1], -1))
+        read = read.view(active, images.shape[1], end - done, -1)
+        shares = weight[taps] * (steps < count[:active, None])
+        total[:active] += (read * shares[:, None, :, None]).sum(dim=2)
+        done = end
     out = torch.empty_like(total)
     out[own] = total
     return out.view_as(images)
