@@ -25,11 +25,12 @@ from simulator.optics.motion import ALONG_ROWS, Movement, path_length
 from simulator.radiance.incident_light import LIKELY
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number, check_type
-from simulator.utils.compute import kernel
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: In place of `Layout.shares` where all pixels have the same blur.
 _ALIKE = np.array([[-1.0], [0.0], [1.0]])
 _WIDEST = DIAMETERS[-1]
+_WORTH_A_THREAD = 256  # captures
 _CPU = torch.device("cpu")
 Fact = TypeVar("Fact")
 ColourMatrix = tuple[tuple[float, float, float], ...]
@@ -259,16 +260,16 @@ def source_noises(
 
 @kernel()
 def _fill_levels(  # type: ignore[no-untyped-def]
-    height, sorts, columns, movements, levels, shares, blur, sharpness
+    begin, end, height, sorts, columns, movements, levels, shares, blur, sharpness
 ):
-    """`PixelBlur` of captures, where `levels` and `shares` have memory for it.
+    """`PixelBlur` of captures `begin` to `end`, where `levels` and `shares` have memory for it.
 
     Each has the columns `first` to before `last` of `sorts`, which are `Layout.shares`. `blur`
     (B,), of pixels that are all alike, becomes the root mean squares over the pixels, `sharpness`
     the means of `Sharpness`.
     """
     first, last, speeds, times, discs, own = columns
-    for i in range(len(blur)):
+    for i in range(begin, end):
         time, disc = times[i], discs[i]
         direction, turn, angle = movements[i, 0], movements[i, 1] * time, movements[i, 3]
         drift, extent = movements[i, 2] * time, speeds[i] * time
@@ -446,7 +447,9 @@ class ShownScenes:
         count = len(scenes) if pixels and first.any() else 0
         levels, shares = np.zeros((2, count, (last - first).max()))
         columns, scores = (first, last, speed, times, discs, own), np.empty(len(scenes))
-        _fill_levels(height, self._sorts, columns, movements, levels, shares, blur, scores)
+        fixed = height, self._sorts, columns, movements, levels, shares, blur, scores
+        least = _WORTH_A_THREAD
+        parallel_ranges(lambda a, b: _fill_levels(a, b, *fixed), len(blur), least=least)
         spread = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)) if count else None
         return blur, spread, scores
 

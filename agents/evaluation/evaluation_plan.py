@@ -34,7 +34,7 @@ SEED_STRIDE = 2**20
 CONDITION_ARGUMENTS = ("lighting", "delay")
 _SET_BY_EVALUATION = (
     *("with_oracle", "max_episode_steps", "autoreset_mode"),
-    *("budget", "max_frames", "num_envs", "render_mode"),
+    *("budget", "max_frames", "num_envs", "render_mode", "device"),
 )
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
 NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "suite", "hash")

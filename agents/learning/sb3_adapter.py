@@ -16,13 +16,17 @@ class SB3VectorAdapter(VecEnv):
     """Lets SB3 and sb3-contrib train on a Gymnasium vector environment, wrapped or not.
 
     Rollouts are those of SB3's `DummyVecEnv` over single environments with the same seeds, without
-    the cost of stepping them one by one. A `ValueError` if the autoreset mode is not SAME_STEP.
+    the cost of stepping them one by one. A `ValueError` if the autoreset mode is not SAME_STEP, or
+    they have a `device`.
     """
 
     def __init__(self, envs: gym.vector.VectorEnv) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(f"`envs` must have autoreset_mode='SAME_STEP', got {mode}")
+        if (device := cast(Any, envs.unwrapped).core.options.device) is not None:
+            rule = "SB3 takes arrays (examples/ppo_on_device.py trains on tensors)"
+            raise ValueError(f"`envs` must have device=None, got {device!r}: {rule}")
         self.envs = envs
         self.render_mode = envs.render_mode
         self._info_of = cast(Any, envs.unwrapped).info_of

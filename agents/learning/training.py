@@ -62,6 +62,10 @@ class AgentConfig(Configuration):
             options.make_lighting()
             taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
             check_word("observation", options.observation, taken)  # that its network takes
+            if options.device is not None:
+                raise ValueError(
+                    f"`device` (={options.device!r}) must be None: it trains on arrays"
+                )
         except ValueError as error:
             raise ValueError(f"environment: {error}") from error
         if self.agent == "ppo":

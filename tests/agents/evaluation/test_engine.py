@@ -177,6 +177,7 @@ def test_delays_multiply_the_conditions_that_have_none_of_their_own():
         ({"conditions": {"a": {"delay": 99}}}, r"`delay` \(=99\)"),
         ({"conditions": {"a": {"delay": 3}}, "frames": 3}, r"`delay` \(=3\)"),
         ({"environment": {"lighting": "sine"}}, "`environment` .* `lighting`"),
+        ({"environment": {"device": "cpu"}}, "`environment` .* `device`"),
         ({"budgets": [0.0]}, r"budgets\.0\n"),
         ({"budgets": [0.1], "environment": {"budget": 1}}, "`environment` .* `budget`"),
         ({"budgets": [0.1], "frames": 3}, "`frames`"),

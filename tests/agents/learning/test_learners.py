@@ -331,6 +331,7 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: ppo\nenvironment: {scorer: balnced}", "environment: .*balnced"),
         ("agent: ppo\nenvironment: {observation: linear}", "`observation`.*'statistics'"),
         ("agent: regression\nenvironment: {delay: .inf}", "environment: .*`delay`"),
+        ("agent: regression\nenvironment: {device: cpu}", "`device`.*None"),
         ("agent: forecaster\ntraining: {mixed: 2}", r"training.mixed \(=2\)"),
         ("agent: forecaster\nenvironment: {split: train}", "`environment`"),
         ("agent: forecaster\nnum_envs: 3", "`num_envs`"),

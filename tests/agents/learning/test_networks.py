@@ -267,9 +267,10 @@ def test_attributes_methods_and_pictures_of_a_wrapped_batch(make_tiny_envs) -> N
     shown = [(picture.dtype, picture.shape[2]) for picture in envs.get_images()]
     assert shown == [(np.uint8, 3)] * 3
     assert list(SB3VectorAdapter(make_tiny_envs(num_envs=2)).get_images()) == [None, None]
-    for mode in ("NEXT_STEP", "DISABLED"):
-        with pytest.raises(ValueError, match="autoreset_mode"):
-            SB3VectorAdapter(make_tiny_envs(autoreset_mode=mode))
+    wrong = {"autoreset_mode": "NEXT_STEP"}, {"autoreset_mode": "DISABLED"}, {"device": "cpu"}
+    for arguments in wrong:
+        with pytest.raises(ValueError, match=next(iter(arguments))):
+            SB3VectorAdapter(make_tiny_envs(**arguments))
 
 
 def test_training_frames_differ_in_the_raw_and_tell_the_right_exposure(make_tiny_envs) -> None:
