@@ -18,7 +18,7 @@ import torch
 from ae_env.observation import decode_observation, encode_observation
 from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, Scorer
 from ae_env.utils.user_files import UserCodeError
-from simulator.raw.develop import develop
+from simulator.raw.develop import develop_known
 from simulator.utils.checks import as_float
 
 logger = logging.getLogger(__name__)
@@ -138,9 +138,9 @@ def developed(
     `white_balance` are (B, 3) gains of R, G, B; for `matrices` see `Captures.colour_matrices`.
     """
     if len(set(matrices)) == 1:
-        return develop(images, white_balance, matrices[0])
+        return develop_known(images, white_balance, matrices[0])
     pairs = zip(images, white_balance, matrices, strict=True)
-    return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
+    return torch.cat([develop_known(image[None], gains, matrix) for image, gains, matrix in pairs])
 
 
 def check_part(name: str, part: Any) -> None:

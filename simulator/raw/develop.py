@@ -83,6 +83,17 @@ def develop(
     """
     images = check_packed("images", images, ndim=4)
     check_word("tone", tone, TONES)
+    _check_gains(white_balance, len(images))
+    return develop_known(images, white_balance, colour_matrix, tone)
+
+
+def develop_known(
+    images: torch.Tensor,
+    white_balance: Gains,
+    colour_matrix: Matrix | None,
+    tone: str = "photographic",
+) -> torch.Tensor:
+    """`develop` without checks, for which the CPU would wait for a device."""
     gains = _plane_gains(white_balance, images)
     encoded = torch.empty(len(images), 3, *images.shape[2:], device=images.device)
     # A few images at a time stay in the CPU's cache: twice as fast, and the same up to the last
@@ -187,13 +198,17 @@ def _decoded(encoded: torch.Tensor) -> torch.Tensor:
     return shown / (PHOTOGRAPHIC_SLOPE - (PHOTOGRAPHIC_SLOPE - 1.0) * shown)
 
 
+def _check_gains(white_balance: Gains, count: int) -> None:
+    gains = torch.as_tensor(white_balance, dtype=torch.float32)
+    positive = bool((torch.isfinite(gains) & (gains > 0)).all())
+    if gains.shape not in ((3,), (count, 3)) or not positive:
+        rule = f"must be (3,) or ({count}, 3), positive and finite"
+        raise ValueError(f"`white_balance` (={gains.tolist()}) {rule}")
+
+
 def _plane_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:
     """Gains of the four planes, the smallest 1, as (B, 4, 1, 1)."""
     gains = torch.as_tensor(white_balance, dtype=torch.float32, device=images.device)
-    positive = bool((torch.isfinite(gains) & (gains > 0)).all())
-    if gains.shape not in ((3,), (len(images), 3)) or not positive:
-        rule = f"must be (3,) or ({len(images)}, 3), positive and finite"
-        raise ValueError(f"`white_balance` (={gains.tolist()}) {rule}")
     gains = (gains / gains.amin(dim=-1, keepdim=True)).clamp_(max=_LARGEST_GAIN)
     return gains[..., [0, 1, 1, 2]].expand(len(images), 4)[..., None, None]
 

@@ -94,7 +94,7 @@ def likeness(images, captures):
         ({"reward": "expected", "noise": False, "with_oracle": True}, 0),
         ({"lighting": "flicker", "costs": {"flicker": 1.0, "switch": 0.1}, "lens": "random"}, 0),
         ({"noise": "sensor", "camera": "sony_a7s2", "source": "raw", "with_subject": True}, None),
-        ({"scorer": {"balanced": 0.7, "banding": 0.3}, "lighting": "flicker"}, 0),
+        ({"scorer": {"balanced": 0.7, "shin": 0.3}, "lighting": "flicker"}, 0),
         ({"scorer": Own(likeness), "lighting": "sine"}, 2),  # for the range of its scores
     ],
 )
