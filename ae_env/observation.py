@@ -77,7 +77,7 @@ def tensor_statistics(codes: torch.Tensor) -> dict[str, torch.Tensor]:
     import torch
 
     lights = decode_observation(np.arange(256, dtype=np.uint8))
-    means = torch.from_numpy(lights).to(codes.device)[codes.long()]
+    means = torch.from_numpy(lights).to(codes.device)[codes.long()].double()  # products: no TF32
     for size, zones in zip(codes.shape[:1:-1], ZONES[::-1], strict=True):  # columns, then rows
         inside = np.repeat(np.eye(zones), np.diff(np.arange(zones + 1) * size // zones), axis=1)
         shares = inside / inside.sum(axis=1, keepdims=True)

@@ -71,7 +71,7 @@ class PixelBlur(NamedTuple):
 
 
 def _fact(work_out: Callable[[Any], Fact]) -> cached_property[Fact]:
-    """A property that is worked out once: tensors that count writes, whatever the scorer's mode."""
+    """A property that is worked out once; tensors are on its device and count writes always."""
 
     @wraps(work_out)
     def placed(captures: Any) -> Any:
@@ -448,8 +448,7 @@ class ShownScenes:
         levels, shares = np.zeros((2, count, (last - first).max()))
         columns, scores = (first, last, speed, times, discs, own), np.empty(len(scenes))
         fixed = height, self._sorts, columns, movements, levels, shares, blur, scores
-        least = _WORTH_A_THREAD
-        parallel_ranges(lambda a, b: _fill_levels(a, b, *fixed), len(blur), least=least)
+        parallel_ranges(lambda a, b: _fill_levels(a, b, *fixed), len(blur), least=_WORTH_A_THREAD)
         spread = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)) if count else None
         return blur, spread, scores
 

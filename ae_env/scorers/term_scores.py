@@ -107,10 +107,7 @@ class TermScores:
     def torch_scores(
         self, images: torch.Tensor | None, captures: Captures, *kinds: DependsOn
     ) -> dict[str, Any]:
-        """Scores (B,) of `torch_terms` that depend on `kinds`, as of `score_parts`.
-
-        They are arrays, or tensors on another device than the CPU.
-        """
+        """Scores (B,) of `torch_terms` that depend on `kinds`; those on the CPU as arrays."""
         if self.torch_terms is None:
             return {}
         scores = self.torch_terms.score_parts(images, captures, kinds)
@@ -228,8 +225,9 @@ class TermScores:
         _, height, width = transitions.shape
         rows = np.ones((len(table), 1)) if row_gain is None else row_gain
         if isinstance(light, torch.Tensor):
-            own = [[*tables].index(key) for key in keys]
-            return _expected_by_torch(light, table[:, 0], rows, [*tables.values()], own)
+            place = {key: number for number, key in enumerate(tables)}
+            own = light, table[:, 0], rows, [*tables.values()], [place[key] for key in keys]
+            return _expected_by_torch(*own)
         fixed = (
             addresses(light),
             1 if row_gain is None else height,

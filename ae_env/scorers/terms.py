@@ -120,7 +120,7 @@ class CompositeScorer:
         """
         placed, totals = any(map(torch.is_tensor, scores.values())), self.combine(scores)
         totals = totals if placed else np.asarray(totals, np.float64)
-        # For tensors on a device it has to be waited.
+        # Of tensors on a device, only what a user's class gives is worth waiting for.
         checked = not placed or not type(self).__module__.startswith("ae_env.")
         if checked and not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
             found = _describe_range(totals)
@@ -200,21 +200,21 @@ def _versions(captures: Captures) -> dict[str, int]:
 
 
 def _checked(name: str, scores: Any, captures: Captures, *, wait: bool = True) -> torch.Tensor:
-    """`scores` as float64 where the captures are, clipped to [0, 1] where rounding left it.
+    """`scores` where the captures are, on the CPU as float64, clipped to [0, 1].
 
-    Their range is checked unless that would make the CPU `wait`.
+    Rounding may leave that. The range is checked unless that would make the CPU `wait`.
     """
-    count = len(captures)
+    count, dtype = len(captures), torch.float64 if captures.device.type == "cpu" else torch.float32
     if not isinstance(scores, torch.Tensor) or scores.shape != (count,) or scores.is_complex():
-        found = type(scores).__name__
+        what = type(scores).__name__
         if isinstance(scores, torch.Tensor):
-            found = f"{tuple(scores.shape)} {scores.dtype}"
-        raise UserCodeError(f"scorer {name!r} returned {found}: it must return a tensor ({count},)")
-    found64: torch.Tensor = scores.detach().to(captures.device, torch.float64)
-    low, high = (float(value) for value in found64.aminmax()) if count and wait else (0.0, 1.0)
+            what = f"{tuple(scores.shape)} {scores.dtype}"
+        raise UserCodeError(f"scorer {name!r} returned {what}: it must return a tensor ({count},)")
+    found: torch.Tensor = scores.detach().to(captures.device, dtype)
+    low, high = (float(value) for value in found.aminmax()) if count and wait else (0.0, 1.0)
     if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # NaN is not
-        raise UserCodeError(f"scorer {name!r} returned {_describe_range(found64)}: rule is [0, 1]")
-    return found64.clamp(0.0, 1.0)
+        raise UserCodeError(f"scorer {name!r} returned {_describe_range(found)}: rule is [0, 1]")
+    return found.clamp(0.0, 1.0)
 
 
 def _describe_range(values: Any) -> str:

@@ -152,9 +152,10 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
+    # float64: a GPU rounds convolutions in float32 to TF32, and in a Fourier transform a lamp a
+    # thousand times above white must not leave ringing in the shadows.
     if taps <= _FFT_TAPS:
-        return F.conv2d(padded, disc[None, None].to(light.dtype)).reshape(light.shape)
-    # float64: a lamp a thousand times above white must not leave ringing in the shadows.
+        return F.conv2d(padded.double(), disc[None, None]).to(light.dtype).reshape(light.shape)
     size = [height + 2 * radius, width + 2 * radius]
     spectrum = torch.fft.rfft2(padded.double()) * torch.fft.rfft2(disc, s=size)
     blurred = torch.fft.irfft2(spectrum, s=size)[..., 2 * radius :, 2 * radius :]
