@@ -28,6 +28,7 @@ STEPS, ROUNDS = 40, 9
 CALLERS = {
     "_plan": "plans of large batches",
     "_run": "blur: discs, blends, motion",
+    "blur": "sharpness of each capture",
     "_record_fused": "exposure, noise, clip, codes",
     "measured": "what codes add to the score",
 }

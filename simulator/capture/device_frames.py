@@ -18,10 +18,10 @@ from simulator.optics.discs import DIAMETERS, LIGHT_LIMIT, disc_blur
 from simulator.optics.motion import motion_blur, taps_of
 from simulator.utils.compute import kernel
 
-#: Samples that are read or added to the memory at once, on a GPU and elsewhere; frames that are
-#: added at once, at least; taps of a frame that are read together, at least where there is memory
-#: for all frames; samples of a frame that is moved along the rows alone.
-_SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**25}, 64, 8, 2**20
+#: Samples that are read or added to the memory at once, on a GPU and elsewhere, where the cache
+#: holds them; frames that are added at once, at least; taps of a frame that a GPU can read
+#: together, at least; samples of a frame that is moved along the rows alone.
+_SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**20}, 64, 8, 2**20
 _KNOTS = torch.tensor(DIAMETERS).square()
 
 
