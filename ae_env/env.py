@@ -123,7 +123,7 @@ class AutoExposure(Task):
             terms["score"] = options.placed(np.array([table.mean[state] for table, state in pairs]))
         else:
             terms = {n: options.placed(columns.pop(f"score:{n}")) for n in self.scorer.parts}
-            terms["score"] = self.scorer.totals(terms)
+            terms["score"] = options.placed(self.scorer.totals(terms))
         reward = 1.0 * terms["score"]
         for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
             terms[name] = cost
@@ -336,10 +336,10 @@ class AutoExposureBase(SpecProperty):
         """Expected scores in an environment's current frame, with standard errors and parts."""
         return self.core.score_table(env_index)
 
-    def info_of(self, columns: Mapping[str, np.ndarray], row: int) -> dict[str, Any]:
+    def info_of(self, columns: Mapping[str, Any], row: int) -> dict[str, Any]:
         """The info of one environment, plain numbers and names, from the columns of many."""
         info: dict[str, Any] = {
-            name: values.item(row) if values.ndim == 1 else values[row]
+            name: values[row].item() if values.ndim == 1 else values[row]
             for name, values in columns.items()
         }
         info["scene_id"] = self.scene_ids[info["scene_id"]]

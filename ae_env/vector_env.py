@@ -183,9 +183,10 @@ class AutoExposureVectorEnv(
             final_obs[i] = {name: values[row] for name, values in last["observation"].items()}
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[finished] = True
-        infos: dict[str, Any] = {"final_obs": final_obs, "_final_obs": mask}
+        placed = self.core.options.placed
+        infos: dict[str, Any] = {"final_obs": final_obs, "_final_obs": placed(mask)}
         infos |= {"final_info": self._vector_info(last["info"], finished)}
-        infos["_final_info"] = mask.copy()
+        infos["_final_info"] = placed(mask.copy())
         self._begin(finished)
         fresh = replace(self.core.observe(finished), reward=last["reward"])
         if whole:
@@ -267,7 +268,7 @@ class AutoExposureVectorEnv(
 def _rows_of(columns: Mapping[str, Any], rows: np.ndarray) -> dict[str, Any]:
     """Copies of `rows` of columns, which may be nested dictionaries."""
     return {
-        name: _rows_of(values, rows) if isinstance(values, dict) else values[rows]
+        name: _rows_of(values, rows) if isinstance(values, dict) else _signed(values)[rows]
         for name, values in columns.items()
     }
 
@@ -278,4 +279,10 @@ def _assign_rows(columns: Mapping[str, Any], new: Mapping[str, Any], rows: np.nd
         if isinstance(values, dict):
             _assign_rows(values, new[name], rows)
         else:
-            values[rows] = new[name]
+            _signed(values)[rows] = _signed(new[name])
+
+
+def _signed(values: Any) -> Any:
+    """`values`, or the same memory as int16: torch cannot index uint16."""
+    is_uint16 = torch.is_tensor(values) and values.dtype == torch.uint16
+    return values.view(torch.int16) if is_uint16 else values

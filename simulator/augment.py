@@ -124,7 +124,7 @@ class ExposureAugmentation:
         Args:
             images: (B, 3, H, W) sRGB pictures, floating point in [0, 1] or uint8, taken for
                 `develop`'s; or (B, 4, H, W) floating point, packed raws, 1.0 at sensor white. On
-                any device; the steps run there, the noise is drawn on the CPU.
+                any device; the steps run there.
             seeds: (B,) integers >= 0, one for each picture (`sample_seeds`), or a generator on the
                 CPU that draws them.
             nlf: Noise that raws have already: only what is missing is added. None stands for none.

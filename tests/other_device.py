@@ -1,4 +1,4 @@
-"""A device beside the CPU that needs no hardware: what mixes both fails, what waits is counted.
+"""A device that needs no hardware: what mixes it with the CPU fails, what is read is counted.
 
 A tensor there holds one on the CPU, with which its operations are done.
 """
@@ -11,8 +11,9 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 NAME = "privateuseone"  # as torch calls a device that is none of its own
-#: Operations for which the CPU waits until the device has done all before; copies to it do, too.
-WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2")
+#: Operations whose results the CPU needs, beside copies to it. Copies to the device do not count,
+#: although CUDA may wait for those, too.
+READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "bincount")
 _MAY_MIX = ("copy_", "_to_copy", "index", "index_put_", "_index_put_impl_")
 _setup_privateuseone_for_python_backend()
 
@@ -37,11 +38,11 @@ class Held(torch.Tensor):
 
 
 class OtherDevice(TorchDispatchMode):
-    """While it is entered there is a device `NAME`; `waits` counts what the CPU waits for."""
+    """While it is entered there is a device `NAME`; `reads` counts what the CPU reads back."""
 
     def __init__(self):
         super().__init__()
-        self.waits = Counter()
+        self.reads = Counter()
 
     def __torch_dispatch__(self, op, types, args=(), kwargs=None):
         name, kwargs = op.overloadpacket.__name__, dict(kwargs or {})
@@ -55,8 +56,8 @@ class OtherDevice(TorchDispatchMode):
         if there and name not in _MAY_MIX:
             mixed = [x for x in given if x.ndim and not isinstance(x, Held)]
             assert not mixed, f"{op} has tensors of both devices"
-        if there and (name in WAITS or not stays):
-            self.waits[name] += 1
+        if there and (name in READS or not stays):
+            self.reads[name] += 1
         args, kwargs = tree_map(lambda x: x.held if isinstance(x, Held) else x, (args, kwargs))
         found, known = op(*args, **kwargs), {id(x.held): x for x in there}
 

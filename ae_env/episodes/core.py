@@ -37,6 +37,7 @@ from simulator.capture.columns import MOVES
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions
 from simulator.noise.generator import Noise, single_normals
+from simulator.utils.compute import outside_inference_mode
 
 #: Samples that are recorded and scored together, at most.
 CHUNK_SAMPLES = 2**24
@@ -153,6 +154,7 @@ class EpisodeCore:
     `options` where they are loaded already.
     """
 
+    @outside_inference_mode
     def __init__(
         self,
         options: EnvOptions,
@@ -262,6 +264,7 @@ class EpisodeCore:
                 self._forget(others)
         return ended
 
+    @outside_inference_mode
     def observe(self, env_indices: np.ndarray) -> Frames:
         """Captures the episodes of `env_indices` (B,), each in its current state."""
         episodes, options = self.episodes, self.options

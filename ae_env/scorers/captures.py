@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property, wraps
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -110,6 +110,11 @@ class Captures:
         shown = ShownScenes(self._scenes, self._shown.captures)
         return {**vars(self), "_shown": shown, "_which": np.arange(len(self))}
 
+    def cpu(self) -> Captures:
+        """The same captures with all tensors on the CPU."""
+        rows = None if self.row_gain is None else self.row_gain.cpu()
+        return replace(self, row_gain=rows, device=_CPU)
+
     @cached_property
     def _scenes(self) -> Sequence[Scene]:
         return [self._shown[scene] for scene in self._which.tolist()]
@@ -171,7 +176,8 @@ class Captures:
     @_fact
     def white_balance(self) -> torch.Tensor:
         """(B, 3) gains of R, G, B."""
-        return torch.tensor([scene.white_balance for scene in self._scenes])
+        gains = [scene.white_balance for scene in self._scenes]
+        return torch.tensor(gains, dtype=torch.float32, device=_CPU)
 
     @property
     def colour_matrices(self) -> Sequence[ColourMatrix | None]:

@@ -48,6 +48,7 @@ class Fidelity:
     version = 1
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        images, captures = images.cpu(), captures.cpu()  # for scikit-image
         first, which = distinct_references(captures)
         ideal = [_lab(picture) for picture in reference_pictures(captures, first)]
         scores = [

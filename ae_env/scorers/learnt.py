@@ -187,7 +187,8 @@ class Nima:
         _network(self.file, self.digest)  # raises now, not at the first score
 
     def __call__(self, images: Tensor, captures: Captures) -> Tensor:
-        return (mean_rating(_network(self.file, self.digest), images) - 1.0) / (RATINGS - 1.0)
+        found = mean_rating(_network(self.file, self.digest), images.cpu())
+        return (found - 1.0) / (RATINGS - 1.0)
 
 
 class NimaAesthetic(Nima):
@@ -289,7 +290,7 @@ class Classifier:
 
         A `UserCodeError` if the network raises, or returns anything but numbers (B, classes).
         """
-        return self._classified(images).amax(dim=1).clamp(max=1.0)
+        return self._classified(images.cpu()).amax(dim=1).clamp(max=1.0)
 
     def labels(self, images: Tensor) -> list[int]:
         """The most likely class of each picture."""
@@ -407,7 +408,7 @@ class PyiqaMetric:
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         with torch.no_grad():
-            values = torch.as_tensor(self._metric(images)).double().reshape(len(images))
+            values = torch.as_tensor(self._metric(images.cpu())).double().reshape(len(images))
         share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
         return 1.0 - share if self.lower_better else share
 

@@ -119,7 +119,7 @@ class CompositeScorer:
         It is checked because a user's class may override it.
         """
         placed, totals = any(map(torch.is_tensor, scores.values())), self.combine(scores)
-        totals = totals if placed else np.asarray(totals, np.float64)
+        totals = torch.as_tensor(totals) if placed else np.asarray(totals, np.float64)
         # Of tensors on a device, only what a user's class gives is worth waiting for.
         checked = not placed or not type(self).__module__.startswith("ae_env.")
         if checked and not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
@@ -167,8 +167,8 @@ def scores_of(
     or changes `captures`.
     """
     if not is_own(scorer):
-        wait = captures.device.type == "cpu"
-        return _checked(name, scorer(images, captures), captures, wait=wait)
+        check = captures.device.type == "cpu"
+        return _checked(name, scorer(images, captures), captures, check=check)
     before, begin = _versions(captures), time.perf_counter()
     try:
         scores = scorer(images, captures)
@@ -199,10 +199,10 @@ def _versions(captures: Captures) -> dict[str, int]:
     return {name: version for name, version in counted.items() if version}
 
 
-def _checked(name: str, scores: Any, captures: Captures, *, wait: bool = True) -> torch.Tensor:
+def _checked(name: str, scores: Any, captures: Captures, *, check: bool = True) -> torch.Tensor:
     """`scores` where the captures are, on the CPU as float64, clipped to [0, 1].
 
-    Rounding may leave that. The range is checked unless that would make the CPU `wait`.
+    Rounding may leave that. To `check` their range, the CPU has to wait for a device.
     """
     count, dtype = len(captures), torch.float64 if captures.device.type == "cpu" else torch.float32
     if not isinstance(scores, torch.Tensor) or scores.shape != (count,) or scores.is_complex():
@@ -211,7 +211,7 @@ def _checked(name: str, scores: Any, captures: Captures, *, wait: bool = True) -
             what = f"{tuple(scores.shape)} {scores.dtype}"
         raise UserCodeError(f"scorer {name!r} returned {what}: it must return a tensor ({count},)")
     found: torch.Tensor = scores.detach().to(captures.device, dtype)
-    low, high = (float(value) for value in found.aminmax()) if count and wait else (0.0, 1.0)
+    low, high = (float(value) for value in found.aminmax()) if count and check else (0.0, 1.0)
     if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # NaN is not
         raise UserCodeError(f"scorer {name!r} returned {_describe_range(found)}: rule is [0, 1]")
     return found.clamp(0.0, 1.0)

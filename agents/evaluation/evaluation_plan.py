@@ -34,7 +34,7 @@ SEED_STRIDE = 2**20
 CONDITION_ARGUMENTS = ("lighting", "delay")
 _SET_BY_EVALUATION = (
     *("with_oracle", "max_episode_steps", "autoreset_mode"),
-    *("budget", "max_frames", "num_envs", "render_mode", "device"),
+    *("budget", "max_frames", "num_envs", "render_mode"),
 )
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
 NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "suite", "hash")
@@ -132,6 +132,8 @@ class EvaluationPlan(Configuration):
                 known = name in CONDITION_ARGUMENTS
                 rule = "give it as a condition's" if known else "the evaluation sets it"
                 raise ValueError(f"`environment` must not have `{name}`: {rule}")
+        if self.environment.get("device") is not None:
+            raise ValueError("`environment` must not have `device`: policies take arrays")
         for name, condition in self.all_conditions.items():
             try:
                 options = self.options(condition)

@@ -238,7 +238,8 @@ class BlurredFrames:
     def _more(self, count: int) -> np.ndarray:
         """Places of new memory for `count` frames or more."""
         spare = min(_SLAB, self._most_bytes // 4) // math.prod(self._shape)
-        slab = torch.empty(max(count, spare), *self._shape)
+        size = max(count, spare), *self._shape
+        slab = torch.empty(size, dtype=torch.float32, device="cpu")  # whatever torch's defaults are
         self._slabs.append(slab)
         self._bytes += slab.nbytes
         return (slab.data_ptr() + np.arange(len(slab)) * slab[0].nbytes).astype(np.uintp)

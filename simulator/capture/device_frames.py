@@ -22,7 +22,7 @@ from simulator.utils.compute import kernel
 #: holds them; frames that are added at once, at least; taps of a frame that a GPU can read
 #: together, at least; samples of a frame that is moved along the rows alone.
 _SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**20}, 64, 8, 2**20
-_KNOTS = torch.tensor(DIAMETERS).square()
+_KNOTS = torch.tensor(DIAMETERS, dtype=torch.float32).square()
 
 
 class DeviceFrames(BlurredFrames):
@@ -32,7 +32,7 @@ class DeviceFrames(BlurredFrames):
         self, num_scenes: int, num_apertures: int, most_bytes: int, device: torch.device
     ) -> None:
         super().__init__(num_scenes, num_apertures, most_bytes)
-        self._frames = torch.empty(0, device=device)
+        self._frames = torch.empty(0, dtype=torch.float32, device=device)
         self._samples = _SAMPLES.get(device.type, _SAMPLES[""])
         # The lights of scenes by `id`, as long as they exist, and their places.
         self._known: dict[int, tuple[weakref.ref[Tensor], int]] = {}
@@ -96,9 +96,10 @@ class DeviceFrames(BlurredFrames):
         self, indices: np.ndarray, diameters: np.ndarray, source: np.ndarray, to: np.ndarray
     ) -> None:
         for diameter in np.unique(diameters).tolist():
-            alike = diameters == diameter
-            light = self._clamped(source[alike])
-            self._frames[self._numbers(to[alike])] = disc_blur(light, diameter)
+            alike = np.flatnonzero(diameters == diameter)
+            for part in self._parts(alike, 4 * math.prod(self._shape)):
+                light = self._clamped(source[part])
+                self._frames[self._numbers(to[part])] = disc_blur(light, diameter)
 
     def _clamped(self, places: np.ndarray) -> Tensor:
         return self._frames[self._numbers(places)].clamp_(-LIGHT_LIMIT, LIGHT_LIMIT)

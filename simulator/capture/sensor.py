@@ -142,7 +142,7 @@ class Transitions:
         noisy = self.table[:, 3:].max(axis=(1, 2)) > 0.0  # the source is
         for i in np.flatnonzero(bands & noisy).tolist():
             share, known = gains[i].expand(-1, width), shares[i]
-            shares[i] = (share if known is None else share * known).contiguous()
+            shares[i] = (share if known is None else share * known.to(share.device)).contiguous()
         return Transitions(lights, self.table, shares)
 
     def seen_by(self, responses: Sequence[torch.Tensor | None]) -> Transitions:

@@ -267,7 +267,7 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
         _sum_products(correlations[:count], taps.rows, taps.columns, weights, products)
     ends = np.column_stack([products[:-1], products[1:, 0]])
     frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
-    out = torch.empty(frame.shape)
+    out = torch.empty(frame.shape, dtype=torch.float32, device="cpu")
     fixed = (frame.contiguous().numpy(), _KNOTS.astype(np.float32), ends.astype(np.float32))
     least = 1 + _WORTH_A_THREAD // frame.shape[1]
     parallel_ranges(lambda a, b: _evaluate(a, b, *fixed, out.numpy()), len(frame), least=least)

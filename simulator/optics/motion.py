@@ -189,7 +189,7 @@ def by_rows(
     light: Tensor, task: Callable[[int, int, np.ndarray, np.ndarray], None], cost: int = 1
 ) -> Tensor:
     """`light` by `task` on shares of its rows; `cost` is that of a sample."""
-    out, width = torch.empty(light.shape), light.shape[-1]
+    out, width = torch.empty_like(light, memory_format=torch.contiguous_format), light.shape[-1]
     rows, result = light.contiguous().reshape(-1, width).numpy(), out.reshape(-1, width).numpy()
     least = 1 + _WORTH_A_THREAD // (cost * width)
     parallel_ranges(lambda a, b: task(a, b, rows, result), len(rows), least=least)

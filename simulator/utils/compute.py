@@ -312,6 +312,19 @@ def check_device(device: str | torch.device) -> torch.device:
     return found
 
 
+def outside_inference_mode(call: Callable[..., Any]) -> Callable[..., Any]:
+    """`call` outside of torch's inference mode, whose tensors could not be written to later."""
+
+    @functools.wraps(call)
+    def called(*args: Any, **options: Any) -> Any:
+        if not torch.is_inference_mode_enabled():
+            return call(*args, **options)
+        with torch.inference_mode(False), torch.no_grad():
+            return call(*args, **options)
+
+    return called
+
+
 def keep_memory() -> None:
     """Makes glibc keep memory that is freed, up to 256 MiB: it is needed again in the next step.
 

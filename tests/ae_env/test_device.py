@@ -86,7 +86,7 @@ def likeness(images, captures):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "waits"),
+    ("arguments", "reads"),
     [
         ({}, 0),
         ({"motion": "none", "depth": "far", "noise": "exact"}, 0),
@@ -94,11 +94,12 @@ def likeness(images, captures):
         ({"reward": "expected", "noise": False, "with_oracle": True}, 0),
         ({"lighting": "flicker", "costs": {"flicker": 1.0, "switch": 0.1}, "lens": "random"}, 0),
         ({"noise": "sensor", "camera": "sony_a7s2", "source": "raw", "with_subject": True}, None),
-        ({"scorer": {"balanced": 0.7, "shin": 0.3}, "lighting": "flicker"}, 0),
+        ({"scorer": {"balanced": 0.7, "shim": 0.3}, "lighting": "flicker"}, 0),
+        ({"scorer": "fidelity", "source": "raw", "lighting": "flicker"}, None),
         ({"scorer": Own(likeness), "lighting": "sine"}, 2),  # for the range of its scores
     ],
 )
-def test_a_step_neither_mixes_devices_nor_waits(arguments, waits) -> None:
+def test_a_step_neither_mixes_devices_nor_reads_back(arguments, reads) -> None:
     """As on a GPU, of which this machine may have none."""
     other = pytest.importorskip("tests.other_device", exc_type=ImportError)
     with other.OtherDevice() as device:
@@ -106,9 +107,9 @@ def test_a_step_neither_mixes_devices_nor_waits(arguments, waits) -> None:
         for envs in (loops, torchs):
             envs.reset(seed=3)
         for actions in np.random.default_rng(0).integers(64, size=(3, 3)):
-            device.waits.clear()
+            device.reads.clear()
             found = torchs.step(actions)
-            assert waits is None or device.waits.total() == waits
+            assert reads is None or device.reads.total() == reads
             found = tree_map(lambda x: x.held, found)  # all of it is there
             assert not any(x.dtype == torch.float64 for x in found[-1].values())
             assert_close(loops.step(actions), found)
@@ -119,9 +120,14 @@ def test_actions_may_be_tensors_and_a_wrapper_gives_arrays() -> None:
     first = envs.reset(seed=0)[0]
     shown = envs.step(torch.tensor([3, 9, 63]))
     assert envs.render()[0].dtype == np.uint8
-    masked = make_envs(device="cpu", autoreset_mode="DISABLED", max_episode_steps=1)
-    masked.reset(seed=0)
-    masked.reset(options={"reset_mask": masked.step(np.array([0, 1, 2]))[3]})
+    with torch.inference_mode():  # as rollouts of some trainers are
+        given = {"autoreset_mode": "DISABLED", "max_episode_steps": 1, "observation": "dn"}
+        masked = make_envs(device="cpu", **given)
+        masked.reset(seed=0)
+    done = masked.step(np.array([0, 1, 2]))[3]
+    masked.reset(options={"reset_mask": done & torch.tensor([True, False, True])})
+    info = {name: values for name, values in shown[4].items() if name[0] != "_"}
+    assert envs.unwrapped.info_of(info, 1)["state"] == 9
     assert shown[0]["raw"].data_ptr() != first["raw"].data_ptr()
     converted = ArrayConversion(make_envs(device="cpu", **SAME), env_xp=torch, target_xp=np)
     converted.reset(seed=0)
