@@ -155,7 +155,8 @@ def frames(device=None, **arguments):
     envs.reset(seed=5, options={"scene": 0})
     for state in (0, 21, 42, 63):
         observation, *_, info = envs.step(np.array([state, 21, 63]))
-        stops = np.round(2.0 * np.log2(info["f_number"]))  # f/5.6 is 4 times the root of 2
+        f_numbers = np.asarray(info["f_number"])
+        stops = np.round(2.0 * np.log2(f_numbers))  # f/5.6 is 4 times the root of 2
         yield np.asarray(observation["raw"]), 2.0 ** (stops / 2.0)[:, None, None, None]
 
 
