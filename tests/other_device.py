@@ -3,19 +3,19 @@
 A tensor there holds one on the CPU, with which its operations are done.
 """
 
+import functools
 from collections import Counter
 
+import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
-from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 NAME = "privateuseone"  # as torch calls a device that is none of its own
 #: Operations whose results the CPU needs, beside copies to it. Copies to the device do not count,
 #: although CUDA may wait for those, too.
 READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "bincount")
 _MAY_MIX = ("copy_", "_to_copy", "index", "index_put_", "_index_put_impl_")
-_setup_privateuseone_for_python_backend()
 
 
 class Held(torch.Tensor):
@@ -42,7 +42,7 @@ class OtherDevice(TorchDispatchMode):
 
     def __init__(self):
         super().__init__()
-        self.reads = Counter()
+        self.reads, self._library = Counter(), _registered()
 
     def __torch_dispatch__(self, op, types, args=(), kwargs=None):
         name, kwargs = op.overloadpacket.__name__, dict(kwargs or {})
@@ -76,6 +76,14 @@ def _copy(to, source, wait=True):
     return to
 
 
-_library = torch.library.Library("aten", "IMPL")  # for what torch's own code calls beneath modes
-_library.impl("empty_strided", _empty, "PrivateUse1")
-_library.impl("copy_", _copy, "PrivateUse1")
+@functools.cache
+def _registered():
+    """Makes torch know the device, which it does from then on: see `tests/on_other_device.py`."""
+    backends = pytest.importorskip("torch.utils.backend_registration")
+    if not hasattr(backends, "_setup_privateuseone_for_python_backend"):
+        pytest.skip("this torch takes no device that is written in Python")
+    backends._setup_privateuseone_for_python_backend()
+    library = torch.library.Library("aten", "IMPL")  # for what torch itself calls beneath modes
+    library.impl("empty_strided", _empty, "PrivateUse1")
+    library.impl("copy_", _copy, "PrivateUse1")
+    return library

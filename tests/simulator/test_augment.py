@@ -161,14 +161,6 @@ def test_settings_are_drawn_within_their_ranges_whatever_acts() -> None:
         assert high - 0.05 * (high - low) < values.max() <= high
 
 
-def test_another_device_gives_the_pictures_of_the_cpu() -> None:
-    other = pytest.importorskip("tests.other_device", exc_type=ImportError)
-    given = pictures()
-    with other.OtherDevice():
-        here, there = (ExposureAugmentation()(x, range(4)) for x in (given, given.to(other.NAME)))
-    assert (here - there.held).abs().max() <= 12.92 * 1.618 / min(CAMERA.span) + 1e-4
-
-
 def test_bad_arguments():
     bad = {"stops": [(1.0, -1.0), (-1.0, math.nan), 2.0], "isos": [(0.0, 100.0)]}
     bad |= {"defocus": [(0.0, 65.0)], "motion": [(-1.0, 1.0)], "highlights": [("a", "b")]}
