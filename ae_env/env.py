@@ -103,7 +103,9 @@ class AutoExposure(Task):
         if "flicker" in self.episodes.options.costs:
             flat = frames.outputs["codes"].reshape(len(frames.gains), -1)
             integers: Any = torch.int64 if torch.is_tensor(flat) else np.int64
-            columns["image_mean"] = flat.sum(1, dtype=integers) / (255.0 * flat.shape[1])
+            total = flat.sum(1, dtype=integers)
+            total = total.float() if torch.is_tensor(total) else total
+            columns["image_mean"] = total / (255.0 * flat.shape[1])
         return columns
 
     def reward(

@@ -56,6 +56,16 @@ def test_a_step_neither_mixes_devices_nor_reads_back(arguments, reads) -> None:
             assert_close(loops.step(actions), found)
 
 
+def test_torchs_default_device_changes_nothing() -> None:
+    with other.OtherDevice():
+        plain, moved = make_envs(), make_envs()
+        plain.reset(seed=1)
+        with torch.device(other.NAME):
+            moved.reset(seed=1)
+            found = moved.step(np.array([3, 9, 63]))
+    np.testing.assert_array_equal(found[1], plain.step(np.array([3, 9, 63]))[1])
+
+
 def test_another_device_gives_the_pictures_of_the_cpu() -> None:
     given = pictures()
     with other.OtherDevice():

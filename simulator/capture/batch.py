@@ -243,10 +243,11 @@ class CaptureBatch:
             count=True,
             **outputs,
         )
-        samples = math.prod(transitions.shape)
+        counted = counts.float() if isinstance(counts, torch.Tensor) else counts
+        shares = counted / math.prod(transitions.shape)
         return FrameStatistics(
-            clipped_low=counts[:, 0] / samples,
-            clipped_high=counts[:, 1] / samples,
+            clipped_low=shares[:, 0],
+            clipped_high=shares[:, 1],
             excess_variance=self._excess_variance[rows],
             predicted_error=self._predicted_error[rows],
             modules=self._modules[rows],

@@ -79,6 +79,21 @@ def test_every_option_has_the_same_episodes(arguments, monkeypatch) -> None:
                 assert apart.max() <= (name == "raw")
 
 
+@pytest.mark.parametrize("device", [None, "cpu"])
+def test_torchs_default_dtype_changes_nothing(device) -> None:
+    found = []
+    for dtype in (torch.float32, torch.bfloat16):
+        torch.set_default_dtype(dtype)
+        try:
+            envs = make_envs(8, device=device, costs={"flicker": 1.0})
+            envs.reset(seed=1)
+            found.append(envs.step(8 * np.arange(8)))
+        finally:
+            torch.set_default_dtype(torch.float32)
+    for name, values in found[0][4].items():
+        np.testing.assert_array_equal(np.asarray(found[1][4][name]), np.asarray(values), name)
+
+
 def test_on_another_device() -> None:
     """In a process of its own: from then on torch knows the stand-in for a device."""
     checks = Path(__file__).parents[1] / "on_other_device.py"
