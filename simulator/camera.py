@@ -1,7 +1,5 @@
 """Camera profiles: what a sensor does to light, and how noisy it is at each ISO."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math
@@ -11,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib import resources
 from numbers import Real
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -199,9 +197,7 @@ class CameraProfile:
         )
         return ReadNoise(row, shape, box_factor)
 
-    def with_levels(
-        self, black_level: Sequence[float], white_level: float, bit_depth: int
-    ) -> CameraProfile:
+    def with_levels(self, black_level: Sequence[float], white_level: float, bit_depth: int) -> Self:
         """This camera with a file's `black_level` (4,) and `white_level` [DN] of `bit_depth` bits.
 
         The noise is scaled to them: the same digital numbers, as shares of the converter's range,
@@ -217,7 +213,7 @@ class CameraProfile:
         table = {iso: nlf.exposed(factor) for iso, nlf in self.nlf_by_iso.items()}
         return replace(other, nlf_by_iso=table)
 
-    def with_nlf(self, iso: float, nlf: NoiseLevelFunction) -> CameraProfile:
+    def with_nlf(self, iso: float, nlf: NoiseLevelFunction) -> Self:
         """This camera with `nlf`, measured at `iso`, as its only noise calibration."""
         return replace(self, nlf_by_iso={float(iso): nlf}, segments=(), source=nlf.source)
 

@@ -1,13 +1,11 @@
 """The camera simulator: plans which steps a change of settings needs, and runs those."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypedDict, TypeVar, Unpack, cast, get_args
+from typing import Any, Literal, Protocol, Self, TypedDict, TypeVar, Unpack, cast, get_args
 
 import torch
 from torch import nn
@@ -195,7 +193,7 @@ class CameraSimulator:
         precision: Literal["float32", "bfloat16"] = "float32",
         cache: Where | None = "memory",
         body_correction: bool = False,
-    ) -> CameraSimulator:
+    ) -> Self:
         """A simulator with trained networks.
 
         A `ValueError` if there are no such weights, or they are damaged.

@@ -1,9 +1,8 @@
 """Camera settings and the photographic arithmetic between them, in log2 and float64."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
+from typing import Self
 
 from simulator.utils.checks import check_number
 
@@ -62,7 +61,7 @@ class CameraSettings:
         object.__setattr__(self, "log2_exposure", exposure)
 
     @classmethod
-    def from_exif(cls, iso: float, exposure_time: float, f_number: float) -> CameraSettings:
+    def from_exif(cls, iso: float, exposure_time: float, f_number: float) -> Self:
         """Settings of a file: `iso`, `f_number` and, of a rounded `exposure_time`, the exact stop.
 
         >>> CameraSettings.from_exif(100, 1 / 60, 2.8).exposure_time == 1 / 64

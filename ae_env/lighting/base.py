@@ -1,7 +1,5 @@
 """`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -58,7 +56,7 @@ class RollingShutter(NamedTuple):
 
 
 #: Lightings by name: every subclass of `Lighting` with a `name` of its own.
-KINDS: dict[str, type[Lighting]] = {}
+KINDS: "dict[str, type[Lighting]]" = {}
 
 
 @dataclass(frozen=True)

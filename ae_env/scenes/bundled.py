@@ -18,17 +18,10 @@ import torch
 from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_frames import Layout
+from simulator.radiance import procedural
 from simulator.radiance.depth import draw_layout
 from simulator.radiance.incident_light import picture_illuminance
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
-from simulator.radiance.procedural import (
-    GENERATOR_VERSION,
-    HARD_KINDS,
-    MOTION_SPEED,
-    NATIVE_SIZE,
-    Drawing,
-    draw,
-)
 from simulator.settings import CameraSettings
 from simulator.utils.cache import cache_key, disk_cache
 from simulator.utils.checks import NOTE
@@ -83,7 +76,7 @@ def bundled_scenes(
         halves = [replace(request, split=split) for split in ("train", "test")]
         return SceneSet([s for half in halves for s in bundled_scenes(half, size=size, part=part)])
     key = {
-        "generator": GENERATOR_VERSION,
+        "generator": procedural.GENERATOR_VERSION,
         "format": _FORMAT,
         "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
         "photographs": [p.name for p in PHOTOGRAPHS],
@@ -99,7 +92,7 @@ def bundled_scenes(
     found = _stored(key_of_all, request.camera, request.resolution)
     if found is not None:
         return found
-    kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
+    kinds = KINDS if part is None else procedural.HARD_KINDS if part == HARD else (part,)
     groups = list(_groups(request, size, kinds))
     return DrawnScenes(f"the bundled scenes ({request.split})", groups, key_of_all)
 
@@ -179,9 +172,9 @@ def procedural_groups(split: str, size: Size) -> Iterator[tuple[str, int]]:
 
 
 def _draw_procedural(kind: str, index: int, name: str, request: SceneRequest) -> list[Scene]:
-    drawing = draw(kind, np.random.default_rng([zlib.crc32(kind.encode()), index]))
-    speed = MOTION_SPEED if kind == "motion" else DEFAULT_SPEED
-    facts = {"kind": kind, "hard": kind in HARD_KINDS, "median_speed": speed}
+    drawing = procedural.draw(kind, np.random.default_rng([zlib.crc32(kind.encode()), index]))
+    speed = procedural.MOTION_SPEED if kind == "motion" else DEFAULT_SPEED
+    facts = {"kind": kind, "hard": kind in procedural.HARD_KINDS, "median_speed": speed}
     return [_scene(drawing, request, scene_id=name, source="procedural, ae-env (MIT)", **facts)]
 
 
@@ -192,7 +185,7 @@ def _draw_photograph(photograph: Photograph, request: SceneRequest) -> list[Scen
     return [_scene(drawing, request, scene_id=name, **facts) for name, drawing in drawings]
 
 
-def _scene(drawing: Drawing, request: SceneRequest, **facts: Any) -> Scene:
+def _scene(drawing: procedural.Drawing, request: SceneRequest, **facts: Any) -> Scene:
     light, lux, illuminant = drawing.light, drawing.illuminance, drawing.illuminant
     scene = Scene.from_radiance(
         light, request.camera, illuminance=lux, illuminant=illuminant, **facts
@@ -255,7 +248,7 @@ def _stored(key: str, camera: CameraProfile, resolution: int | None) -> SceneSet
     values = disk_cache().get(key)
     if values is None:
         return None
-    side = NATIVE_SIZE if resolution is None else resolution
+    side = procedural.NATIVE_SIZE if resolution is None else resolution
     try:
         ids, light = [row["scene_id"] for row in values["facts"]], values["light"]
         if light.shape != (len(ids), 4, side, side) or not light.amax() < math.inf:

@@ -7,8 +7,6 @@ they are. The group of a file is, in this order: the one that a ``groups.csv`` b
 one that `group_shots` finds from its time and colours. No other names are read.
 """
 
-from __future__ import annotations
-
 import glob
 import logging
 import math
@@ -283,7 +281,7 @@ def _read_file(
     group: str | None,
     options: FolderOptions,
     request: SceneRequest,
-    shots: dict[str, Shot],
+    shots: "dict[str, Shot]",
 ) -> list[Scene]:
     """The scenes of a file; the `Shot` of a raw without a group goes into `shots`."""
     fields = options.fields(path)

@@ -24,8 +24,6 @@ What `scenes=` may be:
   ``iso``, ``exposure_time`` and ``f_number`` of files that do not state theirs.
 """
 
-from __future__ import annotations
-
 import inspect
 import logging
 import os
@@ -296,7 +294,7 @@ def environment_scenes(
 
 
 def _prepare(
-    scene: Scene, networks: SceneNetworks | None, finds_defocus: bool, noise: bool | str
+    scene: Scene, networks: "SceneNetworks | None", finds_defocus: bool, noise: bool | str
 ) -> Scene:
     if not finds_defocus and scene.defocus_map is not None:
         scene = replace(scene, defocus_map=None)

@@ -1,10 +1,8 @@
 """Noise module: removes the source's noise, so that the target's can take its place."""
 
-from __future__ import annotations
-
 import copy
 import itertools
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import torch
 import torch.nn.functional as F
@@ -56,7 +54,7 @@ class Stabiliser(NamedTuple):
     root: Tensor
 
     @classmethod
-    def of(cls, shot: Tensor, read: Tensor) -> Stabiliser:
+    def of(cls, shot: Tensor, read: Tensor) -> Self:
         """For noise of (B, 4) `shot` and `read`, in float32."""
         shot, read = (v.float()[:, :, None, None] for v in (shot, read))
         return cls(shot, (read + 0.375 * shot.square()).sqrt().clamp(min=1e-18))

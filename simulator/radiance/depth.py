@@ -18,17 +18,8 @@ import torch.nn.functional as F
 from numpy.random import Generator
 
 from simulator.capture.blurred_frames import Layout
+from simulator.radiance import procedural
 from simulator.radiance.light import temperature_tint
-from simulator.radiance.procedural import (
-    Drawing,
-    LeafStyle,
-    Range,
-    dead_leaves,
-    draw_lux,
-    fractal_noise,
-    log_uniform,
-    paint_leaves,
-)
 from simulator.utils.checks import check_integer, check_word
 
 #: The lens that procedural scenes are drawn for [m], and the f-number of the stated blur.
@@ -56,13 +47,12 @@ class DepthDrawing:
 
     `blur` (H, W) float32 is the signed circle of confusion at `F_NUMBER` [packed pixels], above 0
     behind the plane of focus and at most `LARGEST_BLUR`; `far` the inverse distance [1/m] where it
-    is largest; `surface` (H, W) the number of the thing that each pixel shows, 0 the background.
+    is largest.
     """
 
-    drawing: Drawing
+    drawing: procedural.Drawing
     blur: np.ndarray
     far: float
-    surface: np.ndarray
 
 
 def draw_depth(rng: Generator, size: int, focus: str = "middle") -> DepthDrawing:
@@ -83,10 +73,10 @@ def draw_depth(rng: Generator, size: int, focus: str = "middle") -> DepthDrawing
     if rng.random() < 1.0 / 3.0:
         _add_highlights(rng, picture, surface)
     light = _soften(picture, rng.uniform(0.05, 0.09))
-    lux = draw_lux(rng, 1.0, 20_000.0)
-    drawing = Drawing(light, lux, temperature_tint(rng.uniform(-0.1, 1.0)))
+    lux = procedural.draw_lux(rng, 1.0, 20_000.0)
+    drawing = procedural.Drawing(light, lux, temperature_tint(rng.uniform(-0.1, 1.0)))
     far = math.exp(rng.uniform(math.log(0.02), math.log(1.0)))
-    return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
+    return DepthDrawing(drawing, blur.astype(np.float32), far)
 
 
 def draw_layout(name: str, height: int, width: int) -> Layout:
@@ -101,7 +91,7 @@ def draw_layout(name: str, height: int, width: int) -> Layout:
         levels = _levels(rng, int(rng.integers(1, 4)), focus)
         levels *= LARGEST_BLUR / np.abs(levels).max()  # only what is relative to it matters
         blur = _background(rng, _LAYOUT_SIDE, levels[0], levels[0] - levels[-1])
-        surface = np.zeros(blur.shape, np.int32)
+        surface = np.zeros(blur.shape, np.int32)  # the thing that each pixel shows, 0: none
         for number, level in enumerate(levels[1:], start=1):
             _put_thing(rng, blur, surface, number, level, _LAYOUT_SIDES)
         subject = surface == len(levels) - 1
@@ -166,7 +156,7 @@ def _put_thing(
     surface: np.ndarray,
     number: int,
     level: float,
-    sides: Range = _SIDES,
+    sides: procedural.Range = _SIDES,
 ) -> tuple[tuple[slice, ...], tuple[slice, ...], np.ndarray, np.ndarray]:
     """Adds one thing: its place in the frame and in itself, where it is seen, its tone."""
     size = blur.shape[0]
@@ -193,14 +183,14 @@ def _board(rng: Generator, side: int) -> np.ndarray:
     angle, elongation = rng.uniform(0, np.pi), 2.0 ** rng.uniform(-0.6, 0.6)
     shape = np.array([[angle], [elongation], [rng.random() < 0.5]])
     radius, middle = np.array([rng.uniform(0.28, 0.4) * side]), np.array([0.5 * side])
-    return paint_leaves(side, radius, middle, middle, shape) > 0
+    return procedural.paint_leaves(side, radius, middle, middle, shape) > 0
 
 
 def _bush(rng: Generator, side: int) -> np.ndarray:
     """(side, side) bool: a blob with a fractal outline."""
     axis = np.linspace(-1.0, 1.0, side, dtype=np.float32)
     distance = np.hypot(axis[:, None], axis[None, :])
-    ragged = rng.uniform(0.05, 0.25) * fractal_noise(rng, side, rng.uniform(1.2, 1.8))
+    ragged = rng.uniform(0.05, 0.25) * procedural.fractal_noise(rng, side, rng.uniform(1.2, 1.8))
     return (distance + ragged < rng.uniform(0.6, 0.85)) & (distance < 0.97)
 
 
@@ -211,7 +201,7 @@ def _foliage(rng: Generator, side: int, level: float) -> tuple[np.ndarray, np.nd
     angle, elongation = rng.uniform(0.0, np.pi, number), np.exp2(rng.uniform(-1.2, 1.2, number))
     shape = np.stack([angle, elongation, rng.random(number) < 0.2])
     centre_y, centre_x = rng.uniform(0.2, 0.8, (2, number)) * side
-    label = paint_leaves(side, radius, centre_y, centre_x, shape)
+    label = procedural.paint_leaves(side, radius, centre_y, centre_x, shape)
     spread = rng.uniform(0.0, 1.5)
     depth = np.sort(level + rng.uniform(-spread, spread, number))[::-1]  # painted from far to near
     depth = np.concatenate([[np.inf], depth]).astype(np.float32)
@@ -225,17 +215,18 @@ def _leaves(rng: Generator, size: int) -> np.ndarray:
     The exponent of the additional texture varies, so that smoothness alone does not tell that
     something is out of focus.
     """
-    style = LeafStyle(
-        smallest=float(log_uniform(rng, 1.5, 12.0)),
+    style = procedural.LeafStyle(
+        smallest=float(procedural.log_uniform(rng, 1.5, 12.0)),
         largest=rng.uniform(0.2, 0.5),
         contrast=rng.uniform(0.3, 0.9),
         chroma=rng.uniform(0.1, 0.5),
         texture=rng.uniform(0.2, 1.3),
         mean=float(np.clip(0.17 * np.exp(rng.normal(0.0, 0.5)), 0.05, 0.45)),
     )
-    light = dead_leaves(rng, size, style)
+    light = procedural.dead_leaves(rng, size, style)
     strength = rng.uniform(0.0, 0.6) if rng.random() < 0.8 else 0.0
-    grain = np.exp(np.float32(strength) * fractal_noise(rng, size, rng.uniform(0.6, 1.3)))
+    noise = procedural.fractal_noise(rng, size, rng.uniform(0.6, 1.3))
+    grain = np.exp(np.float32(strength) * noise)
     return np.asarray(np.clip(light * grain, 0.003, 0.97).astype(np.float32))
 
 

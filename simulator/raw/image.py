@@ -1,12 +1,10 @@
 """A raw photograph as the simulator handles it, and its digital numbers."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -58,12 +56,12 @@ class RawImage:
     @classmethod
     def from_mosaic(
         cls, mosaic: np.ndarray, settings: CameraSettings, camera: CameraProfile, **fields: Any
-    ) -> RawImage:
+    ) -> Self:
         """A raw from `mosaic` (2H, 2W) [DN], the CFA of `camera`, `settings` and other `fields`."""
         return cls(pack_mosaic(np.asarray(mosaic), camera), settings, camera, **fields)
 
     @classmethod
-    def from_finite(cls, data: torch.Tensor, *fields: Any, **more: Any) -> RawImage:
+    def from_finite(cls, data: torch.Tensor, *fields: Any, **more: Any) -> Self:
         """A raw of finite `data` (4, H, W) float32, not checked; `fields` and `more` too."""
         raw = cls(data[:, :1, :1], *fields, **more)
         object.__setattr__(raw, "data", data)

@@ -4,8 +4,6 @@ The tags of TIFF-structured files (DNG, NEF, CR2, ARW, ...) are read with tifffi
 containers (CRW, CR3, RAF, MRW) only make and model are read; LibRaw reads their settings.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -16,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import tifffile
@@ -38,7 +36,7 @@ class Ratio(float):
     numerator: int
     denominator: int
 
-    def __new__(cls, numerator: int, denominator: int) -> Ratio:
+    def __new__(cls, numerator: int, denominator: int) -> Self:
         """NaN over a denominator of 0."""
         ratio = super().__new__(cls, numerator / denominator if denominator else math.nan)
         ratio.numerator, ratio.denominator = numerator, denominator

@@ -1,7 +1,5 @@
 """Raw files: any Bayer raw that LibRaw reads, as a `RawImage`."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import logging
@@ -330,7 +328,7 @@ def _settings(
 
 def _profile(
     path: Path,
-    decoded: _Decoded,
+    decoded: "_Decoded",
     make: str,
     model: str,
     camera: CameraProfile | str | None,
@@ -374,7 +372,7 @@ def _profile(
     )
 
 
-def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None:
+def _check_profile(path: Path, decoded: "_Decoded", camera: CameraProfile) -> None:
     brightest, ratio = int(decoded.mosaic.max()), camera.white_level / decoded.white_level
     # Where pixels are brighter than the file's own level, that is wrong.
     corrected = ratio > 1.0 and decoded.white_level < brightest <= camera.white_level

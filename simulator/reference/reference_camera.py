@@ -7,11 +7,10 @@ read noise, black level, clip, whole digital numbers, and only then an average o
 body has a small hidden error of shutter, aperture and black level, as real ones do.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 import torch
@@ -161,7 +160,7 @@ class BodyError:
     black_offset: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod
-    def draw(cls, camera: CameraProfile, seed: int) -> BodyError:
+    def draw(cls, camera: CameraProfile, seed: int) -> Self:
         """Draw a body of `camera` as it might leave the factory; the same `seed` gives the same.
 
         Shutter: 15 us (standard deviation, at most 60 us, so that 1/8000 s stays open) and 1 %.

@@ -26,16 +26,9 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import LOW_ISO, Pair, any_pairs, is_cleaner, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.training import trainer
 from simulator.training.crops import Batch, stacked, stated_fields
 from simulator.training.losses import expose
-from simulator.training.trainer import (
-    SimulatorConfig,
-    first_modules,
-    make_accelerator,
-    save_trained,
-    stage_loss,
-    train_stage,
-)
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
 from simulator.utils.files import read_table, refuse_bomb, sibling
@@ -350,7 +343,7 @@ class CapturedNoiseLoss(nn.Module):
 
 
 def train_on_captures(
-    config: SimulatorConfig,
+    config: trainer.SimulatorConfig,
     sequences: Sequence[CapturedSequence],
     path: Path,
     *,
@@ -363,17 +356,17 @@ def train_on_captures(
     Camera, body and scenes of `config` do not matter.
     """
     check_word("preset", config.preset, ("paper", "pc", "dl"))
-    accelerator = make_accelerator(config, device, None)
-    modules, start = first_modules(config)
+    accelerator = trainer.make_accelerator(config, device, None)
+    modules, start = trainer.first_modules(config)
     names = [name for name in STAGES if name in config.stages()]
     stages: dict[str, dict[str, Any]] = {}
     values, known = config.card(), [sequence.name for sequence in sequences]
     for number, name in enumerate(names, start=1):
         pairs = CapturedPairs(sequences, name, seed=config.seed)
         entries = ("preset", "seed", "precision", *names[:number])
-        stages[name] = train_stage(
+        stages[name] = trainer.train_stage(
             name,
-            CapturedNoiseLoss(modules) if name == "noise" else stage_loss(name, modules),
+            CapturedNoiseLoss(modules) if name == "noise" else trainer.stage_loss(name, modules),
             modules[name],
             pairs,
             config.stages()[name],
@@ -382,5 +375,5 @@ def train_on_captures(
             identity=[{entry: values[entry] for entry in entries}, start, known],
         )
     done = {"start": start, "sequences": len(sequences), "stages": stages}
-    save_trained(path, modules, config, command, **done)
+    trainer.save_trained(path, modules, config, command, **done)
     return sibling(path, ".safetensors")

@@ -24,18 +24,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance import procedural
 from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
 from simulator.radiance.light import camera_light, mean_anchor, reference_settings, temperature_tint
 from simulator.radiance.maps import AZIMUTHS, EV100_RANGE, assumed_ev100, hash_fraction
 from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
-from simulator.radiance.procedural import (
-    KINDS,
-    LeafStyle,
-    dead_leaves,
-    draw,
-    draw_lux,
-    fractal_noise,
-)
 from simulator.radiance.reading import RADIANCE_SUFFIXES, read_radiance
 from simulator.raw.read import read_raw
 from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene, packed_pitch
@@ -232,14 +225,14 @@ def _drawings(split: Split, number: int, seed: int) -> Iterator[DetailPicture]:
 
 def _leaves(rng: np.random.Generator) -> np.ndarray:
     """Dead leaves down to less than a photosite: the sharpest edges that can be."""
-    style = LeafStyle(
+    style = procedural.LeafStyle(
         smallest=float(np.exp(rng.uniform(np.log(0.7), np.log(4.0)))),
         contrast=float(rng.uniform(0.3, 1.1)),
         chroma=float(rng.uniform(0.1, 0.6)),
         texture=float(rng.uniform(0.0, 0.5)),
         palette=int(rng.integers(3, 30)),
     )
-    return dead_leaves(rng, _SIZE, style)
+    return procedural.dead_leaves(rng, _SIZE, style)
 
 
 def _chart(rng: np.random.Generator) -> np.ndarray:
@@ -282,7 +275,7 @@ def _smooth(rng: np.random.Generator) -> np.ndarray:
     tint = np.exp2(rng.uniform(-0.8, 0.8, 3))[:, None, None]
     if rng.random() < 0.3:
         return np.ascontiguousarray(np.broadcast_to(tint, (3, _SIZE, _SIZE)), np.float32)
-    shape = fractal_noise(rng, _SIZE, float(rng.uniform(1.8, 3.0)))
+    shape = procedural.fractal_noise(rng, _SIZE, float(rng.uniform(1.8, 3.0)))
     return np.asarray(tint * np.exp(rng.uniform(0.02, 0.8) * shape), np.float32)
 
 
@@ -330,8 +323,8 @@ def _procedural(
     rng = np.random.default_rng([zlib.crc32(b"reference"), seed, first + position])
     depth, lens = None, Lens()
     if within == _FLAT_EVERY - 1:
-        kind = list(KINDS)[block % len(KINDS)]
-        drawing = draw(kind, rng, 2 * size, lens=False)
+        kind = list(procedural.KINDS)[block % len(procedural.KINDS)]
+        drawing = procedural.draw(kind, rng, 2 * size, lens=False)
     else:
         kind, focus = "depth", FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
         drawn = draw_depth(rng, 2 * size, focus)
@@ -405,7 +398,7 @@ def _bundled_photographs(
             unprocess(read_photograph(photograph.file), rng),
             camera,
             size,
-            lux=draw_lux(rng, *photograph.illuminance),
+            lux=procedural.draw_lux(rng, *photograph.illuminance),
             illuminant=temperature_tint(rng.uniform(*photograph.tint)),
             scene_id=photograph.name,
             group=photograph.name,

@@ -1,13 +1,11 @@
 """Training states on disk, so that a training that is killed goes on from its last checkpoint."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 
@@ -86,7 +84,7 @@ class Checkpoint:
         if time.monotonic() - self._saved > INTERVAL:
             self.save()
 
-    def __enter__(self) -> Checkpoint:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
