@@ -83,7 +83,11 @@ def develop(
     """
     images = check_packed("images", images, ndim=4)
     check_word("tone", tone, TONES)
-    _check_gains(white_balance, len(images))
+    gains = torch.as_tensor(white_balance, dtype=torch.float32)
+    positive = bool((torch.isfinite(gains) & (gains > 0)).all())
+    if gains.shape not in ((3,), (len(images), 3)) or not positive:
+        rule = f"must be (3,) or ({len(images)}, 3), positive and finite"
+        raise ValueError(f"`white_balance` (={gains.tolist()}) {rule}")
     return develop_known(images, white_balance, colour_matrix, tone)
 
 
@@ -196,14 +200,6 @@ def _decoded(encoded: torch.Tensor) -> torch.Tensor:
     shown = torch.where(encoded <= 0.04045, encoded / 12.92, curved)
     # The inverse of Schlick's curve, see `apply_tone`.
     return shown / (PHOTOGRAPHIC_SLOPE - (PHOTOGRAPHIC_SLOPE - 1.0) * shown)
-
-
-def _check_gains(white_balance: Gains, count: int) -> None:
-    gains = torch.as_tensor(white_balance, dtype=torch.float32)
-    positive = bool((torch.isfinite(gains) & (gains > 0)).all())
-    if gains.shape not in ((3,), (count, 3)) or not positive:
-        rule = f"must be (3,) or ({count}, 3), positive and finite"
-        raise ValueError(f"`white_balance` (={gains.tolist()}) {rule}")
 
 
 def _plane_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:

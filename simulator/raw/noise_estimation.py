@@ -75,7 +75,10 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
             f"at least {_MIN_BLOCKS} unclipped blocks of {_BLOCK} x {_BLOCK} to estimate the noise"
         )
     shot, read = 0.0, 1.0
-    levels = _level_sets(mean, slope)
+    # The smooth blocks of equally populated levels, as indices.
+    count = int(np.clip(len(mean) // _BLOCKS_PER_LEVEL, 1, _MAX_LEVELS))
+    sets = np.array_split(np.argsort(mean, kind="stable"), count)
+    levels = [own[slope[own] <= np.quantile(slope[own], _SMOOTH)] for own in sets]
     for _ in range(3):
         # A level set spans a range of signals: correct for the change of the variance inside it.
         level, variance, weight = _variance_by_level(mean, energy, levels, shot, read)
@@ -125,13 +128,6 @@ def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarra
     )
     keep = share <= _CLIPPED
     return mean[keep], energy[keep], slope[keep]
-
-
-def _level_sets(mean: np.ndarray, slope: np.ndarray) -> list[np.ndarray]:
-    """The smooth blocks of equally populated levels, as indices."""
-    levels = int(np.clip(len(mean) // _BLOCKS_PER_LEVEL, 1, _MAX_LEVELS))
-    sets = np.array_split(np.argsort(mean, kind="stable"), levels)
-    return [own[slope[own] <= np.quantile(slope[own], _SMOOTH)] for own in sets]
 
 
 def _variance_by_level(
