@@ -1,10 +1,8 @@
 """The interface of a policy: what it knows of its camera, and what it has to answer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +15,7 @@ Observations = Mapping[str, NDArray[Any]]
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 
 
 class BracketLimits(NamedTuple):
@@ -41,7 +40,7 @@ class PolicyContext:
     bracket: BracketLimits | None = None  #: None for tasks without a bracket
 
     @classmethod
-    def from_envs(cls, envs: gym.vector.VectorEnv[Any, Any, Any]) -> PolicyContext:
+    def from_envs(cls, envs: VectorEnv) -> Self:
         """The context of the environments that `envs` runs."""
         base: Any = envs.unwrapped
         limits = None
@@ -98,7 +97,7 @@ class Policy:
         """
         raise NotImplementedError(f"{type(self).__name__} must implement `act`")
 
-    def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
+    def fit(self, envs: VectorEnv, seed: int = 0) -> None:
         """Learn from the scenes of `envs`, in episodes of `seed`; once, before evaluation."""
 
 

@@ -1,11 +1,9 @@
 """Episodes for fitting and evaluation: the same for every policy, whatever the batch size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
 import numpy as np
@@ -16,14 +14,14 @@ from ae_env.scenes import Scene
 from ae_env.scenes.folder import FEWEST_GROUPS_TO_SPLIT
 from ae_env.scenes.load import BUNDLED, REAL, SceneSpec
 from ae_env.utils.user_files import UserCodeError
-from agents.policy import Bools, Floats, Ints, Observations, Policy
+from agents.policy import Bools, Floats, Ints, Observations, Policy, VectorEnv
 
 ENV_ID = "ae_env:ae_env/AutoExposure-v0"
 
 
 def make_envs(
     env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
-) -> gym.vector.VectorEnv[Any, Any, Any]:
+) -> VectorEnv:
     """Environments of the arguments `env_options`, without autoreset, for `frames` actions."""
     shown = {"with_oracle": with_oracle, "with_subject": True}
     options = {**env_options, **shown, "autoreset_mode": "DISABLED"}
@@ -59,19 +57,19 @@ def fitting_arguments(environment: Mapping[str, Any], resolution: int) -> dict[s
     return training_arguments(scenes, resolution)[0] | own
 
 
-def scenes_of(envs: gym.vector.VectorEnv[Any, Any, Any]) -> list[Scene]:
+def scenes_of(envs: VectorEnv) -> list[Scene]:
     """The scenes that the episodes of `envs` draw from."""
     base: Any = envs.unwrapped
     return list(base.scenes)
 
 
-def expected_scores(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Floats:
+def expected_scores(envs: VectorEnv) -> Floats:
     """q of every state in the current frame of each episode, ``(N, S)``."""
     base: Any = envs.unwrapped
     return np.array(base.expected_scores(), dtype=np.float64)
 
 
-def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Bools:
+def action_masks(envs: VectorEnv) -> Bools:
     """States that the scene of each episode allows, ``(N, S)``."""
     base: Any = envs.unwrapped
     return np.array(base.action_masks(), dtype=np.bool_)
@@ -80,9 +78,7 @@ def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Bools:
 class WatchedEnvs(gym.vector.VectorWrapper):
     """Environments that call `watch` before each step; an error that it raises ends the work."""
 
-    def __init__(
-        self, envs: gym.vector.VectorEnv[Any, Any, Any], watch: Callable[[], None]
-    ) -> None:
+    def __init__(self, envs: VectorEnv, watch: Callable[[], None]) -> None:
         super().__init__(envs)
         self._watch = watch
 
@@ -120,7 +116,7 @@ class RolloutPlan:
     @classmethod
     def of_each_scene(
         cls, scenes: Sequence[Scene], *, count: int, seed: int, most: int | None = None
-    ) -> RolloutPlan:
+    ) -> Self:
         """All scenes, `count` times in a row; episode i has the seed ``seed + i``.
 
         Of more scenes than `most`, so many are used, evenly over the list.
@@ -133,7 +129,7 @@ class RolloutPlan:
     def __len__(self) -> int:
         return len(self.seeds)
 
-    def batches(self, envs: gym.vector.VectorEnv[Any, Any, Any]) -> Iterator[EpisodeBatch]:
+    def batches(self, envs: VectorEnv) -> Iterator[EpisodeBatch]:
         """Resets `envs` to each batch in turn; the last one repeats its episodes to be full."""
         for begin in range(0, len(self), envs.num_envs):
             index = np.arange(begin, min(begin + envs.num_envs, len(self)))

@@ -4,8 +4,6 @@ A shard is a few files. Its results are written when it is whole, so that a run 
 continues with the shards that are missing, and a worker that is lost costs one shard's work.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
@@ -14,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -60,7 +58,7 @@ class ShardPlan:
     settings: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, what: str, out: Path, **options: Any) -> ShardPlan:
+    def of(cls, what: str, out: Path, **options: Any) -> Self:
         """The plan for a file, folder or glob of raws and radiance maps."""
         base, files = find_files(what)
         names = [printable(str(f.relative_to(base)) if f != base else f.name) for f in files]

@@ -21,6 +21,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
+from agents import rollouts
 from agents.bracketing.policies import run_brackets
 from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
@@ -36,24 +37,11 @@ from agents.evaluation.evaluation_plan import (
 from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
 from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.reading import signal_codes
-from agents.policy import Ints, Policy, PolicyContext
+from agents.policy import Ints, Policy, PolicyContext, VectorEnv
 from agents.policy_names import make_policy, training_seeds
-from agents.rollouts import (
-    EpisodeBatch,
-    RolloutPlan,
-    WatchedEnvs,
-    action_masks,
-    checked_states,
-    choose,
-    errors_of,
-    expected_scores,
-    fitting_arguments,
-    make_envs,
-)
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer, check_number
 
-VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 Arrays = dict[str, NDArray[Any]]
 #: Called with work done, work in all, and what is being done.
 Progress = Callable[[int, int, str], None]
@@ -235,7 +223,9 @@ class EvaluationRun:
         if not self.plan.options().in_sequences:  # those must know that they are sequences
             options["scenes"] = self.scenes
         key = repr(condition), num_envs, frames, scored
-        return self._open(make_envs, *key, env_options=options, num_envs=num_envs, frames=frames)
+        return self._open(
+            rollouts.make_envs, *key, env_options=options, num_envs=num_envs, frames=frames
+        )
 
     def _make_brackets(self, condition: Condition, *, fit: bool = False) -> VectorEnv:
         """Environments of a budget; with `fit` of its training scenes."""
@@ -252,16 +242,18 @@ class EvaluationRun:
         ``defocus`` (J,) and ``movement`` (J, 4) are those that the episodes drew.
         """
         count, frames, own = self.num_tables, self.plan.frames, self.episodes
-        episodes = RolloutPlan(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
+        episodes = rollouts.RolloutPlan(
+            self.scenes, own.seeds[:count], own.scene[:count], [0] * count
+        )
         envs = self._make_envs(condition, batch_size(count, self.batch), frames, scored=True)
         base: Any = envs.unwrapped
         scores, allowed, drawn = [], [], []
         for batch in episodes.batches(envs):
-            tables, masks = [expected_scores(envs)], [batch.action_masks]
+            tables, masks = [rollouts.expected_scores(envs)], [batch.action_masks]
             for _ in range(frames):
                 envs.step(np.zeros(envs.num_envs, np.int64))
-                tables.append(expected_scores(envs))
-                masks.append(action_masks(envs))
+                tables.append(rollouts.expected_scores(envs))
+                masks.append(rollouts.action_masks(envs))
                 report(float(batch.valid.sum()))
             scores.append(np.stack(tables, axis=1)[batch.valid])
             allowed.append(np.stack(masks, axis=1)[batch.valid])
@@ -293,9 +285,9 @@ class EvaluationRun:
             envs = self._make_brackets(condition, fit=True)
         else:  # the same in all conditions, which share score tables
             base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-            base = fitting_arguments(base, self.plan.options().resolution)
+            base = rollouts.fitting_arguments(base, self.plan.options().resolution)
             envs = self._open(_training_envs, None, env_options=base)
-        with errors_of(trained.name, "fit"):
+        with rollouts.errors_of(trained.name, "fit"):
             policy.fit(envs, self.plan.seeds[0])
         return policy
 
@@ -418,8 +410,8 @@ def fit_policies(
     with closing(_training_envs(env_options, batch)) as envs:
         for i, (name, policy) in enumerate(learners):
             report(i, len(learners), name)
-            watched = envs if watch is None else WatchedEnvs(envs, partial(watch, name))
-            with errors_of(name, "fit"):
+            watched = envs if watch is None else rollouts.WatchedEnvs(envs, partial(watch, name))
+            with rollouts.errors_of(name, "fit"):
                 if keep and isinstance(policy, MeteringPolicy):
                     policy.fit_once(watched, seed, env_options)
                     continue
@@ -434,14 +426,14 @@ def _learns(policy: Policy) -> bool:
 
 
 def _training_envs(env_options: Mapping[str, Any], batch: int = BATCH) -> VectorEnv:
-    return make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
+    return rollouts.make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
 
 
 def run_batch(
     name: str,
     policy: Policy,
     envs: VectorEnv,
-    batch: EpisodeBatch,
+    batch: rollouts.EpisodeBatch,
     frames: int,
     *,
     oracle: Ints | None = None,
@@ -453,7 +445,7 @@ def run_batch(
     valid episodes, their ``start_states`` (n,), and ``seconds`` (frames,) that `act` took.
     """
     base: Any = envs.unwrapped
-    with errors_of(name, "reset"):
+    with rollouts.errors_of(name, "reset"):
         policy.reset(envs.num_envs, seed=batch.seed)
     observations, info, masks = batch.observations, batch.info, batch.action_masks
     start = np.array(info["state"], dtype=np.int64)[batch.valid]
@@ -462,10 +454,10 @@ def run_batch(
     for frame in range(frames):
         told = info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}
         begin = time.perf_counter()
-        actions = choose(name, policy, observations, masks, told)
+        actions = rollouts.choose(name, policy, observations, masks, told)
         seconds.append(time.perf_counter() - begin)
-        observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
-        masks = action_masks(envs)  # the next frame of a sequence is another scene
+        observations, _, _, _, info = envs.step(rollouts.checked_states(name, actions, masks))
+        masks = rollouts.action_masks(envs)  # the next frame of a sequence is another scene
         codes = signal_codes(observations["raw"], base.camera)
         shown = {
             "states": np.array(info["state"], dtype=np.int64),  # with a delay, an older choice
@@ -490,7 +482,7 @@ def _oracle_info(base: Any, oracle: Ints, frame: int) -> dict[str, Ints]:
 
 
 def _milliseconds_alone(
-    name: str, policy: Policy, envs: VectorEnv, episodes: RolloutPlan, oracle: Ints | None
+    name: str, policy: Policy, envs: VectorEnv, episodes: rollouts.RolloutPlan, oracle: Ints | None
 ) -> float:
     """Median time in `act` for one camera alone [ms]; the last (1, T) state of `oracle` stays."""
     if oracle is not None:

@@ -1,13 +1,11 @@
 """An evaluation's plan, from YAML: scenes, conditions, starts, frames, seeds, policies."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import pandas as pd
@@ -111,7 +109,7 @@ class EvaluationPlan(Configuration):
         return values
 
     @model_validator(mode="after")
-    def _check(self) -> EvaluationPlan:
+    def _check(self) -> Self:
         for entry in self._unused:
             field = type(self).model_fields[entry]
             if getattr(self, entry) != field.get_default(call_default_factory=True):
@@ -219,10 +217,10 @@ class EvaluationPlan(Configuration):
             del found["task"]
         return found
 
-    def changed(self, **entries: Any) -> EvaluationPlan:
+    def changed(self, **entries: Any) -> Self:
         """The same plan with other `entries`, checked."""
         given = {name: getattr(self, name) for name in self.model_fields_set}
-        return EvaluationPlan.model_validate(given | entries)
+        return self.model_validate(given | entries)
 
 
 def load_plan(name: str | Path) -> EvaluationPlan:

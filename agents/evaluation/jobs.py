@@ -19,27 +19,11 @@ import numpy as np
 
 from ae_env.scenes import Scene
 from ae_env.scorers.registry import scorer_fingerprint
-from agents.evaluation.engine import (
-    Arrays,
-    EvaluationRun,
-    Progress,
-    Report,
-    TrainedPolicy,
-    check_scorers,
-    other_scores,
-)
+from agents import policy_names
+from agents.evaluation import engine
 from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
 from agents.evaluation.result import EvaluationResult, Track
 from agents.learning.workers import core_count, run_in_parallel, send_progress
-from agents.policy_names import (
-    FORECASTERS,
-    LEARNT,
-    LEARNT_AGENTS,
-    split_class,
-    split_options,
-    training_seeds,
-    weight_files,
-)
 from simulator.utils.cache import Store, cache_key
 from simulator.utils.files import printable, sibling
 
@@ -60,11 +44,11 @@ class Job:
     """
 
     conditions: tuple[str, ...]
-    trained: TrainedPolicy | None
+    trained: engine.TrainedPolicy | None
     cost: float
 
 
-class Jobs(EvaluationRun):
+class Jobs(engine.EvaluationRun):
     """A run of a plan, of JSON values, in jobs; finished parts are stored in `folder`."""
 
     def __init__(
@@ -86,7 +70,7 @@ class Jobs(EvaluationRun):
         lighting = condition.lighting
         return cache_key("light", [*self._shared, lighting, file_content(lighting)])
 
-    def policy_key(self, trained: TrainedPolicy, condition: Condition) -> str:
+    def policy_key(self, trained: engine.TrainedPolicy, condition: Condition) -> str:
         """Key of the part with the track of `trained` in `condition`."""
         # Not the full name: the same weights in another folder do the same.
         own = (trained.policy, trained.index, named_content(trained.name), self.device)
@@ -102,7 +86,7 @@ class Jobs(EvaluationRun):
         return list(found.values())
 
     @cached_property
-    def privileged(self) -> dict[TrainedPolicy, bool]:
+    def privileged(self) -> dict[engine.TrainedPolicy, bool]:
         """Whether each policy is told the best states; raises where one cannot be made."""
         conditions = self.plan.all_conditions
         return {
@@ -117,12 +101,12 @@ class Jobs(EvaluationRun):
         return list(dict.fromkeys(one.policy for one, told in self.privileged.items() if not told))
 
     def run(
-        self, *, workers: int | None = 1, progress: Progress | None = None
+        self, *, workers: int | None = 1, progress: engine.Progress | None = None
     ) -> dict[str, EvaluationResult]:
         """Does the work that is left; see `run_plan`."""
         if not self.plan.policies:
             raise ValueError("`policies` (=[]) must hold at least one policy")
-        check_scorers(self.plan.other_scorers)
+        engine.check_scorers(self.plan.other_scorers)
         privileged = self.privileged
         jobs = self._left()
         total = max(sum(job.cost for job in jobs), 1.0)
@@ -174,7 +158,7 @@ class Jobs(EvaluationRun):
                 found.append(Job(left, trained, cost))
         return sorted(found, key=lambda job: (job.trained is not None, -job.cost))
 
-    def do(self, job: Job, report: Report) -> None:
+    def do(self, job: Job, report: engine.Report) -> None:
         """Does a job and stores its parts; `report` gets its costs as they are done [ms]."""
         conditions = [self.plan.all_conditions[name] for name in job.conditions]
         if job.trained is None:
@@ -190,7 +174,7 @@ class Jobs(EvaluationRun):
             others = {key: value for key, value in vars(track).items() if key != "arrays"}
             self.store.put(self.policy_key(job.trained, condition), {**track.arrays, **others})
 
-    def light(self, condition: Condition) -> Arrays:
+    def light(self, condition: Condition) -> engine.Arrays:
         """The finished score tables of `condition`, see `score_light`; nothing for brackets."""
         return self._stored(self.light_key(condition)) if self.num_tables else {}
 
@@ -217,7 +201,7 @@ class Jobs(EvaluationRun):
         key = cache_key("scorers", [self.light_key(condition), plan.starts, *own])
         scores = self.store.get(key)
         if scores is None:
-            scores = other_scores(result)
+            scores = engine.other_scores(result)
             self.store.put(key, scores)
         return replace(result, other_scores=scores)
 
@@ -229,7 +213,7 @@ def run_plan(
     scenes: list[Scene] | None = None,
     workers: int | None = 1,
     device: str = "cpu",
-    progress: Progress | None = None,
+    progress: engine.Progress | None = None,
 ) -> dict[str, EvaluationResult]:
     """Runs `plan`, or the part of it that `folder` does not hold yet; the results by condition.
 
@@ -288,13 +272,16 @@ def named_content(name: str) -> str:
     They are its module, weights and folders. With a Python file, all others of its folder count,
     since it may import them; data that it reads is not known.
     """
-    base, options = split_options(name)
+    base, options = policy_names.split_options(name)
     is_word = Path(base).expanduser().is_dir()  # such as the light `train`, beside its data
     files = _own_files(base) or ([] if is_word else _named_files(base))
     for value in options.values():
         files += _named_files(str(value))
-        if value == LEARNT:
-            files += [Path(f"{file}.safetensors") for file in weight_files(FORECASTERS)]
+        if value == policy_names.LEARNT:
+            files += [
+                Path(f"{file}.safetensors")
+                for file in policy_names.weight_files(policy_names.FORECASTERS)
+            ]
     found = hashlib.sha256()
     for file in filter(Path.is_file, files):
         with file.open("rb") as stream:
@@ -307,9 +294,9 @@ def named_content(name: str) -> str:
 
 def _own_files(base: str) -> list[Path]:
     """Files of a name's own kind; of a module, the first `_MAX_NEIGHBOURS` beside it, too."""
-    head, tail = split_class(base)
-    if head in LEARNT_AGENTS:
-        names = training_seeds(base)
+    head, tail = policy_names.split_class(base)
+    if head in policy_names.LEARNT_AGENTS:
+        names = policy_names.training_seeds(base)
         return [file for name in names for file in _named_files(name.partition(":")[2])]
     if head == "recorded":
         return _named_files(tail)

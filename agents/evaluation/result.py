@@ -1,11 +1,9 @@
 """Everything that an evaluation measured in one condition, and the rows of its tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -13,15 +11,8 @@ from numpy.typing import NDArray
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
-from agents.evaluation import metrics
+from agents.evaluation import intervals, metrics
 from agents.evaluation.evaluation_plan import EvaluationPlan
-from agents.evaluation.intervals import (
-    RANK_COLUMNS,
-    RESAMPLES,
-    difference_interval,
-    rank,
-    score_interval,
-)
 from agents.policy import Bools, Floats, Ints
 from agents.policy_names import is_metering
 from simulator.optics.motion import Movement
@@ -84,7 +75,7 @@ class Track:
         return len(next(iter(self.arrays.values())))
 
     @classmethod
-    def of_seeds(cls, tracks: Sequence[Track]) -> Track:
+    def of_seeds(cls, tracks: Sequence[Self]) -> Self:
         """The tracks of several training seeds as one."""
         alone = [track.ms_alone for track in tracks if track.ms_alone is not None]
         return cls(
@@ -266,7 +257,7 @@ def result_rows(
     *,
     source: str | None = None,
     split: str | None = None,
-    resamples: int = RESAMPLES,
+    resamples: int = intervals.RESAMPLES,
 ) -> pd.DataFrame:
     """A row per policy and condition of `results`: `ROW_COLUMNS` and `MORE_COLUMNS`.
 
@@ -297,7 +288,7 @@ def result_rows(
 def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> dict[str, Any]:
     members, track = result.part(part), result.tracks[policy]
     gains, span = result.group_gains(policy, part)
-    interval = score_interval(gains, span, resamples=resamples)
+    interval = intervals.score_interval(gains, span, resamples=resamples)
     errors = result.episode_metrics(policy)["ev_error"][:, members]
     # Every source group has the same share of the frames.
     _, index, counts = np.unique(result.groups[members], return_inverse=True, return_counts=True)
@@ -333,11 +324,11 @@ def bracket_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:
         best = result.group_gains(names[0])[0]
         for policy in names:
             gains, span = result.group_gains(policy)
-            change = difference_interval(gains, best, span)
+            change = intervals.difference_interval(gains, best, span)
             row = {
                 "policy": policy,
                 "budget": budget,
-                "ci95": score_interval(gains, span).pair,
+                "ci95": intervals.score_interval(gains, span).pair,
                 "to_best": change.value,
                 "to_best_ci95": change.pair,
                 "num_groups": len(span),
@@ -410,7 +401,7 @@ def best_meter(result: EvaluationResult) -> str | None:
 
 
 def difference_rows(
-    result: EvaluationResult, minus: str, *, resamples: int = RESAMPLES
+    result: EvaluationResult, minus: str, *, resamples: int = intervals.RESAMPLES
 ) -> pd.DataFrame:
     """Paired differences of every other policy's normalised score to that of `minus`, by part."""
     rows = []
@@ -418,23 +409,23 @@ def difference_rows(
         other, span = result.group_gains(minus, part)
         for policy in (name for name in result.tracks if name != minus):
             gains = result.group_gains(policy, part)[0]
-            interval = difference_interval(gains, other, span, resamples=resamples)
+            interval = intervals.difference_interval(gains, other, span, resamples=resamples)
             counts = interval.num_groups, interval.num_seeds
             rows.append((policy, minus, part, interval.value, interval.pair, *counts))
     columns = ["policy", "minus", "condition", "difference", "ci95"]
     return pd.DataFrame(rows, columns=[*columns, "num_groups", "num_training_seeds"])
 
 
-def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> pd.DataFrame:
+def overall_ranking(results: Results, *, resamples: int = intervals.RESAMPLES) -> pd.DataFrame:
     """`rank` of policies by their score over all conditions, each with the same weight; none that
     is privileged.
     """
     first = next(iter(results.values()))
     names = [name for name, track in first.tracks.items() if not track.privileged]
     if not names:
-        return pd.DataFrame(columns=list(RANK_COLUMNS))
+        return pd.DataFrame(columns=list(intervals.RANK_COLUMNS))
     gains = {name: overall_gains(results, name)[0] for name in names}
-    return rank(gains, overall_gains(results, names[0])[1], resamples=resamples)
+    return intervals.rank(gains, overall_gains(results, names[0])[1], resamples=resamples)
 
 
 def overall_gains(results: Results, policy: str, part: str = "all") -> tuple[Floats, Floats]:

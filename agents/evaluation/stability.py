@@ -5,8 +5,6 @@ for some frames ago, as a faulty actuator carries it out; the controller sees th
 the next exposure. All cases run side by side: NumPy columns of (frames, cases), in stops.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -72,7 +70,7 @@ class Cases(NamedTuple):
     step: Floats  # of the light [EV]
     light: Floats
 
-    def take(self, rows: Ints) -> Cases:
+    def take(self, rows: Ints) -> "Cases":
         """The cases of these indices."""
         columns: Any = (column[rows] for column in self)
         return Cases(*columns)

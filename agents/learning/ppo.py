@@ -20,17 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.networks import (
-    LIGHT_NUMBERS,
-    NUMBERS,
-    UNWATCHED,
-    ExposureFeatures,
-    MeterHistory,
-    Session,
-    StateHead,
-    exposure_loss,
-    with_history,
-)
+from agents.learning import networks
 from agents.learning.policy_file import MAX_HISTORY, MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.learning.sb3_adapter import SB3VectorAdapter, TrainingFrames, WithHistory
 from agents.policy import Bools, Ints, Observations, PolicyContext
@@ -46,8 +36,8 @@ class ExposureExtractor(BaseFeaturesExtractor):
 
     def __init__(self, observation_space: gym.spaces.Dict, width: int = 256) -> None:
         sensors = 2 if "sensors" in observation_space.spaces else 0
-        super().__init__(observation_space, width + LIGHT_NUMBERS + sensors)
-        self.features = ExposureFeatures(observation_space, width)
+        super().__init__(observation_space, width + networks.LIGHT_NUMBERS + sensors)
+        self.features = networks.ExposureFeatures(observation_space, width)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Features (B, features_dim)."""
@@ -65,8 +55,8 @@ class _StateLogits(nn.Module):
         self, grid: ExposureGrid, width: int, has_sensors: bool, trained_on: ExposureGrid | None
     ) -> None:
         super().__init__()
-        self.sizes = [width, LIGHT_NUMBERS, 2 if has_sensors else 0]
-        self.head = StateHead(grid, width, has_sensors, trained_on=trained_on)
+        self.sizes = [width, networks.LIGHT_NUMBERS, 2 if has_sensors else 0]
+        self.head = networks.StateHead(grid, width, has_sensors, trained_on=trained_on)
         nn.init.orthogonal_(self.head.values.weight, 0.01)  # all states start alike
         nn.init.zeros_(self.head.values.bias)
 
@@ -79,7 +69,7 @@ class _StateLogits(nn.Module):
     def loss(self, extracted: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         """Loss of what the head says of the right exposure, whose EV100 is `right` (B,)."""
         features, light, _ = torch.split(extracted, self.sizes, dim=1)
-        return exposure_loss(*self.head.right_ev100(features, light), right)
+        return networks.exposure_loss(*self.head.right_ev100(features, light), right)
 
 
 class _WithLoss(torch.autograd.Function):
@@ -127,7 +117,7 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
     def _build(self, lr_schedule: Callable[[float], float]) -> None:
         super()._build(lr_schedule)
         # SB3 has made a plain linear layer for the logits, and an optimiser that knows only that.
-        has_sensors = self.features_dim > self.width + LIGHT_NUMBERS
+        has_sensors = self.features_dim > self.width + networks.LIGHT_NUMBERS
         self.action_net = _StateLogits(self.grid, self.width, has_sensors, self.trained_on)
         rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
@@ -193,7 +183,7 @@ class PPOPolicy(NetworkPolicy):
         """See `NetworkPolicy.make_network`."""
         history, space = card["history"], context.observation_space
         return ExposureActorCritic(
-            with_history(space, history) if history else space,
+            networks.with_history(space, history) if history else space,
             gym.spaces.Discrete(len(context.grid)),
             lambda _: 0.0,
             grid=context.grid,
@@ -204,8 +194,8 @@ class PPOPolicy(NetworkPolicy):
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forgets the frames so far."""
         super().reset(num_envs, seed)
-        frames = self.network.features_extractor.features.history // NUMBERS
-        self._history = MeterHistory(self.context, num_envs, frames) if frames else None
+        frames = self.network.features_extractor.features.history // networks.NUMBERS
+        self._history = networks.MeterHistory(self.context, num_envs, frames) if frames else None
 
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Most probable allowed state (N,)."""
@@ -223,7 +213,9 @@ class PPOPolicy(NetworkPolicy):
 
 
 def train_ppo(
-    envs: gym.vector.VectorEnv, training: PPOTraining, session: Session = UNWATCHED
+    envs: gym.vector.VectorEnv,
+    training: PPOTraining,
+    session: networks.Session = networks.UNWATCHED,
 ) -> ExposureActorCritic:
     """A policy network, trained by PPO on the scenes of `envs` (autoreset mode SAME_STEP)."""
     training.check_batch(envs.num_envs)
@@ -264,7 +256,7 @@ def train_ppo(
 class _TrainingCallback(BaseCallback):
     """Progress, falling entropy, and checkpoints between the updates."""
 
-    def __init__(self, training: PPOTraining, session: Session) -> None:
+    def __init__(self, training: PPOTraining, session: networks.Session) -> None:
         super().__init__()
         self.training, self.session = training, session
         self._rewards: deque[float] = deque(maxlen=50)

@@ -20,16 +20,8 @@ from torch import nn
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
 from agents.foresight import make_foresight
+from agents.learning import networks
 from agents.learning.forecaster import LightForecaster, load_forecasters
-from agents.learning.networks import (
-    UNWATCHED,
-    ExposureFeatures,
-    Optimisation,
-    Session,
-    StateHead,
-    exposure_loss,
-    random_shift,
-)
 from agents.learning.policy_file import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.metering_policy import HYSTERESIS_SCORE
 from agents.metering.meters import make_meter
@@ -68,10 +60,10 @@ class ScoreRegressor(nn.Module):
     ) -> None:
         super().__init__()
         self.width = width
-        self.features = ExposureFeatures(observation_space, width, _OF_CHANNELS * dropout)
+        self.features = networks.ExposureFeatures(observation_space, width, _OF_CHANNELS * dropout)
         self.dropout = nn.Dropout(dropout)
         has_sensors = "sensors" in observation_space.spaces
-        self.states = StateHead(grid, width, has_sensors, outputs=2, trained_on=trained_on)
+        self.states = networks.StateHead(grid, width, has_sensors, outputs=2, trained_on=trained_on)
 
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
@@ -223,7 +215,9 @@ class RegressionTraining(Configuration):
 
 
 def train_regression(
-    envs: gym.vector.VectorEnv, training: RegressionTraining, session: Session = UNWATCHED
+    envs: gym.vector.VectorEnv,
+    training: RegressionTraining,
+    session: networks.Session = networks.UNWATCHED,
 ) -> ScoreRegressor:
     """A regression agent, trained on the scenes of `envs` (autoreset mode SAME_STEP)."""
     context = PolicyContext.from_envs(envs)
@@ -232,7 +226,7 @@ def train_regression(
         network = ScoreRegressor(space, grid, training.width, training.dropout)
     network.to(session.device)
     steps = max(2, training.frames // envs.num_envs)
-    run = Optimisation(network, training, session, steps=steps, warm_up=0.1)
+    run = networks.Optimisation(network, training, session, steps=steps, warm_up=0.1)
     frames = rollout(envs, RegressionPolicy(context, network=network), training, run.done)
     with run.store:
         while run.done < steps:
@@ -285,7 +279,7 @@ class Replay:
             past = self.memory[self.rng.integers(len(self.memory))]
             rows = self.rng.integers(len(scores), size=max(1, len(scores) // _CHUNKS))
             seen = {name: values[rows] for name, values in past.items()}
-            parts.append({**seen, "raw": random_shift(seen["raw"], self.rng)})
+            parts.append({**seen, "raw": networks.random_shift(seen["raw"], self.rng)})
         steps = max(1, self.training.memory // len(scores))
         self.memory = [*self.memory, new][-steps:]
         merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
@@ -308,7 +302,7 @@ def _loss(
     error = (scores - known).square()
     regret = known.amax(dim=1) - known.gather(1, scores.argmax(dim=1, keepdim=True))[:, 0]
     likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
-    loss = error.mean() + 0.01 * likelihood + ev_coef * exposure_loss(ev100, spread, right)
+    loss = error.mean() + 0.01 * likelihood + ev_coef * networks.exposure_loss(ev100, spread, right)
     seen = {"mse": error, "regret": regret, "ev": (ev100 - right).abs()}
     return loss, {name: values.mean().item() for name, values in seen.items()}
 

@@ -149,7 +149,11 @@ def train_agent(
         if isinstance(training, ForecasterTraining):
             network: Any = train_forecaster(training, session)
         else:
-            envs = stack.enter_context(closing(_make_envs(config)))
+            options = {**config.environment, "autoreset_mode": "SAME_STEP"}
+            if config.max_episode_steps is not None:
+                options["max_episode_steps"] = config.max_episode_steps
+            made = gym.make_vec(f"ae_env:{config.task}", num_envs=config.num_envs, **options)
+            envs = stack.enter_context(closing(made))
             context = PolicyContext.from_envs(envs)
             if isinstance(training, RegressionTraining):
                 network = train_regression(envs, training, session)
@@ -160,13 +164,6 @@ def train_agent(
     save_agent(out, config.agent, network, network.width, context, config.card())
     checkpoint.unlink(missing_ok=True)
     return out
-
-
-def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
-    options = {**config.environment, "autoreset_mode": "SAME_STEP"}
-    if config.max_episode_steps is not None:
-        options["max_episode_steps"] = config.max_episode_steps
-    return gym.make_vec(f"ae_env:{config.task}", num_envs=config.num_envs, **options)
 
 
 @contextmanager

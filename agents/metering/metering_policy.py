@@ -1,13 +1,11 @@
 """A light meter with a program: the controllers ``METER:PROGRAM``, such as ``matrix:A``."""
 
-from __future__ import annotations
-
 import copy
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -42,7 +40,7 @@ SECOND_PASS = 1_000_000
 #: What a meter may foresee.
 FORESIGHTS = ("none", "trend", "model", "learnt")
 #: Fits of this process by key, see `MeteringPolicy.fit_once`: no folder need be writable.
-_FITS: dict[str, ScoreRegression] = {}
+_FITS: "dict[str, ScoreRegression]" = {}
 
 
 class MeteringPolicy(Policy):
@@ -215,7 +213,7 @@ class MeteringPolicy(Policy):
         if self.learns:
             self.regression = self._fit(envs, seed)
 
-    def _fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int) -> ScoreRegression:
+    def _fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int) -> "ScoreRegression":
         leader = copy.copy(self)
         leader.program, leader.foresight = "P", "none"  # the light of these episodes stays
         per_scene = FIT_EPISODES // (2 * len(scenes_of(envs)))
@@ -299,7 +297,7 @@ class ScoreRegression:
     bandwidths: Floats  # (d,) standard deviation of the kernel [stops]
 
     @classmethod
-    def fit(cls, features: Floats, scores: Floats, groups: NDArray[Any]) -> ScoreRegression:
+    def fit(cls, features: Floats, scores: Floats, groups: NDArray[Any]) -> Self:
         """Choose the bandwidths by cross-validation over source `groups` (n,): one is never split.
 
         The criterion is the mean score of the state that the regression picks for the groups left
@@ -376,7 +374,7 @@ class ScoreRegression:
         return write_atomically(path, content)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:
+    def load(cls, path: str | os.PathLike[str], name: str = "path") -> Self:
         """Read what `save` wrote; a `ValueError`, where `name` names the file, if it is none."""
         try:
             found = read_weights(read_bounded(Path(path), 2**30))

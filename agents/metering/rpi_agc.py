@@ -6,8 +6,6 @@ recordings of libcamera's own, frame by frame (``tests/agents/metering``). `RpiA
 nearest states of a grid. The numbers of that tuning come first; a file has others (`read_tuning`).
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import os
@@ -56,7 +54,7 @@ def _check_pairs(numbers: list[float]) -> list[float]:
     return numbers
 
 
-def _in_seconds(ladder: Ladder) -> Ladder:
+def _in_seconds(ladder: "Ladder") -> "Ladder":
     """`ladder` with times in seconds, from microseconds."""
     alike = len(ladder.shutter) == len(ladder.gain) >= 2 and 0.0 not in ladder.gain
     if not alike or list(ladder.shutter) != sorted(ladder.shutter):

@@ -15,17 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ae_env.scenes import Scene
+from agents import policy_names
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest, load_plan, plan_scenes
 from agents.evaluation.intervals import score_interval
 from agents.evaluation.metrics import group_means
 from agents.evaluation.result import Results, overall_gains, static_condition
-from agents.policy_names import (
-    LEARNT_AGENTS,
-    WITH_FILE,
-    split_class,
-    split_options,
-    training_seeds,
-)
 from agents.report.evaluation import escape, fill
 from simulator.utils.files import machine, read_table, sibling, versions, write_atomically
 
@@ -118,12 +112,12 @@ def row_name(policy: str) -> str:
     >>> row_name("u/my.py:Mine?gain=2"), row_name("ppo:runs/mine"), row_name("matrix:P")
     ('my.py:Mine?gain=2', 'ppo:mine', 'matrix:P')
     """
-    base, _ = split_options(policy)
+    base, _ = policy_names.split_options(policy)
     options = policy[len(base) :]
-    head, tail = split_class(base)
+    head, tail = policy_names.split_class(base)
     if head.endswith(".py"):
         return f"{Path(head).name}:{tail}{options}"
-    if head in WITH_FILE and tail:
+    if head in policy_names.WITH_FILE and tail:
         return f"{head}:{Path(tail).name}{options}"
     return policy
 
@@ -178,9 +172,9 @@ def _refusal(table: Path, text: str) -> ValueError:
 
 def training_of(policy: str, plan: EvaluationPlan) -> tuple[str, int | None]:
     """Scenes that a built-in policy learnt from, and frames that it saw; ("", None) for none."""
-    base, _ = split_options(training_seeds(policy)[0])
+    base, _ = policy_names.split_options(policy_names.training_seeds(policy)[0])
     head, _, file = base.partition(":")
-    if head in LEARNT_AGENTS and (card := sibling(Path(file), ".json")).is_file():
+    if head in policy_names.LEARNT_AGENTS and (card := sibling(Path(file), ".json")).is_file():
         training = json.loads(card.read_text(encoding="utf-8"))["training"]
         own = training["training"]
         return training["environment"]["scenes"], own.get("frames", own.get("total_timesteps"))

@@ -38,13 +38,7 @@ from agents.evaluation.result import (
     training_seed_rows,
 )
 from agents.evaluation.stability import Stability, stability_rows
-from agents.report.plots import (
-    path_sheets,
-    plot_convergence,
-    plot_cost,
-    plot_scores,
-    plot_stability,
-)
+from agents.report import plots
 from simulator.settings import format_exposure_time
 from simulator.utils.files import result_meta, write_atomically, write_results
 
@@ -274,15 +268,15 @@ def _write_pictures(
         named = {"condition": "all conditions", "num_groups": rows.num_groups.iloc[0]}
         rows = pd.concat([rows, together.assign(**named)])
     pictures = {
-        "scores.png": plot_scores(folder / "scores.png", rows, order),
-        "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
+        "scores.png": plots.plot_scores(folder / "scores.png", rows, order),
+        "ev_error.png": plots.plot_convergence(folder / "ev_error.png", results, order),
     }
     alone = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
     ranked = ranking[ranking.policy.isin(list(alone))]
     scores = dict(zip(ranked.policy, ranked.normalised_score, strict=True))
     if scores:
-        pictures["cost.png"] = plot_cost(folder / "cost.png", alone, scores, order)
-    return pictures | path_sheets(folder, results, order)
+        pictures["cost.png"] = plots.plot_cost(folder / "cost.png", alone, scores, order)
+    return pictures | plots.path_sheets(folder, results, order)
 
 
 def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -499,7 +493,7 @@ def write_stability(
         rows = stability_rows(one)
         picture = re.sub(r"[^\w.=-]+", "_", one.name).strip("_")[-100:]
         picture += f"-{len(pictures)}" * (f"{picture}.png" in pictures) + ".png"
-        pictures[picture] = plot_stability(out / picture, one, rows)
+        pictures[picture] = plots.plot_stability(out / picture, one, rows)
         faults = [_fault_row(own) for _, own in rows.groupby("fault", sort=False)]
         own = {"faults": faults, "third": THIRD_EV, "picture": picture}
         shown.append({"name": one.name, **own})

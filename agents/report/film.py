@@ -5,12 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw
 
 from ae_env.rendering import fitting_font
-from agents.policy import Policy
+from agents.policy import Policy, VectorEnv
 from agents.rollouts import choose, errors_of
 from simulator.utils.files import write_picture
 
@@ -39,7 +38,7 @@ class Recording:
 def record(
     name: str,
     policy: Policy,
-    envs: gym.vector.VectorEnv[Any, Any, Any],
+    envs: VectorEnv,
     frames: int,
     seed: int,
     scene: str | None = None,

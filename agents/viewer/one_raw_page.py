@@ -1,7 +1,5 @@
 """The tab of what else one raw gives: a shallower depth of field, and an HDR picture."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Mapping
@@ -10,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Self
 
 from nicegui import ui
 from PIL import Image
@@ -43,7 +41,7 @@ class RenderedImage:
     files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, image: Image.Image, text: str, **files: Callable[[Path], object]) -> RenderedImage:
+    def of(cls, image: Image.Image, text: str, **files: Callable[[Path], object]) -> Self:
         """`image`, averaged down for the page."""
         small = image.reduce(max(1, -(-max(image.size) // _LONGEST)))
         return cls(encoded(small), small.width / small.height, text, files)

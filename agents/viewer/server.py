@@ -44,7 +44,9 @@ class TokenGuard:
             await self._app(scope, receive, send)
             return
         asked = HTTPConnection(scope)
-        own = asked.headers.get("host") in self._hosts and self._is_own(asked.headers.get("origin"))
+        origin = asked.headers.get("origin")
+        own = asked.headers.get("host") in self._hosts
+        own = own and (origin is None or origin.removeprefix("http://") in self._hosts)
         by_query = own and self._is_token(asked.query_params.get("token", ""))
         if not by_query and not (own and any(map(self._is_token, self._cookies(asked)))):
             text = "Open the address that ae-env printed: it contains the token."
@@ -72,9 +74,6 @@ class TokenGuard:
             await send(message)
 
         await self._app(scope, limited if scope["type"] == "http" else receive, with_cookie)
-
-    def _is_own(self, origin: str | None) -> bool:
-        return origin is None or origin.removeprefix("http://") in self._hosts
 
     def _cookies(self, asked: HTTPConnection) -> list[str]:
         """Values of the cookie; other servers of this machine may set one of the same name."""
