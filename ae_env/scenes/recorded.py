@@ -11,8 +11,6 @@ Three layouts, told apart by where the settings stand:
 A table is a ``settings.csv`` or ``grid-options*.csv`` in the folder or below, a row for each.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections import Counter
@@ -83,6 +81,23 @@ _TRUTH = re.compile(r"(?<![a-z])(gt|ground[_\-. ]?truth)(?![a-z])", re.I)
 
 
 @dataclass(frozen=True)
+class RecordedFile:
+    """One real capture."""
+
+    path: Path
+    settings: CameraSettings  # that it was taken at
+    scene: str  # name of what it shows, of a frame of video with the frame's number
+    group: str  # source group: what it shows whatever the light
+    sequence: str  # the video that it is a frame of, empty for a still scene
+    frame: int  # which of its frames
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether it is a developed picture; else it is a raw."""
+        return self.path.suffix.lower() in PICTURE_SUFFIXES
+
+
+@dataclass(frozen=True)
 class RecordedOptions:
     """A folder of recorded grids; ISO, time [s] and f-number of files that do not state theirs."""
 
@@ -105,7 +120,7 @@ class RecordedOptions:
         return {name: value for name, value in values.items() if value is not None}
 
     @classmethod
-    def of(cls, spec: object) -> RecordedOptions | None:
+    def of(cls, spec: object) -> "RecordedOptions | None":
         """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing."""
         if isinstance(spec, RecordedOptions):
             return spec
@@ -310,23 +325,6 @@ def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
 
 
 # -- which file is which state of which scene ---------------------------------------------------
-
-
-@dataclass(frozen=True)
-class RecordedFile:
-    """One real capture."""
-
-    path: Path
-    settings: CameraSettings  # that it was taken at
-    scene: str  # name of what it shows, of a frame of video with the frame's number
-    group: str  # source group: what it shows whatever the light
-    sequence: str  # the video that it is a frame of, empty for a still scene
-    frame: int  # which of its frames
-
-    @property
-    def is_picture(self) -> bool:
-        """Whether it is a developed picture; else it is a raw."""
-        return self.path.suffix.lower() in PICTURE_SUFFIXES
 
 
 def index_recorded(

@@ -402,8 +402,14 @@ class PyiqaMetric:
             raise ValueError(f"{rule} cannot be made by pyiqa.create_metric: {what}") from error
         if getattr(self._metric, "metric_mode", "NR") != "NR":
             raise ValueError(f"{rule} must be a metric that needs no reference picture")
-        self.metric = metric
-        self.low, self.high = _range(getattr(self._metric, "score_range", None), rule)
+        stated = getattr(self._metric, "score_range", None)  # such as "~0, ~100"
+        numbers = [float(n) for n in _NUMBER.findall(str(stated))]
+        if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or numbers[0] >= numbers[1]:
+            raise ValueError(
+                f"{rule} states the score range {stated!r}, which must be two finite numbers to be "
+                "mapped to [0, 1]: wrap the metric in a scorer of your own"
+            )
+        self.metric, (self.low, self.high) = metric, numbers
         self.lower_better = bool(getattr(self._metric, "lower_better", False))
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
@@ -411,14 +417,3 @@ class PyiqaMetric:
             values = torch.as_tensor(self._metric(images.cpu())).double().reshape(len(images))
         share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
         return 1.0 - share if self.lower_better else share
-
-
-def _range(stated: Any, rule: str) -> tuple[float, float]:
-    """Two finite numbers from such as ``"~0, ~100"``."""
-    numbers = [float(n) for n in _NUMBER.findall(str(stated))]
-    if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or numbers[0] >= numbers[1]:
-        raise ValueError(
-            f"{rule} states the score range {stated!r}, which must be two finite numbers to be "
-            "mapped to [0, 1]: wrap the metric in a scorer of your own"
-        )
-    return numbers[0], numbers[1]

@@ -30,19 +30,16 @@ from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.metering.meters import weight_map
 from agents.metering.reading import Region
 from agents.policy_names import CLASSIC_METERS
-from simulator import (
-    CameraSettings,
-    CameraSimulator,
-    PreparedScene,
-    RawImage,
-    get_camera,
-    read_raw,
-    write_dng,
-)
-from simulator.camera_simulator import Depth
+from simulator.camera import get_camera
+from simulator.camera_simulator import CameraSimulator, Depth
 from simulator.capture.plan import SimulationPlan
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.radiance.reading import RADIANCE_SUFFIXES
 from simulator.raw.develop import render_srgb, upright
+from simulator.raw.dng import write_dng
+from simulator.raw.image import RawImage
+from simulator.raw.read import read_raw
+from simulator.settings import CameraSettings
 from simulator.utils.checks import did_you_mean
 from simulator.utils.files import RAW_SUFFIXES, printable
 
@@ -175,7 +172,6 @@ def _loaded(spec: str, taken: Container[str] = ()) -> dict[str, Callable[[], Ope
 
 def _bundled() -> dict[str, Callable[[], OpenedScene]]:
     """The bundled scenes by id, each drawn when it is opened."""
-
     found: dict[str, Callable[[], OpenedScene]] = {}
     for split in ("train", "test"):
         scenes = bundled_scenes(SceneRequest(split, get_camera(CAMERA), resolution=None))
@@ -416,7 +412,8 @@ class ViewedScene:
         whole, gain = view.centre is None, 1.0
         if view.equal_brightness:
             gain = 2.0 ** -(view.settings.log2_exposure + self.scene.ev100)
-        raw = _raw(self.scene, view.settings, capture * gain)
+        balance = self.scene.white_balance
+        raw = RawImage(capture * gain, view.settings, self.scene.camera, white_balance=balance)
         image = render_srgb(raw, "half" if whole else "malvar").permute(1, 2, 0).numpy()
         if view.clipping:
             image = image.copy()
@@ -439,10 +436,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(_THREADS)
-
-
-def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:
-    return RawImage(capture, settings, scene.camera, white_balance=scene.white_balance)
 
 
 def encoded(picture: Image.Image | np.ndarray, kind: str = "JPEG", quality: int = 90) -> bytes:

@@ -1,23 +1,19 @@
 """Sequences of captures of one scene, and the pairs of them that train and test each module."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol, get_args
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.reference.reference_camera import ReferenceScene
 from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, sensor_signal
 from simulator.utils.checks import check_word
-
-if TYPE_CHECKING:
-    from simulator.reference.reference_camera import ReferenceScene
 
 Stage = Literal["exposure", "noise", "aperture", "all"]
 

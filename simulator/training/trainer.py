@@ -253,8 +253,7 @@ def train_and_save(
             identity=config.card(last_stage=name),
             progress=functools.partial(progress, f"{name}: training"),
         )
-        values = validate(loss, validation.pairs(name), stage.crop, accelerator)
-        stages[name]["validation"] = values
+        stages[name]["validation"] = validate(loss, validation.pairs(name), stage.crop, accelerator)
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
