@@ -86,6 +86,8 @@ class AutoExposure(Task):
         # Of the parts that depend on a scene's light alone; NaN where they are not known.
         self._of_light = [n for n in self._known if depends_on(torch_parts[n]) == "light"]
         self._light_scores = np.full((len(episodes.scenes), states, len(self._of_light)), np.nan)
+        self._unlit = len(episodes.scenes)  # of how many scenes they are not
+        self._sharp = terms.only_sharpness
         self._means = options.placed(np.zeros((lights, states, 3) if expected else 0))
         self._expected = np.zeros((lights, states), bool)  # whether these means are known
         self._shown = ShownScenes(episodes.scenes, terms.captures)
@@ -179,7 +181,9 @@ class AutoExposure(Task):
         """Scores (B,) of the captures by part."""
         episodes, terms = self.episodes, self._terms
         boxes = episodes.box_factor[episodes.scene[frames.env_indices]]
-        source_noise = frames.statistics.source_noise * np.square(boxes)[:, None, None]
+        source_noise = frames.statistics.source_noise
+        if source_noise is not None:
+            source_noise = source_noise * np.square(boxes)[:, None, None]
         captures: Captures | None = None
         if self._reads_images or not episodes.static or terms.reads_captures:
             captures = self._describe(frames, source_noise, device=episodes.options.torch_device)
@@ -200,39 +204,53 @@ class AutoExposure(Task):
             scores |= terms.torch_scores(images, captures, "image")
         return scores
 
-    def _known_scores(self, frames: FrameBatch, source_noise: np.ndarray) -> dict[str, np.ndarray]:
-        """Scores in static light of the parts that look at no frame, cached."""
+    def _known_scores(
+        self, frames: FrameBatch, source_noise: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
+        """Scores (B,) in static light of the parts that look at no frame."""
         episodes, env_indices = self.episodes, frames.env_indices
+        if source_noise is None and len(self._of_light) + len(self._sharp) == len(self._known):
+            return self._clean_scores(frames, env_indices)
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
-        new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
+        new = np.flatnonzero(~self._scored[lights, states])
         if len(new):
-            found = self._scores_of_new(frames, source_noise, new)
+            if source_noise is None or not source_noise[new].any():
+                found = self._clean_scores(frames, env_indices[new], new)
+            else:  # blur averages it
+                described = self._describe(frames, source_noise, new)
+                found = self._terms.torch_scores(None, described, "light", "blur")
             each = np.stack([found[name] for name in self._known], axis=1)
             self._scores[lights[new], states[new]] = each
             self._scored[lights[new], states[new]] = True
         return dict(zip(self._known, self._scores[lights, states].T, strict=True))
 
-    def _scores_of_new(
-        self, frames: FrameBatch, source_noise: np.ndarray, new: np.ndarray
+    def _clean_scores(
+        self, frames: FrameBatch, env_indices: np.ndarray, part: Any = slice(None)
     ) -> dict[str, np.ndarray]:
-        """Scores (K,) of the frames `new` (K,) by part, of those that look at no frame."""
-        if source_noise[new].any():  # blur averages it
-            described = self._describe(frames, source_noise, new)
-            return self._terms.torch_scores(None, described, "light", "blur")
-        episodes, env_indices = self.episodes, frames.env_indices[new]
+        """The same of `part` of the frames, those of `env_indices` (K,), from light without noise.
+
+        Motion is no matter to what depends on the light alone.
+        """
+        episodes, found = self.episodes, {}
         scenes, states = episodes.scene[env_indices], episodes.state[env_indices]
-        unknown = np.isnan(self._light_scores[scenes, 0]).any(axis=1)
-        for env_index in env_indices[unknown].tolist():  # without noise the motion is no matter
-            scene, light = episodes.scene.item(env_index), episodes.light_index.item(env_index)
-            shown = episodes.scenes[scene], self._captures.prepared_scene(light)
-            of_light = self._terms.closed_form_terms(*shown, "light")
-            self._light_scores[scene] = np.stack([*of_light.values()], axis=1)
-        found = dict(zip(self._of_light, self._light_scores[scenes, states].T, strict=True))
-        if self._terms.only_sharpness:
+        if self._of_light:
+            known = self._light_scores[scenes, states]
+            if self._unlit and (unknown := np.isnan(known[:, 0])).any():
+                for scene, k in {scenes.item(i): i for i in np.flatnonzero(unknown)}.items():
+                    light = episodes.light_index.item(env_indices[k])
+                    shown = episodes.scenes[scene], self._captures.prepared_scene(light)
+                    of_light = self._terms.closed_form_terms(*shown, "light")
+                    self._light_scores[scene] = np.stack([*of_light.values()], axis=1)
+                    self._unlit -= 1
+                known = self._light_scores[scenes, states]
+            found = dict(zip(self._of_light, known.T, strict=True))
+        if self._sharp:
             *_, scores = self._shown.blur(scenes, states, **self._moves(env_indices))
-            return found | dict.fromkeys(self._terms.only_sharpness, scores)
-        described = self._describe(frames, source_noise, new)
-        return found | self._terms.torch_scores(None, described, "blur")
+            found |= dict.fromkeys(self._sharp, scores)
+        elif len(self._known) > len(self._of_light):
+            described = self._describe(frames, None, part)
+            found |= self._terms.torch_scores(None, described, "blur")
+        return found
 
     def _expected_means(
         self, frames: FrameBatch, transitions: FindTransitions, boxes: np.ndarray
@@ -250,11 +268,15 @@ class AutoExposure(Task):
         return self._means[lights, states]
 
     def _describe(
-        self, frames: FrameBatch, source_noise: np.ndarray, part: Any = slice(None), **where: Any
+        self,
+        frames: FrameBatch,
+        source_noise: np.ndarray | None,
+        part: Any = slice(None),
+        **where: Any,
     ) -> Captures:
         episodes, env_indices = self.episodes, frames.env_indices[part]
         noises, rows = None, frames.rows
-        if source_noise[part].any():
+        if source_noise is not None and source_noise[part].any():
             pairs = source_noise[part].tolist()
             noises = [NoiseLevelFunction(tuple(shot), tuple(read)) for shot, read in pairs]
         return self._terms.captures.of(

@@ -55,7 +55,7 @@ def _compile() -> None:
     record(Transitions(light, table, None), camera, keys=keys, noise="bank", codes=codes)
     states = ExposureGrid.default().states
     terms = TermScores(make_scorer("balanced"), camera, states, noise=True)
-    terms.measured(codes, np.zeros(1, np.int64), np.zeros((1, 2, 4)))
+    terms.measured(codes, np.zeros(1, np.int64))
 
 
 if __name__ == "__main__":

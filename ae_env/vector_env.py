@@ -135,22 +135,25 @@ class AutoExposureVectorEnv(
         if torch.is_tensor(actions):
             actions = actions.cpu().numpy()
         actions = check_actions("actions", actions, (self.num_envs,))
-        resetting = np.flatnonzero(self._done)
-        if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
-        running = np.flatnonzero(~self._done)
-        terminated = np.zeros(self.num_envs, dtype=bool)
-        terminated[running] = self.core.transition(running, actions[running])
-        self._steps[running] += 1
-        if len(resetting):  # NEXT_STEP: this step begins their new episodes
-            self._begin(resetting)
+        resetting = None
+        if np.count_nonzero(self._done):
+            if self.autoreset_mode == AutoresetMode.DISABLED:
+                raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
+            resetting, running = np.flatnonzero(self._done), np.flatnonzero(~self._done)
+            terminated = np.zeros(self.num_envs, dtype=bool)
+            terminated[running] = self.core.transition(running, actions[running])
+            self._steps[running] += 1
+            self._begin(resetting)  # NEXT_STEP: this step begins their new episodes
+        else:
+            terminated = self.core.transition(self._all, actions)
+            self._steps += 1
         frames = self.core.observe(self._all)
-        frames.reward[resetting] = 0.0
-        truncated = np.zeros(self.num_envs, dtype=bool)
-        if self.max_episode_steps is not None:
-            truncated = self._steps >= self.max_episode_steps
+        if resetting is not None:
+            frames.reward[resetting] = 0.0
+        most = np.inf if self.max_episode_steps is None else self.max_episode_steps
+        truncated = self._steps >= most
         done = terminated | truncated
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and np.count_nonzero(done):
             observation, infos = self._restart(np.flatnonzero(done), frames)
         else:
             self._done = done

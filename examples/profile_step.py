@@ -27,7 +27,7 @@ from simulator.utils import compute
 STEPS, ROUNDS = 40, 9
 CALLERS = {
     "_plan": "plans of large batches",
-    "_run": "blur: discs, blends, motion",
+    "_photograph": "blur, exposure, noise, clip, codes",
     "blur": "sharpness of each capture",
     "_record_fused": "exposure, noise, clip, codes",
     "measured": "what codes add to the score",

@@ -71,7 +71,7 @@ class LookupBatch:
             excess_variance=nothing,
             predicted_error=nothing,
             modules=np.full(count, _MODULE),
-            source_noise=np.zeros((count, 2, 4)),
+            source_noise=None,
             keys=noise_keys(seeds, frames),
         )
 

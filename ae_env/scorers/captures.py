@@ -265,33 +265,49 @@ def source_noises(
 
 
 @kernel()
-def _fill_levels(  # type: ignore[no-untyped-def]
-    begin, end, height, sorts, columns, movements, levels, shares, blur, sharpness
-):
+def lacking_facts(scenes, defocus, movements, own, ends):  # type: ignore[no-untyped-def]
+    """The captures (K,) whose scenes `ShownScenes` knows too little about."""
+    found, count = np.empty(len(scenes), np.int64), 0
+    for i in range(len(scenes)):
+        differ = defocus[i] != 0.0 or movements[i, 2] != 0.0
+        if np.isnan(own[0, scenes[i]]) or (differ and ends[1, scenes[i]] == 0):
+            found[count] = i
+            count += 1
+    return found[:count]
+
+
+@kernel()
+def _fill_levels(begin, end, frames, moves, shown, found):  # type: ignore[no-untyped-def]
     """`PixelBlur` of captures `begin` to `end`, where `levels` and `shares` have memory for it.
 
-    Each has the columns `first` to before `last` of `sorts`, which are `Layout.shares`. `blur`
-    (B,), of pixels that are all alike, becomes the root mean squares over the pixels, `sharpness`
-    the means of `Sharpness`.
+    See `ShownScenes` for the columns of scenes that are `shown`. Of what is `found`, `blur` (B,)
+    become the root mean squares over the pixels, `sharpness` the means of `Sharpness`.
     """
-    first, last, speeds, times, discs, own = columns
+    (scenes, states, lenses), (speeds, defocus, movements) = frames, moves
+    (own, sorts, ends), (levels, shares, blur, sharpness) = shown, found
     for i in range(begin, end):
-        time, disc = times[i], discs[i]
+        scene, (time, f_number) = scenes[i], lenses[states[i]]
+        height, differ = own[2, scene], defocus[i] != 0.0 or movements[i, 2] != 0.0
+        disc = defocus[i] * (4.0 / f_number) * height / 64.0
+        scenes_own = own[0, scene] * max(1.0, own[1, scene] / f_number)
+        # The others' if that is 0.
+        whole = math.hypot(math.hypot(speeds[i] * time * height, disc), scenes_own)
         direction, turn, angle = movements[i, 0], movements[i, 1] * time, movements[i, 3]
         drift, extent = movements[i, 2] * time, speeds[i] * time
         x, y = drift * math.cos(angle), drift * math.sin(angle)
-        rest = (extent * height) ** 2 + own[i] ** 2
-        apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + own[i] ** 2
+        rest = (extent * height) ** 2 + scenes_own**2
+        apart = (path_length(extent, direction, turn, x, y) * height) ** 2 + scenes_own**2
         squares = sharp = 0.0
-        for sort in range(first[i], last[i]):
+        first, last = (ends[0, scene], ends[1, scene]) if differ else (0, 1)
+        for sort in range(first, last):
             circle = min(disc * sorts[0, sort], _WIDEST)  # as in the frame
             moved = apart if sorts[1, sort] > 0.0 and drift > 0.0 else rest
             alike = sorts[0, sort] < 0.0
-            level = blur[i] if alike else math.sqrt(circle * circle + moved)
+            level = whole if alike else math.sqrt(circle * circle + moved)
             squares += sorts[2, sort] * level**2
             sharp += sorts[2, sort] / (1.0 + (level * (64.0 / height)) ** 2)
             if levels.size:
-                levels[i, sort - first[i]], shares[i, sort - first[i]] = level, sorts[2, sort]
+                levels[i, sort - first], shares[i, sort - first] = level, sorts[2, sort]
         blur[i], sharpness[i] = math.sqrt(squares), sharp
 
 
@@ -306,8 +322,9 @@ class SceneCaptures:
     ) -> None:
         self.camera, self.states, self.noisy = camera, list(states), noisy
         self._nlf = camera.nlfs(states)
-        numbers = [(s.exposure_time, s.effective_f_number, s.log2_exposure) for s in states]
-        self.times, self.f_numbers, self._log2_exposures = np.array(numbers).T
+        #: (S, 2) exposure times and effective f-numbers.
+        self.lenses = np.array([(s.exposure_time, s.effective_f_number) for s in states])
+        self._log2_exposures = np.array([s.log2_exposure for s in states])
 
     def of(
         self,
@@ -396,7 +413,8 @@ class ShownScenes:
 
     def __init__(self, scenes: Sequence[Scene], captures: SceneCaptures) -> None:
         self._scenes, self.captures = scenes, captures
-        self._own = np.full((len(scenes), len(captures.states)), np.nan)  # of the scenes' own maps
+        # Of each, once it is known: the blur of its own map, the f-number of that, and the height.
+        self._own = np.full((3, len(scenes)), np.nan)
         # `Layout.shares` of scenes, one behind the other, and where those of each are.
         self._sorts, self._ends = _ALIKE, np.zeros((2, len(scenes)), np.int64)
         # Exposure of the references, EV100 that is right, and all that are likely.
@@ -436,31 +454,34 @@ class ShownScenes:
             `Captures.blur_px`; `Captures.pixel_blur`, None unless asked for by `pixels`; and the
             scores (B,) of `Sharpness`.
         """
-        times, f_numbers = self.captures.times[states], self.captures.f_numbers[states]
-        height = self._scenes[scenes.item(0)].light.shape[-2]
-        own = self._own[scenes, states]
-        if (new := np.isnan(own)).any():
-            for i in np.flatnonzero(new).tolist():
-                own[i] = self._scenes[scenes.item(i)].own_blur(f_numbers.item(i))
-            self._own[scenes, states] = own
-        discs = defocus * (4.0 / f_numbers) * height / 64.0
-        blur = np.hypot(np.hypot(speed * times * height, discs), own)  # the others' if own is 0
-        apart = (discs != 0.0) | (movements[:, 2] != 0.0)
-        new = apart & (self._ends[1, scenes] == 0)
-        if new.any():
-            self._add(np.unique(scenes[new]).tolist())
-        first, last = np.where(apart, self._ends[:, scenes], [[0], [1]])
-        count = len(scenes) if pixels and first.any() else 0
-        levels, shares = np.zeros((2, count, (last - first).max()))
-        columns, scores = (first, last, speed, times, discs, own), np.empty(len(scenes))
-        fixed = height, self._sorts, columns, movements, levels, shares, blur, scores
+        if len(new := lacking_facts(scenes, defocus, movements, self._own, self._ends)):
+            self._add(np.unique(scenes[new]), np.unique(scenes[_differ(defocus, movements)]))
+        levels = shares = np.empty((0, 0))
+        if pixels and (apart := _differ(defocus, movements)).any():
+            first, last = self._ends[:, scenes] * apart
+            levels, shares = np.zeros((2, len(scenes), (last - first).max()))
+        blur, scores = np.empty((2, len(scenes)))
+        frames, moves = (scenes, states, self.captures.lenses), (speed, defocus, movements)
+        fixed = frames, moves, (self._own, self._sorts, self._ends), (levels, shares, blur, scores)
         parallel_ranges(lambda a, b: _fill_levels(a, b, *fixed), len(blur), least=_WORTH_A_THREAD)
-        spread = PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)) if count else None
-        return blur, spread, scores
+        if not levels.size:
+            return blur, None, scores
+        return blur, PixelBlur(torch.from_numpy(levels), torch.from_numpy(shares)), scores
 
-    def _add(self, scenes: list[int]) -> None:
-        layouts = [self._scenes[index].layout for index in scenes]
+    def _add(self, scenes: np.ndarray, differ: np.ndarray) -> None:
+        """Learns about `scenes`; pixels of captures of those of `differ` do so in their blur."""
+        for index in scenes.tolist():
+            scene = self._scenes[index]
+            reference, height = scene.reference.effective_f_number, scene.light.shape[-2]
+            self._own[:, index] = scene.own_blur(math.inf), reference, height
+        scenes = differ[self._ends[1, differ] == 0]
+        layouts = [self._scenes[index].layout for index in scenes.tolist()]
         parts = [_ALIKE if layout is None else layout.shares for layout in layouts]
         ends = self._sorts.shape[1] + np.cumsum([0] + [part.shape[1] for part in parts])
         self._ends[:, scenes] = ends[:-1], ends[1:]
         self._sorts = np.concatenate([self._sorts, *parts], axis=1)
+
+
+def _differ(defocus: np.ndarray, movements: np.ndarray) -> np.ndarray:
+    """(B,) whether pixels of captures may differ in their blur."""
+    return np.asarray((defocus != 0.0) | (movements[:, 2] != 0.0))

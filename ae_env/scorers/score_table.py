@@ -179,7 +179,7 @@ class ScoreTables:
             found: dict[str, np.ndarray] = {}
             if terms.parts:
                 codes = encode_observation(shown).numpy()
-                means = terms.measured(codes, states, np.zeros((len(states), 2, 4)))
+                means = terms.measured(codes, states)
                 found = terms.score(means, captures)
             if not terms.closed_form:
                 found |= terms.torch_scores(shown.clamp(0.0, 1.0), captures, "image")

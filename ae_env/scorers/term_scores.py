@@ -161,11 +161,10 @@ class TermScores:
         return {name: _score(part, means, captures) for name, part in self.parts.items()}
 
     def _shares_of_frames(
-        self, states: np.ndarray, source_noise: np.ndarray
+        self, states: np.ndarray, source_noise: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Noise shares (K, 4, 256) and which of them each frame has; see `measured`."""
-        noisy = source_noise.any(axis=(1, 2))
-        if not noisy.any():
+        if source_noise is None or not (noisy := source_noise.any(axis=(1, 2))).any():
             return self._shares, self._which[states]
         own = self._noise_shares(self._shot_read[states[noisy]], source_noise[noisy])
         which = self._which[states]
@@ -173,14 +172,17 @@ class TermScores:
         return np.concatenate([self._shares, own]), which
 
     def measured(
-        self, codes: np.ndarray | torch.Tensor, states: np.ndarray, source_noise: np.ndarray
+        self,
+        codes: np.ndarray | torch.Tensor,
+        states: np.ndarray,
+        source_noise: np.ndarray | None = None,
     ) -> Any:
         """Means (B, 3) of recorded frames: shares of blown and of blocked samples, and `noise`.
 
         Args:
             codes: (B, 4, H, W) uint8 of the frames; a tensor on any device gives one on it.
             states: (B,) at which they were taken.
-            source_noise: (B, 2, 4) shot and read noise of the sources, of a native pixel.
+            source_noise: (B, 2, 4) shot and read noise of the sources, of a native pixel, or None.
         """
         shares, which = self._shares_of_frames(states, source_noise)
         flat = codes.reshape(len(codes), 4, -1)
@@ -297,7 +299,7 @@ def _score(part: Any, means: Any, captures: Captures | None) -> Any:
         scores = part(None, captures)
         return scores.to(means) if placed else np.asarray(scores.numpy())
     values, exp = means[:, column], torch.exp if placed else np.exp
-    return (values if column == 2 else exp(-values / part.scale)).clip(0.0, 1.0)
+    return values.clip(0.0, 1.0) if column == 2 else exp(-values / part.scale)
 
 
 def _means_by_torch(

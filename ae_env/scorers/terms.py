@@ -120,9 +120,9 @@ class CompositeScorer:
         """
         placed, totals = any(map(torch.is_tensor, scores.values())), self.combine(scores)
         totals = torch.as_tensor(totals) if placed else np.asarray(totals, np.float64)
-        # Of tensors on a device, only what a user's class gives is worth waiting for.
-        checked = not placed or not type(self).__module__.startswith("ae_env.")
-        if checked and not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
+        if type(self).__module__.startswith("ae_env."):
+            return totals
+        if not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
             found = _describe_range(totals)
             raise UserCodeError(
                 f"scorer {type(self).__name__!r}: `combine` returned {found}: rule is [0, 1]"
@@ -382,13 +382,15 @@ class Balanced(CompositeScorer):
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total of the parts' `scores`: tensors, arrays of any one shape, or numbers."""
-        # The logarithm of arrays by NumPy: torch's threads do not survive a fork.
-        log: Any = torch.log if torch.is_tensor(scores["highlights"]) else np.log
+        # Those of arrays by NumPy: torch's threads do not survive a fork.
+        placed = torch.is_tensor(scores["highlights"])
+        log: Any = torch.log if placed else np.log
+        least: Any = torch.clamp_min if placed else np.maximum
         parts: Mapping[str, Any] = self.parts
         blown = -parts["highlights"].scale * log(scores["highlights"])
         blocked = -parts["shadows"].scale * log(scores["shadows"])
         # Rounding may leave a share above 1.
-        score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
+        score = least(1.0 - blown**4, 0.0) * least(1.0 - blocked**4, 0.0)
         for name, weight in self.weights.items():
             score = score * scores[name] ** weight
         return score

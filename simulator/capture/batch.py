@@ -6,7 +6,8 @@ batch of frames is then one call of `simulator.capture.sensor.record`.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -15,32 +16,19 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.blurred_frames import BLUR
+from simulator.capture import blurred_frames, columns
 from simulator.capture.blurred_light import new_frames
-from simulator.capture.columns import (
-    BLURS,
-    SCENE,
-    blur_column,
-    fits_columns,
-    moved_columns,
-    noise_columns,
-    plan_frames,
-    scene_column,
-    state_columns,
-    statistics_column,
-    subject_column,
-    vignetting_column,
-    widest_defocus,
-)
 from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, exposure_table, record
+from simulator.capture.sensor import Transitions, exposure_table, record, record_units
 from simulator.capture.statistics import BINS, LightStatistics
 from simulator.noise.generator import Noise, noise_keys
 from simulator.settings import CameraSettings
-from simulator.utils.compute import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
+#: What it costs to record a frame, in the unit of `simulator.capture.blurred_frames.PASS`.
+RECORDING = 100.0
 #: Frames that are worth a thread when they are planned.
 _WORTH_A_THREAD = 256
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
@@ -68,7 +56,8 @@ class FrameStatistics:
     #: `SimulationPlan.predicted_error`; of a light without noise only what is left out.
     predicted_error: np.ndarray
     modules: np.ndarray  # int64 index into `MODULES`; of a recorded frame, their number
-    source_noise: np.ndarray  # (B, 2, 4) shot and read noise of the source in the frame
+    #: (B, 2, 4) shot and read noise of the source in the frame; None where no source has any.
+    source_noise: np.ndarray | None
     keys: np.ndarray  # of the noise, uint64
 
 
@@ -140,19 +129,21 @@ class CaptureBatch:
         self._moved = moved
         self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
         self._device = device
-        self._columns = state_columns(states)
+        self._columns = columns.state_columns(states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
         self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
         # Noise of captures, (S, 2, 4) for each of the box factors.
         self._boxes, self._targets = list[int](), np.empty((0, len(states), 2, 4))
-        # Scenes as columns; whether their captures are planned in columns, too: where the light has
-        # no noise of its own, and no aperture is opened.
+        # Scenes as columns, and at rest the one that each shows, whose light it has; -1 where its
+        # captures are planned alone: where the light has noise, or an aperture is opened.
         self._scenes: dict[int, PreparedScene] = {}
         self._known = np.zeros(num_scenes, bool)
-        self._scene_columns, self._in_columns = np.zeros(num_scenes, SCENE), self._known.copy()
-        # Of scenes at rest, what those that show them in motion share: the light, the largest
-        # defocus, the subject, the vignetting, and the statistics, where they are known.
-        self._light, self._widest = np.empty(num_scenes, object), np.zeros(num_scenes)
+        self._scene_columns = np.zeros(num_scenes, columns.SCENE)
+        self._rest = np.full(num_scenes, -1)
+        # Of scenes at rest, what those that show them in motion share: the light and its place, the
+        # largest defocus, the subject, the vignetting, and the statistics, where they are known.
+        self._light: dict[int, torch.Tensor] = {}
+        self._widest, self._place = np.zeros(num_scenes), np.zeros(num_scenes, np.uintp)
         self._height, self._subjects = 0, np.zeros((num_scenes, 2), np.uintp)
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
@@ -163,19 +154,21 @@ class CaptureBatch:
         count = num_scenes * len(states)
         self._gain = np.full(count, np.nan)  # light that it was planned for; NaN where it was not
         self._table = np.zeros((count, 5, 4), np.float32)  # of `exposure_table`
-        self._blur = np.zeros(count, BLUR)
+        self._blur = np.zeros(count, blurred_frames.BLUR)
         # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
         self._modules = np.zeros(count, np.int64)
         # What is added to these for each blur, and always; see `plan_frames`.
-        always = _BIT["noise"] + bool(camera.prnu) * _BIT["pixel_response"]
-        self._bits = np.array([_BIT[name] for name in BLURS] + [always * (noise is not None)])
-        self._blurs = np.zeros(count, bool)  # whether it must be, else the light is the source
-        self._blurred = np.zeros(count, np.uintp)  # its place
+        always = (_BIT["noise"] + bool(camera.prnu) * _BIT["pixel_response"]) * (noise is not None)
+        self._bits = np.array([*(_BIT[name] for name in columns.BLURS), always])
+        self._blurs = np.zeros(count, bool)  # whether light must be blurred
+        self._blurred = np.zeros(count, np.uintp)  # place of the light, blurred where it must be
         # Of captures that are not planned in columns, the light (4, H, W) that they start from,
         # `Exposure.remaining_variance` and the exposure.
         self._source, self._remaining_variance, self._exposure = np.empty((3, count), object)
         self._any_remaining = False
+        # Blur of so many frames that are prepared, which is still to be done.
+        self._pending: tuple[int, blurred_frames.Passes] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         options: dict[str, Any] = {"noise": self.noise, "light_bytes": self._light_bytes}
@@ -184,6 +177,9 @@ class CaptureBatch:
 
     def forget(self, indices: np.ndarray) -> None:
         """See `FrameSource`; the memory is used again."""
+        pending, self._pending = self._pending, None
+        if pending is not None:  # what its light is made of may be gone before
+            indices = np.union1d(indices, pending[1].passes["scene"])
         count, objects = len(self.states), (self._source, self._remaining_variance, self._exposure)
         self._gain.reshape(-1, count)[indices] = np.nan
         for column in objects if self._any_remaining else ():
@@ -197,21 +193,39 @@ class CaptureBatch:
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
-        stale = self._gain[rows] != gains
-        if stale.any():
+        self._finish()
+        stale = np.flatnonzero(self._gain[rows] != gains)
+        if len(stale):
             self._plan(indices[stale], rows[stale], gains[stale])
-        missing = self._blurs[rows] & (self._blurred_row[indices] != rows)
-        if missing.any():
-            self._blur_frames(np.unique(rows[missing]))
+        with self._forgetting(indices):
+            self._make_light(indices, rows)
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
+        self._finish()
+        return self._transitions(indices, states)
+
+    def _finish(self) -> None:
+        """Makes the light that is planned."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            with self._forgetting(pending[1].passes["scene"]):
+                self._frames.run(pending[1])
+
+    @contextmanager
+    def _forgetting(self, indices: np.ndarray) -> Iterator[None]:
+        """Drops what is cached for scenes `indices` if their light may not be made."""
+        try:
+            yield
+        except BaseException:
+            self.forget(indices)
+            raise
+
+    def _transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         rows = indices * len(self.states) + states
         remaining = self._remaining_variance[rows] if self._any_remaining else None
-        places, plain = self._blurred[rows], np.flatnonzero(~self._blurs[rows])
-        if len(plain):
-            places[plain] = self._places(indices[plain], rows[plain])
-        found = Transitions(self._frames.at(places), self._table[rows], remaining)
+        light = self._frames.at(self._blurred[rows])
+        found = Transitions(light, self._table.take(rows, axis=0), remaining)
         if not self.camera.prnu or self.noise is None:
             return found
         return found.seen_by([self.prepared_scene(i).response for i in indices.tolist()])
@@ -227,8 +241,14 @@ class CaptureBatch:
     ) -> FrameStatistics:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
-        keys, transitions = noise_keys(seeds, frames), self.transitions(indices, states)
-        read_noise = None
+        read_noise, run = None, None
+        apart = row_gain is not None or self.camera.prnu or self._device or self.noise == "sensor"
+        several = len(indices) >= 2 * torch.get_num_threads()
+        if self._pending is None or apart or not several or self._pending[0] != len(indices):
+            self._finish()
+        else:
+            run = partial(self._photograph, indices)
+        keys, transitions = noise_keys(seeds, frames), self._transitions(indices, states)
         if self.noise == "sensor":
             pairs = zip(indices.tolist(), states.tolist(), strict=True)
             boxes = [(self.states[s].iso, self.prepared_scene(i).box_factor) for i, s in pairs]
@@ -241,6 +261,7 @@ class CaptureBatch:
             read_noise=read_noise,
             row_gain=row_gain,
             count=True,
+            run=run,
             **outputs,
         )
         counted = counts.float() if isinstance(counts, torch.Tensor) else counts
@@ -251,9 +272,23 @@ class CaptureBatch:
             excess_variance=self._excess_variance[rows],
             predicted_error=self._predicted_error[rows],
             modules=self._modules[rows],
-            source_noise=transitions.averaged_table()[:, 3:],
+            source_noise=transitions.averaged_table()[:, 3:] if self._any_remaining else None,
             keys=keys,
         )
+
+    def _photograph(self, indices: np.ndarray, units: int, fixed: tuple[Any, ...]) -> None:
+        """Makes the light that is planned, and records frames of `indices` (B,)."""
+        assert self._pending is not None
+        (_, planned), self._pending = self._pending, None
+        with self._forgetting(indices):
+            lanes = 8 * torch.get_num_threads()
+            order, ends, wide = deal_out(planned.passes, indices, lanes)
+            if wide:  # NumPy makes these
+                self._frames.run(planned)
+                order, ends = len(planned.passes) + np.arange(len(indices)), np.arange(lanes + 1)
+                ends = ends * len(indices) // lanes
+            given = order, units, *planned, fixed
+            parallel_ranges(lambda a, b: photograph(ends[a], ends[b], *given), lanes)
 
     def prepared_scene(self, index: int) -> PreparedScene:
         """See `FrameSource`."""
@@ -273,15 +308,15 @@ class CaptureBatch:
             rest, moves = self._moved(indices)
             for index in np.unique(rest[(rest >= 0) & ~self._known[rest]]).tolist():
                 self._add_alone(index)
-            inside = (rest >= 0) & self._in_columns[rest]
+            inside = (rest >= 0) & (self._rest[rest] >= 0)
             inside &= moves["defocus"] <= self._widest[rest]
             new, rest = indices[inside], rest[inside]
             own = self._scene_columns[rest], moves[inside], self._subjects[rest]
-            self._scene_columns[new] = moved_columns(*own)
+            self._scene_columns[new] = columns.moved_columns(*own)
             for index in np.unique(rest[~self._counted[rest]]).tolist():
                 self._statistics[index] = self._scenes[index].statistics.columns
                 self._counted[index] = True
-            self._in_columns[new] = self._known[new] = True
+            self._rest[new], self._known[new] = rest, True
             indices = indices[~inside]
         for index in indices.tolist():
             self._add_alone(index)
@@ -292,35 +327,36 @@ class CaptureBatch:
         box = scene.box_factor
         if box not in self._boxes:
             self._boxes.append(box)
-            own = noise_columns(self.camera, self.states, box)
+            own = columns.noise_columns(self.camera, self.states, box)
             self._targets = np.stack([*self._targets, own])
-        self._vignetting[index] = vignetting_column(scene, self.states)
-        self._in_columns[index] = fits_columns(scene, self._columns)
-        if self._in_columns[index]:
-            self._scene_columns[index] = scene_column(scene, self._boxes.index(box), index)
-            self._statistics[index] = found = statistics_column(scene)
+        self._vignetting[index] = columns.vignetting_column(scene, self.states)
+        self._rest[index] = -1
+        if columns.fits_columns(scene, self._columns):
+            self._rest[index] = index
+            self._scene_columns[index] = columns.scene_column(scene, self._boxes.index(box), index)
+            self._statistics[index] = found = columns.statistics_column(scene)
             self._counted[index] = found.any()
-            self._widest[index] = widest_defocus(scene, self._columns)
-            self._subjects[index] = subject_column(scene)
+            self._widest[index] = columns.widest_defocus(scene, self._columns)
+            self._subjects[index] = columns.subject_column(scene)
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
         """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
         unknown = ~self._known[indices]
-        if unknown.any():
+        if np.count_nonzero(unknown):
             self._add(np.unique(indices[unknown]))
-        inside = self._in_columns[indices]
-        others = np.flatnonzero(~inside).tolist()
-        for i in others:
-            self._plan_alone(self._scenes[indices[i]], int(rows[i]), float(gains[i]))
-        if len(others) < len(rows):
-            planned = rows[inside]
+        inside = self._rest[indices] >= 0
+        given, planned = (indices, rows, gains), rows
+        if np.count_nonzero(inside) < len(rows):
+            for i in np.flatnonzero(~inside).tolist():
+                self._plan_alone(self._scenes[indices[i]], int(rows[i]), float(gains[i]))
+            given, planned = (indices[inside], rows[inside], gains[inside]), rows[inside]
+        if len(planned):
             known = self._scene_columns, self._statistics, self._vignetting
-            columns = self._blur, self._table, self._predicted_error, self._modules
+            made = self._blur, self._table, self._predicted_error, self._modules
             fixed = *known, self._columns, self._targets, self._height, self._bits
-            given = indices[inside], planned, gains[inside]
             parallel_ranges(
-                lambda first, last: plan_frames(first, last, *fixed, *given, *columns),
+                lambda first, last: columns.plan_frames(first, last, *fixed, *given, *made),
                 len(planned),
                 least=_WORTH_A_THREAD,
             )
@@ -336,7 +372,7 @@ class CaptureBatch:
         blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to
         self._blurs[row] = blurs or exposure.vignetting is not None
         self._exposure[row], self._any_remaining = exposure, True
-        self._blur[row] = blur_column(exposure)
+        self._blur[row] = columns.blur_column(exposure)
         remaining = exposure.remaining_variance
         remaining = None if remaining is None else remaining.float().contiguous()
         self._remaining_variance[row] = remaining
@@ -353,37 +389,36 @@ class CaptureBatch:
         self._modules[row] += sum(_BIT[step.name] for step in exposure.steps if step.runs)
         self._table[row] = exposure_table([exposure])[0]
 
-    def _blur_frames(self, rows: np.ndarray) -> None:
-        """Makes the light of `rows`, all different, on as many threads as torch may use."""
-        indices, states = np.divmod(rows, len(self.states))
-        alone = rows[~self._in_columns[indices]]
-        try:
-            opens = [row for row in alone.tolist() if self._exposure[row].opened_to is not None]
-            if opens:
-                parallel_ranges(lambda a, b: [*map(self._open, opens[a:b])], len(opens))
-                # Light that was opened before may have had the same address.
-                self._frames.release(np.array(opens) // len(self.states))
-            light = self._places(indices, rows)
-            made = self._frames.make(indices, self._slots[states], self._blur[rows], light)
-            self._blurred[rows] = made
-            for row in alone.tolist():
-                self._balance(row)
-        except BaseException:  # some of the light is not made
-            self.forget(indices)
-            raise
-        self._blurred_row[indices] = rows
+    def _make_light(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        """Finds the places of the light of `rows`, and makes what is not there."""
+        shown, source = shown_at_rest(indices, self._rest), np.zeros(len(rows), np.uintp)
+        if len(shown):
+            self._place[shown] = self._frames.places([self._light[i] for i in shown.tolist()])
+        if self._any_remaining and len(alone := np.flatnonzero(self._rest[indices] < 0)):
+            source[alone] = self._own_light(indices[alone], rows[alone])
+        given = self._blurs, self._rest, self._place
+        missing = find_light(indices, rows, *given, self._blurred_row, self._blurred, source)
+        if not len(missing):
+            return
+        indices, rows = indices[missing], rows[missing]
+        slots, blurs = self._slots[rows - indices * len(self.states)], self._blur.take(rows)
+        self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, source[missing])
+        self._blurred_row[indices], self._pending = rows, (len(source), planned)
+        if self._any_remaining and len(unknown := rows[np.isnan(self._excess_variance[rows])]):
+            self._finish()
+            for row in unknown.tolist():  # depends on the pixels
+                light = self._frames.at(self._blurred[[row]])[0].cpu()
+                self._excess_variance[row], _ = noise_balance(light, self._exposure[row])
 
-    def _places(self, indices: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Places of the light that `rows` (K,) of scenes `indices` start from."""
-        inside, places = self._in_columns[indices], np.empty(len(rows), np.uintp)
-        if inside.any():
-            shown = self._scene_columns["rest"][indices[inside]]
-            rest = np.flatnonzero(np.bincount(shown))  # once each; `np.unique` would sort
-            found = self._frames.places(self._light[rest].tolist())
-            places[inside] = found[np.searchsorted(rest, shown)]
-        if not inside.all():
-            places[~inside] = self._frames.places(self._source[rows[~inside]])
-        return places
+    def _own_light(self, indices: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Places of the light that `rows` (K,) start from, which are planned alone."""
+        new = self._blurred_row[indices] != rows
+        opens = [row for row in {*rows[new].tolist()} if self._exposure[row].opened_to is not None]
+        if opens:
+            parallel_ranges(lambda a, b: [*map(self._open, opens[a:b])], len(opens))
+            # Light that was opened before may have had the same address.
+            self._frames.release(np.array(opens) // len(self.states))
+        return self._frames.places(self._source[rows])
 
     def _open(self, row: int) -> None:
         """Opens the aperture; the scene caches its result."""
@@ -392,11 +427,102 @@ class CaptureBatch:
         if self._frames.is_full and lights.aperture_blur is not None:
             lights.aperture_blur.forget()
 
-    def _balance(self, row: int) -> None:
-        """Computes the excess variance where it depends on the pixels."""
-        if np.isnan(self._excess_variance[row]):
-            light = self._frames.at(self._blurred[[row]])[0]
-            self._excess_variance[row], _ = noise_balance(light.cpu(), self._exposure[row])
+
+@kernel(fastmath={"contract"})
+def photograph(  # type: ignore[no-untyped-def]
+    first, last, order, units, passes, blurs, levels, shape, fixed
+):
+    """Does `order` from `first` to `last`, of `deal_out`: passes, and `record_units` of frames.
+
+    A frame has so many `units`, which take the arguments `fixed`; for the others see
+    `BlurredFrames.run`. One frame comes after the other, and its light stays in the cache.
+    """
+    for at in order[first:last]:
+        if at >= len(passes):
+            frame = at - len(passes)
+            record_units(frame * units, (frame + 1) * units, *fixed)
+        elif passes[at].kind == blurred_frames.DISC:
+            blurred_frames.blur_discs(at, at + 1, 1, shape, passes, blurs, levels)
+        elif passes[at].kind == blurred_frames.BLEND:
+            blurred_frames.blend_discs(at, at + 1, 1, shape, passes, blurs, levels)
+        elif passes[at].kind == blurred_frames.ALONG_ROWS:
+            blurred_frames.move_along_rows(at, at + 1, 1, shape, passes, blurs, levels)
+        elif passes[at].kind == blurred_frames.ALONG_PATH:
+            blurred_frames.move_along_paths(at, at + 1, 1, shape, passes, blurs, levels)
+        else:
+            blurred_frames.darken(at, at + 1, 1, shape, passes, blurs, levels)
+
+
+@kernel()
+def deal_out(passes, scenes, lanes):  # type: ignore[no-untyped-def]
+    """Passes (J,), and behind them frames of `scenes` (B,), dealt out to lanes of the same cost.
+
+    A scene is in one lane, with its passes before its frames.
+
+    Returns:
+        (J + B,) order of both; (lanes + 1,) where in it each lane begins and the last ends; and
+        whether a disc is wide.
+    """
+    owner, total = np.empty(len(passes) + len(scenes), np.int64), scenes.max() + 1
+    cost = np.zeros(total + len(scenes))
+    wide = False
+    for j in range(len(passes)):
+        owner[j], wide = passes[j].scene, wide or passes[j].kind == blurred_frames.WIDE
+        cost[owner[j]] += passes[j].cost
+    for k in range(len(scenes)):  # a frame without passes can be anywhere
+        one = owner[len(passes) + k] = scenes[k] if cost[scenes[k]] > 0.0 else total + k
+        cost[one] += RECORDING
+    lane, load = np.zeros(len(cost), np.int64), np.zeros(lanes)
+    costly_first = np.argsort(-cost, kind="mergesort")
+    for one in costly_first:
+        lane[one] = np.argmin(load)
+        load[lane[one]] += cost[one]
+    counts, begin = np.bincount(owner, minlength=len(cost)), np.empty(len(cost), np.int64)
+    ends, done = np.zeros(lanes + 1, np.int64), 0
+    for number in range(lanes):
+        for one in costly_first:
+            if lane[one] == number:
+                begin[one] = done
+                done += counts[one]
+        ends[number + 1] = done
+    order = np.empty(len(owner), np.int64)
+    for unit in range(len(owner)):
+        order[begin[owner[unit]]] = unit
+        begin[owner[unit]] += 1
+    return order, ends, wide
+
+
+@kernel()
+def shown_at_rest(indices, rest):  # type: ignore[no-untyped-def]
+    """The different scenes that those of `indices` show, -1 apart."""
+    seen, found, count = np.zeros(len(rest), np.bool_), np.empty(len(indices), np.int64), 0
+    for index in indices:
+        scene = rest[index]
+        if scene >= 0 and not seen[scene]:
+            found[count], seen[scene] = scene, True
+            count += 1
+    return found[:count]
+
+
+@kernel()
+def find_light(  # type: ignore[no-untyped-def]
+    indices, rows, blurs, rest, place, blurred_row, blurred, source
+):
+    """The frames among `rows` (K,) of scenes `indices` whose light has to be blurred.
+
+    See `CaptureBatch` for the columns. `source` (K,) become the places of the light that each frame
+    starts from, and `blurred` those of the frames that need no blur.
+    """
+    found, count = np.empty(len(rows), np.int64), 0
+    for k in range(len(rows)):
+        if rest[indices[k]] >= 0:
+            source[k] = place[rest[indices[k]]]
+        if not blurs[rows[k]]:
+            blurred[rows[k]] = source[k]
+        elif blurred_row[indices[k]] != rows[k]:
+            found[count] = k
+            count += 1
+    return found[:count]
 
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:

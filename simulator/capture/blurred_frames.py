@@ -12,23 +12,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.optics.discs import (
-    DIAMETERS,
-    LIGHT_LIMIT,
-    WIDE_PX,
-    blend_rows,
-    disc_radius,
-    disc_taps,
-    mark_levels,
-    wide_disc,
-)
+from simulator.optics import discs
 from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak_share, taps_of
 from simulator.utils.checks import check_number, check_type
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
@@ -55,11 +46,32 @@ _SLAB, _LARGE = 2**20, 2**16
 _LEVELS = 255
 #: A bit more than half of a level.
 _HALF_STEP = np.float32(0.51 / _LEVELS)
-_KNOTS = (np.array(DIAMETERS) ** 2).astype(np.float32)
-_MOST = np.float32(LIGHT_LIMIT)  # of its type, lest kernels compile twice
+_DISCS = np.array(discs.DIAMETERS)
+_KNOTS = (_DISCS**2).astype(np.float32)
+_MOST = np.float32(discs.LIGHT_LIMIT)  # of its type, lest kernels compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
-#: A kind of blur of K frames: a kernel, the scenes (K,), the cost of each, and what it is given.
-Pass = tuple[Any, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
+#: What is to be done to a frame, and where: one step of its blur.
+PASS = np.dtype(
+    [
+        *((n, "i8") for n in ("kind", "frame", "scene")),  # index into `_TASKS`
+        *((n, "uintp") for n in ("source", "to")),  # places
+        *((n, "f8") for n in ("diameter", "radius")),  # of the disc; 0 for another kind
+        ("cost", "f8"),  # about microseconds at 128 x 128
+    ]
+)
+
+
+class Passes(NamedTuple):
+    """What is to be done for K frames, in this order."""
+
+    passes: np.ndarray  # (J,) `PASS`
+    blurs: np.ndarray  # (K,) `BLUR`
+    levels: np.ndarray  # (K, 13) places that blends read
+    shape: tuple[int, ...]  # of all frames
+
+
+#: Kinds of passes, in the order in which a frame has them.
+WIDE, DISC, BLEND, ALONG_ROWS, ALONG_PATH, DARKEN = range(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,15 +208,15 @@ class BlurredFrames:
         self._most_bytes, self._shape = most_bytes, tuple[int, ...]()
         # Places that each scene holds: behind the lens at each aperture, behind each disc, in
         # motion, and of its layout where that is a frame, too.
-        self._held = np.zeros((num_scenes, num_apertures + len(DIAMETERS) + 2), np.uintp)
+        self._held = np.zeros((num_scenes, num_apertures + len(discs.DIAMETERS) + 2), np.uintp)
         self._lens, self._levels = self._held[:, :num_apertures], self._held[:, num_apertures:-2]
         self._moved, self._layouts = self._held[:, -2], self._held[:, -1]
         # The light, and the diameter of the disc, that they were made of.
         self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
-        self._slabs, self._free = list[torch.Tensor](), np.empty(0, np.uintp)
+        self._slabs = list[torch.Tensor]()
+        self._free, self._left = np.empty(0, np.uintp), 0  # places, of which these many are free
         self._bytes = 0  # of all memory
-        self._passes = list[Pass]()  # that are still to run
 
     @property
     def is_full(self) -> bool:
@@ -227,13 +239,22 @@ class BlurredFrames:
 
     def _take(self, count: int) -> np.ndarray:
         """Places of memory for `count` frames."""
-        if (lacking := count - len(self._free)) > 0:
-            self._give_back(self._more(lacking))
-        taken, self._free = self._free[:count], self._free[count:]
-        return taken
+        while (lacking := count - self._left) > 0:
+            self._grow(lacking)
+        self._left -= count
+        return self._free[self._left : self._left + count].copy()
+
+    def _grow(self, count: int) -> None:
+        """Makes places for `count` frames or more."""
+        made = self._more(count)
+        self._free = np.append(self._free, made)  # room for all that there are
+        self._give_back(made)
 
     def _give_back(self, places: np.ndarray) -> None:
-        self._free = np.concatenate([self._free, places[places > 0]])
+        """Makes places free that are not 0."""
+        places = places[places > 0]
+        self._free[self._left : self._left + len(places)] = places
+        self._left += len(places)
 
     def _more(self, count: int) -> np.ndarray:
         """Places of new memory for `count` frames or more."""
@@ -259,10 +280,10 @@ class BlurredFrames:
         self._held[indices] -= others
         self._give_back(others)
 
-    def make(
+    def plan(
         self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
-    ) -> np.ndarray:
-        """(K,) places of the light of scenes `indices` behind their blurs.
+    ) -> tuple[np.ndarray, Passes]:
+        """(K,) places of the light of scenes `indices` behind their blurs, and what makes it.
 
         `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the places of the light
         (4, H, W) that they start from. Each stays until its scene blurs another. No two have the
@@ -270,148 +291,37 @@ class BlurredFrames:
         """
         if self.is_full:
             self._free_others(indices, slots)
-        self._passes.clear()
-        behind_lens = blurs["defocus_px"] > 0.0
-        known = (self._lens[indices, slots] > 0) & (self._source[indices, slots] == source)
-        known &= self._diameter[indices, slots] == blurs["defocus_px"]
-        new = behind_lens & ~known
-        if new.any():
-            self._focus(indices[new], slots[new], blurs[new], source[new])
-        light = np.where(behind_lens, self._lens[indices, slots], source)
-        # What changes by motion, or by the lens, has memory of its own.
-        for name, write in ("motion_px", self._move), ("vignetting", self._darken):
-            if (own := blurs[name] > 0).any():
-                some, source = indices[own], light[own]
-                lacking = some[self._moved[some] == 0]
-                self._moved[lacking] = self._take(len(lacking))
-                light[own] = self._moved[some]
-                write(some, blurs[own], source, light[own])
-        _run(self._passes, self._shape)
-        return light
+        count, done, planned, lacking = len(indices), 0, 0, 0
+        light, levels = np.empty(count, np.uintp), np.empty((count, len(discs.DIAMETERS)), np.uintp)
+        passes = np.empty(count * (len(discs.DIAMETERS) + 3), PASS)
+        held = self._held, self._source, self._diameter, self._levels_source
+        frames = indices, slots, blurs, source, float(sum(self._shape[1:])), discs.radius_table()
+        while done < count:
+            if lacking:
+                self._grow(lacking)
+            free, made = (self._free, self._left), (light, levels, passes)
+            found = plan_passes(done, planned, frames, held, free, made)
+            done, planned, self._left, lacking = found
+        return light, Passes(passes[:planned], blurs, levels, self._shape)
 
-    def _focus(
-        self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
-    ) -> None:
-        """Makes the light behind the lens, of scenes that are out of focus; see `make`."""
-        lacking = self._lens[indices, slots] == 0
-        self._lens[indices[lacking], slots[lacking]] = self._take(int(lacking.sum()))
-        self._source[indices, slots] = source
-        self._diameter[indices, slots] = blurs["defocus_px"]
-        to, blends = self._lens[indices, slots], blurs["diameter"] > 0
-        if blends.any():
-            own = indices[blends], blurs[blends]
-            self._blend(*own, self._made_levels(*own, source[blends]), to[blends])
-        one = ~blends  # disc everywhere
-        self._blur(indices[one], blurs["defocus_px"][one], source[one], to[one])
+    def run(self, planned: Passes) -> None:
+        """Does all passes, kind by kind, each on all threads."""
+        kinds = planned.passes["kind"]
+        for kind in np.unique(kinds).tolist():
+            self._run(kind, planned.passes[kinds == kind], planned)
 
-    def _made_levels(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray
-    ) -> np.ndarray:
-        """(K, 13) places of the light of scenes behind the discs that their blend needs."""
-        stale = np.flatnonzero(np.bincount(indices[self._levels_source[indices] != source]))
-        self._give_back(self._levels[stale])
-        self._levels[stale] = 0
-        self._levels_source[indices] = source
-        needed = np.zeros((len(indices), len(DIAMETERS)), bool)
-        mark_needed(blurs, _KNOTS, needed)
-        frame, level = np.nonzero(needed & (self._levels[indices] == 0))
-        keys, numbers = indices[frame] * len(DIAMETERS) + level, np.arange(len(frame))
-        maker = np.empty(self._levels.size, np.intp)
-        maker[keys] = numbers  # of frames with the same disc one makes it
-        frame, level = (column[maker[keys] == numbers] for column in (frame, level))
-        self._levels[indices[frame], level] = made = self._take(len(frame))
-        self._blur(indices[frame], np.array(DIAMETERS)[level], source[frame], made)
-        levels = self._levels[indices]  # those without a share are read, too, times 0
-        return np.where(levels == 0, source[:, None], levels)
-
-    # Each writes frames of scenes to the places `to` (K,): behind one disc, behind discs of the
-    # pixels' own, moved, and darkened. Costs are about microseconds at 128 x 128.
-    def _blur(
-        self, indices: np.ndarray, diameters: np.ndarray, source: np.ndarray, to: np.ndarray
-    ) -> None:
-        radii = np.zeros(len(diameters))
-        for i, diameter in enumerate(diameters.tolist()):
-            if diameter > WIDE_PX:
-                light, out = (frame_at(int(at[i]), self._shape) for at in (source, to))
-                wide_disc(light, diameter, LIGHT_LIMIT, out)
-            else:
-                radii[i] = _radius(diameter)
-        own = radii > 0.0
-        cost = 85.0 + 13.0 * radii[own] ** 2
-        self._add(blur_discs, indices[own], cost, source[own], to[own], radii[own])
-
-    def _blend(
-        self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
-    ) -> None:
-        self._add(blend_discs, indices, np.full(len(to), 200.0), to, blurs, levels)
-
-    def _move(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
-    ) -> None:
-        # Sums of taps take as long as these are many; with a subject there are more.
-        taps = 95.0 + 9.0 * np.minimum(blurs["motion_px"], sum(self._shape[1:]))
-        taps *= np.where(blurs["mask"] > 0, 1.6, 1.0)
-        for task, own in (move_along_rows, blurs["streaks"]), (move_along_paths, ~blurs["streaks"]):
-            self._add(task, indices[own], taps[own], source[own], to[own], blurs[own])
-
-    def _darken(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
-    ) -> None:
-        left = np.ascontiguousarray(blurs["vignetting"])
-        self._add(darken, indices, np.full(len(to), 20.0), source, to, left)
-
-    def _add(self, task: Any, scenes: np.ndarray, cost: np.ndarray, *columns: np.ndarray) -> None:
-        if len(scenes):
-            self._passes.append((task, scenes, cost, columns))
-
-
-_radius = functools.lru_cache(maxsize=4096)(disc_radius)
-
-
-def _run(passes: Sequence[Pass], shape: tuple[int, ...]) -> None:
-    """Runs passes, in order, on frames of `shape`, on all threads, which share the cost.
-
-    A thread has all passes of a scene. Where scenes are few, threads share each pass instead, and
-    of few large frames planes, or rows where there are more threads.
-    """
-    if not passes:
-        return
-    threads, parts = torch.get_num_threads(), 1
-    owner = np.concatenate([p[1] for p in passes])
-    cost = np.bincount(owner, np.concatenate([p[2] for p in passes]))
-    different = np.flatnonzero(cost)
-    if len(different) < 2 * threads:
-        if len(passes) > 1:
+    def _run(self, kind: int, passes: np.ndarray, planned: Passes) -> None:
+        threads, (planes, height, width), parts = torch.get_num_threads(), self._shape, 1
+        if kind == WIDE:  # several at once would fill the memory
             for one in passes:
-                _run([one], shape)
+                light, out = (frame_at(int(one[name]), self._shape) for name in ("source", "to"))
+                discs.wide_disc(light, one["diameter"].item(), discs.LIGHT_LIMIT, out)
             return
-        owner = different = np.arange(count := len(owner))
-        cost = passes[0][2]
-        if count < 2 * threads and math.prod(shape) >= _LARGE:
-            parts = shape[0] * min(1 + (threads - 1) // (count * shape[0]), shape[1])
-        threads = min(threads, count * parts)
-    order = different[np.argsort(-cost[different], kind="stable")]
-    # Dealt out in turns, there and back: each thread has costly scenes and cheap ones.
-    turn = np.arange(len(order)) % (2 * threads)
-    order = order[np.argsort(np.minimum(turn, 2 * threads - 1 - turn), kind="stable")]
-    costs, place = np.repeat(cost[order], parts), np.empty(len(cost), np.int64)
-    place[order] = np.arange(len(order))
-    # A unit belongs to the thread in whose share of the cost its middle is.
-    share = ((costs.cumsum() - 0.5 * costs) * (threads / costs.sum())).reshape(-1, parts)
-    work = []
-    for task, scenes, _, columns in passes:
-        at, owner = owner[: len(scenes)], owner[len(scenes) :]
-        own = np.argsort(place[at], kind="stable")
-        ends = np.searchsorted(share[place[at[own]]].ravel(), np.arange(threads + 1)).tolist()
-        work.append((task, ends, (own, parts, *shape, *columns)))
-
-    def do(first: int, last: int) -> None:
-        for thread in range(first, last):
-            for task, ends, fixed in work:
-                if ends[thread] < ends[thread + 1]:
-                    task(ends[thread], ends[thread + 1], *fixed)
-
-    parallel_ranges(do, threads)
+        # Of few large frames, threads share planes, or rows where there are more threads.
+        if (count := len(passes)) < 2 * threads and planes * height * width >= _LARGE:
+            parts = planes * min(1 + (threads - 1) // (count * planes), height)
+        task, fixed = _TASKS[kind], (parts, self._shape, passes, *planned[1:3])
+        parallel_ranges(lambda first, last: task(first, last, *fixed), count * parts)
 
 
 @_jit()
@@ -420,19 +330,117 @@ def _array_at(address, shape):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def mark_needed(blurs, knots, needed):  # type: ignore[no-untyped-def]
-    """Marks the discs, other than none, that the blend of each frame needs."""
-    for i in range(len(blurs)):
-        blur = blurs[i]
-        if blur.diameter:
+def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-untyped-def]
+    """Plans the passes of `frames` (K,) from `done` on, behind those that are `planned`.
+
+    See `BlurredFrames.plan` for the frames, and `BlurredFrames` for the `memory`, of which these
+    many places are to `spare`. What is `made` are (K,) places of light, (K, 13) of what blends
+    read, and `PASS`.
+
+    Returns:
+        The frames that are done, the passes, the places that are left, and how many lack.
+    """
+    indices, slots, blurs, source, longest, table = frames
+    held, sources, diameters, levels_source = memory
+    (free, left), (light, levels, passes) = spare, made
+    needed, lens = np.zeros(len(_KNOTS), np.bool_), sources.shape[1]
+    for k in range(done, len(indices)):
+        scene, slot, blur, at = indices[k], slots[k], blurs[k], source[k]
+        diameter, blends, moved = blur.defocus_px, blur.diameter > 0, held.shape[1] - 2
+        known = held[scene, slot] > 0 and sources[scene, slot] == at
+        known = known and diameters[scene, slot] == diameter
+        new = diameter > 0.0 and not known
+        changes = blur.motion_px > 0.0 or blur.vignetting > 0
+        needed[:] = False
+        if new and blends:
+            if levels_source[scene] != at:
+                left = _give_up(held[scene, lens:moved], free, left)
+                levels_source[scene] = at
             sorts = _array_at(blur.sorts, (blur.num_sorts,))
-            mark_levels(sorts, np.float32(blur.defocus_px), _HALF_STEP, knots, needed[i])
-        needed[i, 0] = False
+            discs.mark_levels(sorts, np.float32(diameter), _HALF_STEP, _KNOTS, needed)
+            needed[0] = False
+        lacking = (new and not held[scene, slot]) + (changes and not held[scene, moved])
+        for level in range(len(needed)):
+            needed[level] &= not held[scene, lens + level]
+            lacking += needed[level]
+        if lacking > left:
+            return k, planned, left, lacking - left
+        light[k], levels[k, :] = at, at  # levels without a share are read, too, times 0
+        if new:
+            left = _hold(held[scene], slot, free, left)
+            sources[scene, slot], diameters[scene, slot] = at, diameter
+            for level in range(len(needed) if blends else 0):
+                if needed[level]:
+                    left = _hold(held[scene], lens + level, free, left)
+                    to = held[scene, lens + level]
+                    planned = _add_disc(passes, planned, k, scene, at, to, _DISCS[level], table)
+                if held[scene, lens + level]:
+                    levels[k, level] = held[scene, lens + level]
+            to = held[scene, slot]
+            if blends:
+                planned = _add(passes, planned, BLEND, k, scene, at, to, 200.0)
+            else:
+                planned = _add_disc(passes, planned, k, scene, at, to, diameter, table)
+        if diameter > 0.0:
+            light[k] = held[scene, slot]
+        if changes:  # what changes by motion, or by the lens, has memory of its own
+            left = _hold(held[scene], moved, free, left)
+            to = held[scene, moved]
+            if blur.motion_px > 0.0:
+                kind = ALONG_ROWS if blur.streaks else ALONG_PATH
+                # Sums of taps take as long as these are many; with a subject there are more.
+                cost = (95.0 + 9.0 * min(blur.motion_px, longest)) * (1.6 if blur.mask else 1.0)
+                planned = _add(passes, planned, kind, k, scene, light[k], to, cost)
+                light[k] = to
+            if blur.vignetting:
+                planned = _add(passes, planned, DARKEN, k, scene, light[k], to, 20.0)
+            light[k] = to
+    return len(indices), planned, left, 0
 
 
-# Passes do units `first` to `last`: a unit is one of `parts` equal shares of the rows of all planes
-# (P, H, W) of a frame, ``order[unit // parts]``, which is read and written at addresses (K,). There
-# is one for each kind of blur: what compiles slowly and is not needed is not compiled.
+@_jit()
+def _give_up(held, free, left):  # type: ignore[no-untyped-def]
+    """The places that are left when all of `held` are free."""
+    for place in range(len(held)):
+        if held[place]:
+            free[left], held[place] = held[place], 0
+            left += 1
+    return left
+
+
+@_jit()
+def _hold(held, place, free, left):  # type: ignore[no-untyped-def]
+    """The places that are left when `held` has one at `place`."""
+    if held[place]:
+        return left
+    held[place] = free[left - 1]
+    return left - 1
+
+
+@_jit()
+def _add(passes, planned, kind, frame, scene, source, to, cost):  # type: ignore[no-untyped-def]
+    """Adds a pass; how many there are then."""
+    one = passes[planned]
+    one.kind, one.frame, one.scene, one.source, one.to = kind, frame, scene, source, to
+    one.diameter, one.radius, one.cost = 0.0, 0.0, cost
+    return planned + 1
+
+
+@_jit()
+def _add_disc(  # type: ignore[no-untyped-def]
+    passes, planned, frame, scene, source, to, diameter, table
+):
+    """The same of the disc of a diameter."""
+    one, radius = passes[planned], discs.disc_radius(diameter, table[0], table[1])
+    kind = WIDE if diameter > discs.WIDE_PX else DISC
+    planned = _add(passes, planned, kind, frame, scene, source, to, 85.0 + 13.0 * radius**2)
+    one.diameter, one.radius = diameter, radius
+    return planned
+
+
+# Tasks do units `first` to `last` of passes (J,): a unit is one of `parts` equal shares of the rows
+# of all planes (P, H, W) of a frame. There is one for each kind of pass: what compiles slowly and
+# is not needed is not compiled.
 @_jit()
 def _share(unit, parts, rows):  # type: ignore[no-untyped-def]
     """The first row of a unit, and the first behind it."""
@@ -440,70 +448,55 @@ def _share(unit, parts, rows):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def blur_discs(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, source, to, radii
-):
-    """Light behind one disc each."""
+def _at(unit, parts, shape, passes):  # type: ignore[no-untyped-def]
+    """Rows of a unit, and what it reads and writes, (P H, W)."""
+    planes, height, width = shape
+    one, rows = passes[unit // parts], _share(unit, parts, planes * height)
     shape = planes * height, width
-    for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, shape[0])
-        image, out = _array_at(source[i], shape), _array_at(to[i], shape)
-        blur_planes(rows[0], rows[1], image, height, disc_taps(radii[i]), _MOST, out)
+    return rows, _array_at(one.source, shape), _array_at(one.to, shape)
 
 
 @_jit()
-def blend_discs(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, to, blurs, levels
-):
+def blur_discs(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
+    """Light behind one disc each."""
+    for unit in range(first, last):
+        rows, image, out = _at(unit, parts, shape, passes)
+        taps = discs.disc_taps(passes[unit // parts].radius)
+        blur_planes(rows[0], rows[1], image, shape[1], taps, _MOST, out)
+
+
+@_jit()
+def blend_discs(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light behind a disc of its own for each pixel, from `levels` (K, 13)."""
+    planes, height, width = shape
     samples, count = planes * height * width, max(planes // parts, 1)
     for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, planes * height)
-        diameter = _array_at(blurs[i].diameter, (height, width))
-        scale = np.float32(blurs[i].defocus_px)
+        one, rows = passes[unit // parts], _share(unit, parts, planes * height)
+        blur = blurs[one.frame]
+        diameter = _array_at(blur.diameter, (height, width))
+        scale = np.float32(blur.defocus_px)
         top, plane = rows[0] % height, rows[0] // height
-        out = _array_at(to[i], (planes, height, width))[plane : plane + count]
-        bottom, begin = top + (rows[1] - rows[0]) // count, plane * height * width
-        blend_rows(top, bottom, diameter, scale, _KNOTS, levels[i], begin, samples, out)
+        out = _array_at(one.to, (planes, height, width))[plane : plane + count]
+        bottom, begin, own = top + (rows[1] - rows[0]) // count, plane * height * width, one.frame
+        discs.blend_rows(top, bottom, diameter, scale, _KNOTS, levels[own], begin, samples, out)
 
 
 @_jit()
-def move_along_rows(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, light, to, blurs
-):
+def move_along_rows(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light that moves along the rows."""
-    shape = planes * height, width
     for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, shape[0])
-        n, share = streak_share(blurs[i].motion_px)
-        image, out = _array_at(light[i], shape), _array_at(to[i], shape)
+        rows, image, out = _at(unit, parts, shape, passes)
+        n, share = streak_share(blurs[passes[unit // parts].frame].motion_px)
         move_rows(rows[0], rows[1], image, n, share, _MOST, out)
 
 
 @_jit()
-def darken(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, light, to, vignetting
-):
-    """Light through a lens with vignetting."""
-    shape = planes * height, width
-    for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, shape[0])
-        image, out = _array_at(light[i], shape), _array_at(to[i], shape)
-        left = _array_at(vignetting[i], (height, width))
-        for y in range(rows[0], rows[1]):
-            for x in range(width):
-                out[y, x] = image[y, x] * left[y % height, x]
-
-
-@_jit()
-def move_along_paths(  # type: ignore[no-untyped-def]
-    first, last, order, parts, planes, height, width, light, to, blurs
-):
+def move_along_paths(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light that moves along a path, and a subject that moves along its own."""
-    still, shape = 0.0, (planes * height, width)
+    still, (_, height, width) = 0.0, shape
     for unit in range(first, last):
-        i, rows = order[unit // parts], _share(unit, parts, shape[0])
-        blur, image, out = blurs[i], _array_at(light[i], shape), _array_at(to[i], shape)
+        rows, image, out = _at(unit, parts, shape, passes)
+        blur = blurs[passes[unit // parts].frame]
         path = blur.extent, blur.direction, blur.turn
         taps = taps_of(path[0], path[1], path[2], still, still, height, width)
         if not blur.mask:
@@ -515,3 +508,17 @@ def move_along_paths(  # type: ignore[no-untyped-def]
             behind = _array_at(blur.behind, (height, width)).view(np.int32)
             begin, end = rows[0], (rows[1] + height - 1) // height * height
             blur_apart(image[begin:end], mask, behind, taps, own, _MOST, out[begin:end])
+
+
+@_jit()
+def darken(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
+    """Light through a lens with vignetting; a frame may be darkened in place."""
+    for unit in range(first, last):
+        rows, image, out = _at(unit, parts, shape, passes)
+        left = _array_at(blurs[passes[unit // parts].frame].vignetting, shape[1:])
+        for y in range(rows[0], rows[1]):
+            for x in range(shape[2]):
+                out[y, x] = image[y, x] * left[y % shape[1], x]
+
+
+_TASKS: Any = None, blur_discs, blend_discs, move_along_rows, move_along_paths, darken

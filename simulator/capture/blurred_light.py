@@ -276,7 +276,8 @@ class BlurredLight:
         # One light out of focus shares discs; each motion or vignetting has memory of its own.
         same = np.unique(places, return_inverse=True)[1]
         indices = np.where(_changes(blurs[todo]), slots, same)
-        done = frames.make(indices, slots, blurs[todo], places)
+        done, planned = frames.plan(indices, slots, blurs[todo], places)
+        frames.run(planned)
         for i, light in zip(todo.tolist(), frames.kept(done), strict=True):
             result[i] = light
         return result

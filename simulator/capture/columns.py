@@ -13,16 +13,8 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
+from simulator.capture import decision
 from simulator.capture.blurred_frames import BLUR, LAYOUT, Layout
-from simulator.capture.decision import (
-    MAX_DISC_PX,
-    RATIO_LIMIT,
-    STREAK_TO_DISC,
-    Exposure,
-    Origin,
-    decide,
-    weigh_blurs,
-)
 from simulator.capture.sensor import exposure_table
 from simulator.capture.statistics import BINS, curvature
 from simulator.optics.motion import Path, path_length
@@ -73,7 +65,9 @@ def fits_columns(scene: PreparedScene, states: np.ndarray) -> bool:
 
 def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
     """The largest `PreparedScene.defocus` whose disc is not too wide at `STATE` (S,)."""
-    return float(max(*scene.light.shape[-2:], MAX_DISC_PX) * states["f_number"].min() / 4.0)
+    return float(
+        max(*scene.light.shape[-2:], decision.MAX_DISC_PX) * states["f_number"].min() / 4.0
+    )
 
 
 def statistics_column(scene: PreparedScene) -> np.ndarray:
@@ -131,7 +125,7 @@ def _address(array: np.ndarray | None) -> int:
     return 0 if array is None else array.ctypes.data
 
 
-def blur_column(exposure: Exposure) -> tuple[Any, ...]:
+def blur_column(exposure: decision.Exposure) -> tuple[Any, ...]:
     """The `BLUR` of an exposure."""
     path, own = exposure.path, exposure.subject_path
     if path is None:
@@ -187,7 +181,7 @@ def plan_frames(  # type: ignore[no-untyped-def]
         scene, state, blur = scenes[indices[k]], states[at], blurs[row]
         target, time = targets[scene.targets, at], state.time
         ratio = 2.0 ** (state.log2_exposure - scene.log2_reference)
-        ratio = min(scene.gain * gains[k] * ratio, RATIO_LIMIT)
+        ratio = min(scene.gain * gains[k] * ratio, decision.RATIO_LIMIT)
         drift = scene.subject_speed * time * height
         blur.extent = moved = scene.speed * time * height
         blur.direction, blur.turn, blur.streaks = scene.direction, scene.turn * time, scene.streaks
@@ -200,8 +194,8 @@ def plan_frames(  # type: ignore[no-untyped-def]
         disc = line = math.inf
         if scene.tolerance > 0.0 and extents[1] + moved > 0.0:
             disc, line = curvature(statistics[scene.rest], ratio, target)
-            line = line if scene.streaks else STREAK_TO_DISC * disc
-        weigh_blurs(extents, disc, line, 0.0, scene.tolerance, errors, runs)
+            line = line if scene.streaks else decision.STREAK_TO_DISC * disc
+        decision.weigh_blurs(extents, disc, line, 0.0, scene.tolerance, errors, runs)
         blur.defocus_px = extents[1] if runs[1] else 0.0
         blur.motion_px = moved if runs[2] else 0.0
         blur.diameter, blur.sorts = scene.diameter, scene.sorts
@@ -223,7 +217,7 @@ def plan_frames(  # type: ignore[no-untyped-def]
 
 def plan_sweep(
     scene: PreparedScene, states: Sequence[CameraSettings], gains: np.ndarray, *, noise: bool
-) -> tuple[Sequence[Origin], np.ndarray, np.ndarray, Sequence[torch.Tensor | None] | None]:
+) -> tuple[Sequence[decision.Origin], np.ndarray, np.ndarray, Sequence[torch.Tensor | None] | None]:
     """Captures of one scene at S states, in light (S,) relative to its own; see `decide`.
 
     Returns:
@@ -233,7 +227,7 @@ def plan_sweep(
     # One state alone is decided on in less time than it takes to call a kernel.
     if len(states) < 2 or not fits_columns(scene, columns := state_columns(states)):
         pairs = zip(states, gains.tolist(), strict=True)
-        exposures = [decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
+        exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
         # Of one scene, how far it moves tells its path.
         keys = [(e.defocus_px, e.motion_px, _address(e.vignetting)) for e in exposures]
         kinds = dict(zip(keys, exposures, strict=True))

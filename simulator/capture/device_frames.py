@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from simulator.capture.blurred_frames import BlurredFrames, frame_at
+from simulator.capture.blurred_frames import BlurredFrames, Passes, frame_at
 from simulator.optics.discs import DIAMETERS, LIGHT_LIMIT, disc_blur
 from simulator.optics.motion import motion_blur, taps_of
 from simulator.utils.compute import kernel
@@ -72,18 +72,17 @@ class DeviceFrames(BlurredFrames):
         gone = {key: place for key, (light, place) in self._known.items() if light() is None}
         for key in gone:
             del self._known[key]
-        freed, old = np.array([*gone.values()], np.uintp), self._frames
-        lacking = count - len(freed)
+        self._give_back(np.array([*gone.values()], np.uintp))
+        lacking, old = count - len(gone), self._frames
         if lacking <= 0:
-            return freed
+            return self._free[:0]
         begin = len(old)
         spare = max(begin // 2, min(_FRAMES, self._samples // math.prod(self._shape)))
         self._frames = old.new_empty(begin + max(lacking, spare), *self._shape)
         self._bytes = self._frames.nbytes
         if begin:
             self._frames[:begin] = old
-        added = np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
-        return np.concatenate([freed, added])
+        return np.arange(begin, len(self._frames), dtype=np.uintp) + np.uintp(1)
 
     def _parts(self, chosen: np.ndarray, samples: int) -> list[np.ndarray]:
         """`chosen` in parts of frames that need so many `samples` each at once."""
@@ -92,23 +91,26 @@ class DeviceFrames(BlurredFrames):
 
     # -- passes -------------------------------------------------------------------------------
 
-    def _blur(
-        self, indices: np.ndarray, diameters: np.ndarray, source: np.ndarray, to: np.ndarray
-    ) -> None:
+    def _run(self, kind: int, passes: np.ndarray, planned: Passes) -> None:
+        tasks = self._blur, self._blur, self._blend, self._move, self._move, self._darken
+        own = passes["frame"]
+        tasks[kind](passes, planned.blurs[own], planned.levels[own])
+
+    # Each does passes (K,) for the frames of `blurs` (K,); blends read `levels` (K, 13).
+    def _blur(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
+        diameters = passes["diameter"]
         for diameter in np.unique(diameters).tolist():
             alike = np.flatnonzero(diameters == diameter)
             for part in self._parts(alike, 4 * math.prod(self._shape)):
-                light = self._clamped(source[part])
-                self._frames[self._numbers(to[part])] = disc_blur(light, diameter)
+                light = self._clamped(passes["source"][part])
+                self._frames[self._numbers(passes["to"][part])] = disc_blur(light, diameter)
 
     def _clamped(self, places: np.ndarray) -> Tensor:
         return self._frames[self._numbers(places)].clamp_(-LIGHT_LIMIT, LIGHT_LIMIT)
 
-    def _blend(
-        self, indices: np.ndarray, blurs: np.ndarray, levels: np.ndarray, to: np.ndarray
-    ) -> None:
-        for part in self._parts(np.arange(len(to)), 2 * math.prod(self._shape)):
-            maps = self._layout_frames(indices[part], blurs[part])
+    def _blend(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
+        for part in self._parts(np.arange(len(passes)), 2 * math.prod(self._shape)):
+            maps = self._layout_frames(passes["scene"][part], blurs[part])
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
             knots = _KNOTS.to(maps.device)
             squared = (maps[:, 0].flatten(1) * scale[:, None]).square_()
@@ -118,7 +120,8 @@ class DeviceFrames(BlurredFrames):
             numbers = self._numbers(levels[part])
             low, high = (self._pixels(numbers.gather(1, below + i)) for i in range(2))
             blended = torch.lerp(low, high, share[:, None])
-            self._frames[self._numbers(to[part])] = blended.reshape(-1, *self._shape)
+            to = self._numbers(passes["to"][part])
+            self._frames[to] = blended.reshape(-1, *self._shape)
 
     def _pixels(self, numbers: Tensor) -> Tensor:
         """(K, 4, H W) pixels, each of the frame at `numbers` (K, H W)."""
@@ -146,9 +149,8 @@ class DeviceFrames(BlurredFrames):
             self._masks[indices[stale]] = blurs["mask"][stale]
         return self._frames[self._numbers(self._layouts[indices])]
 
-    def _move(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
-    ) -> None:
+    def _move(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
+        source, to = passes["source"], passes["to"]
         apart, samples, plane = blurs["mask"] > 0, math.prod(self._shape), self._shape[1:]
         # Large frames one by one: the time of a streak's running sum is the same for all lengths.
         alone = blurs["streaks"] & (samples >= _ALONE)
@@ -162,7 +164,7 @@ class DeviceFrames(BlurredFrames):
         for part in self._parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
             # See `simulator.optics.motion.blur_apart`.
             light = self._clamped(source[part])
-            maps = self._layout_frames(indices[part], blurs[part])
+            maps = self._layout_frames(passes["scene"][part], blurs[part])
             mask, behind = maps[:, 1:2], maps[:, 2:3].long().flatten(2)
             back = light.flatten(2).gather(2, behind.expand(-1, light.shape[1], -1)).view_as(light)
             back = moved_sums(back, self._samples, *tap_columns(blurs[part], False, *plane))
@@ -171,9 +173,8 @@ class DeviceFrames(BlurredFrames):
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
             self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
 
-    def _darken(
-        self, indices: np.ndarray, blurs: np.ndarray, source: np.ndarray, to: np.ndarray
-    ) -> None:
+    def _darken(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
+        source, to = passes["source"], passes["to"]
         for address in np.unique(blurs["vignetting"]).tolist():
             same = blurs["vignetting"] == address
             left = torch.from_numpy(frame_at(address, self._shape[1:])).to(self._frames)

@@ -53,12 +53,22 @@ mixed_word = kernel()(mixed)
 
 
 @kernel()
-def _fold(keys, bits):  # type: ignore[no-untyped-def]
+def _begin(seeds, keys):  # type: ignore[no-untyped-def]
+    """Writes the keys of as many seeds, or of one; whether none is negative."""
     for frame in range(len(keys)):
-        key = mixed_word(keys[frame] + KEY_STEP)
-        for number in range(bits.shape[1]):
-            key = mixed_word((key ^ bits[frame, number]) + KEY_STEP)
-        keys[frame] = key
+        if seeds[frame % len(seeds)] < 0:
+            return False
+        keys[frame] = mixed_word(np.uint64(seeds[frame % len(seeds)]) + KEY_STEP)
+    return True
+
+
+@kernel()
+def _fold(numbers, keys):  # type: ignore[no-untyped-def]
+    """Makes the keys differ by as many numbers, or by one."""
+    bits = np.empty(1)
+    for frame in range(len(keys)):
+        bits[0] = numbers[frame % len(numbers)]
+        keys[frame] = mixed_word((keys[frame] ^ bits.view(np.uint64)[0]) + KEY_STEP)
 
 
 def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndarray:
@@ -67,16 +77,13 @@ def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndar
     `seeds` are (B,) or a single integer, >= 0. The noise of the frames also differs by `numbers`,
     each (B,) or a single one: the frame of an episode, the settings of a capture.
     """
-    given = np.asarray(seeds)
-    if given.dtype.kind not in "iu" or (given.dtype.kind == "i" and given.min(initial=0) < 0):
+    given, *columns = map(np.asarray, (seeds, *numbers))
+    sizes = [len(values) for values in (given, *columns) if values.ndim]
+    keys = np.empty(sizes[0] if sizes else 1, np.uint64)
+    if given.dtype.kind not in "iu" or not _begin(given.reshape(-1), keys):
         raise ValueError(f"`seeds` (={seeds!r}) must be integers >= 0")
-    columns = [np.asarray(number, np.float64) for number in numbers]
-    count = next((len(values) for values in (given, *columns) if values.ndim), 1)
-    keys, folded = np.empty(count, np.uint64), np.empty((count, len(columns)))
-    keys[:] = given
-    for column, values in enumerate(columns):
-        folded[:, column] = values
-    _fold(keys, folded.view(np.uint64))
+    for values in columns:
+        _fold(values.reshape(-1), keys)
     return keys
 
 

@@ -88,7 +88,7 @@ def coverage(radius):  # type: ignore[no-untyped-def]
 
 
 @functools.cache
-def _radius_table() -> tuple[np.ndarray, np.ndarray]:
+def radius_table() -> tuple[np.ndarray, np.ndarray]:
     """Second moments per axis of covered discs, and their radii: the inverse is interpolated."""
     radii = np.concatenate([[0.5], 0.5 + np.geomspace(1e-4, 7.5, 700)])
     profiles = [coverage(radius).sum(0) for radius in radii]
@@ -96,18 +96,20 @@ def _radius_table() -> tuple[np.ndarray, np.ndarray]:
     return np.maximum.accumulate(moments), radii
 
 
-def disc_radius(diameter_px: float) -> float:
+@kernel()
+def disc_radius(diameter_px, moments, radii):  # type: ignore[no-untyped-def]
     """Radius of the disc whose coverage has the second moment of one of `diameter_px`.
 
-    At most 0.5 where the diameter is too small to blur anything.
+    At most 0.5 where the diameter is too small to blur anything. The others are `radius_table`.
     """
     target = diameter_px * diameter_px / 16.0
     if target < 1e-6:
         return 0.5
-    moments, radii = _radius_table()
     if target >= moments[-1]:
         return 2.0 * math.sqrt(target - 1.0 / 12.0)
-    return float(np.interp(target, moments, radii))
+    i = np.searchsorted(moments, target, side="right") - 1
+    slope = (radii[i + 1] - radii[i]) / (moments[i + 1] - moments[i])
+    return slope * (target - moments[i]) + radii[i]
 
 
 @functools.lru_cache(maxsize=64)
@@ -119,7 +121,7 @@ def disc_kernel(diameter_px: float) -> np.ndarray:
     0.56
     """
     diameter = check_number("diameter_px", diameter_px, 0.0, sys.float_info.max)
-    return np.asarray(coverage(disc_radius(diameter)))
+    return np.asarray(coverage(disc_radius(diameter, *radius_table())))
 
 
 @functools.lru_cache(maxsize=4096)
@@ -148,7 +150,7 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
         return light
     height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
-        return path_blur(light, Taps(*disc_taps(disc_radius(diameter_px))))
+        return path_blur(light, Taps(*disc_taps(disc_radius(diameter_px, *radius_table()))))
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)

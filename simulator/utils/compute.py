@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import logging
 import multiprocessing
 import os
@@ -22,10 +23,9 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import pairwise
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numba
@@ -253,44 +253,65 @@ def add_shifts(typing, light, shifts, weights, sums):  # type: ignore[no-untyped
 # -- threads --------------------------------------------------------------------------------------
 
 _inside = threading.local()
+#: Pieces of work for each thread: what one is late another does.
+_PIECES = 8
 
 
 def parallel_ranges(
     task: Callable[[int, int], object], count: int, *, least: int = 1, threads: int | None = None
 ) -> None:
-    """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
+    """Call ``task(first, last)`` on contiguous pieces of ``range(count)``, on several threads.
 
-    The caller's thread takes the first share, of at least `least` items. A task that calls
-    `parallel_ranges` itself gets one share. Returns when all shares are done; an error in any of
-    them is raised here.
+    The caller's is one of them; there are as many as have `least` items each. Whoever is done with
+    a piece takes the next. A task that calls `parallel_ranges` itself has one thread. Returns when
+    all is done, or, after an error, what was under way; the error is raised here.
     """
     shares = min(threads or torch.get_num_threads(), count // max(least, 1))
     if shares <= 1 or getattr(_inside, "task", False):
         if count:
             task(0, count)
         return
-    bounds = [count * i // shares for i in range(shares + 1)]
-    pool = _pool(os.getpid(), shares - 1)
-    others = [pool.submit(_run, task, first, last) for first, last in pairwise(bounds[1:])]
-    try:
-        _run(task, 0, bounds[1])
-    finally:
-        _inside.task = False
-        errors = [other.exception() for other in others]  # waits for every one of them
-    for error in errors:
-        if error is not None:
-            raise error
+    pieces = min(_PIECES * shares, count)
+    numbers = itertools.count()
+    errors: list[BaseException] = []
+    done: SimpleQueue[None] = SimpleQueue()
 
+    def work() -> None:
+        _inside.task = True  # a thread that waited for others could wait for itself
+        try:
+            while not errors and (piece := next(numbers)) < pieces:
+                task(count * piece // pieces, count * (piece + 1) // pieces)
+        except BaseException as error:
+            errors.append(error)
+        finally:
+            done.put(None)
 
-def _run(task: Callable[[int, int], object], first: int, last: int) -> None:
-    _inside.task = True  # a worker that waited for workers would wait for itself
-    task(first, last)
+    jobs = _jobs(os.getpid(), shares - 1)
+    for _ in range(shares - 1):
+        jobs.put(work)
+    work()
+    _inside.task = False
+    for _ in range(shares):
+        done.get()
+    if errors:
+        raise errors[0]
 
 
 @functools.cache
-def _pool(process: int, size: int) -> ThreadPoolExecutor:
-    """The threads of a process; a forked child must not use its parent's."""
-    return ThreadPoolExecutor(size, thread_name_prefix="simulator")
+def _jobs(process: int, size: int) -> SimpleQueue[Callable[[], None]]:
+    """What so many threads of a process do; a forked child must not use its parent's.
+
+    An executor takes twice as long to hand over a piece of work.
+    """
+    jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def serve() -> None:
+        while True:
+            jobs.get()()
+
+    for number in range(size):
+        threading.Thread(target=serve, name=f"simulator_{number}", daemon=True).start()
+    return jobs
 
 
 # -- what else a computation needs ----------------------------------------------------------------

@@ -247,7 +247,8 @@ def test_many_images_are_scipys_correlation(threads, most_bytes, monkeypatch):
     frames = blurred_frames.BlurredFrames(9, 2, most_bytes)
     for used in (np.arange(7), np.array([5, 2]), np.arange(4)):
         some = frames.places([lights[i] for i in used])
-        made = frames.make(used + 1, np.zeros(len(used), int), blurs[used], some)
+        made, planned = frames.plan(used + 1, np.zeros(len(used), int), blurs[used], some)
+        frames.run(planned)
         for i, found in zip(used, frames.at(made), strict=True):
             rtol, clipped = 2e-4 if i == 0 else 1e-5, lights[i].double().clamp(-1e9, 1e9).numpy()
             weights = disc_kernel(blurs["defocus_px"][i])[None]
@@ -313,7 +314,8 @@ def alone(index, state, gain, key, noise="bank"):
 @pytest.mark.parametrize("light_bytes", [2**30, 0])
 def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
     monkeypatch.setattr(blurred_frames, "_LARGE", light_bytes)  # at 0, rows are shared out
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 61)
+    # All that a scene needs at once, or each kind of pass on threads that share rows.
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2 if light_bytes else 61)
     scenes, rng, seen = Mock(side_effect=prepared), np.random.default_rng(0), set()
     batch = made(noise, light_bytes=light_bytes, scenes=scenes)
     for _ in range(12):
@@ -340,6 +342,21 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
     assert noise is None or seen >= {"noise", "excess"}
 
 
+def test_wide_discs_and_frames_that_others_ask_for(monkeypatch) -> None:
+    """NumPy makes wide discs, before the frames; light that was never asked for is made later."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    scene = prepared(0).changed(defocus=50.0)
+    batch = made(scenes=lambda index: scene)
+    for states in (0, 1):
+        batch.prepare(SCENES, np.full(10, 4), np.ones(10))  # and no `record`
+        frames, _ = photographed(batch, states)
+        exposure = scene.exposure(STATES[states])
+        light = [scene.blurred_light.blurred(exposure)] * 10
+        wanted = np.empty_like(frames)
+        record(Transitions.of(light, [exposure] * 10), Z6, keys=KEYS, noise="bank", signals=wanted)
+        np.testing.assert_array_equal(frames, wanted)
+
+
 def test_forgotten_scenes_are_asked_for_again() -> None:
     calls: list[int] = []
     batch = made(scenes=lambda index: calls.append(index) or prepared(index))
@@ -352,13 +369,13 @@ def test_forgotten_scenes_are_asked_for_again() -> None:
     np.testing.assert_array_equal(after, first)
 
 
-@pytest.mark.parametrize("stage", ["_run", "decide"])
+@pytest.mark.parametrize("stage", ["photograph", "noise_balance", "decide"])
 def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
-    """While the light is blurred, or while the plan of a later frame is made."""
-    batch, calls = made(), []
+    """While light is blurred, once it is, or while the plan of a later frame is made."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    noise = None if stage == "photograph" else "bank"
+    batch, calls, original = made(noise), [], getattr(batch_module, stage)
     photographed(batch, 0)
-    module = blurred_frames if stage == "_run" else batch_module
-    original = getattr(module, stage)
 
     def fail(*args, **kwargs):
         calls.append(args)
@@ -367,9 +384,9 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, stage, fail)
+        patch.setattr(batch_module, stage, fail)
         with pytest.raises(KeyboardInterrupt):
             photographed(batch, 1)
     for states in (1, 0):
-        expected, _ = photographed(made(), states)
+        expected, _ = photographed(made(noise), states)
         np.testing.assert_array_equal(photographed(batch, states)[0], expected)

@@ -6,6 +6,7 @@ import logging
 import os
 import pickle
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
@@ -457,32 +458,34 @@ def test_every_item_is_done_once(count, threads):
     assert sorted(done) == [*range(count)]
 
 
-def test_shares_are_contiguous_and_run_at_the_same_time():
-    barrier, shares = threading.Barrier(3, timeout=30), []
+def test_pieces_are_contiguous_and_run_at_the_same_time():
+    barrier, pieces = threading.Barrier(3, timeout=30), []
 
     def task(first: int, last: int) -> None:
         barrier.wait()  # passes only if all three are under way
-        shares.append((first, last))
+        pieces.append((first, last))
 
-    parallel_ranges(task, 9, threads=3)
-    assert sorted(shares) == [(0, 3), (3, 6), (6, 9)]
+    parallel_ranges(task, 48, threads=3)
+    assert sorted(pieces) == [(first, first + 2) for first in range(0, 48, 2)]
     names = []  # little work stays on the caller's thread
     parallel_ranges(lambda *_: names.append(threading.current_thread()), 5, least=3, threads=4)
     assert names == [threading.current_thread()]
 
 
 @pytest.mark.parametrize("bad", [0, 3])
-def test_errors_of_any_share_are_raised_once_all_are_done(bad):
-    done: list[int] = []
+def test_errors_of_any_piece_are_raised_once_the_others_under_way_are_done(bad):
+    begun, done = [], [bad]
 
     def task(first: int, last: int) -> None:
+        begun.append(first)
         if first == bad:
-            raise ValueError(f"share {first}")
+            raise ValueError(f"piece {first}")
+        time.sleep(0.01)
         done.append(first)
 
-    with pytest.raises(ValueError, match=f"share {bad}"):
+    with pytest.raises(ValueError, match=f"piece {bad}"):
         parallel_ranges(task, 6, threads=2)
-    assert done == [3 - bad]
+    assert sorted(done) == sorted(begun)
 
 
 def frame(*size, seed=0):
