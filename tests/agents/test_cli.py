@@ -288,7 +288,8 @@ def _warm_up_and_use(folder: Path) -> list[str]:
 
     def used(kernel: Dispatcher) -> set[Dispatcher]:
         code, names = kernel.py_func, kernel.py_func.__code__.co_names
-        called = (code.__globals__.get(name) for name in names)
+        called = [code.__globals__.get(name) for name in names]
+        called += [getattr(one, name, None) for one in called for name in names]  # of modules
         return {kernel}.union(*(used(each) for each in called if isinstance(each, Dispatcher)))
 
     make_vec, small = gym.make_vec, {"scenes": "bundled:small", "resolution": 36}
