@@ -215,7 +215,9 @@ class BlurredFrames:
         self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs = list[torch.Tensor]()
-        self._free, self._left = np.empty(0, np.uintp), 0  # places, of which these many are free
+        # Places, of which the first are free, and how many: an array, which kernels change at once
+        # with what is held, whatever interrupts their caller.
+        self._free, self._left = np.empty(0, np.uintp), np.zeros(1, np.int64)
         self._bytes = 0  # of all memory
 
     @property
@@ -239,10 +241,11 @@ class BlurredFrames:
 
     def _take(self, count: int) -> np.ndarray:
         """Places of memory for `count` frames."""
-        while (lacking := count - self._left) > 0:
+        while (lacking := count - self._left.item()) > 0:
             self._grow(lacking)
         self._left -= count
-        return self._free[self._left : self._left + count].copy()
+        left = self._left.item()
+        return self._free[left : left + count].copy()
 
     def _grow(self, count: int) -> None:
         """Makes places for `count` frames or more."""
@@ -252,8 +255,8 @@ class BlurredFrames:
 
     def _give_back(self, places: np.ndarray) -> None:
         """Makes places free that are not 0."""
-        places = places[places > 0]
-        self._free[self._left : self._left + len(places)] = places
+        places, left = places[places > 0], self._left.item()
+        self._free[left : left + len(places)] = places
         self._left += len(places)
 
     def _more(self, count: int) -> np.ndarray:
@@ -267,8 +270,9 @@ class BlurredFrames:
 
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
-        self._give_back(self._held[np.unique(indices)])
-        self._held[indices] = 0
+        places = self._held[np.unique(indices)]
+        self._held[indices] = 0  # first: an interrupt may cost memory, but nothing has two owners
+        self._give_back(places)
 
     def _free_others(self, indices: np.ndarray, slots: np.ndarray) -> None:
         """Frees all of the scenes `indices` but the light at the apertures `slots`, and in motion.
@@ -300,8 +304,7 @@ class BlurredFrames:
             if lacking:
                 self._grow(lacking)
             free, made = (self._free, self._left), (light, levels, passes)
-            found = plan_passes(done, planned, frames, held, free, made)
-            done, planned, self._left, lacking = found
+            done, planned, lacking = plan_passes(done, planned, frames, held, free, made)
         return light, Passes(passes[:planned], blurs, levels, self._shape)
 
     def run(self, planned: Passes) -> None:
@@ -338,7 +341,7 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
     read, and `PASS`.
 
     Returns:
-        The frames that are done, the passes, the places that are left, and how many lack.
+        The frames that are done, the passes, and how many places lack.
     """
     indices, slots, blurs, source, longest, table = frames
     held, sources, diameters, levels_source = memory
@@ -354,7 +357,7 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         needed[:] = False
         if new and blends:
             if levels_source[scene] != at:
-                left = _give_up(held[scene, lens:moved], free, left)
+                _give_up(held[scene, lens:moved], free, left)
                 levels_source[scene] = at
             sorts = _array_at(blur.sorts, (blur.num_sorts,))
             discs.mark_levels(sorts, np.float32(diameter), _HALF_STEP, _KNOTS, needed)
@@ -363,15 +366,15 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         for level in range(len(needed)):
             needed[level] &= not held[scene, lens + level]
             lacking += needed[level]
-        if lacking > left:
-            return k, planned, left, lacking - left
+        if lacking > left[0]:
+            return k, planned, lacking - left[0]
         light[k], levels[k, :] = at, at  # levels without a share are read, too, times 0
         if new:
-            left = _hold(held[scene], slot, free, left)
+            _hold(held[scene], slot, free, left)
             sources[scene, slot], diameters[scene, slot] = at, diameter
             for level in range(len(needed) if blends else 0):
                 if needed[level]:
-                    left = _hold(held[scene], lens + level, free, left)
+                    _hold(held[scene], lens + level, free, left)
                     to = held[scene, lens + level]
                     planned = _add_disc(passes, planned, k, scene, at, to, _DISCS[level], table)
                 if held[scene, lens + level]:
@@ -384,7 +387,7 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         if diameter > 0.0:
             light[k] = held[scene, slot]
         if changes:  # what changes by motion, or by the lens, has memory of its own
-            left = _hold(held[scene], moved, free, left)
+            _hold(held[scene], moved, free, left)
             to = held[scene, moved]
             if blur.motion_px > 0.0:
                 kind = ALONG_ROWS if blur.streaks else ALONG_PATH
@@ -395,26 +398,24 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
             if blur.vignetting:
                 planned = _add(passes, planned, DARKEN, k, scene, light[k], to, 20.0)
             light[k] = to
-    return len(indices), planned, left, 0
+    return len(indices), planned, 0
 
 
 @_jit()
 def _give_up(held, free, left):  # type: ignore[no-untyped-def]
-    """The places that are left when all of `held` are free."""
+    """Makes all places free that are `held`."""
     for place in range(len(held)):
         if held[place]:
-            free[left], held[place] = held[place], 0
-            left += 1
-    return left
+            free[left[0]], held[place] = held[place], 0
+            left[0] += 1
 
 
 @_jit()
 def _hold(held, place, free, left):  # type: ignore[no-untyped-def]
-    """The places that are left when `held` has one at `place`."""
-    if held[place]:
-        return left
-    held[place] = free[left - 1]
-    return left - 1
+    """Takes a free one for `place`, unless it has one."""
+    if not held[place]:
+        left[0] -= 1
+        held[place] = free[left[0]]
 
 
 @_jit()

@@ -272,9 +272,10 @@ def parallel_ranges(
             task(0, count)
         return
     pieces = min(_PIECES * shares, count)
-    numbers = itertools.count()
+    numbers, begun = itertools.count(), 0
     errors: list[BaseException] = []
     done: SimpleQueue[None] = SimpleQueue()
+    ended: list[None] = []  # beside the queue: an interrupt may lose what was just taken from it
 
     def work() -> None:
         _inside.task = True  # a thread that waited for others could wait for itself
@@ -283,16 +284,27 @@ def parallel_ranges(
                 task(count * piece // pieces, count * (piece + 1) // pieces)
         except BaseException as error:
             errors.append(error)
-        finally:
-            done.put(None)
 
-    jobs = _jobs(os.getpid(), shares - 1)
-    for _ in range(shares - 1):
-        jobs.put(work)
-    work()
-    _inside.task = False
-    for _ in range(shares):
-        done.get()
+    def help_out() -> None:
+        work()
+        ended.append(None)
+        done.put(None)
+
+    try:
+        jobs = _jobs(os.getpid(), shares - 1)
+        for _ in range(shares - 1):
+            jobs.put(help_out)
+            begun += 1
+        work()
+    except BaseException as error:  # an interrupt may come anywhere
+        errors.append(error)
+    finally:
+        _inside.task = False
+    while len(ended) < begun:
+        try:
+            done.get()
+        except KeyboardInterrupt as error:  # memory that others still write to must stay
+            errors.append(error)
     if errors:
         raise errors[0]
 

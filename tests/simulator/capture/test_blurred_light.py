@@ -369,22 +369,25 @@ def test_forgotten_scenes_are_asked_for_again() -> None:
     np.testing.assert_array_equal(after, first)
 
 
-@pytest.mark.parametrize("stage", ["photograph", "noise_balance", "decide"])
+@pytest.mark.parametrize("stage", ["photograph", "noise_balance", "decide", "plan_passes"])
 def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
-    """While light is blurred, once it is, or while the plan of a later frame is made."""
+    """While light is blurred, once it is, while a later frame is planned, once memory is taken."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     noise = None if stage == "photograph" else "bank"
-    batch, calls, original = made(noise), [], getattr(batch_module, stage)
+    module = blurred_frames if stage == "plan_passes" else batch_module
+    batch, calls, original = made(noise), [], getattr(module, stage)
     photographed(batch, 0)
 
     def fail(*args, **kwargs):
         calls.append(args)
         if stage == "decide" and len(calls) < 4:
             return original(*args, **kwargs)
+        if stage == "plan_passes":
+            original(*args)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(batch_module, stage, fail)
+        patch.setattr(module, stage, fail)
         with pytest.raises(KeyboardInterrupt):
             photographed(batch, 1)
     for states in (1, 0):
