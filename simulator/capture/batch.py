@@ -2,7 +2,7 @@
 
 Nothing is worked out twice: all that a frame depends on, except for its noise, is planned when a
 state is first used, and cached as a row of columns; blurred light, as long as its scene is shown. A
-batch of frames is then one call of `simulator.capture.sensor.record`.
+batch of frames is then one call of `simulator.capture.sensor.record`, which makes this light, too.
 """
 
 import math
