@@ -50,10 +50,10 @@ _NOTICEABLE = 1.2
 #: Warnings that kernels are compiled which are not in the cache.
 _KEPT = (
     "compiling parts of the simulator that were not used on this machine before, for this and "
-    "later runs (all take 10 s or so; `ae-env warm-up` compiles them beforehand)"
+    "later runs (a minute for all; `ae-env warm-up` compiles them beforehand)"
 )
 _NOT_KEPT = (
-    "compiling parts of the simulator, as in every run (10 s or so for all): no folder can be "
+    "compiling parts of the simulator, as in every run (a minute for all): no folder can be "
     "written to keep them; NUMBA_CACHE_DIR names one"
 )
 if hasattr(os, "register_at_fork"):
