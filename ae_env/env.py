@@ -212,7 +212,7 @@ class AutoExposure(Task):
         if source_noise is None and len(self._of_light) + len(self._sharp) == len(self._known):
             return self._clean_scores(frames, env_indices)
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
-        new = np.flatnonzero(~self._scored[lights, states])
+        new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
         if len(new):
             if source_noise is None or not source_noise[new].any():
                 found = self._clean_scores(frames, env_indices[new], new)

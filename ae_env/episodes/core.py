@@ -254,7 +254,7 @@ class EpisodeCore:
         """
         self.check_begun(env_indices)
         wrong = (actions < 0) | (actions >= self.num_actions)
-        if np.count_nonzero(wrong):  # `any` takes ten times as long where memory is cold
+        if np.count_nonzero(wrong):
             raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {self.num_actions})")
         takes, moved, ended = self.task.transition(env_indices, actions)
         if takes is not None:
