@@ -160,7 +160,13 @@ class Episodes:
         self.scenes.load(new)  # several at once: on several threads
         for index in new:
             scene = self.scenes[index]
-            self.allowed[index] = _allowed_states(scene, len(self.grid))
+            if scene.allowed is not None:
+                if len(scene.allowed) != len(self.grid):
+                    raise ValueError(
+                        f"`allowed` of scene {scene.scene_id!r} (length {len(scene.allowed)}) must "
+                        f"have one entry for each of the {len(self.grid)} states of `grid`"
+                    )
+                self.allowed[index] = scene.allowed
             self._median_speed[index] = scene.median_speed
             self._own_blur[index] = scene.own_blur(4.0)
             self.illuminance_spread[index] = scene.incident_light.spread
@@ -359,17 +365,6 @@ def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
     if option == "random":
         return drawn
     return np.full(len(drawn), 0.0 if isinstance(option, str) else float(option))
-
-
-def _allowed_states(scene: Scene, num_states: int) -> np.ndarray:
-    if scene.allowed is None:
-        return np.ones(num_states, bool)
-    if len(scene.allowed) != num_states:
-        raise ValueError(
-            f"`allowed` of scene {scene.scene_id!r} (length {len(scene.allowed)}) must have one "
-            f"entry for each of the {num_states} states of `grid`"
-        )
-    return scene.allowed
 
 
 def _stacked(
