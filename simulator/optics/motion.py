@@ -316,7 +316,21 @@ def taps_of(extent, direction, turn, drift_x, drift_y, height, width):  # type: 
         return _streak_taps(abs(extent + drift_x), width)
     length = path_length(extent, direction, turn, drift_x, drift_y)
     count = math.ceil(min(max(_POINTS_PER_PIXEL * length, 8.0), _MOST_POINTS))
-    return _rasterised(extent, direction, turn, drift_x, drift_y, count, height, width)
+    y, x = _positions(extent, direction, turn, drift_x, drift_y, count)
+    y, x = _widened(y), _widened(x)
+    top, bottom = max(math.floor(y.min()), 1 - height), min(math.floor(y.max()) + 1, height - 1)
+    left, right = max(math.floor(x.min()), 1 - width), min(math.floor(x.max()) + 1, width - 1)
+    grid = np.zeros((bottom - top + 1, right - left + 1))
+    for i in range(count):  # each point has a share of the four pixels around it
+        row, column = math.floor(y[i]), math.floor(x[i])
+        for down in range(2):
+            part = (y[i] - row if down else 1.0 - (y[i] - row)) / count
+            inside = min(max(row + down, top), bottom) - top
+            for over in range(2):
+                share = x[i] - column if over else 1.0 - (x[i] - column)
+                grid[inside, min(max(column + over, left), right) - left] += part * share
+    rows, columns, weights = grid_taps(grid, top, left, _LEAST_WEIGHT)
+    return rows, columns, (weights / weights.sum()).astype(np.float32)
 
 
 @_jit()
@@ -384,28 +398,6 @@ def _moment(points, scale):  # type: ignore[no-untyped-def]
         share = value - math.floor(value)
         moment += value * value + share * (1.0 - share)
     return moment
-
-
-@_jit()
-def _rasterised(  # type: ignore[no-untyped-def]
-    extent, direction, turn, drift_x, drift_y, count, height, width
-):
-    """Rows, columns and weights of `Taps`: each point has a share of the four pixels around it."""
-    y, x = _positions(extent, direction, turn, drift_x, drift_y, count)
-    y, x = _widened(y), _widened(x)
-    top, bottom = max(math.floor(y.min()), 1 - height), min(math.floor(y.max()) + 1, height - 1)
-    left, right = max(math.floor(x.min()), 1 - width), min(math.floor(x.max()) + 1, width - 1)
-    grid = np.zeros((bottom - top + 1, right - left + 1))
-    for i in range(count):
-        row, column = math.floor(y[i]), math.floor(x[i])
-        for down in range(2):
-            part = (y[i] - row if down else 1.0 - (y[i] - row)) / count
-            inside = min(max(row + down, top), bottom) - top
-            for over in range(2):
-                share = x[i] - column if over else 1.0 - (x[i] - column)
-                grid[inside, min(max(column + over, left), right) - left] += part * share
-    rows, columns, weights = grid_taps(grid, top, left, _LEAST_WEIGHT)
-    return rows, columns, (weights / weights.sum()).astype(np.float32)
 
 
 @_jit()
