@@ -189,27 +189,19 @@ def tap_columns(blurs, own, height, width):  # type: ignore[no-untyped-def]
         (K,) int64 where the taps of each begin, and behind them the end of all; and the taps one
         behind the other: (T,) int64 rows and columns, (T,) float32 weights.
     """
-    ends = np.zeros(len(blurs) + 1, np.int64)
-    rows, columns, weights = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
-    for i in range(len(blurs)):
-        blur = blurs[i]
+    found = []
+    for blur in blurs:
         x, y = (blur.drift_x, blur.drift_y) if own else (0.0, 0.0)
-        found = taps_of(blur.extent, blur.direction, blur.turn, x, y, height, width)
-        ends[i + 1] = end = ends[i] + len(found[0])
-        if end > len(rows):
-            more = end + len(rows)
-            rows, columns = _longer(rows, more), _longer(columns, more)
-            weights = _longer(weights, more)
-        rows[ends[i] : end], columns[ends[i] : end] = found[0], found[1]
-        weights[ends[i] : end] = found[2]
-    return ends, rows[: ends[-1]], columns[: ends[-1]], weights[: ends[-1]]
-
-
-@kernel()
-def _longer(values, size):  # type: ignore[no-untyped-def]
-    out = np.empty(size, values.dtype)
-    out[: len(values)] = values
-    return out
+        found.append(taps_of(blur.extent, blur.direction, blur.turn, x, y, height, width))
+    ends = np.zeros(len(found) + 1, np.int64)
+    for i, taps in enumerate(found):
+        ends[i + 1] = ends[i] + len(taps[0])
+    rows, columns = np.empty(ends[-1], np.int64), np.empty(ends[-1], np.int64)
+    weights = np.empty(ends[-1], np.float32)
+    for i, taps in enumerate(found):
+        begin, end = ends[i], ends[i + 1]
+        rows[begin:end], columns[begin:end], weights[begin:end] = taps
+    return ends, rows, columns, weights
 
 
 def moved_sums(
