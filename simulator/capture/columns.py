@@ -228,12 +228,7 @@ def plan_sweep(
     if len(states) < 2 or not fits_columns(scene, columns := state_columns(states)):
         pairs = zip(states, gains.tolist(), strict=True)
         exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
-        # Of one scene, how far it moves tells its path.
-        keys = [(e.defocus_px, e.motion_px, _address(e.vignetting)) for e in exposures]
-        kinds = dict(zip(keys, exposures, strict=True))
-        numbers = {kind: number for number, kind in enumerate(kinds)}
-        which = [numbers[key] for key in keys]
-        blurs = np.array([*map(blur_column, kinds.values())], BLUR)[which]
+        blurs = np.array([*map(blur_column, exposures)], BLUR)
         left = (exposure.remaining_variance for exposure in exposures)
         shares = [None if share is None else share.float().contiguous() for share in left]
         return [e.origin for e in exposures], blurs, exposure_table(exposures), shares

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -139,18 +139,6 @@ class Exposure:
 # -- deciding ---------------------------------------------------------------------------------
 
 
-class _Wanted(NamedTuple):
-    """A capture that is decided on."""
-
-    scene: PreparedScene
-    ratio: float
-    target: NoiseLevelFunction
-    noise: bool
-    extents: dict[str, float]  # of its blurs [pixel]; inf where that is not known
-    along_rows: bool  # whether the motion is a streak along the rows
-    opens: bool  # whether the aperture opens
-
-
 def decide(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
 ) -> Exposure:
@@ -167,11 +155,11 @@ def decide(
         "defocus": disc_px(scene, f_number) if scene.defocus else 0.0,
         "motion_blur": motion_px,
     }
-    opens = blur is not None and f_number < blur.f_number
-    wanted = _Wanted(scene, ratio, target, noise, extents, path is None, opens)
-    noise_reduction = _decide_noise_reduction(wanted)
+    opens = bool(extents["aperture"])
+    noise_reduction = _decide_noise_reduction(scene, ratio, target, noise=noise, opens=opens)
     denoised = noise_reduction.network
-    aperture, defocus, motion_blur = blurs = _decide_blurs(wanted, noise_reduction)
+    given = ratio, target, f_number, extents, path is None
+    aperture, defocus, motion_blur = blurs = _decide_blurs(scene, noise_reduction, *given)
     defocus_px = defocus.extent if defocus.runs else 0.0
     moves, vignetting = motion_blur.runs, scene.vignetting(f_number)
     subject_path = subject_path if moves else None
@@ -189,7 +177,7 @@ def decide(
         lens=scene.lens,
         vignetting=vignetting,
         noise=noise,
-        steps=(noise_reduction, *blurs, *_vignetting(scene, f_number), *_response(scene, noise)),
+        steps=(noise_reduction, *blurs, *_decide_products(scene, f_number, noise)),
     )
     if exposure.source.is_zero:
         return exposure
@@ -202,8 +190,6 @@ def _motion(scene: PreparedScene, time: float) -> tuple[float, Path | None, Path
     """
     layout, movement, height = scene.layout, scene.movement, scene.light.shape[-2]
     apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0
-    if not (scene.image_speed or apart):
-        return 0.0, None, None
     moment = scene.image_speed, time, height
     length = scene.image_speed * time * height
     if apart:
@@ -225,9 +211,11 @@ def disc_px(scene: PreparedScene, f_number: float) -> float:
     return diameter
 
 
-def _decide_noise_reduction(wanted: _Wanted) -> Step:
+def _decide_noise_reduction(
+    scene: PreparedScene, ratio: float, target: NoiseLevelFunction, *, noise: bool, opens: bool
+) -> Step:
     """The cheapest of all ways within the tolerance, or else the one with the least error."""
-    name, (scene, ratio, target, noise, extents, *_) = "noise_reduction", wanted
+    name, blur = "noise_reduction", scene.aperture_blur
     if scene.nlf.is_zero:
         return Step(name, False, "the source carries no noise")
     statistics, residuals = scene.blurred_light.statistics, scene.blurred_light.residuals
@@ -242,8 +230,7 @@ def _decide_noise_reduction(wanted: _Wanted) -> Step:
         found = network.residual
         return 0.0 if found is None else residuals.error(found, ratio, target, noise=noise)
 
-    blur = scene.aperture_blur
-    if blur is not None and blur.needs_denoised and extents["aperture"]:
+    if blur is not None and blur.needs_denoised and opens:
         # Blur averages noise, too: not counted on.
         reason = "the aperture module works on the noise-reduced light only" + _WITHOUT
         network = networks[-1]
@@ -270,28 +257,44 @@ def _decide_noise_reduction(wanted: _Wanted) -> Step:
     return Step(name, True, reason + _WITHOUT, error, 0.0, least, best)
 
 
-def _decide_blurs(wanted: _Wanted, noise_reduction: Step) -> list[Step]:
-    """Aperture, defocus and motion blur.
+def _decide_blurs(
+    scene: PreparedScene,
+    noise_reduction: Step,
+    ratio: float,
+    target: NoiseLevelFunction,
+    f_number: float,
+    extents: dict[str, float],
+    along_rows: bool,
+) -> list[Step]:
+    """Aperture, defocus and motion blur of `extents` [pixel], inf where that is not known.
 
     Noise that stays widens a pixel's distribution, blur that is missing shifts it: squares add.
     Several missing blurs shift it the same way and add up; the error of each is what it adds to the
     square, so that the root of the sum of squares of all errors is right for any set of steps.
     """
-    scene, estimated = wanted.scene, wanted.scene.aperture_blur is not None
-    if not any(wanted.extents.values()):
-        return [_without_blur(name, estimated, wanted.opens) for name in wanted.extents]
+    blur = scene.aperture_blur
+    opens = None if blur is None else f_number < blur.f_number
+    if not any(extents.values()):
+        return [_without_blur(name, opens) for name in extents]
     missing_noise = 0.0
     if scene.denoised_lights:
         missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
     if missing_noise > scene.tolerance:  # no network can mend it: blur has it all to itself
         missing_noise = 0.0
-    extents, errors, runs = np.array([*wanted.extents.values()]), np.empty(3), np.empty(3, bool)
-    curvature = _curvature(wanted, noise_reduction.network)
-    weigh_blurs(extents, *curvature, missing_noise, scene.tolerance, errors, runs)
+    disc = row = math.inf  # at a tolerance of 0 no blur is left out, however small
+    known = extents["defocus"] or extents["motion_blur"] or extents["aperture"] != math.inf
+    if scene.tolerance > 0.0 and known:  # else the network need not run for it
+        network = noise_reduction.network
+        light = scene.blurred_light.statistics if network is None else network.statistics
+        disc, row = light.curvature(ratio, target)
+        # No second difference exceeds the Laplacian, in the root mean square: (k u)^4 <= |k|^4.
+        row = row if along_rows else STREAK_TO_DISC * disc
+    values, errors, runs = np.array([*extents.values()]), np.empty(3), np.empty(3, bool)
+    weigh_blurs(values, disc, row, missing_noise, scene.tolerance, errors, runs)
     blurs = []
-    for i, (name, extent) in enumerate(wanted.extents.items()):
+    for i, (name, extent) in enumerate(extents.items()):
         if not extent:
-            blurs.append(_without_blur(name, estimated, wanted.opens))
+            blurs.append(_without_blur(name, opens))
             continue
         reason, added = "the aperture opens and adds blur", float(errors[i])
         if extent < math.inf:
@@ -331,55 +334,40 @@ def weigh_blurs(  # type: ignore[no-untyped-def]
             missing_blur = together
 
 
-def _curvature(wanted: _Wanted, network: DenoisedLight | None) -> tuple[float, float]:
-    """`LightStatistics.curvature` of the light that is blurred."""
-    scene, extents = wanted.scene, wanted.extents
-    if scene.tolerance == 0.0:  # no blur is left out, however small
-        return math.inf, math.inf
-    if not (extents["defocus"] or extents["motion_blur"] or extents["aperture"] != math.inf):
-        return math.inf, math.inf  # not needed: the network need not run for it
-    light = scene.blurred_light.statistics if network is None else network.statistics
-    disc, row = light.curvature(wanted.ratio, wanted.target)
-    # No second difference exceeds the Laplacian, in the root mean square: (k u)^4 <= |k|^4.
-    return disc, row if wanted.along_rows else STREAK_TO_DISC * disc
+def _decide_products(scene: PreparedScene, f_number: float, noise: bool) -> Iterator[Step]:
+    """Vignetting and pixel response, where there are any: cheap, so their errors are not weighed.
 
-
-def _vignetting(scene: PreparedScene, f_number: float) -> list[Step]:
-    """The shading by a lens, if there is one; its error is not weighed, as a product is cheap."""
-    name, lens = "vignetting", scene.lens
-    if lens is None:
-        return []
-    if scene.vignetting(f_number) is None:
-        return [Step(name, False, "the source was taken through the same aperture")]
-    reason = f"the lens takes {lens.corner_loss(f_number):.2g} EV of the corners' light"
-    if scene.seen_through_lens:
-        source = lens.corner_loss(scene.reference.effective_f_number)
-        reason += f", {source:.2g} in the source"
-    return [Step(name, True, reason)]
-
-
-def _response(scene: PreparedScene, noise: bool) -> list[Step]:
-    """What photosites differ by, if they do; see `PreparedScene.response`."""
-    name, prnu = "pixel_response", scene.camera.prnu
-    if not prnu:
-        return []
-    if not noise:
-        return [Step(name, False, "only the light is wanted")]
-    if not scene.nlf.is_zero:
-        return [Step(name, False, "the source has the pattern of its own sensor")]
-    return [Step(name, True, f"the gains of photosites differ by {prnu:.2%}")]
+    See `PreparedScene.vignetting` and `PreparedScene.response`.
+    """
+    lens, prnu = scene.lens, scene.camera.prnu
+    if lens is not None:
+        reason, runs = "the source was taken through the same aperture", False
+        if scene.vignetting(f_number) is not None:
+            loss, runs = lens.corner_loss(f_number), True
+            reason = f"the lens takes {loss:.2g} EV of the corners' light"
+            if scene.seen_through_lens:
+                source = lens.corner_loss(scene.reference.effective_f_number)
+                reason += f", {source:.2g} in the source"
+        yield Step("vignetting", runs, reason)
+    if prnu:
+        reason = f"the gains of photosites differ by {prnu:.2%}"
+        if not noise:
+            reason = "only the light is wanted"
+        elif not scene.nlf.is_zero:
+            reason = "the source has the pattern of its own sensor"
+        yield Step("pixel_response", noise and scene.nlf.is_zero, reason)
 
 
 @functools.cache
-def _without_blur(name: str, estimated: bool, opens: bool) -> Step:
-    """A blur that would do nothing, where the scene's defocus was `estimated` or not."""
+def _without_blur(name: str, opens: bool | None) -> Step:
+    """A blur that would do nothing; `opens` of an aperture, None where no defocus was estimated."""
     if name == "motion_blur":
         reason = "the image does not move"
     elif name == "defocus":
         reason = "the scene is taken as far or in focus throughout"
-        if estimated:
+        if opens is not None:
             reason = "none is given for the whole frame: each pixel's was estimated"
-    elif not estimated:
+    elif opens is None:
         reason = "the scene is taken as in focus: `depth` is not 'unknown'"
     elif opens:
         reason = "the picture was found to be in focus throughout"
