@@ -13,7 +13,7 @@ import functools
 import math
 import reprlib
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -168,9 +168,6 @@ class LightStatistics:
     def __init__(self, light: torch.Tensor) -> None:
         self.light = light
 
-    def __reduce__(self) -> tuple[type[LightStatistics], tuple[torch.Tensor]]:
-        return LightStatistics, (self.light,)
-
     def excess_error(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
@@ -242,30 +239,23 @@ class LightStatistics:
         signal = self._bins.light * ratio
         return signal, np.maximum(_variance(signal, target), _FLOOR)
 
-    @property
-    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Light (4, R, W): sampled rows and their neighbours; and the indices of the sampled ones.
-
-        Whole rows: every column counts alike whatever the width, and a row is read at once.
-        """
-        height, width = self.light.shape[-2:]
-        step = max(1, math.ceil(height * width / SAMPLES))
-        if step == 1:
-            return self.light.cpu().numpy(), np.arange(height)
-        rows = torch.arange(min(step, height) // 2, height, step)
-        around = torch.stack([(rows - 1).clamp(min=0), rows, (rows + 1).clamp(max=height - 1)], 1)
-        picked = self.light[:, around.flatten().to(self.light.device)].cpu().numpy()
-        return picked, np.arange(1, picked.shape[1], 3)
-
     @functools.cached_property
     def _bins(self) -> _Bins:
-        light, rows = self._rows
+        picked, (height, width) = self.light, self.light.shape[-2:]
+        rows, step = np.arange(height), max(1, math.ceil(height * width / SAMPLES))
+        # Whole rows: every column counts alike whatever the width, and a row is read at once.
+        if step > 1:  # of a large frame, some with their neighbours
+            some = torch.arange(min(step, height) // 2, height, step)
+            around = [(some - 1).clamp(min=0), some, (some + 1).clamp(max=height - 1)]
+            picked = picked[:, torch.stack(around, 1).flatten().to(picked.device)]
+            rows = np.arange(1, picked.shape[1], 3)
+        light = picked.cpu().numpy()
         samples = len(rows) * light.shape[-1]
         step = max(1, samples // _SORTED)
         while math.gcd(step, light.shape[-1]) > 1:  # every column counts alike
             step += 1
-        some = np.sort(light[:, rows].reshape(4, -1)[:, ::step], axis=1)
-        edges = some[:, np.arange(1, BINS) * some.shape[1] // BINS]
+        ordered = np.sort(light[:, rows].reshape(4, -1)[:, ::step], axis=1)
+        edges = ordered[:, np.arange(1, BINS) * ordered.shape[1] // BINS]
         bins = np.zeros((4, BINS, 6))
         bins[..., 4] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
@@ -398,17 +388,13 @@ def _error(bias, variance, level, share, ratio, source, target, noise):  # type:
 class ResidualStatistics:
     """Predicts the errors of networks on one recorded light, for any target.
 
-    Each value is computed when it is first needed; the first answer takes a pass over the pixels
-    (over some rows of blocks, where the frame is large), later ones a few microseconds. `nlf` is
-    the noise of `light` (4, H, W) as recorded.
+    As fast as `LightStatistics`; of a large frame, some rows of blocks are looked at. `nlf` is the
+    noise of `light` (4, H, W) as recorded.
     """
 
     def __init__(self, light: torch.Tensor, nlf: NoiseLevelFunction) -> None:
         self.light, self.nlf = light, nlf
         self._gathered: dict[Residual, tuple[np.ndarray, np.ndarray]] = {}
-
-    def __reduce__(self) -> tuple[type[ResidualStatistics], tuple[Any, ...]]:
-        return ResidualStatistics, (self.light, self.nlf)
 
     def error(
         self, residual: Residual, ratio: float, target: NoiseLevelFunction, *, noise: bool = True
@@ -418,16 +404,12 @@ class ResidualStatistics:
         Without `noise` the light alone is wanted, in which noise that is left is an error in full;
         the other arguments are those of `LightStatistics`.
         """
-        level, share = self._levels
-        noises = noise_numbers(self.nlf), noise_numbers(target)
-        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise))
-
-    def _of(self, residual: Residual) -> tuple[np.ndarray, np.ndarray]:
-        """Squared bias and variance of a network by plane and level of light, (4, L) each."""
-        if residual not in self._gathered:
+        if residual not in self._gathered:  # squared bias and variance, (4, L) each
             bias, variance = map(self._by_level, residual.at(self._measured[0]))
             self._gathered[residual] = bias, variance
-        return self._gathered[residual]
+        noises = noise_numbers(self.nlf), noise_numbers(target)
+        known = *self._gathered[residual], *self._levels
+        return float(_error(*known, float(ratio), *noises, noise))
 
     def _by_level(self, values: np.ndarray) -> np.ndarray:
         """(4, L) means of `values` of the blocks, (4, N) or (N,) for all planes."""
@@ -444,7 +426,11 @@ class ResidualStatistics:
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Wiener error (N,) and light (4, N) of blocks, their levels, and how many each has."""
-        parts = _sampled(self.light)
+        (height, width), parts = self.light.shape[-2:], [self.light]
+        blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
+        if blocks > _BLOCKS and height >= 2 * _WINDOW:  # bands of rows that are sampled
+            tops = range(0, height - _WINDOW + 1, _WINDOW * math.ceil(blocks / _BLOCKS))
+            parts = [self.light[:, top : top + _WINDOW] for top in tops]
         error = torch.cat([wiener_error(part, self.nlf).flatten() for part in parts])
         block = tuple(min(BLOCK, n) for n in parts[0].shape[-2:])
         means = [F.avg_pool2d(part, block).flatten(1) for part in parts]
@@ -454,16 +440,6 @@ class ResidualStatistics:
         place = order * _LEVELS // values.shape[1]
         counts = np.stack([np.bincount(p, minlength=_LEVELS) for p in place])
         return error.double().cpu().numpy(), values, place, counts
-
-
-def _sampled(light: torch.Tensor) -> Sequence[torch.Tensor]:
-    """The bands of rows (4, H, W) that are sampled; of a small frame all is one."""
-    height, width = light.shape[-2:]
-    blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
-    if blocks <= _BLOCKS or height < 2 * _WINDOW:
-        return [light]
-    step = _WINDOW * math.ceil(blocks / _BLOCKS)
-    return [light[:, top : top + _WINDOW] for top in range(0, height - _WINDOW + 1, step)]
 
 
 # -- denoised light ---------------------------------------------------------------------------
