@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from abc import ABC, abstractmethod
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ CACHE_BYTES, OPENED_BYTES = 512 * 2**20, 256 * 2**20
 # -- opening the aperture ---------------------------------------------------------------------
 
 
-class ApertureBlur(ABC):
+class ApertureBlur:
     """Opens the aperture of one scene's light; results are cached, as f-numbers are few.
 
     The light was recorded at the effective `f_number`. `everywhere` says whether it opens also
@@ -77,15 +77,15 @@ class ApertureBlur(ABC):
             self._opened.put(key, result, result.nbytes)
         return result
 
-    @abstractmethod
     def remaining_variance(self, f_number: float) -> Tensor | None:
         """(H, W) share of the recorded noise's variance that the blur leaves; None for all."""
+        return None
 
-    @abstractmethod
-    def _largest(self, f_number: float) -> float: ...
+    def _largest(self, f_number: float) -> float:
+        return math.inf  # unknown before a network ran
 
-    @abstractmethod
-    def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor: ...
+    def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:
+        raise NotImplementedError
 
 
 class MapApertureBlur(ApertureBlur):
@@ -163,7 +163,8 @@ class MapApertureBlur(ApertureBlur):
 class NetworkApertureBlur(ApertureBlur):
     """Runs the paper's attention U-Net for every f-number (presets ``"paper"``, ``"ncs"``).
 
-    The light has little noise; `module` is the trained network, called as `ApertureModule` is.
+    The light has little noise: none of the recorded is left to account for. `module` is the trained
+    network, called as `ApertureModule` is.
     """
 
     needs_denoised = True
@@ -176,12 +177,6 @@ class NetworkApertureBlur(ApertureBlur):
     ) -> None:
         super().__init__(f_number)
         self._denoised, self._module = denoised, module
-
-    def remaining_variance(self, f_number: float) -> None:
-        """None: the recorded noise is gone, there is nothing to account for."""
-
-    def _largest(self, f_number: float) -> float:
-        return float("inf")  # unknown before the network ran
 
     @torch.no_grad()
     def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:

@@ -61,9 +61,6 @@ DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
 _TINY = torch.finfo(torch.float32).tiny
 #: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
 _BALANCED = 2**15
-#: Reasons why no noise is added.
-_ONLY_LIGHT = "only the light is wanted"
-_ENOUGH_NOISE = "no pixel lacks noise: the source has the target's already, or more"
 
 
 @dataclass(frozen=True)
@@ -94,27 +91,16 @@ class SimulationPlan:
     @functools.cached_property
     def steps(self) -> tuple[Step, ...]:
         """Every step in order, with the reason why it runs or not."""
-        wanted, lacks, reason = self.exposure.noise, self.lacks_noise, _ONLY_LIGHT
-        if wanted:
-            reason = "" if lacks else _ENOUGH_NOISE
+        wanted, lacks = self.exposure.noise, self.lacks_noise
+        unwanted = "" if wanted else "only the light is wanted"
+        enough = "no pixel lacks noise: the source has the target's already, or more"
         steps = (
             Step("exposure", True, ""),
             *self.exposure.steps,
-            Step("noise", wanted and lacks, reason),
-            Step("clip_and_quantise", wanted, "" if wanted else _ONLY_LIGHT),
+            Step("noise", wanted and lacks, unwanted or ("" if lacks else enough)),
+            Step("clip_and_quantise", wanted, unwanted),
         )
         return tuple(_planned(step, self.samples) for step in steps)
-
-    @property
-    def exposure_ratio(self) -> float:
-        """How much brighter than the source the result is."""
-        return self.exposure.ratio
-
-    @property
-    def network(self) -> str | None:
-        """Name of the noise module that runs; None for none."""
-        denoised = self.exposure.denoised
-        return None if denoised is None else denoised.name
 
     @property
     def extrapolated(self) -> float:
@@ -161,10 +147,9 @@ class SimulationPlan:
 
     def explain(self) -> str:
         """The plan in three lines: the steps that run, the error, the cost."""
-        runs = [
-            f"{name} ({self.network})" if name == "noise_reduction" else name
-            for name in self.modules
-        ]
+        runs, denoised = " -> ".join(self.modules), self.exposure.denoised
+        if denoised is not None:
+            runs = runs.replace("noise_reduction", f"noise_reduction ({denoised.name})")
         parts = [f"{name} {_short(error)}" for name, error in self.errors.items() if error >= 0.005]
         avoidable = math.hypot(self.errors["left out"], self.errors["network"])
         within = "kept"
@@ -175,7 +160,7 @@ class SimulationPlan:
         capture, shared = self.milliseconds
         once = f" and {_short(shared)} ms once for all settings" if shared else ""
         return (
-            f"{self.settings}: {self.exposure_ratio:.4g} x the light; {' -> '.join(runs)}\n"
+            f"{self.settings}: {self.exposure.ratio:.4g} x the light; {runs}\n"
             f"error {_short(self.predicted_error)} of the target's noise, 90 % bound "
             f"{_short(self.error_bound)}{': ' * bool(parts)}{', '.join(parts)} "
             f"(tolerance {self.tolerance:g}: {within})\n"
