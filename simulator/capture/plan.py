@@ -103,6 +103,12 @@ class SimulationPlan:
         return tuple(_planned(step, self.samples) for step in steps)
 
     @property
+    def network(self) -> str | None:
+        """Name of the noise module that runs; None for none."""
+        denoised = self.exposure.denoised
+        return None if denoised is None else denoised.name
+
+    @property
     def extrapolated(self) -> float:
         """Stops by which the target's ISO lies outside the camera's calibration."""
         return abs(self.exposure.target.extrapolation) if self.exposure.noise else 0.0
@@ -147,9 +153,8 @@ class SimulationPlan:
 
     def explain(self) -> str:
         """The plan in three lines: the steps that run, the error, the cost."""
-        runs, denoised = " -> ".join(self.modules), self.exposure.denoised
-        if denoised is not None:
-            runs = runs.replace("noise_reduction", f"noise_reduction ({denoised.name})")
+        named = {"noise_reduction": f"noise_reduction ({self.network})"}
+        runs = " -> ".join(named.get(name, name) for name in self.modules)
         parts = [f"{name} {_short(error)}" for name, error in self.errors.items() if error >= 0.005]
         avoidable = math.hypot(self.errors["left out"], self.errors["network"])
         within = "kept"
@@ -225,10 +230,9 @@ def _planned(step: Step, samples: int) -> Step:
     if not step.runs:
         return step._replace(reason=reason)
     if step.network is not None:
-        operations = step.network.operations
-    else:  # else of the taps of a disc
-        per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)
-        operations = per_sample * samples
+        return step._replace(reason=reason, estimate=0.0, operations=step.network.operations)
+    per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
+    operations = per_sample * samples
     return step._replace(reason=reason, estimate=0.0, operations=operations)
 
 
