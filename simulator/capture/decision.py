@@ -185,17 +185,17 @@ def decide(
 
 
 def _motion(scene: PreparedScene, time: float) -> tuple[float, Path | None, Path | None]:
-    """Length of the longest path in an exposure [pixel]; the background's, None for a streak along
-    the rows; and the subject's, None where it does not move on its own.
+    """How far the image moves at most [pixel], and the paths of the background and of the subject.
+
+    The first path is None for a streak along the rows, the other where the subject does not move on
+    its own.
     """
     layout, movement, height = scene.layout, scene.movement, scene.light.shape[-2]
-    apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0
-    moment = scene.image_speed, time, height
-    length = scene.image_speed * time * height
-    if apart:
-        own = movement.subject_path(*moment)
-        return max(length, own.length), movement.path(*moment), own
-    return length, None if movement.along_rows else movement.path(*moment), None
+    path = movement.path(scene.image_speed, time, height)
+    if layout is not None and layout.subject is not None and movement.subject_speed > 0.0:
+        own = movement.subject_path(scene.image_speed, time, height)
+        return max(path.extent, own.length), path, own
+    return path.extent, None if movement.along_rows else path, None
 
 
 def disc_px(scene: PreparedScene, f_number: float) -> float:
@@ -273,17 +273,17 @@ def _decide_blurs(
     square, so that the root of the sum of squares of all errors is right for any set of steps.
     """
     blur = scene.aperture_blur
-    opens = None if blur is None else f_number < blur.f_number
+    known = 0 if blur is None else 1 + (f_number < blur.f_number)  # see `_NO_BLUR_REASONS`
     if not any(extents.values()):
-        return [_without_blur(name, opens) for name in extents]
+        return [Step(name, False, _NO_BLUR_REASONS[name][known]) for name in extents]
     missing_noise = 0.0
     if scene.denoised_lights:
         missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
     if missing_noise > scene.tolerance:  # no network can mend it: blur has it all to itself
         missing_noise = 0.0
     disc = row = math.inf  # at a tolerance of 0 no blur is left out, however small
-    known = extents["defocus"] or extents["motion_blur"] or extents["aperture"] != math.inf
-    if scene.tolerance > 0.0 and known:  # else the network need not run for it
+    decides = extents["defocus"] or extents["motion_blur"] or extents["aperture"] != math.inf
+    if scene.tolerance > 0.0 and decides:  # else the network need not run for it
         network = noise_reduction.network
         light = scene.blurred_light.statistics if network is None else network.statistics
         disc, row = light.curvature(ratio, target)
@@ -294,7 +294,7 @@ def _decide_blurs(
     blurs = []
     for i, (name, extent) in enumerate(extents.items()):
         if not extent:
-            blurs.append(_without_blur(name, opens))
+            blurs.append(Step(name, False, _NO_BLUR_REASONS[name][known]))
             continue
         reason, added = "the aperture opens and adds blur", float(errors[i])
         if extent < math.inf:
@@ -335,10 +335,7 @@ def weigh_blurs(  # type: ignore[no-untyped-def]
 
 
 def _decide_products(scene: PreparedScene, f_number: float, noise: bool) -> Iterator[Step]:
-    """Vignetting and pixel response, where there are any: cheap, so their errors are not weighed.
-
-    See `PreparedScene.vignetting` and `PreparedScene.response`.
-    """
+    """Vignetting and pixel response, where there are any: too cheap to weigh their errors."""
     lens, prnu = scene.lens, scene.camera.prnu
     if lens is not None:
         reason, runs = "the source was taken through the same aperture", False
@@ -358,24 +355,6 @@ def _decide_products(scene: PreparedScene, f_number: float, noise: bool) -> Iter
         yield Step("pixel_response", noise and scene.nlf.is_zero, reason)
 
 
-@functools.cache
-def _without_blur(name: str, opens: bool | None) -> Step:
-    """A blur that would do nothing; `opens` of an aperture, None where no defocus was estimated."""
-    if name == "motion_blur":
-        reason = "the image does not move"
-    elif name == "defocus":
-        reason = "the scene is taken as far or in focus throughout"
-        if opens is not None:
-            reason = "none is given for the whole frame: each pixel's was estimated"
-    elif opens is None:
-        reason = "the scene is taken as in focus: `depth` is not 'unknown'"
-    elif opens:
-        reason = "the picture was found to be in focus throughout"
-    else:
-        reason = "the aperture does not open; what is blurred in the source stays so"
-    return Step(name, False, reason)
-
-
 _WITHOUT = "; leaving it out would be an error of {error:.2g}"
 #: Reasons why a blur runs, and why it is left out; filled in when a plan is shown.
 _BLUR_REASONS = {
@@ -391,4 +370,18 @@ _BLUR_REASONS = {
         "the image moves by {extent:.3g} pixel during the exposure",
         "the image moves by {extent:.2g} pixel during the exposure, which would hardly show",
     ),
+}
+#: Reasons why there is no blur: where no pixel's defocus was estimated; and where it was, as the
+#: aperture does not open, and as it does.
+_NO_BLUR_REASONS = {
+    "aperture": (
+        "the scene is taken as in focus: `depth` is not 'unknown'",
+        "the aperture does not open; what is blurred in the source stays so",
+        "the picture was found to be in focus throughout",
+    ),
+    "defocus": (
+        "the scene is taken as far or in focus throughout",
+        *["none is given for the whole frame: each pixel's was estimated"] * 2,
+    ),
+    "motion_blur": ("the image does not move",) * 3,
 }
