@@ -44,7 +44,7 @@ class DeviceFrames(BlurredFrames):
         new = {id(light): light for light in lights if self._place_of(light) == 0}
         if new:
             made = self._take(len(new))
-            self._put(made, list(new.values()))
+            self._put(made, torch.stack(list(new.values())))
             for (key, light), place in zip(new.items(), made.tolist(), strict=True):
                 self._known[key] = weakref.ref(light), place
         return np.array([self._known[id(light)][1] for light in lights], np.uintp)
@@ -64,8 +64,8 @@ class DeviceFrames(BlurredFrames):
     def _numbers(self, places: np.ndarray) -> Tensor:
         return torch.from_numpy(places.astype(np.int64) - 1).to(self._frames.device)
 
-    def _put(self, places: np.ndarray, frames: Sequence[Tensor]) -> None:
-        self._frames[self._numbers(places)] = torch.stack(list(frames)).to(self._frames.device)
+    def _put(self, places: np.ndarray, frames: Tensor) -> None:
+        self._frames[self._numbers(places)] = frames.to(self._frames.device)
 
     def _more(self, count: int) -> np.ndarray:
         # Lights of scenes that are gone come first.
@@ -103,10 +103,10 @@ class DeviceFrames(BlurredFrames):
             alike = np.flatnonzero(diameters == diameter)
             for part in self._parts(alike, 4 * math.prod(self._shape)):
                 light = self._clamped(passes["source"][part])
-                self._frames[self._numbers(passes["to"][part])] = disc_blur(light, diameter)
+                self._put(passes["to"][part], disc_blur(light, diameter))
 
     def _clamped(self, places: np.ndarray) -> Tensor:
-        return self._frames[self._numbers(places)].clamp_(-LIGHT_LIMIT, LIGHT_LIMIT)
+        return self.at(places).clamp_(-LIGHT_LIMIT, LIGHT_LIMIT)
 
     def _blend(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
         for part in self._parts(np.arange(len(passes)), 2 * math.prod(self._shape)):
@@ -119,9 +119,8 @@ class DeviceFrames(BlurredFrames):
             share = (squared - knots[below]) / (knots[below + 1] - knots[below])  # (K, H W)
             numbers = self._numbers(levels[part])
             low, high = (self._pixels(numbers.gather(1, below + i)) for i in range(2))
-            blended = torch.lerp(low, high, share[:, None])
-            to = self._numbers(passes["to"][part])
-            self._frames[to] = blended.reshape(-1, *self._shape)
+            blended = torch.lerp(low, high, share[:, None]).reshape(-1, *self._shape)
+            self._put(passes["to"][part], blended)
 
     def _pixels(self, numbers: Tensor) -> Tensor:
         """(K, 4, H W) pixels, each of the frame at `numbers` (K, H W)."""
@@ -137,17 +136,16 @@ class DeviceFrames(BlurredFrames):
         if stale.any():
             lacking = indices[stale & (self._layouts[indices] == 0)]
             self._layouts[lacking] = self._take(len(lacking))
-            frames, plane = [], self._shape[1:]
-            for blur in blurs[stale]:
-                frame = np.zeros(self._shape, np.float32)
+            own, plane = blurs[stale], self._shape[1:]
+            frames = np.zeros((len(own), *self._shape), np.float32)
+            for frame, blur in zip(frames, own, strict=True):
                 frame[0] = frame_at(blur["diameter"].item(), plane)
                 if blur["mask"]:
                     frame[1] = frame_at(blur["mask"].item(), plane)
                     frame[2] = frame_at(blur["behind"].item(), plane).view(np.int32)
-                frames.append(torch.from_numpy(frame))
-            self._put(self._layouts[indices[stale]], frames)
+            self._put(self._layouts[indices[stale]], torch.from_numpy(frames))
             self._masks[indices[stale]] = blurs["mask"][stale]
-        return self._frames[self._numbers(self._layouts[indices])]
+        return self.at(self._layouts[indices])
 
     def _move(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
         source, to = passes["source"], passes["to"]
@@ -155,12 +153,12 @@ class DeviceFrames(BlurredFrames):
         # Large frames one by one: the time of a streak's running sum is the same for all lengths.
         alone = blurs["streaks"] & (samples >= _ALONE)
         for i in np.flatnonzero(alone).tolist():
-            moved = motion_blur(self._clamped(source[[i]]), float(blurs["motion_px"][i]))
-            self._frames[self._numbers(to[[i]])] = moved
+            light = self._clamped(source[[i]])
+            self._put(to[[i]], motion_blur(light, float(blurs["motion_px"][i])))
         for part in self._parts(np.flatnonzero(~apart & ~alone), _TOGETHER * samples):
             light = self._clamped(source[part])
-            moved = moved_sums(light, self._samples, *tap_columns(blurs[part], False, *plane))
-            self._frames[self._numbers(to[part])] = moved
+            taps = tap_columns(blurs[part], False, *plane)
+            self._put(to[part], moved_sums(light, self._samples, *taps))
         for part in self._parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
             # See `simulator.optics.motion.blur_apart`.
             light = self._clamped(source[part])
@@ -171,14 +169,14 @@ class DeviceFrames(BlurredFrames):
             own = self._samples, *tap_columns(blurs[part], True, *plane)
             front = moved_sums(torch.cat([light * mask, mask], dim=1), *own)
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
-            self._frames[self._numbers(to[part])] = seen * back + front[:, :-1]
+            self._put(to[part], seen * back + front[:, :-1])
 
     def _darken(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
         source, to = passes["source"], passes["to"]
         for address in np.unique(blurs["vignetting"]).tolist():
             same = blurs["vignetting"] == address
             left = torch.from_numpy(frame_at(address, self._shape[1:])).to(self._frames)
-            self._frames[self._numbers(to[same])] = self._frames[self._numbers(source[same])] * left
+            self._put(to[same], self.at(source[same]) * left)
 
 
 @kernel()
