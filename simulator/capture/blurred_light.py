@@ -191,8 +191,7 @@ class NetworkApertureBlur(ApertureBlur):
 class BlurredLight:
     """Blurs a scene's light, each blur when it is first needed, and caches the latest.
 
-    `light` is (4, H, W) as recorded, `nlf` its noise. Wider apertures add the `aperture_blur`. When
-    the cache is full, the light that was used longest ago goes first.
+    `light` is (4, H, W) as recorded, `nlf` its noise. Wider apertures add the `aperture_blur`.
     """
 
     def __init__(

@@ -65,9 +65,8 @@ def fits_columns(scene: PreparedScene, states: np.ndarray) -> bool:
 
 def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
     """The largest `PreparedScene.defocus` whose disc is not too wide at `STATE` (S,)."""
-    return float(
-        max(*scene.light.shape[-2:], decision.MAX_DISC_PX) * states["f_number"].min() / 4.0
-    )
+    most = max(*scene.light.shape[-2:], decision.MAX_DISC_PX)
+    return float(most * states["f_number"].min() / 4.0)
 
 
 def statistics_column(scene: PreparedScene) -> np.ndarray:
@@ -108,10 +107,7 @@ def moved_columns(rest: np.ndarray, moves: np.ndarray, subjects: np.ndarray) -> 
 
 def subject_column(scene: PreparedScene) -> tuple[int, ...]:
     """Addresses of the mask of a scene's subject and of the pixels behind it; 0 without one."""
-    layout = scene.layout
-    if layout is None or layout.subject is None:
-        return 0, 0
-    return _addresses(layout, subject=True)[3:]
+    return _addresses(scene.layout, subject=True)[3:]
 
 
 def vignetting_column(scene: PreparedScene, states: Sequence[CameraSettings]) -> np.ndarray:

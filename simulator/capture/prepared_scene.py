@@ -79,10 +79,9 @@ class PreparedScene:
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
-        if cached is not None and cached.light is not self.light:
-            cached = None
-        if cached is None:  # else the light was checked before
+        if cached is None or cached.light is not self.light:  # else the light was checked before
             object.__setattr__(self, "light", check_packed("light", self.light))
+            cached = None
         known = None if cached is None else (cached.residuals.nlf, cached.aperture_blur)
         if known != (self.nlf, self.aperture_blur):
             statistics = None if cached is None else cached.statistics

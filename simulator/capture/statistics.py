@@ -255,21 +255,16 @@ class LightStatistics:
         while math.gcd(step, light.shape[-1]) > 1:  # every column counts alike
             step += 1
         ordered = np.sort(light[:, rows].reshape(4, -1)[:, ::step], axis=1)
-        edges = ordered[:, np.arange(1, BINS) * ordered.shape[1] // BINS]
+        limits = ordered[:, np.arange(1, BINS) * ordered.shape[1] // BINS]
         bins = np.zeros((4, BINS, 6))
         bins[..., 4] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
-        fixed = (light, rows, np.ascontiguousarray(edges), bins)
+        fixed = (light, rows, np.ascontiguousarray(limits), bins)
         parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
         found = np.ascontiguousarray(np.moveaxis(bins, 2, 0))
         light, disc, row = found[1:4] / np.maximum(found[0], 1.0)  # equal light leaves bins empty
-        return _Bins(
-            share=found[0] / (4.0 * samples),
-            light=light,
-            edges=np.where(found[0] > 0, found[4:], 0.0),
-            disc=disc,
-            row=row,
-        )
+        edges = np.where(found[0] > 0, found[4:], 0.0)
+        return _Bins(found[0] / (4.0 * samples), light, edges, disc, row)
 
 
 def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:

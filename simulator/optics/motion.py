@@ -154,10 +154,7 @@ def motion_kernel(extent_px: float) -> np.ndarray:
 
 
 def motion_blur(light: Tensor, extent_px: float) -> Tensor:
-    """Linear light (..., H, W) as it moves by `extent_px` >= 0 pixels along the rows, uniformly.
-
-    The cost of long streaks hardly depends on the extent.
-    """
+    """Linear light (..., H, W) as it moves by `extent_px` >= 0 pixels along the rows, uniformly."""
     n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
     if not n and not end:
         return light
@@ -512,7 +509,5 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
 
 def path_blur(light: Tensor, taps: Taps) -> Tensor:
     """Motion of float32 `light` (..., H, W) along a path, on the CPU; borders are replicated."""
-    fixed = light.shape[-2], tuple(taps), np.float32(math.inf)
-    return by_rows(
-        light, lambda a, b, rows, to: blur_planes(a, b, rows, *fixed, to), len(taps.rows)
-    )
+    fixed, count = (light.shape[-2], tuple(taps), np.float32(math.inf)), len(taps.rows)
+    return by_rows(light, lambda a, b, rows, to: blur_planes(a, b, rows, *fixed, to), count)
