@@ -346,26 +346,18 @@ class _Source:
         if stage == "noise":
             return self.crops
         camera, sequences = self._sequences
+        if stage == "aperture":  # learnt of known depth, and in focus, where nothing may change
+            useful = [s for s in sequences if s.scene.depth is not None or s.scene.in_focus]
+        else:  # a draped scene shows a picture that was seen before, a mosaic has noise of its own
+            useful = [s for s in sequences if s.scene.kind not in (DRAPED, MOSAIC)]
         return ReferencePairs(
-            [s for s in sequences if _is_useful_for(s.scene, stage)],
+            useful,
             camera,
             _PAIRS[stage],
             seed=self.config.seed,
             blurred_light=self.blurred_light,
             progress=progress,
         )
-
-
-def _is_useful_for(scene: ReferenceScene, stage: str) -> bool:
-    """Whether a stage is trained on `scene`.
-
-    The aperture is learnt from scenes of known depth and from those in focus throughout, in which
-    nothing may change. The other stages have seen the picture that a draped scene shows, and a
-    recorded mosaic has noise of its own.
-    """
-    if stage == "aperture":
-        return scene.depth is not None or scene.in_focus
-    return scene.kind not in (DRAPED, MOSAIC)
 
 
 def stage_loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
