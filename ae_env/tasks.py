@@ -5,7 +5,7 @@ frames late, and `ae_env/ExposureBracket-v0`, in which a few frames are merged i
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Unpack, cast
 
 import gymnasium as gym
@@ -118,15 +118,6 @@ BUDGET, MAX_FRAMES = 0.3, 3
 _MOST_SECONDS, _MOST_FRAMES = 3600.0, 16
 
 
-@dataclass(frozen=True)
-class _Truth:
-    """Light that a merged image is compared with, its floor, and which pixels are known."""
-
-    light: torch.Tensor
-    floor: float
-    known: torch.Tensor | None
-
-
 class ExposureBracket(Task):
     """Merges the frames of an episode, and rewards what each adds to the quality.
 
@@ -157,7 +148,8 @@ class ExposureBracket(Task):
         self._fresh = np.zeros(count, bool)  # a frame was taken that is not merged yet
         self._quality, self._error = np.zeros((2, count))
         self._unseen, self._white, self._noisy = np.ones((3, count))
-        self._truths: dict[int, _Truth] = {}
+        # By scene, the light that a merged image is compared with, its floor, and the known pixels.
+        self._truths: dict[int, tuple[torch.Tensor, float, torch.Tensor | slice]] = {}
         self._metered: dict[int, int] = {}  # state, by scene
         self._times = np.array([state.exposure_time for state in grid])
         levels = torch.tensor([camera.black_level, camera.span], dtype=torch.float32)
@@ -265,13 +257,11 @@ class ExposureBracket(Task):
         self._fresh[env_indices] = False
         light, precision = self.merged(env_indices)
         truths = [self._truth(int(scene)) for scene in self.episodes.scene[env_indices]]
-        truth = torch.stack([t.light for t in truths])
-        floor = torch.tensor([t.floor for t in truths])
-        errors = log_error(light, precision, truth, floor)
+        truth, floors, pixels = zip(*truths, strict=True)
+        errors = log_error(light, precision, torch.stack(truth), torch.tensor(floors))
         unseen = precision <= 0.0
         noisy = light.clamp(min=0.0) * precision.sqrt() * NOISY < 1.0
-        for row, (env_index, t) in enumerate(zip(env_indices.tolist(), truths, strict=True)):
-            known = slice(None) if t.known is None else t.known
+        for row, (env_index, known) in enumerate(zip(env_indices.tolist(), pixels, strict=True)):
             error, hidden = errors[row][:, known], unseen[row][:, known]
             self._quality[env_index] = 1.0 - float(error.double().mean()) / WORST_EV
             share = float(hidden.double().mean())
@@ -288,13 +278,13 @@ class ExposureBracket(Task):
         gains, noise = (torch.from_numpy(a[env_indices]) for a in (self._gains, self._noise))
         return merge(signals, gains, noise[:, :, 0], noise[:, :, 1])
 
-    def _truth(self, scene: int) -> _Truth:
+    def _truth(self, scene: int) -> tuple[torch.Tensor, float, torch.Tensor | slice]:
         if scene not in self._truths:
             own = self.episodes.scenes[scene]
             white = WHITE_SIGNAL * 2.0 ** (own.ev100 + own.reference.log2_exposure)
             marks = own.saturated
-            known = None if marks is None or bool(marks.all()) else ~marks
-            self._truths[scene] = _Truth(own.clean_light, LOG_FLOOR * white, known)
+            known = slice(None) if marks is None or bool(marks.all()) else ~marks
+            self._truths[scene] = own.clean_light, LOG_FLOOR * white, known
         return self._truths[scene]
 
     def _offsets(self, env_indices: np.ndarray) -> np.ndarray:

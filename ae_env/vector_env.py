@@ -113,7 +113,12 @@ class AutoExposureVectorEnv(
         seeds = self._seeds(seed)
         options = check_options(options, "reset_mask")
         mask = self._reset_mask(options.pop("reset_mask", None))
-        per_env = self._split_options(options)
+        per_env: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for name, value in options.items():
+            values = self._entries(f"options[{name!r}]", value)
+            values = [plain(value)] * self.num_envs if values is None else values
+            for single, own in zip(per_env, values, strict=True):
+                single[name] = own
         env_indices = np.flatnonzero(mask)
         if not self.core.episodes.begun[~mask].all():
             raise gym.error.ResetNeeded("the first reset() must be of all environments")
@@ -248,15 +253,6 @@ class AutoExposureVectorEnv(
                 f"({self.num_envs},) with at least one True"
             )
         return mask
-
-    def _split_options(self, options: dict[str, Any]) -> list[dict[str, Any]]:
-        split: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for name, value in options.items():
-            values = self._entries(f"options[{name!r}]", value)
-            values = [plain(value)] * self.num_envs if values is None else values
-            for single, own in zip(split, values, strict=True):
-                single[name] = own
-        return split
 
     def _entries(self, name: str, value: Any) -> list[Any] | None:
         """The entries of an ordered collection, one per environment; None for a single value."""
