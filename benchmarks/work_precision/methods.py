@@ -19,7 +19,6 @@ from simulator.capture.decision import DEFAULT_TOLERANCE
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.utils.compute import computes_bfloat16
 
 Dtype = Literal["float32", "bfloat16"]
 
@@ -60,7 +59,7 @@ def all_methods() -> list[Method]:
         Method("exposure+nlf", prepare=bare.prepare),
         *(_denoised_by(name, denoise, bare) for name, denoise in classical().items()),
     ]
-    both = computes_bfloat16(torch.device("cpu"))
+    both = bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     dtypes: tuple[Dtype, ...] = ("float32", "bfloat16") if both else ("float32",)
     for dtype in dtypes:
         for name in FAMILY:

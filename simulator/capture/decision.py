@@ -309,14 +309,10 @@ def _decide_blurs(
 def weigh_blurs(  # type: ignore[no-untyped-def]
     extents, disc, row, missing_noise, tolerance, errors, runs
 ):
-    """Which of aperture, defocus and motion blur run, and the error of leaving each out.
+    """Which of aperture, defocus and motion blur run, and the error of leaving each out, (3,) each.
 
-    Args:
-        extents: (3,) of each [pixel]; inf where it is not known.
-        disc, row: `LightStatistics.curvature` of the light.
-        missing_noise: Error that cannot be mended, which counts as well.
-        tolerance: See `PreparedScene`.
-        errors, runs: (3,) to fill.
+    `extents` (3,) are in pixels, inf where it is not known; `disc` and `row` are the
+    `LightStatistics.curvature` of the light; `missing_noise` cannot be mended, and counts as well.
     """
     missing_blur = 0.0
     for i in range(3):

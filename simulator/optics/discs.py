@@ -278,10 +278,7 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
 
 @functools.cache
 def _correlations() -> np.ndarray:
-    """(K, 2, R, R) correlations of a disc with itself and its successor; the middle is no shift.
-
-    The last disc's successor is the first.
-    """
+    """(K, 2, R, R) correlations of a disc with itself and with the next; the middle is no shift."""
     discs = [disc_kernel(diameter) for diameter in DIAMETERS]
     size = 2 * len(discs[-1]) - 1
     spectra = np.fft.rfft2([np.pad(disc, (size - len(disc)) // 2) for disc in discs])

@@ -99,10 +99,7 @@ class PulsedLamp(Lamp):
 def _periods(
     start: np.ndarray, time: float, frequency: float, phase: float
 ) -> tuple[np.ndarray, int, float]:
-    """Where in a period exposures begin, whole periods that they last, and what is left of one.
-
-    Begin and rest are in [0, 1).
-    """
+    """Begin within a period, in [0, 1); whole periods that exposures last; the rest, in [0, 1)."""
     turns, missing = _product(start, frequency)
     # Each exact: what is left of a day of periods must still tell where in one it is.
     begin = np.mod(np.mod(turns, 1.0) + np.mod(phase, 1.0) + missing, 1.0)

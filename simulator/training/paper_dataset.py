@@ -30,7 +30,7 @@ from simulator.training import trainer
 from simulator.training.crops import Batch, stacked, stated_fields
 from simulator.training.losses import expose
 from simulator.utils.cache import LruCache
-from simulator.utils.checks import check_word
+from simulator.utils.checks import check_word, parse_number
 from simulator.utils.files import read_table, refuse_bomb, sibling
 
 logger = logging.getLogger(__name__)
@@ -185,12 +185,7 @@ def _capture(
     camera: CameraProfile,
     developing: Balance | None,
 ) -> PackedCapture:
-    values = []
-    for name in ("iso", "time", "aperture"):
-        try:
-            values.append(float(row[name]))
-        except ValueError:
-            raise ValueError(f"`{name}` (={row[name]!r}) must be a number") from None
+    values = [parse_number(row[name], name) for name in ("iso", "time", "aperture")]
     settings = CameraSettings.from_exif(*values)
     gains, noise = _numbers(row.get("wb", "")), _numbers(row.get("noiseprofile", ""))
     balance = (gains[0] / gains[1], 1.0, gains[2] / gains[1]) if _positive(gains) else developing

@@ -375,11 +375,6 @@ def release_memory(pixels: int) -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def computes_bfloat16(device: torch.device) -> bool:
-    """Whether the device computes in bfloat16 instead of emulating it."""
-    return device.type != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
-
-
 def check_bfloat16(device: torch.device) -> None:
     """Logs a warning where bfloat16 makes networks slower."""
     if device.type == "cpu" and (longer := _bfloat16_time()) > _NOTICEABLE:
