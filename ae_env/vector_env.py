@@ -93,9 +93,8 @@ class AutoExposureVectorEnv(
         """(N,) float64: EV100 of the right exposure of the current frame; its mean if unknown."""
         episodes = self.core.episodes
         scenes = [episodes.scenes[i].ev100 for i in episodes.scene.tolist()]
-        times = [self.grid[state].exposure_time for state in episodes.state.tolist()]
-        gains = [episodes.gain(i, time)[0] for i, time in enumerate(times)]
-        return np.array(scenes) + np.log2(gains)
+        times = np.array([self.grid[state].exposure_time for state in episodes.state.tolist()])
+        return np.array(scenes) + np.log2(episodes.gains(self._all, times)[0])
 
     def reset(
         self,

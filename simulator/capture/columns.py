@@ -123,9 +123,7 @@ def _address(array: np.ndarray | None) -> int:
 
 def blur_column(exposure: decision.Exposure) -> tuple[Any, ...]:
     """The `BLUR` of an exposure."""
-    path, own = exposure.path, exposure.subject_path
-    if path is None:
-        path = Path(exposure.motion_px)
+    path, own = exposure.path or Path(exposure.motion_px), exposure.subject_path
     drift = (0.0, 0.0) if own is None else own[3:]
     numbers = exposure.defocus_px, exposure.motion_px, exposure.path is None
     layout = _addresses(exposure.layout, own is not None)

@@ -229,10 +229,8 @@ def _planned(step: Step, samples: int) -> Step:
     reason = step.reason.format(extent=step.extent, error=step.error)
     if not step.runs:
         return step._replace(reason=reason)
-    if step.network is not None:
-        return step._replace(reason=reason, estimate=0.0, operations=step.network.operations)
     per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
-    operations = per_sample * samples
+    operations = per_sample * samples if step.network is None else step.network.operations
     return step._replace(reason=reason, estimate=0.0, operations=operations)
 
 
