@@ -29,6 +29,7 @@ from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES, FrameSource
+from simulator.capture.sensor import CodeMeans
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_seed, check_word
@@ -96,6 +97,12 @@ class AutoExposure(Task):
     def forget(self, lights: np.ndarray) -> None:
         """Makes the scores under these `Episodes.light_index` unknown."""
         self._scored[lights] = self._expected[lights] = False
+
+    def code_means(self, env_indices: np.ndarray) -> CodeMeans | None:
+        """Those of the terms; on a device the frames alone have what these need."""
+        if not self._terms.parts or self._transitions or self.episodes.options.device is not None:
+            return None
+        return self._terms.means_of(self.episodes.state[env_indices])
 
     def measure(self, frames: FrameBatch) -> dict[str, Any]:
         """Scores (B,) by ``score:`` and part, and ``image_mean`` where a cost needs it."""
@@ -194,7 +201,9 @@ class AutoExposure(Task):
             scores = terms.torch_scores(None, captures, "light", "blur")
         if terms.parts:
             states = episodes.state[frames.env_indices]
-            if self._transitions is None:
+            if frames.means is not None and source_noise is None:
+                means = frames.means.means
+            elif self._transitions is None:
                 means = terms.measured(frames.outputs["codes"], states, source_noise)
             else:
                 means = self._expected_means(frames, self._transitions, boxes)

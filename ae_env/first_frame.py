@@ -42,20 +42,14 @@ def compile_beside() -> None:
 def _compile() -> None:
     import numpy as np
 
-    from ae_env.grid import ExposureGrid
-    from ae_env.scorers import make_scorer
-    from ae_env.scorers.term_scores import TermScores
     from simulator.camera import get_camera
     from simulator.capture.sensor import Transitions, record
 
     torch.set_num_threads(1)
     light, table = [torch.full((4, 16, 16), 0.1)], np.zeros((1, 5, 4), np.float32)
     keys, codes = np.ones(1, np.uint64), np.empty((1, 4, 16, 16), np.uint8)
-    camera = get_camera("nikon_z6")
-    record(Transitions(light, table, None), camera, keys=keys, noise="bank", codes=codes)
-    states = ExposureGrid.default().states
-    terms = TermScores(make_scorer("balanced"), camera, states, noise=True)
-    terms.measured(codes, np.zeros(1, np.int64))
+    given = Transitions(light, table, None), get_camera("nikon_z6")
+    record(*given, keys=keys, noise="bank", count=True, codes=codes)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from ae_env.scorers.terms import CompositeScorer
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.columns import MOVES
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions
+from simulator.capture.sensor import CodeMeans, Transitions
 from simulator.noise.generator import Noise, single_normals
 from simulator.utils.compute import outside_inference_mode
 
@@ -71,6 +71,7 @@ class FrameBatch:
     outputs: Mapping[str, Any]
     gains: np.ndarray  # (B,) light relative to the scenes' own
     rows: np.ndarray | None  # (B, R) light of each row relative to that, or None; see `Captures`
+    means: CodeMeans | None  # of `Task.code_means`
 
 
 class Task:
@@ -119,6 +120,10 @@ class Task:
     def observation(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
         """What is observed beside the latest frame, (B, ...) by name."""
         return {}
+
+    def code_means(self, env_indices: np.ndarray) -> CodeMeans | None:
+        """What `measure` reads of the output ``codes`` of frames (B,), to be filled; or None."""
+        return None
 
     def measure(self, frames: FrameBatch) -> dict[str, Any]:
         """Columns (B,) that `reward` takes, from the frames just recorded."""
@@ -336,12 +341,14 @@ class EpisodeCore:
                 if kept is None or len(kept) < len(raw):
                     kept = self._outputs[name] = self._memory(len(raw), name)
                 outputs[name] = kept[: len(raw)]
+        means = self.task.code_means(env_indices)
         found = self._captures.record(
             episodes.light_index[env_indices],
             episodes.state[env_indices],
             episodes.noise_seed[env_indices],
             episodes.frame[env_indices],
             row_gain=rows,
+            means=means,
             **outputs,
         )
         columns = {
@@ -354,7 +361,7 @@ class EpisodeCore:
         }
         if self.options.sensors:
             columns["sensor_normals"] = single_normals(found.keys, 2)
-        columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows))
+        columns |= self.task.measure(FrameBatch(env_indices, found, outputs, gains, rows, means))
         return columns
 
     def _moved(self, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from ae_env.scenes.scene import Scene
 from simulator.camera import LOW_CLIP, CameraProfile
 from simulator.capture.batch import MODULES, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import LEAST_SIGNALS
+from simulator.capture.sensor import LEAST_SIGNALS, CodeMeans
 from simulator.noise.generator import noise_keys
 
 #: The step that makes a recorded frame, and its index behind those of the simulator.
@@ -52,6 +52,7 @@ class LookupBatch:
         seeds: np.ndarray,
         frames: np.ndarray,
         row_gain: np.ndarray | None = None,
+        means: CodeMeans | None = None,
         **outputs: np.ndarray,
     ) -> FrameStatistics:
         """Copies frames to the outputs; see `CaptureBatch.record`."""
@@ -60,6 +61,8 @@ class LookupBatch:
         digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
         if "codes" in outputs:
             encode_observation(torch.from_numpy(shown), out=torch.from_numpy(outputs["codes"]))
+        if means is not None:
+            means.fill(outputs["codes"])
         if "numbers" in outputs:
             outputs["numbers"][:] = digital
         for name in LEAST_SIGNALS.keys() & outputs:

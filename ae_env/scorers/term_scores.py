@@ -31,10 +31,10 @@ from ae_env.scorers.terms import (
 )
 from simulator.camera import CameraProfile
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, record
+from simulator.capture.sensor import CodeMeans, Transitions, packed_tables, record
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.compute import addresses, as_pointer, kernel, load_alone, parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Memory for tabulated expectations [byte].
 _BYTES = 2**25
@@ -54,8 +54,6 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _PEDESTAL = np.float32(PEDESTAL)
 _SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
 _BLOCK = 256
-#: What `_packed` counts as 1, and how its words are split.
-_WHOLE, _HALF_WORD, _LOW_HALF = 2.0**24 - 1.0, np.uint64(32), np.uint64(2**32 - 1)
 #: Column of the means for each term; and the terms that need none.
 _COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
 _WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
@@ -94,7 +92,7 @@ class TermScores:
         self._shot_read = np.array([[n.shot, n.read] for n in noises])[self._which]  # (S, 2, 4)
         self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
         self._dark = Shadows().shares(_SIGNALS).numpy()
-        self._packed = _packed(self._shares, self._dark)
+        self._packed = packed_tables(self._dark, self._shares)
         self._edges = _code_edges(camera)
         # Up to light beyond white that even the most noise does not bring back.
         shot, read = (max(max(getattr(n, name)) for n in noises) for name in ("shot", "read"))
@@ -185,15 +183,16 @@ class TermScores:
             source_noise: (B, 2, 4) shot and read noise of the sources, of a native pixel, or None.
         """
         shares, which = self._shares_of_frames(states, source_noise)
-        flat = codes.reshape(len(codes), 4, -1)
-        if isinstance(flat, torch.Tensor):
-            return _means_by_torch(flat, shares, which, self._dark)
-        packed = self._packed if shares is self._shares else _packed(shares, self._dark)
-        means = np.empty((len(codes), 3))
-        least = max(1, _WORTH_A_THREAD // flat[0].size)
-        fixed = (flat, packed, which, means)
-        parallel_ranges(lambda a, b: measure_codes(a, b, *fixed), len(codes), least=least)
-        return means
+        if isinstance(codes, torch.Tensor):
+            return _means_by_torch(codes.flatten(2), shares, which, self._dark)
+        packed = self._packed if shares is self._shares else packed_tables(self._dark, shares)
+        found = CodeMeans.empty(packed, which)
+        found.fill(codes)
+        return found.means
+
+    def means_of(self, states: np.ndarray) -> CodeMeans:
+        """`measured`, to be filled when frames of clean sources are recorded at `states` (B,)."""
+        return CodeMeans.empty(self._packed, self._which[states])
 
     def expected(
         self,
@@ -305,7 +304,7 @@ def _score(part: Any, means: Any, captures: Captures | None) -> Any:
 def _means_by_torch(
     codes: torch.Tensor, shares: np.ndarray, which: np.ndarray, dark: np.ndarray
 ) -> torch.Tensor:
-    """`measure_codes` by torch operations on any device."""
+    """`CodeMeans` by torch operations on any device."""
     to, index = codes.device, codes.long()
     own = torch.from_numpy(shares).to(to)[torch.from_numpy(which).to(to)]  # (B, 4, 256)
     blocked = torch.from_numpy(dark).to(to)[index].mean(dim=(1, 2))
@@ -336,42 +335,6 @@ def _expected_by_torch(
     above, blocked, clean = (torch.lerp(values[i], values[i + 1], share) for i in starts)
     blown = (1.0 - (1.0 - above).prod(dim=1)).mean(dim=1)
     return torch.stack([blown, blocked.mean(dim=(1, 2)), clean.mean(dim=(1, 2))], dim=1)
-
-
-def _packed(shares: np.ndarray, dark: np.ndarray) -> np.ndarray:
-    """(K, 4, 256) uint64 of what each code adds: `dark` and, in the lower half, `shares`.
-
-    One sum serves both: with 24 bits each, the halves hold that of a block.
-    """
-    first, second = (np.rint(_WHOLE * np.float64(x)).astype(np.uint64) for x in (dark, shares))
-    return (first << _HALF_WORD) + second
-
-
-@_jit
-def measure_codes(first, last, codes, packed, which, means):  # type: ignore[no-untyped-def]
-    """Means (B, 3) float64 of frames (B, 4, N) uint8, from the `first` to before the `last`.
-
-    A sample adds to the share of blocked ones and to `noise` what `packed` (K, 4, 256) has for its
-    code, of which frame b has those at ``which[b]``.
-    """
-    size = codes.shape[2]
-    for frame in range(first, last):
-        blocked, clean, blown = np.uint64(0), np.uint64(0), 0
-        for plane in range(4):
-            table = packed[which[frame], plane]
-            for start in range(0, size, _BLOCK):
-                total = np.uint64(0)
-                for code in codes[frame, plane, start : start + _BLOCK]:
-                    total += load_alone(table, code)  # type: ignore[call-arg]
-                blocked += total >> _HALF_WORD
-                clean += total & _LOW_HALF
-        red, green, other, blue = codes[frame]
-        for i in range(size):
-            brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
-            blown += brightest == 255
-        means[frame, 0] = blown / size
-        means[frame, 1] = blocked / (_WHOLE * 4 * size)
-        means[frame, 2] = clean / (_WHOLE * 4 * size)
 
 
 @_jit

@@ -21,7 +21,13 @@ from simulator.capture.blurred_light import new_frames
 from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, exposure_table, record, record_units
+from simulator.capture.sensor import (
+    CodeMeans,
+    Transitions,
+    exposure_table,
+    record,
+    record_units,
+)
 from simulator.capture.statistics import BINS, LightStatistics
 from simulator.noise.generator import Noise, noise_keys
 from simulator.settings import CameraSettings
@@ -84,6 +90,7 @@ class FrameSource(Protocol):
         seeds: np.ndarray,
         frames: np.ndarray,
         row_gain: np.ndarray | None = None,
+        means: CodeMeans | None = None,
         **outputs: Any,
     ) -> FrameStatistics:
         """Records scenes that are prepared, and fills the outputs.
@@ -94,8 +101,8 @@ class FrameSource(Protocol):
             frames: (B,) numbers that the noise of one seed differs by.
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None
                 where all rows have the same.
-            outputs: Those of `simulator.capture.sensor.record`, arrays or, where there is a
-                device, tensors on it.
+            means, outputs: Those of `simulator.capture.sensor.record`, arrays or, where there is
+                a device, tensors on it, but then no `means`.
         """
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -237,6 +244,7 @@ class CaptureBatch:
         seeds: np.ndarray,
         frames: np.ndarray,
         row_gain: np.ndarray | None = None,
+        means: CodeMeans | None = None,
         **outputs: Any,
     ) -> FrameStatistics:
         """See `FrameSource`."""
@@ -261,6 +269,7 @@ class CaptureBatch:
             read_noise=read_noise,
             row_gain=row_gain,
             count=True,
+            means=means,
             run=run,
             **outputs,
         )
@@ -282,12 +291,12 @@ class CaptureBatch:
         (_, planned), self._pending = self._pending, None
         with self._forgetting(indices):
             lanes = 8 * torch.get_num_threads()
-            order, ends, wide = deal_out(planned.passes, indices, lanes)
+            order, ends, wide = deal_out(planned.passes, indices, self.num_scenes, lanes)
             if wide:  # NumPy makes these
                 self._frames.run(planned)
                 order, ends = len(planned.passes) + np.arange(len(indices)), np.arange(lanes + 1)
                 ends = ends * len(indices) // lanes
-            given = order, units, *planned, fixed
+            given = order, units, (1, planned.shape, *planned[:3]), fixed
             parallel_ranges(lambda a, b: photograph(ends[a], ends[b], *given), lanes)
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -429,32 +438,32 @@ class CaptureBatch:
 
 
 @kernel(fastmath={"contract"})
-def photograph(  # type: ignore[no-untyped-def]
-    first, last, order, units, passes, blurs, levels, shape, fixed
-):
+def photograph(first, last, order, units, blurring, recording):  # type: ignore[no-untyped-def]
     """Does `order` from `first` to `last`, of `deal_out`: passes, and `record_units` of frames.
 
-    A frame has so many `units`, which take the arguments `fixed`; for the others see
-    `BlurredFrames.run`. One frame comes after the other, and its light stays in the cache.
+    A frame has so many `units`. What follows are the other arguments of the blur tasks
+    (`BlurredFrames.tasks`) and of `record_units`. One frame comes after the other, and its light
+    stays in the cache.
     """
+    passes = blurring[2]
     for at in order[first:last]:
         if at >= len(passes):
             frame = at - len(passes)
-            record_units(frame * units, (frame + 1) * units, *fixed)
+            record_units(frame * units, (frame + 1) * units, *recording)
         elif passes[at].kind == blurred_frames.DISC:
-            blurred_frames.blur_discs(at, at + 1, 1, shape, passes, blurs, levels)
+            blurred_frames.blur_discs(at, at + 1, *blurring)
         elif passes[at].kind == blurred_frames.BLEND:
-            blurred_frames.blend_discs(at, at + 1, 1, shape, passes, blurs, levels)
+            blurred_frames.blend_discs(at, at + 1, *blurring)
         elif passes[at].kind == blurred_frames.ALONG_ROWS:
-            blurred_frames.move_along_rows(at, at + 1, 1, shape, passes, blurs, levels)
+            blurred_frames.move_along_rows(at, at + 1, *blurring)
         elif passes[at].kind == blurred_frames.ALONG_PATH:
-            blurred_frames.move_along_paths(at, at + 1, 1, shape, passes, blurs, levels)
+            blurred_frames.move_along_paths(at, at + 1, *blurring)
         else:
-            blurred_frames.darken(at, at + 1, 1, shape, passes, blurs, levels)
+            blurred_frames.darken(at, at + 1, *blurring)
 
 
 @kernel()
-def deal_out(passes, scenes, lanes):  # type: ignore[no-untyped-def]
+def deal_out(passes, scenes, num_scenes, lanes):  # type: ignore[no-untyped-def]
     """Passes (J,), and behind them frames of `scenes` (B,), dealt out to lanes of the same cost.
 
     A scene is in one lane, with its passes before its frames.
@@ -463,28 +472,29 @@ def deal_out(passes, scenes, lanes):  # type: ignore[no-untyped-def]
         (J + B,) order of both; (lanes + 1,) where in it each lane begins and the last ends; and
         whether a disc is wide.
     """
-    owner, total = np.empty(len(passes) + len(scenes), np.int64), scenes.max() + 1
-    cost = np.zeros(total + len(scenes))
-    wide = False
-    for j in range(len(passes)):
-        owner[j], wide = passes[j].scene, wide or passes[j].kind == blurred_frames.WIDE
-        cost[owner[j]] += passes[j].cost
-    for k in range(len(scenes)):  # a frame without passes can be anywhere
-        one = owner[len(passes) + k] = scenes[k] if cost[scenes[k]] > 0.0 else total + k
-        cost[one] += RECORDING
-    lane, load = np.zeros(len(cost), np.int64), np.zeros(lanes)
-    costly_first = np.argsort(-cost, kind="mergesort")
-    for one in costly_first:
-        lane[one] = np.argmin(load)
-        load[lane[one]] += cost[one]
-    counts, begin = np.bincount(owner, minlength=len(cost)), np.empty(len(cost), np.int64)
-    ends, done = np.zeros(lanes + 1, np.int64), 0
-    for number in range(lanes):
-        for one in costly_first:
-            if lane[one] == number:
-                begin[one] = done
-                done += counts[one]
-        ends[number + 1] = done
+    owner = np.empty(len(passes) + len(scenes), np.int64)
+    cost, counts = np.zeros(num_scenes + len(scenes)), np.zeros(num_scenes + len(scenes), np.int64)
+    wide, total = False, 0.0
+    for unit in range(len(owner)):
+        k = unit - len(passes)
+        if k < 0:
+            one, more = passes[unit].scene, passes[unit].cost
+            wide = wide or passes[unit].kind == blurred_frames.WIDE
+        else:  # a frame without passes can be anywhere
+            one, more = scenes[k] if counts[scenes[k]] else num_scenes + k, RECORDING
+        owner[unit] = one
+        cost[one] += more
+        counts[one] += 1
+        total += more
+    begin, ends = np.empty(len(cost), np.int64), np.full(lanes + 1, len(owner))
+    done, spent, lane = 0, 0.0, 0
+    for one in range(len(cost)):
+        while spent * lanes >= total * lane:
+            ends[lane] = done
+            lane += 1
+        begin[one] = done
+        done += counts[one]
+        spent += cost[one]
     order = np.empty(len(owner), np.int64)
     for unit in range(len(owner)):
         order[begin[owner[unit]]] = unit

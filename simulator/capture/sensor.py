@@ -29,7 +29,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -51,10 +51,17 @@ from simulator.noise.generator import (
 from simulator.noise.noise_level_function import ReadNoise, plane_tensor
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
-from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges, prefetch
+from simulator.utils.compute import (
+    addresses,
+    as_pointer,
+    kernel,
+    load_alone,
+    parallel_ranges,
+    prefetch,
+)
 
 #: Blocks of a plane that one thread works on at a time, and samples that are worth a thread.
-_UNIT_BLOCKS, _WORTH_A_THREAD = 256, 4 * 64 * 64 * 4
+_UNIT_BLOCKS, _WORTH_A_THREAD, _CODES_WORTH_A_THREAD = 256, 4 * 64 * 64 * 4, 2**15
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
 #: Bit from which samples clipped high are counted: no unit has as many that are clipped low.
 _HIGH_BITS = 16
@@ -67,6 +74,8 @@ _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
 #: Outputs that are signals, and the least one that each shows.
 LEAST_SIGNALS = {"signals": -_LARGEST, "linear": np.float32(-PEDESTAL), "images": _ZERO}
 _LEAST = tuple(LEAST_SIGNALS.values())
+#: What `packed_tables` count as 1, and how their words are split.
+_WHOLE, _HALF_WORD, _LOW_HALF = 2.0**24 - 1.0, np.uint64(32), np.uint64(2**32 - 1)
 _KINDS = {"codes": np.uint8, "numbers": np.uint16} | dict.fromkeys(LEAST_SIGNALS, np.float32)
 _jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundscheck=False)
 
@@ -255,6 +264,7 @@ def record(
     read_noise: Sequence[ReadNoise] | None = None,
     row_gain: np.ndarray | None = None,
     count: bool = False,
+    means: CodeMeans | None = None,
     run: Callable[[int, tuple[Any, ...]], None] | None = None,
     **outputs: torch.Tensor | np.ndarray,
 ) -> np.ndarray | torch.Tensor:
@@ -268,6 +278,7 @@ def record(
         read_noise: Rows and tails of each frame's read noise, for the noise ``"sensor"``.
         row_gain: See `Transitions.in_bands`; None where all rows have the frame's light.
         count: Whether clipped samples are counted.
+        means: Of the output ``codes``, an array, to fill.
         run: Calls `record_units` for all frames, of which each has so many units, with these
             arguments, once their light is made; there is no light before, and nothing reads it.
         outputs: What to fill, each (B, 4, H, W) and contiguous: ``codes``, uint8, companded;
@@ -289,9 +300,11 @@ def record(
         kind: Noise = "exact" if noise == "sensor" else noise
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
         counts = record_stepwise(transitions, camera, keys, kind, tensors, read_noise, count=count)
+        if means is not None:
+            means.fill(tensors["codes"].numpy())
         return counts if transitions.needs_torch else counts.numpy()
     arrays = {name: np.asarray(out) for name, out in outputs.items()}
-    return _record_fused(transitions, camera, keys, noise, arrays, count, run)
+    return _record_fused(transitions, camera, keys, noise, arrays, count, means, run)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -391,6 +404,64 @@ def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tens
     return numbers.sub_(black).div_(span)
 
 
+# -- means over codes -------------------------------------------------------------------------
+
+
+class CodeMeans(NamedTuple):
+    """Means over the codes of B frames, which `record` fills in while a frame is in the cache."""
+
+    tables: np.ndarray  # (K, 4, 256) of `packed_tables`
+    which: np.ndarray  # (B,) the one of each frame
+    #: (B, 3) float64: share of the pixels with a plane at white, and means of both functions.
+    means: np.ndarray
+
+    @classmethod
+    def empty(cls, tables: np.ndarray, which: np.ndarray) -> CodeMeans:
+        """Those that are still to be filled."""
+        return cls(tables, which, np.empty((len(which), 3)))
+
+    def fill(self, codes: np.ndarray) -> None:
+        """Fills in those of codes (B, 4, ...) uint8."""
+        flat = codes.reshape(len(codes), 4, -1)
+        least = max(1, _CODES_WORTH_A_THREAD // flat[0].size)
+        parallel_ranges(lambda a, b: mean_codes(a, b, flat, *self), len(flat), least=least)
+
+
+_NO_MEANS = CodeMeans.empty(np.empty((0, 4, 256), np.uint64), np.empty(0, np.int64))
+
+
+def packed_tables(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(K, 4, 256) uint64 of two functions of a code, in [0, 1], the second in the lower half.
+
+    One sum serves both: with 24 bits each, the halves hold that of a block.
+    """
+    high, low = (np.rint(_WHOLE * np.float64(x)).astype(np.uint64) for x in (first, second))
+    return (high << _HALF_WORD) + low
+
+
+@kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
+def mean_codes(first, last, codes, tables, which, means):  # type: ignore[no-untyped-def]
+    """`CodeMeans` of the frames (B, 4, N) uint8 from the `first` to before the `last`."""
+    size = codes.shape[2]
+    for frame in range(first, last):
+        total_first, total_second, white = np.uint64(0), np.uint64(0), 0
+        for plane in range(4):
+            table = tables[which[frame], plane]
+            for start in range(0, size, BLOCK):
+                total = np.uint64(0)
+                for code in codes[frame, plane, start : start + BLOCK]:
+                    total += load_alone(table, code)  # type: ignore[call-arg]
+                total_first += total >> _HALF_WORD
+                total_second += total & _LOW_HALF
+        red, green, other, blue = codes[frame]
+        for i in range(size):
+            brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
+            white += brightest == 255
+        means[frame, 0] = white / size
+        means[frame, 1] = total_first / (_WHOLE * 4 * size)
+        means[frame, 2] = total_second / (_WHOLE * 4 * size)
+
+
 # -- the fused kernel -------------------------------------------------------------------------
 
 
@@ -488,9 +559,12 @@ def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-de
 
 @_jit()
 def record_units(  # type: ignore[no-untyped-def]
-    first, last, samples, light, remaining_variance, exposure, noise_source, sensor, outputs
+    first, last, samples, light, remaining_variance, exposure, noise_source, sensor, outputs, means
 ):
-    """Units `first` to `last` of a batch: pieces of the planes of frames, in this order."""
+    """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
+
+    Where there are `means` (of `CodeMeans`) to fill, frames are not divided.
+    """
     (keys, drawn, bank), (codes, numbers, signals, counts) = noise_source, outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
@@ -544,6 +618,8 @@ def record_units(  # type: ignore[no-untyped-def]
         if counts.size:
             counts[unit, 0] = (clipped & (_HIGH - 1)).sum()
             counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
+        if means[2].size and (unit + 1) % (4 * pieces) == 0:
+            mean_codes(frame, frame + 1, codes, *means)
 
 
 def is_compiled() -> bool:
@@ -559,6 +635,7 @@ def _record_fused(
     noise: Noise,
     given: Mapping[str, np.ndarray],
     count: bool,
+    means: CodeMeans | None,
     run: Callable[[int, tuple[Any, ...]], None] | None,
 ) -> np.ndarray:
     """`record` on the CPU."""
@@ -583,9 +660,18 @@ def _record_fused(
         camera.digits,
         (codes, numbers, tuple(signals), counts),
     )
+    # Means come with the frames where none of these is to be divided.
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
+    size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
+    whole = *fixed, tuple(_NO_MEANS if means is None or size == 1 else means)
     if run is None:
-        parallel_ranges(lambda first, last: record_units(first, last, *fixed), units, least=least)
+        parallel_ranges(
+            lambda first, last: record_units(first * size, last * size, *whole),
+            units // size,
+            least=max(1, least // size),
+        )
     else:
-        run(4 * pieces, fixed)
+        run(4 * pieces, whole)
+    if means is not None and size == 1:
+        means.fill(codes)
     return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)

@@ -69,7 +69,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     """Decorator of a function that numba compiles when first called, with options of `njit`."""
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-        given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
+        given: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        given |= options
         try:
             dispatcher: Callable[..., Any] = numba.njit(cache=True, **given)(function)
         except RuntimeError as error:

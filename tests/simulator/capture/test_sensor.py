@@ -304,10 +304,13 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind,
     lights = [random_light(4, 250, 265, seed=i) for i in range(3)]
     exposures = [Exposure(0.6 * (i + 1), ZERO, Z6.nlf(400 * 4**i)) for i in range(3)]
     keys, transitions = noise_keys(np.arange(3), 2), Transitions.of(lights, exposures)
+    functions, which = np.random.default_rng(0).random((2, 2, 4, 256)), np.array([1, 0, 1])
+    tables, planes = sensor.packed_tables(*functions), np.arange(4)[:, None, None]
     for threads in (1, 3):
         monkeypatch.setattr("torch.get_num_threads", lambda n=threads: n)
         codes, signals = np.empty((3, 4, 250, 265), np.uint8), torch.empty(3, 4, 250, 265)
-        outputs = {"codes": codes, "signals": signals, "count": True}
+        means = sensor.CodeMeans.empty(tables, which)
+        outputs = {"codes": codes, "signals": signals, "count": True, "means": means}
         counts = record(transitions, Z6, keys=keys, noise=kind, **outputs)
         for i, light in enumerate(lights):
             alone = torch.empty(1, *light.shape)
@@ -317,6 +320,9 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind,
             np.testing.assert_array_equal(codes[i], encode_observation(alone[0]))
             clipped = [(alone <= 2.0**-10).sum(), (alone >= 1.0 - 1e-6).sum()]
             assert counts[i].tolist() == [int(number) for number in clipped]
+            wanted = [function[which[i], planes, codes[i]].mean() for function in functions]
+            wanted = [(codes[i] == 255).any(axis=0).mean(), *wanted]
+            np.testing.assert_allclose(means.means[i], wanted, rtol=0, atol=1e-7)
     assert counts[1:, 1].min() > 10_000
 
 
