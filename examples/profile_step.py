@@ -27,10 +27,9 @@ from simulator.utils import compute
 STEPS, ROUNDS = 40, 9
 CALLERS = {
     "_plan": "plans of large batches",
-    "_photograph": "blur, exposure, noise, clip, codes",
+    "_photograph": "blur, frames, sums of codes",
     "blur": "sharpness of each capture",
-    "_record_fused": "exposure, noise, clip, codes",
-    "measured": "what codes add to the score",
+    "_record_fused": "frames, sums of codes",
 }
 
 

@@ -31,7 +31,7 @@ from simulator.capture.sensor import (
 from simulator.capture.statistics import BINS, LightStatistics
 from simulator.noise.generator import Noise, noise_keys
 from simulator.settings import CameraSettings
-from simulator.utils.compute import kernel, parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges, take_next
 
 #: What it costs to record a frame, in the unit of `simulator.capture.blurred_frames.PASS`.
 RECORDING = 100.0
@@ -290,14 +290,14 @@ class CaptureBatch:
         assert self._pending is not None
         (_, planned), self._pending = self._pending, None
         with self._forgetting(indices):
-            lanes = 8 * torch.get_num_threads()
-            order, ends, wide = deal_out(planned.passes, indices, self.num_scenes, lanes)
+            order, ends, wide = deal_out(planned.passes, indices, self.num_scenes)
             if wide:  # NumPy makes these
                 self._frames.run(planned)
-                order, ends = len(planned.passes) + np.arange(len(indices)), np.arange(lanes + 1)
-                ends = ends * len(indices) // lanes
-            given = order, units, (1, planned.shape, *planned[:3]), fixed
-            parallel_ranges(lambda a, b: photograph(ends[a], ends[b], *given), lanes)
+                order = len(planned.passes) + np.arange(len(indices))
+                ends = np.arange(len(indices) + 1)
+            given = order, ends, units, (1, planned.shape, *planned[:3]), fixed
+            counter = np.zeros(1, np.int64)
+            parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
 
     def prepared_scene(self, index: int) -> PreparedScene:
         """See `FrameSource`."""
@@ -438,43 +438,47 @@ class CaptureBatch:
 
 
 @kernel(fastmath={"contract"})
-def photograph(first, last, order, units, blurring, recording):  # type: ignore[no-untyped-def]
-    """Does `order` from `first` to `last`, of `deal_out`: passes, and `record_units` of frames.
+def photograph(counter, order, ends, units, blurring, recording):  # type: ignore[no-untyped-def]
+    """Does scenes of `order`, of `deal_out`: passes, and `record_units` of frames.
 
-    A frame has so many `units`. What follows are the other arguments of the blur tasks
-    (`BlurredFrames.tasks`) and of `record_units`. One frame comes after the other, and its light
-    stays in the cache.
+    Threads that share a `counter` share the scenes. A frame has so many `units`. What follows are
+    the other arguments of the blur tasks (`BlurredFrames`) and of `record_units`. One frame comes
+    after the other, and its light stays in the cache.
     """
     passes = blurring[2]
-    for at in order[first:last]:
-        if at >= len(passes):
-            frame = at - len(passes)
-            record_units(frame * units, (frame + 1) * units, *recording)
-        elif passes[at].kind == blurred_frames.DISC:
-            blurred_frames.blur_discs(at, at + 1, *blurring)
-        elif passes[at].kind == blurred_frames.BLEND:
-            blurred_frames.blend_discs(at, at + 1, *blurring)
-        elif passes[at].kind == blurred_frames.ALONG_ROWS:
-            blurred_frames.move_along_rows(at, at + 1, *blurring)
-        elif passes[at].kind == blurred_frames.ALONG_PATH:
-            blurred_frames.move_along_paths(at, at + 1, *blurring)
-        else:
-            blurred_frames.darken(at, at + 1, *blurring)
+    while True:
+        one = take_next(counter)  # type: ignore[call-arg, var-annotated]
+        if one >= len(ends) - 1:
+            return
+        for at in order[ends[one] : ends[one + 1]]:
+            if at >= len(passes):
+                frame = at - len(passes)
+                record_units(frame * units, (frame + 1) * units, *recording)
+            elif passes[at].kind == blurred_frames.DISC:
+                blurred_frames.blur_discs(at, at + 1, *blurring)
+            elif passes[at].kind == blurred_frames.BLEND:
+                blurred_frames.blend_discs(at, at + 1, *blurring)
+            elif passes[at].kind == blurred_frames.ALONG_ROWS:
+                blurred_frames.move_along_rows(at, at + 1, *blurring)
+            elif passes[at].kind == blurred_frames.ALONG_PATH:
+                blurred_frames.move_along_paths(at, at + 1, *blurring)
+            else:
+                blurred_frames.darken(at, at + 1, *blurring)
 
 
 @kernel()
-def deal_out(passes, scenes, num_scenes, lanes):  # type: ignore[no-untyped-def]
-    """Passes (J,), and behind them frames of `scenes` (B,), dealt out to lanes of the same cost.
+def deal_out(passes, scenes, num_scenes):  # type: ignore[no-untyped-def]
+    """Passes (J,), and behind them frames of `scenes` (B,), scene by scene, the costly ones first.
 
-    A scene is in one lane, with its passes before its frames.
+    The passes of a scene come before its frames.
 
     Returns:
-        (J + B,) order of both; (lanes + 1,) where in it each lane begins and the last ends; and
+        (J + B,) order of both; (N + 1,) where in it each scene begins and the last ends; and
         whether a disc is wide.
     """
-    owner = np.empty(len(passes) + len(scenes), np.int64)
-    cost, counts = np.zeros(num_scenes + len(scenes)), np.zeros(num_scenes + len(scenes), np.int64)
-    wide, total = False, 0.0
+    owner, total = np.empty(len(passes) + len(scenes), np.int64), num_scenes + len(scenes)
+    cost, counts = np.zeros(total), np.zeros(total, np.int64)
+    wide, number, spent = False, 0, 0.0
     for unit in range(len(owner)):
         k = unit - len(passes)
         if k < 0:
@@ -483,18 +487,19 @@ def deal_out(passes, scenes, num_scenes, lanes):  # type: ignore[no-untyped-def]
         else:  # a frame without passes can be anywhere
             one, more = scenes[k] if counts[scenes[k]] else num_scenes + k, RECORDING
         owner[unit] = one
-        cost[one] += more
+        number += counts[one] == 0
         counts[one] += 1
-        total += more
-    begin, ends = np.empty(len(cost), np.int64), np.full(lanes + 1, len(owner))
-    done, spent, lane = 0, 0.0, 0
-    for one in range(len(cost)):
-        while spent * lanes >= total * lane:
-            ends[lane] = done
-            lane += 1
-        begin[one] = done
-        done += counts[one]
-        spent += cost[one]
+        cost[one] += more
+        spent += more
+    begin, ends, done = np.empty(total, np.int64), np.zeros(number + 1, np.int64), 0
+    number = 0
+    for cheap in range(2):
+        for one in range(total):
+            if counts[one] and cheap == (cost[one] * len(ends) < spent):
+                begin[one] = done
+                done += counts[one]
+                number += 1
+                ends[number] = done
     order = np.empty(len(owner), np.int64)
     for unit in range(len(owner)):
         order[begin[owner[unit]]] = unit

@@ -204,6 +204,17 @@ def load_alone(typing, words, index):  # type: ignore[no-untyped-def]
     return types.uint64(words, types.intp), generate
 
 
+@numba.extending.intrinsic
+def take_next(typing, counter):  # type: ignore[no-untyped-def]
+    """Counts ``counter[0]`` of int64 up, inside a kernel: what it was, to one thread alone."""
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(counter)(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(counter), generate
+
+
 #: Samples that `add_shifts` adds to.
 LANES = 64
 
