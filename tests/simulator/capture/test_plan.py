@@ -98,12 +98,6 @@ def test_reasons(changes: dict, settings: CameraSettings, left_out: str | None, 
     assert word in (plan.details() if left_out is None else plan.left_out[left_out])
 
 
-def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
-    with_module, without = prepared().plan(CLEANER), prepared(networks=False).plan(CLEANER)
-    assert with_module.excess_noise == 0.0
-    assert without.excess_noise > 1.0
-
-
 def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Per sample: 2 + 4 + 2 (1 + 3^2) + 6 + 14 + 6, for a disc of 3.5 pixel; and the network's."""
     monkeypatch.setattr(plan_module, "seconds_per_operation", lambda: 1e-9)
