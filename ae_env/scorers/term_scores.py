@@ -224,15 +224,14 @@ class TermScores:
             if key not in tables:
                 tables[key] = self._tabulated(key, table[i, 1:3], shares[which[i]])
         _, height, width = transitions.shape
-        rows = np.ones((len(table), 1)) if row_gain is None else row_gain
+        rows = np.ones((len(table), height)) if row_gain is None else row_gain
         if isinstance(light, torch.Tensor):
             place = {key: number for number, key in enumerate(tables)}
             own = light, table[:, 0], rows, [*tables.values()], [place[key] for key in keys]
             return _expected_by_torch(*own)
         fixed = (
             addresses(light),
-            1 if row_gain is None else height,
-            height * width if row_gain is None else width,
+            *transitions.shape[1:],
             table[:, 0].astype(np.float32),
             rows.astype(np.float32),
             self._size,
@@ -400,8 +399,7 @@ def expect_means(  # type: ignore[no-untyped-def]
     """Expected means (B, 3) of the frames from the `first` to before the `last`.
 
     `light` has addresses (B,) of (4, R, C) float32, which `ratio` (B, 4) and `row_gain` (B, R)
-    multiply; R is 1 where all rows have the same gain. `tables` has those of (4, 3, G) float32 of
-    `expect_codes`, G the `grid`.
+    multiply. `tables` has those of (4, 3, G) float32 of `expect_codes`, G the `grid`.
     """
     kept, shares = np.empty((2, _BLOCK), np.float32)
     places = np.empty(_BLOCK, np.int32)
@@ -411,10 +409,14 @@ def expect_means(  # type: ignore[no-untyped-def]
         signal = numba.carray(pointer, (4, size))
         own = numba.carray(as_pointer(tables[frame]), (4, 3, grid))
         blown = blocked = clean = 0.0
-        for row in range(rows):
+        bands = False
+        for gain in row_gain[frame]:
+            bands |= gain != row_gain[frame, 0]
+        length = columns if bands else size  # a frame without any is summed as alone
+        for row in range(size // length):
             gain = row_gain[frame, row]
-            for start in range(row * columns, (row + 1) * columns, _BLOCK):
-                end = min(start + _BLOCK, (row + 1) * columns)
+            for start in range(row * length, (row + 1) * length, _BLOCK):
+                end = min(start + _BLOCK, (row + 1) * length)
                 number = end - start
                 kept[:number] = _ONE
                 for plane in range(4):

@@ -288,13 +288,13 @@ class CaptureBatch:
     def _photograph(self, indices: np.ndarray, units: int, fixed: tuple[Any, ...]) -> None:
         """Makes the light that is planned, and records frames of `indices` (B,)."""
         assert self._pending is not None
-        (_, planned), self._pending = self._pending, None
+        (count, planned), self._pending = self._pending, None
         with self._forgetting(indices):
-            order, ends, wide = deal_out(planned.passes, indices, self.num_scenes)
-            if wide:  # NumPy makes these
+            order = np.empty(len(planned.passes) + count, np.int64)
+            ends = np.zeros(count + 1, np.int64)
+            if deal_out(planned.passes, indices, self.num_scenes, order, ends):  # NumPy makes some
                 self._frames.run(planned)
-                order = len(planned.passes) + np.arange(len(indices))
-                ends = np.arange(len(indices) + 1)
+                order, ends = len(planned.passes) + np.arange(count), np.arange(count + 1)
             given = order, ends, units, (1, planned.shape, *planned[:3]), fixed
             counter = np.zeros(1, np.int64)
             parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
@@ -467,19 +467,16 @@ def photograph(counter, order, ends, units, blurring, recording):  # type: ignor
 
 
 @kernel()
-def deal_out(passes, scenes, num_scenes):  # type: ignore[no-untyped-def]
-    """Passes (J,), and behind them frames of `scenes` (B,), scene by scene, the costly ones first.
+def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untyped-def]
+    """Puts passes (J,), and behind them frames of `scenes` (B,), in `order`; whether one is wide.
 
-    The passes of a scene come before its frames.
-
-    Returns:
-        (J + B,) order of both; (N + 1,) where in it each scene begins and the last ends; and
-        whether a disc is wide.
+    They come scene by scene, the costly ones first, the passes of a scene before its frames. `ends`
+    (B + 1,), zeros, get where each scene begins and the last ends; the length where there are less.
     """
-    owner, total = np.empty(len(passes) + len(scenes), np.int64), num_scenes + len(scenes)
+    owner, total = np.empty(len(order), np.int64), num_scenes + len(scenes)
     cost, counts = np.zeros(total), np.zeros(total, np.int64)
-    wide, number, spent = False, 0, 0.0
-    for unit in range(len(owner)):
+    wide, spent = False, 0.0
+    for unit in range(len(order)):
         k = unit - len(passes)
         if k < 0:
             one, more = passes[unit].scene, passes[unit].cost
@@ -487,24 +484,22 @@ def deal_out(passes, scenes, num_scenes):  # type: ignore[no-untyped-def]
         else:  # a frame without passes can be anywhere
             one, more = scenes[k] if counts[scenes[k]] else num_scenes + k, RECORDING
         owner[unit] = one
-        number += counts[one] == 0
         counts[one] += 1
         cost[one] += more
         spent += more
-    begin, ends, done = np.empty(total, np.int64), np.zeros(number + 1, np.int64), 0
-    number = 0
+    begin, done, number = np.empty(total, np.int64), 0, 0
     for cheap in range(2):
         for one in range(total):
-            if counts[one] and cheap == (cost[one] * len(ends) < spent):
+            if counts[one] and cheap == (cost[one] * len(scenes) < spent):
                 begin[one] = done
                 done += counts[one]
                 number += 1
                 ends[number] = done
-    order = np.empty(len(owner), np.int64)
-    for unit in range(len(owner)):
+    ends[number + 1 :] = done
+    for unit in range(len(order)):
         order[begin[owner[unit]]] = unit
         begin[owner[unit]] += 1
-    return order, ends, wide
+    return wide
 
 
 @kernel()

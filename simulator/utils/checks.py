@@ -26,8 +26,10 @@ def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: fl
     >>> did_you_mean("scorrer", ["scenes", "scorer"])
     "; did you mean 'scorer'?"
     """
-    near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=cutoff)
-    return f"; did you mean {mark}{near[0]}{mark}?" if near else ""
+    asked, names = str(name).lower(), {one.lower(): one for one in known}
+    near = [one for one in names if len(asked) > 2 and one.startswith(asked)]
+    near = near or difflib.get_close_matches(asked, names, n=1, cutoff=cutoff)
+    return f"; did you mean {mark}{names[near[0]]}{mark}?" if near else ""
 
 
 def import_extra(name: str, extra: str, what: str) -> Any:

@@ -131,8 +131,9 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
         if function.__module__.partition(".")[0] in _PACKAGES:
             if not self.warned and multiprocessing.parent_process() is None:  # children are many
                 self.warned = True
-                cache = getattr(event.data["dispatcher"], "_cache", None)
-                logger.log(NOTE, _KEPT if hasattr(cache, "_cache_file") else _NOT_KEPT)
+                kept = hasattr(getattr(event.data["dispatcher"], "_cache", None), "_cache_file")
+                level = NOTE if logger.hasHandlers() else logging.WARNING  # Python shows these
+                logger.log(level, _KEPT if kept else _NOT_KEPT)
             logger.info("compiling %s.%s", function.__module__, function.__name__)
             if self.depth == 1:
                 bar = progress_bar("compiling the simulator", _FIRST_KERNELS, done=self.compiled)

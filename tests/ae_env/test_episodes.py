@@ -128,8 +128,7 @@ def test_expected_rewards_are_those_of_the_running_episodes(arguments):
         info = envs.step(rng.integers(64, size=8))[4]
         for i in range(8):
             episode = core.episode(i)
-            scene = core.scenes[episode.scene]
-            wanted = core.task.tables.table(scene, **episode.moves)
+            wanted = core.task.tables.table(core.scenes[episode.scene], **episode.moves)
             for name, scores in wanted.parts.items():
                 assert info[f"rewards.{name}"][i] == pytest.approx(scores[episode.state], abs=1e-12)
             assert info["rewards.score"][i] == pytest.approx(wanted.mean[episode.state], abs=1e-12)
@@ -241,13 +240,14 @@ RICH = {"with_oracle": True, "observation": "linear", "lighting": "sine", "delay
 RICH["costs"] = {"flicker": 0.1, "switch": 0.1}
 BANDED = {"with_oracle": True, "scorer": {"balanced": 0.7, "banding": 0.3}, "delay": 2}
 BANDED["lighting"] = {"kind": "flicker", "frequency": 500, "duty": 0.2}
+EXPECTED = {"with_subject": True, "reward": "expected", "lighting": "flicker"}
 
 
 @pytest.mark.parametrize(
     ("mode", "extra"),
     [
         *((mode.name, RICH) for mode in AutoresetMode),
-        *(("SAME_STEP", extra) for extra in (BANDED, {"noise": "exact"}, {"with_subject": True})),
+        *(("SAME_STEP", extra) for extra in (BANDED, {"noise": "exact"}, EXPECTED)),
     ],
 )
 def test_parity_with_sync_vector_env(mode, extra):
