@@ -98,7 +98,7 @@ def prepared_of(source: Source, device: torch.device) -> PreparedScene:
             reference=source.settings,
             camera=camera,
             nlf=noise,
-            saturated=marks.to(device) if marks.count_nonzero() else None,
+            saturated=marks.to(device) if marks.cpu().numpy().any() else None,
             white_balance=source.white_balance,
             box_factor=source.box_factor,
             blurred_light=BlurredLight(light, noise, None),  # the raw was checked
