@@ -224,7 +224,7 @@ class TermScores:
             if key not in tables:
                 tables[key] = self._tabulated(key, table[i, 1:3], shares[which[i]])
         _, height, width = transitions.shape
-        rows = np.ones((len(table), height)) if row_gain is None else row_gain
+        rows = np.ones((len(table), 1)) if row_gain is None else row_gain
         if isinstance(light, torch.Tensor):
             place = {key: number for number, key in enumerate(tables)}
             own = light, table[:, 0], rows, [*tables.values()], [place[key] for key in keys]
@@ -398,8 +398,8 @@ def expect_means(  # type: ignore[no-untyped-def]
 ):
     """Expected means (B, 3) of the frames from the `first` to before the `last`.
 
-    `light` has addresses (B,) of (4, R, C) float32, which `ratio` (B, 4) and `row_gain` (B, R)
-    multiply. `tables` has those of (4, 3, G) float32 of `expect_codes`, G the `grid`.
+    `light` has addresses (B,) of (4, R, C) float32, which `ratio` (B, 4) and `row_gain` (B, R),
+    or (B, 1), multiply. `tables` has those of (4, 3, G) float32 of `expect_codes`, G the `grid`.
     """
     kept, shares = np.empty((2, _BLOCK), np.float32)
     places = np.empty(_BLOCK, np.int32)
