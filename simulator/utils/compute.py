@@ -104,16 +104,24 @@ def _adapt_cache(dispatcher: Any, module: Path) -> None:
 @functools.cache
 def _checksum(module: Path) -> int:
     """Checksum of `module` and of every module of this project that it imports, at any depth."""
-    pending, texts = [module], dict[Path, str]()
+    pending, found = [module], dict[Path, int]()
     while pending:
         path = pending.pop()
-        if path not in texts and path.is_file():
-            texts[path] = path.read_text(encoding="utf-8")
-            for name, imported in _IMPORTS.findall(texts[path]):
-                folder = _ROOT.joinpath(*name.split("."))  # a package, or a module without ".py"
-                modules = (folder / part for part in re.findall(r"\w+", imported))
-                pending += [path.with_suffix(".py") for path in (folder, *modules)]
-    return zlib.crc32("".join(texts[path] for path in sorted(texts)).encode())
+        if path not in found:
+            found[path], imported = _read(path)
+            pending += imported
+    return zlib.crc32(str([found[path] for path in sorted(found)]).encode())
+
+
+@functools.cache
+def _read(module: Path) -> tuple[int, list[Path]]:
+    """Checksum of `module` alone, and the modules of this project that it imports."""
+    text, modules = module.read_text(encoding="utf-8"), list[Path]()
+    for name, imported in _IMPORTS.findall(text):
+        folder = _ROOT.joinpath(*name.split("."))  # a package, or a module without ".py"
+        parts = (folder, *(folder / part for part in re.findall(r"\w+", imported)))
+        modules += [path for part in parts if (path := part.with_suffix(".py")).is_file()]
+    return zlib.crc32(text.encode()), modules
 
 
 class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]

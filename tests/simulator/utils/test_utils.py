@@ -439,6 +439,7 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
         for name, text in texts.items():
             (tmp_path / name).parent.mkdir(exist_ok=True)
             (tmp_path / name).write_text(text + " # changed" * (name == change))
+        jit._read.cache_clear()
         checksums.append(jit._checksum.__wrapped__(tmp_path / "ae_env/kernels.py"))
     assert checksums[-1] == checksums[0]
     assert len(set(checksums)) == 4
