@@ -308,8 +308,6 @@ class PreparedScene:
         """Memory for `count` frames, `out` if that fits."""
         wanted = self.light.expand(count, *self.light.shape)
         if out is None:
-            if count > 1 and wanted.is_cpu:  # large pages, a fifth of a large sweep: `new_frame`
-                return torch.from_numpy(np.empty(wanted.shape, np.float32))
             return new_frame(wanted)
         fits = isinstance(out, torch.Tensor) and out.shape == wanted.shape
         fits = fits and (out.dtype, out.device) == (torch.float32, wanted.device)

@@ -112,8 +112,7 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
     if mosaic.ndim != 2 or min(mosaic.shape) < 2:
         raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
     height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
-    packed = torch.empty(4, height, width, dtype=torch.float32)  # see `new_frame`
-    planes = packed.numpy()
+    planes = np.empty((4, height, width), np.float32)
 
     # One kernel for what files hold, and one for all else.
     dtype = np.uint16 if mosaic.dtype == np.uint16 else np.float64
@@ -126,7 +125,7 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
             pack_rows(np.ascontiguousarray(rows, dtype), tile, black, span, top, planes)
 
     parallel_ranges(pack, height, least=_SHARE)
-    return packed
+    return torch.from_numpy(planes)
 
 
 def unpack_mosaic(
@@ -160,9 +159,11 @@ def _tile(camera: CameraProfile) -> np.ndarray:
 def new_frame(like: torch.Tensor) -> torch.Tensor:
     """Uninitialised float32 memory for a frame of the shape of `like`.
 
-    Torch's, as NumPy's has huge pages: where a virtual machine's host has not given these yet, the
-    first write takes ten times as long, else half.
+    On the CPU NumPy's, which asks for huge pages: to write to it first takes a quarter of the time
+    that torch's takes, but longer where a virtual machine's host still has to give them.
     """
+    if like.is_cpu:
+        return torch.from_numpy(np.empty(like.shape, np.float32))
     return torch.empty(like.shape, dtype=torch.float32, device=like.device)
 
 
