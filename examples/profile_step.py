@@ -7,7 +7,7 @@ interpreter's, on one thread whatever there are. A step on n threads takes at le
 n-th of the sections. The fused kernel of `ae-env bench throughput` runs in turns with the steps.
 
 Then steps on one thread and on two take turns. With `cached`, so do steps, the benchmark's torch
-scorer on frames of its own (`LiveScore`), and steps with that scorer.
+scorer on recorded frames (`LiveScore`), and steps with that scorer.
 """
 
 import gc
@@ -21,7 +21,7 @@ import torch
 
 import ae_env  # noqa: F401  (registers the environments)
 from benchmarks.throughput.kernel_limit import KernelLimit
-from benchmarks.throughput.steps import LiveScore
+from benchmarks.throughput.steps import LiveScore, recorded
 from simulator.utils import compute
 
 STEPS, ROUNDS = 40, 9
@@ -119,7 +119,7 @@ def main(size=64, num_envs=64, *, cached=False):
         options |= {"scorer": f"{LiveScore.__module__}:{LiveScore.__name__}"}
         scored = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **options)
         scored.reset(seed=0)
-        images, scorer = torch.rand(num_envs, 4, size, size), LiveScore()
+        images, scorer = recorded(num_envs, resolution=size), LiveScore()
         alone, live, both = in_turns(step, lambda: scorer(images, None), lambda: step(scored)).T
         print(f"{'in turns: step, then torch scorer':34} {scale * np.median(alone + live):7.1f}")
         print(f"{'step with torch scorer':34} {scale * np.median(both):7.1f}", end="")

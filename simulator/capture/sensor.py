@@ -66,9 +66,7 @@ _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.f
 #: Bit from which samples clipped high are counted: no unit has as many that are clipped low.
 _HIGH_BITS = 16
 _NEITHER, _LOW, _HIGH = np.int32(0), np.int32(1), np.int32(1 << _HIGH_BITS)
-#: How the noise is made: not at all, from the bank, or drawn.
-_OFF, _BANK, _DRAWN = 0, 1, 2
-_NO_BANK = np.empty(0, np.float32)
+_NO_KEYS, _NO_BANK = np.empty(0, np.uint64), np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
 _LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
 #: Outputs that are signals, and the least one that each shows.
@@ -559,13 +557,14 @@ def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-de
 
 @_jit()
 def record_units(  # type: ignore[no-untyped-def]
-    first, last, samples, light, remaining_variance, exposure, noise_source, sensor, outputs, means
+    first, last, samples, light, remaining_variance, exposure, noise, sensor, outputs, means, drawn
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
 
+    Of `noise` there are keys and the bank; where it is not `drawn` (None), that is not compiled.
     Where there are `means` (of `CodeMeans`) to fill, frames are not divided.
     """
-    (keys, drawn, bank), (codes, numbers, signals, counts) = noise_source, outputs
+    (keys, bank), (codes, numbers, signals, counts) = noise, outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
@@ -588,15 +587,15 @@ def record_units(  # type: ignore[no-untyped-def]
             start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
             exposed, normals, sign = frame_light[at : at + size], made, _ONE
-            if drawn == _BANK:
+            if drawn is not None:
+                draw_block(keys[frame], number, words, made)
+            elif keys.size:
                 offset, sign = bank_block(keys[frame], number)
                 normals = bank[offset : offset + BLOCK]
                 coming = bank_block(keys[frame], number + 1)[0]
                 for line in range(coming, coming + BLOCK, STRIDE):
                     prefetch(bank, line)
-            elif drawn == _DRAWN:
-                draw_block(keys[frame], number, words, made)
-            if drawn == _OFF:
+            if not keys.size:
                 _digitise(size, exposed, bound, ratio, body, part)
             elif shares:
                 noise, left = (shot, read, source_shot, source_read), share[start:end]
@@ -645,8 +644,7 @@ def _record_fused(
     pieces = -(-blocks // _UNIT_BLOCKS)
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
-    drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
-    keys = np.zeros(frames, np.uint64) if keys is None else keys
+    drawn = None if keys is None or noise == "bank" else True
     codes, numbers, *signals = (
         given[name].reshape(frames, 4, samples) if name in given else np.empty((0, 4, 0), dtype)
         for name, dtype in _KINDS.items()
@@ -656,14 +654,14 @@ def _record_fused(
         addresses(light),
         np.zeros(frames, np.uintp) if remaining is None else addresses(remaining),
         transitions.table,
-        (keys, drawn, noise_bank() if drawn == _BANK else _NO_BANK),
+        (_NO_KEYS, _NO_BANK) if keys is None else (keys, _NO_BANK if drawn else noise_bank()),
         camera.digits,
         (codes, numbers, tuple(signals), counts),
     )
     # Means come with the frames where none of these is to be divided.
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
-    whole = *fixed, tuple(_NO_MEANS if means is None or size == 1 else means)
+    whole = *fixed, tuple(_NO_MEANS if means is None or size == 1 else means), drawn
     if run is None:
         parallel_ranges(
             lambda first, last: record_units(first * size, last * size, *whole),
