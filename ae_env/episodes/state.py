@@ -324,30 +324,31 @@ class Episodes:
         seed = self.noise_seed[env_index : env_index + 1]
         return random_lens(int(noise_keys(seed, 0.5)[0] % RANDOM_LENSES))
 
-    def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure [s] in an episode's current frame, relative to its scene's own.
-
-        And (R,) that of each row relative to the frame's, or None (`Lighting.rows`).
-        """
-        frame, phase = self.frame.item(env_index), self.phase.item(env_index)
-        if not self.lighting.within_frame:
-            return self.lighting.gain(frame, exposure_time, phase), None
-        rows_per_row = 2 * self.scenes[self.scene[env_index]].box_factor
-        shutter = RollingShutter(self.options.resolution, self.camera.row_time, rows_per_row)
-        return self.lighting.rows(frame, exposure_time, phase, shutter)
-
     def gains(
         self, env_indices: np.ndarray, exposure_times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """`gain` of one exposure of each of `env_indices` (B,): (B,), and (B, R) or None."""
-        pairs = zip(env_indices.tolist(), exposure_times.tolist(), strict=True)
-        return _stacked([self.gain(env_index, time) for env_index, time in pairs])
+        """Light of exposures (B,) [s] in current frames, relative to that of the frames' scenes.
+
+        And (B, R) that of each row relative to the frame's, or None (`Lighting.rows`).
+        """
+        columns = self.frame[env_indices], exposure_times, self.phase[env_indices]
+        if not self.lighting.within_frame:
+            each = zip(*(values.tolist() for values in columns), strict=True)
+            return np.array([self.lighting.gain(*one) for one in each]), None
+        gains = np.empty(len(env_indices))
+        rows = np.empty((len(env_indices), self.options.resolution))
+        factors = self.box_factor[self.scene[env_indices]]
+        for factor in np.unique(factors):
+            own = np.flatnonzero(factors == factor)
+            shutter = RollingShutter(rows.shape[1], self.camera.row_time, 2 * int(factor))
+            gains[own], rows[own] = self.lighting.batch(*(v[own] for v in columns), shutter)
+        return gains, rows if (rows != 1.0).any() else None
 
     def gains_by_state(self, env_index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """`gains` (S,) and (S, R) of all states in one environment."""
-        times = [state.exposure_time for state in self.grid]
-        known = {time: self.gain(env_index, time) for time in set(times)}
-        return _stacked([known[time] for time in times])
+        times, states = np.unique([s.exposure_time for s in self.grid], return_inverse=True)
+        gains, rows = self.gains(np.full(len(times), env_index), times)
+        return gains[states], None if rows is None else rows[states]
 
 
 def check_options(options: Any, *more: str) -> dict[str, Any]:
@@ -365,14 +366,3 @@ def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
     if option == "random":
         return drawn
     return np.full(len(drawn), 0.0 if isinstance(option, str) else float(option))
-
-
-def _stacked(
-    lights: Sequence[tuple[float, np.ndarray | None]],
-) -> tuple[np.ndarray, np.ndarray | None]:
-    gains = np.array([gain for gain, _ in lights])
-    shown = [rows for _, rows in lights if rows is not None]
-    if not shown:
-        return gains, None
-    alike = np.ones_like(shown[0])
-    return gains, np.stack([alike if rows is None else rows for _, rows in lights])

@@ -1,6 +1,7 @@
 """`Lighting`, `make_lighting`, which finds one, and the changes that follow a rule or a list."""
 
 import csv
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -112,6 +113,20 @@ class Lighting:
         where all rows have the same.
         """
         return self.gain(frame, exposure_time, phase), None
+
+    def batch(
+        self,
+        frames: np.ndarray,
+        exposure_times: np.ndarray,
+        phases: np.ndarray,
+        shutter: RollingShutter,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`rows` of B frames: (B,), and (B, rows), where 1 stands for None."""
+        columns = (values.tolist() for values in (frames, exposure_times, phases))
+        found = [self.rows(*each, shutter) for each in zip(*columns, strict=True)]
+        alike = np.ones(shutter.rows)
+        gains = np.array([gain for gain, _ in found])
+        return gains, np.stack([alike if rows is None else rows for _, rows in found])
 
 
 KINDS[Lighting.name] = Lighting
@@ -314,32 +329,41 @@ class FlickerLighting(Lighting):
     #: of the lamp.
     frame_rate: float = 30.0
 
-    def lamp(self, phase: float) -> Lamp:
-        """The part of the light that flickers, at a `phase` as of `gain`."""
+    @functools.cached_property
+    def _lamp(self) -> Lamp:
+        """The part of the light that flickers, of an episode with the phase 0."""
         if self.duty is None:
-            return MainsLamp(frequency=self.frequency, phase=phase)
-        return PulsedLamp(frequency=self.frequency, duty=self.duty, phase=phase)
+            return MainsLamp(frequency=self.frequency)
+        return PulsedLamp(frequency=self.frequency, duty=self.duty)
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`: `exposure_time` begins with `frame`; `phase` shifts the lamp."""
-        light = self.lamp(phase).mean_light(self._start(frame), exposure_time)
+        light = self._lamp.mean_light(self._start(frame), exposure_time, phase)
         return float(self._with_steady_light(light))
 
     def rows(
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
         """See `Lighting.rows`: `frame`, `exposure_time`, `phase`, `shutter`."""
-        light = self.lamp(phase).row_light(
-            self._start(frame), exposure_time, shutter.rows, shutter.row_time, shutter.sensor_rows
-        )
-        light = self._with_steady_light(light)
-        mean = float(light.mean())
-        if np.ptp(light) <= 8.0 * _RESOLUTION:
-            return float(light[0]), None
-        return mean, light / mean
+        (gain,), (rows,) = self.batch(*np.array([[frame], [exposure_time], [phase]]), shutter)
+        return float(gain), rows if np.ptp(rows) else None
 
-    def _start(self, frame: int) -> float:
-        return math.fmod(frame / self.frame_rate, _CLOCK)
+    def batch(
+        self,
+        frames: np.ndarray,
+        exposure_times: np.ndarray,
+        phases: np.ndarray,
+        shutter: RollingShutter,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Lighting.batch`."""
+        given = self._start(frames), exposure_times, *shutter, phases
+        light = self._with_steady_light(self._lamp.row_light(*given))
+        alike = np.ptp(light, axis=1) <= 8.0 * _RESOLUTION
+        gains = np.where(alike, light[:, 0], light.mean(axis=1))
+        return gains, np.where(alike[:, None], 1.0, light / gains[:, None])
+
+    def _start(self, frames: Any) -> Any:
+        return np.fmod(frames / self.frame_rate, _CLOCK)
 
     def _with_steady_light(self, light: np.ndarray) -> np.ndarray:
         depth = self.depth

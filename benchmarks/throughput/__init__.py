@@ -14,26 +14,23 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from benchmarks.harness import Part, Report, Row, benchmark, pivot, sections, table
-from benchmarks.isolated import CORES
 from benchmarks.throughput import frames
 from benchmarks.throughput.steps import measure_cold_start, measure_resets, measure_steps
 from benchmarks.throughput.sweeps import sweep_parts
 
-#: Threads and frame sizes of the steps; the first is drawn.
-STEPS = ((CORES, 64), (CORES, 128), (1, 64), (1, 128))
+#: Frame sizes of the steps; the first is drawn.
+SIZES = (64, 128)
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    found = []
-    for n, size in list(dict.fromkeys(STEPS))[: 1 if quick else None]:
-        arguments = {"threads": n, "size": size}
-        found.append(Part(f"steps {n} {size}", measure_steps, arguments, threads=n))
+    sizes = SIZES[:1] if quick else SIZES
+    found = [Part(f"steps {size}", measure_steps, {"size": size}) for size in sizes]
     found += [Part("resets", measure_resets, threads=1), Part("cold start", measure_cold_start)]
     return [*found, *sweep_parts(quick), *frames.growth_parts(quick), *frames.frame_parts(quick)]
 
 
 _STEPS = """case = {case} | envs = {num_envs} | steps/s = {steps_per_second:,.0f} |
-of kernel = {ratio_to_kernel:.2f} | spread = {spread:.0%}"""
+of kernel = {ratio_to_kernel:.2f} | of one thread = {of_one_thread:.2f} | spread = {spread:.0%}"""
 _RESETS = """case = {case} | envs = {num_envs} | reset [ms] = {reset_ms:.2f} |
 step [ms] = {step_ms:.2f} | reset in steps = {ratio:.2f} | of the means = {ratio_of_means:.2f} |
 spread = {spread:.0%}"""

@@ -7,10 +7,13 @@ nothing else at hand draws them as fast (torch's generator takes three times as 
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numba
 import numpy as np
+import torch
 
+from benchmarks.isolated import CORES
 from simulator.noise.generator import draw_block
 
 _F = np.float32
@@ -63,36 +66,35 @@ def _loop(  # type: ignore[no-untyped-def]
 
 
 class KernelLimit:
-    """The bare loop over a batch of frames, shared out among threads.
+    """The bare loop over a batch of frames, shared out among as many threads as torch uses.
 
     Frames of a step are exposed from `lights` (S, 4, H, W), drawn at random. With the noise
     ``"bank"`` normals are read from a table, with ``"exact"`` new ones are drawn.
     """
 
-    def __init__(
-        self, lights: np.ndarray, num_frames: int, *, noise: str, threads: int, seed: int
-    ) -> None:
+    def __init__(self, lights: np.ndarray, num_frames: int, *, noise: str, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         self._lights = np.ascontiguousarray(lights.reshape(*lights.shape[:2], -1))
         self._exact = noise == "exact"
         self._out = np.empty((num_frames, *lights.shape[1:]), np.uint8)
         self._flat = self._out.reshape(num_frames, 4, -1)
         self._bank = self._rng.standard_normal(_BANK, dtype=_F)
-        self._states = [np.uint64(seed + i + 1) for i in range(threads)]
+        self._states = [np.uint64(seed + i + 1) for i in range(CORES)]
         # Variances of the order of those of a camera at ISO 400.
         self._shot, self._read = np.full(4, 1e-4, _F), np.full(4, 1e-6, _F)
-        self._pool = ThreadPoolExecutor(threads)
+        self._pool = ThreadPoolExecutor(CORES)
 
     def step(self) -> np.ndarray:
         """Makes all frames, (B, 4, H, W), in an array that the next step overwrites."""
         count = len(self._flat)
         self._chosen = self._rng.integers(len(self._lights), size=count)
         self._ratios = self._rng.uniform(0.1, 2.0, count).astype(_F)
-        list(self._pool.map(self._share, range(len(self._states))))
+        threads = torch.get_num_threads()
+        list(self._pool.map(partial(self._share, threads), range(threads)))
         return self._out
 
-    def _share(self, thread: int) -> None:
-        count, threads, state = len(self._flat), len(self._states), self._states[thread]
+    def _share(self, threads: int, thread: int) -> None:
+        count, state = len(self._flat), self._states[thread]
         part = count * thread // threads, count * (thread + 1) // threads
         noise = self._shot, self._read, self._bank, self._exact
         args = (*part, self._lights, self._chosen, self._ratios, *noise, state, self._flat)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -34,6 +35,8 @@ SCENES = "bundled:small"
 QUICK, FULL = (3, 0.08), (9, 0.3)
 #: Numbers of environments, and kinds of light.
 COUNTS, LIGHTS = (1, 8, 64, 512), ("sine", "flicker")
+#: Numbers of threads, which take turns.
+THREADS = tuple(dict.fromkeys((1, CORES)))
 #: Names of the limits that others are compared with.
 KERNEL = {"bank": "fused kernel, noise bank", "exact": "fused kernel, exact noise"}
 
@@ -53,7 +56,9 @@ class LiveScore:
 
 def recorded(num_envs: int, **make: Any) -> torch.Tensor:
     """(N, 4, H, W) frames of environments at random states, as a scorer gets them."""
-    envs = gym.make_vec(ID, num_envs=num_envs, scenes=SCENES, **CACHED, observation="linear", **make)
+    envs = gym.make_vec(
+        ID, num_envs=num_envs, scenes=SCENES, **CACHED, observation="linear", **make
+    )
     envs.reset(seed=0)
     observation, *_ = envs.step(np.random.default_rng(0).integers(64, size=num_envs))
     return torch.from_numpy(observation["raw"]).clamp(min=0.0)
@@ -74,7 +79,7 @@ def warm_environments(num_envs: int, make: dict[str, Any], seed: int = 0) -> Any
 class Case:
     """One thing to time: `step` makes `num_envs` frames; `noise` names its kernel limit.
 
-    `seconds` are the times per frame, one for each round.
+    `seconds` are the times per frame by `threads`, one for each round.
     """
 
     name: str
@@ -82,29 +87,30 @@ class Case:
     step: Callable[[], Any]
     noise: str = "bank"
     close: Callable[[], Any] = lambda: None
-    seconds: list[float] = field(default_factory=list)
+    threads: tuple[int, ...] = THREADS
+    seconds: dict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
 
 
-def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
+def measure_steps(size: int, seed: int, quick: bool) -> list[Row]:
     torch.set_num_threads(1)  # while children are forked: threads would not come along
-    cases = [_copies(8 if quick else 64, size, seed)] if threads > 1 else []
-    torch.set_num_threads(threads)
+    cases = [_copies(8 if quick else 64, size, seed)]
+    torch.set_num_threads(CORES)
     scenes: Any = gym.make(ID, scenes=SCENES, resolution=size).unwrapped
     lights = np.stack([scene.light.numpy() for scene in scenes.scenes])
     for noise, name in KERNEL.items():
-        kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
+        kernel = KernelLimit(lights, 64, noise=noise, seed=seed)
         cases.append(Case(name, 64, kernel.step, noise))
     images = recorded(64, resolution=size)
     cases.append(Case("a torch scorer alone", 64, partial(LiveScore(), images, None)))
     cases += _cases(size, seed)
-    if threads > 1 and size == 64 and not quick:
+    if size == 64 and not quick:
         cases.append(_ppo(seed))
     try:
         _measure(cases, *(QUICK if quick else FULL))
     finally:
         for case in cases:
             case.close()
-    return _rows(cases, threads, size)
+    return [row | {"size": size} for threads in THREADS[::-1] for row in _rows(cases, threads)]
 
 
 # -- the cases ------------------------------------------------------------------------------------
@@ -138,7 +144,8 @@ def _ppo(seed: int) -> Case:
     """PPO's whole loop in the environment that it has by default."""
     envs = warm_environments(64, {"scenes": SCENES, "autoreset_mode": "SAME_STEP"}, seed)
     training = PPOTraining(total_timesteps=1024)
-    return Case("PPO, motion and defocus", 1024, partial(train_ppo, envs, training))
+    train = partial(train_ppo, envs, training)
+    return Case("PPO, motion and defocus", 1024, train, threads=(CORES,))
 
 
 def _copies(count: int, size: int, seed: int) -> Case:
@@ -148,7 +155,7 @@ def _copies(count: int, size: int, seed: int) -> Case:
     copies, mode = [partial(warm_environments, 1, options)] * count, AutoresetMode.SAME_STEP
     envs = AsyncVectorEnv(copies, context="fork", autoreset_mode=mode)  # on one thread each
     name = "copies in subprocesses, cached scene"
-    return Case(name, count, _stepper(envs, seed), close=envs.close)
+    return Case(name, count, _stepper(envs, seed), close=envs.close, threads=(CORES,))
 
 
 def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
@@ -168,28 +175,33 @@ def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
 
 def _measure(cases: list[Case], rounds: int, slice_seconds: float) -> None:
     """Case after case, round after round; the first round warms up and sets the repeats."""
-    repeats = [1] * len(cases)
+    turns = [(case, threads) for case in cases for threads in case.threads]
+    repeats = [1] * len(turns)
     for i in range(rounds + 1):
-        for k, case in enumerate(cases):
+        for k, (case, threads) in enumerate(turns):
+            torch.set_num_threads(threads)
             start = time.perf_counter()
             for _ in range(repeats[k]):
                 case.step()
             elapsed = time.perf_counter() - start
             if i:
-                case.seconds.append(elapsed / (repeats[k] * case.num_envs))
+                case.seconds[threads].append(elapsed / (repeats[k] * case.num_envs))
             else:  # warm now; whole episodes, so that resets have their share
                 repeats[k] = 8 * max(1, round(slice_seconds / timed(case.step) / 8))
 
 
-def _rows(cases: list[Case], threads: int, size: int) -> list[Row]:
+def _rows(cases: list[Case], threads: int) -> list[Row]:
     limits, rows = {case.name: case.seconds for case in cases}, []
     for case in cases:
-        low, middle, high = quartiles(case.seconds)
-        row: Row = {"case": case.name, "num_envs": case.num_envs}
-        row |= {"steps_per_second": 1.0 / middle, "spread": (high - low) / middle}
-        pairs = zip(limits[KERNEL[case.noise]], case.seconds, strict=True)
-        row["ratio_to_kernel"] = statistics.median(least / own for least, own in pairs)
-        rows.append(row | {"size": size, "threads": threads})
+        if threads in case.threads:
+            own = np.array(case.seconds[threads])
+            low, middle, high = quartiles(case.seconds[threads])
+            row: Row = {"case": case.name, "num_envs": case.num_envs, "threads": threads}
+            row |= {"steps_per_second": 1.0 / middle, "spread": (high - low) / middle}
+            row["ratio_to_kernel"] = float(np.median(limits[KERNEL[case.noise]][threads] / own))
+            if case.threads[0] < threads:
+                row["of_one_thread"] = float(np.median(case.seconds[1] / own))
+            rows.append(row)
     return rows
 
 

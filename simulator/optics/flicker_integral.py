@@ -34,33 +34,43 @@ class Lamp:
         for field in fields(self):
             check_number(field.name, getattr(self, field.name), *_RANGES[field.name])
 
-    def mean_light(self, start: ArrayLike, exposure_time: float) -> np.ndarray:
+    def mean_light(
+        self, start: ArrayLike, exposure_time: ArrayLike, phase: ArrayLike = 0.0
+    ) -> np.ndarray:
         """Mean light (...) float64 of exposures, relative to the lamp's long-term mean.
 
-        `start` (...) in [-1e9, 1e9] and `exposure_time` in [1e-12, 1e9] are in seconds.
+        `start` (...) in [-1e9, 1e9] and `exposure_time` (...) in [1e-12, 1e9] are in seconds;
+        `phase` (...) adds to the lamp's.
         """
-        start = np.asarray(start, np.float64)
-        time = check_number("exposure_time", exposure_time, _SHORTEST, _LONGEST, more=" s")
-        if not (np.abs(start) <= _LONGEST).all():
-            raise ValueError(f"`start` must be finite, in [{-_LONGEST:g}, {_LONGEST:g}] s")
-        return self._mean(start, time)
+        start, time = np.asarray(start, np.float64), np.asarray(exposure_time, np.float64)
+        for name, values, low in (("start", start, -_LONGEST), ("exposure_time", time, _SHORTEST)):
+            if not ((values >= low) & (values <= _LONGEST)).all():
+                raise ValueError(f"`{name}` must be finite, in [{low:g}, {_LONGEST:g}] s")
+        return self._mean(start, time, np.asarray(phase))
 
-    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
+    def _mean(self, start: np.ndarray, time: np.ndarray, phase: np.ndarray) -> np.ndarray:
         return np.ones_like(start)
 
     def row_light(
-        self, start: float, exposure_time: float, rows: int, row_time: float, sensor_rows: int = 2
+        self,
+        start: ArrayLike,
+        exposure_time: ArrayLike,
+        rows: int,
+        row_time: float,
+        sensor_rows: int = 2,
+        phase: ArrayLike = 0.0,
     ) -> np.ndarray:
-        """Mean light (rows,) float64 of each row of a packed raw behind a rolling shutter.
+        """Mean light (..., rows) float64 of each row of a packed raw behind a rolling shutter.
 
-        The first sensor row begins its exposure at `start`, the next one `row_time` later [s]. A
-        packed row is the mean of `sensor_rows` of them.
+        The first sensor row begins its exposure at `start` (...), the next one `row_time` later
+        [s]. A packed row is the mean of `sensor_rows` of them. See `mean_light` for the others.
         """
         check_integer("rows", rows, 1, 2**20)
         check_integer("sensor_rows", sensor_rows, 1, 2**12)
         check_number("row_time", row_time, 0.0, _LONGEST, more=" s")
-        begins = start + row_time * np.arange(rows * sensor_rows)
-        return self.mean_light(begins, exposure_time).reshape(rows, sensor_rows).mean(axis=1)
+        start, time, phase = (np.asarray(v)[..., None] for v in (start, exposure_time, phase))
+        light = self.mean_light(start + row_time * np.arange(rows * sensor_rows), time, phase)
+        return light.reshape(*light.shape[:-1], rows, sensor_rows).mean(axis=-1)
 
 
 @dataclass(frozen=True)
@@ -71,10 +81,10 @@ class MainsLamp(Lamp):
     depth: float = 1.0  # from 0 (steady) to 1 (dark once a period)
     phase: float = 0.0  # of the first brightest moment, in periods
 
-    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
-        begin, whole, rest = _periods(start, time, self.frequency, self.phase)
+    def _mean(self, start: np.ndarray, time: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        begin, whole, rest = _periods(start, time, self.frequency, self.phase, phase)
         # sin(pi (n + r)) = (-1)^n sin(pi r), and half a period's turn for every odd n in cos.
-        swing = math.sin(math.pi * rest) / (math.pi * (whole + rest))
+        swing = np.sin(math.pi * rest) / (math.pi * (whole + rest))
         # Where the lamp is darkest, 1 - |cos| would lose its digits: 2 sin^2 of half the angle.
         half = math.pi * (begin + rest / 2.0 + 0.5)
         dark = 2.0 * np.sin(half) ** 2  # 1 + cos of the middle, less whole periods
@@ -89,31 +99,28 @@ class PulsedLamp(Lamp):
     duty: float = 0.5  # share of the period that it is on, in (0, 1]; a strobe's is tiny
     phase: float = 0.0  # where in a period the time 0 is, in periods; it is on from 0 to `duty`
 
-    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
-        begin, whole, rest = _periods(start, time, self.frequency, self.phase)
+    def _mean(self, start: np.ndarray, time: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        begin, whole, rest = _periods(start, time, self.frequency, self.phase, phase)
         now = np.clip(self.duty - begin, 0.0, rest)  # of the pulse that it begins in
         later = np.clip(rest - (1.0 - begin), 0.0, self.duty)  # of the next one
         return (whole + (now + later) / self.duty) / (whole + rest)
 
 
 def _periods(
-    start: np.ndarray, time: float, frequency: float, phase: float
-) -> tuple[np.ndarray, int, float]:
+    start: np.ndarray, time: np.ndarray, frequency: float, phase: float, more: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Begin within a period, in [0, 1); whole periods that exposures last; the rest, in [0, 1)."""
     turns, missing = _product(start, frequency)
     # Each exact: what is left of a day of periods must still tell where in one it is.
-    begin = np.mod(np.mod(turns, 1.0) + np.mod(phase, 1.0) + missing, 1.0)
+    begin = np.mod(np.mod(turns, 1.0) + np.mod(phase + more, 1.0) + missing, 1.0)
     span, missing = _product(time, frequency)
-    whole = math.floor(span)
-    rest = float(span - whole + missing)
-    if rest < 0.0:
-        whole, rest = whole - 1, rest + 1.0
-    return begin, whole, rest
+    whole = np.floor(span)
+    rest = span - whole + missing
+    return begin, whole - (rest < 0.0), rest + (rest < 0.0)
 
 
-def _product(values: ArrayLike, factor: float) -> tuple[np.ndarray, np.ndarray]:
+def _product(values: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
     """The product as float64 rounds it, and what the rounding left out (Dekker 1971)."""
-    values = np.asarray(values)
     rounded = values * factor
     (high, low), (factor_high, factor_low) = _halves(values), _halves(np.asarray(factor))
     left_out = high * factor_high - rounded + high * factor_low + low * factor_high
