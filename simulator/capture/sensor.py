@@ -291,9 +291,10 @@ def record(
         raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
     if len(transitions.light) == 0:
         return np.zeros((0, 2), np.int64)
-    if row_gain is not None:
-        transitions = transitions.in_bands(row_gain)
-    if transitions.needs_torch or (read_noise is not None and keys is not None):
+    stepwise = transitions.needs_torch or (read_noise is not None and keys is not None)
+    if row_gain is not None and (stepwise or transitions.table[:, 3:].any()):
+        transitions, row_gain = transitions.in_bands(row_gain), None
+    if stepwise or transitions.needs_torch:
         transitions = transitions.before_rounding(camera)
         kind: Noise = "exact" if noise == "sensor" else noise
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
@@ -302,7 +303,7 @@ def record(
             means.fill(tensors["codes"].numpy())
         return counts if transitions.needs_torch else counts.numpy()
     arrays = {name: np.asarray(out) for name, out in outputs.items()}
-    return _record_fused(transitions, camera, keys, noise, arrays, count, means, run)
+    return _record_fused(transitions, camera, keys, noise, row_gain, arrays, count, means, run)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -556,16 +557,30 @@ def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-de
 
 
 @_jit()
+def _in_bands(start, light, width, gain, out):  # type: ignore[no-untyped-def]
+    """`Transitions.in_bands` of a piece of a plane of rows that have so many samples."""
+    first, size = 0, len(light)
+    while first < size:
+        row = (start + first) // width
+        last = min(size, (row + 1) * width - start)
+        for i in range(first, last):
+            out[i] = light[i] * gain[row]
+        first = last
+
+
+@_jit()
 def record_units(  # type: ignore[no-untyped-def]
-    first, last, samples, light, remaining_variance, exposure, noise, sensor, outputs, means, drawn
+    first, last, samples, light, remaining, exposure, noise, sensor, outputs, means, drawn, gains
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
 
-    Of `noise` there are keys and the bank; where it is not `drawn` (None), that is not compiled.
-    Where there are `means` (of `CodeMeans`) to fill, frames are not divided.
+    Of `noise` there are keys and the bank. What is None is not compiled: whether the noise is
+    `drawn`, and the `gains` (B, H) of rows. Where there are `means` (of `CodeMeans`) to fill, frames
+    are not divided.
     """
     (keys, bank), (codes, numbers, signals, counts) = noise, outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    lit = np.empty(BLOCK, np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
@@ -580,13 +595,16 @@ def record_units(  # type: ignore[no-untyped-def]
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
         pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
         frame_light = numba.carray(pointer, (4 * samples,))
-        shares = samples if remaining_variance[frame] else 0
-        share = numba.carray(as_pointer(remaining_variance[frame]), (shares,))
+        shares = samples if remaining[frame] else 0
+        share = numba.carray(as_pointer(remaining[frame]), (shares,))
         clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
             exposed, normals, sign = frame_light[at : at + size], made, _ONE
+            if gains is not None:
+                _in_bands(start, exposed, samples // gains.shape[1], gains[frame], lit)
+                exposed = lit[:size]
             if drawn is not None:
                 draw_block(keys[frame], number, words, made)
             elif keys.size:
@@ -632,6 +650,7 @@ def _record_fused(
     camera: CameraProfile,
     keys: np.ndarray | None,
     noise: Noise,
+    row_gain: np.ndarray | None,
     given: Mapping[str, np.ndarray],
     count: bool,
     means: CodeMeans | None,
@@ -661,7 +680,8 @@ def _record_fused(
     # Means come with the frames where none of these is to be divided.
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
-    whole = *fixed, tuple(_NO_MEANS if means is None or size == 1 else means), drawn
+    gains = None if row_gain is None else row_gain.astype(np.float32)
+    whole = *fixed, tuple(_NO_MEANS if means is None or size == 1 else means), drawn, gains
     if run is None:
         parallel_ranges(
             lambda first, last: record_units(first * size, last * size, *whole),
