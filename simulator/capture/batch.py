@@ -21,13 +21,7 @@ from simulator.capture.blurred_light import new_frames
 from simulator.capture.decision import Exposure, decide
 from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import (
-    CodeMeans,
-    Transitions,
-    exposure_table,
-    record,
-    record_units,
-)
+from simulator.capture.sensor import CodeMeans, Transitions, exposure_table, record, record_units
 from simulator.capture.statistics import BINS, LightStatistics
 from simulator.noise.generator import Noise, noise_keys
 from simulator.settings import CameraSettings
@@ -347,7 +341,7 @@ class CaptureBatch:
             self._statistics[index] = found = columns.statistics_column(scene)
             self._counted[index] = found.any()
             self._widest[index] = columns.widest_defocus(scene, self._columns)
-            self._subjects[index] = columns.subject_column(scene)
+            self._subjects[index] = columns.layout_column(scene.layout, subject=True)[3:]
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -364,9 +358,9 @@ class CaptureBatch:
         if len(planned):
             known = self._scene_columns, self._statistics, self._vignetting
             made = self._blur, self._table, self._predicted_error, self._modules
-            fixed = *known, self._columns, self._targets, self._height, self._bits
+            camera = self._columns, self._targets, self._height, self._bits
             parallel_ranges(
-                lambda first, last: columns.plan_frames(first, last, *fixed, *given, *made),
+                lambda first, last: columns.plan_frames(first, last, known, camera, given, made),
                 len(planned),
                 least=_WORTH_A_THREAD,
             )

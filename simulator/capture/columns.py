@@ -86,7 +86,7 @@ def scene_column(scene: PreparedScene, targets: int, rest: int) -> tuple[Any, ..
         *(scene.defocus, scene.image_speed, movement.direction, movement.turn),
         *(own, movement.subject_direction),
         *(targets, rest, movement.along_rows and not apart),
-        *_addresses(layout, apart),
+        *layout_column(layout, apart),
     )
 
 
@@ -105,11 +105,6 @@ def moved_columns(rest: np.ndarray, moves: np.ndarray, subjects: np.ndarray) -> 
     return columns
 
 
-def subject_column(scene: PreparedScene) -> tuple[int, ...]:
-    """Addresses of the mask of a scene's subject and of the pixels behind it; 0 without one."""
-    return _addresses(scene.layout, subject=True)[3:]
-
-
 def vignetting_column(scene: PreparedScene, states: Sequence[CameraSettings]) -> np.ndarray:
     """(S,) uintp addresses of the vignetting of captures, 0 for none; the lens keeps its maps."""
     if scene.lens is None:
@@ -126,49 +121,34 @@ def blur_column(exposure: decision.Exposure) -> tuple[Any, ...]:
     path, own = exposure.path or Path(exposure.motion_px), exposure.subject_path
     drift = (0.0, 0.0) if own is None else own[3:]
     numbers = exposure.defocus_px, exposure.motion_px, exposure.path is None
-    layout = _addresses(exposure.layout, own is not None)
+    layout = layout_column(exposure.layout, own is not None)
     return (*numbers, *path[:3], *drift, *layout, _address(exposure.vignetting))
 
 
-def _addresses(layout: Layout | None, subject: bool) -> tuple[int, ...]:
-    """The fields `LAYOUT`."""
+def layout_column(layout: Layout | None, subject: bool) -> tuple[int, ...]:
+    """The `LAYOUT` of a layout, 0 where there is none, or none of its `subject`."""
     arrays = () if layout is None else layout.arrays[: 4 if subject else 2]
     found = [array.__array_interface__["data"][0] for array in arrays] + [0] * (4 - len(arrays))
     return (*found[:2], arrays[1].size if arrays else 0, *found[2:])
 
 
 @kernel(fastmath={"contract"})
-def plan_frames(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    scenes,
-    statistics,
-    vignetting,
-    states,
-    targets,
-    height,
-    bits,
-    indices,
-    rows,
-    gains,
-    blurs,
-    table,
-    error,
-    modules,
-):
-    """Plans `rows` of the columns `blurs`, `table`, `error` and `modules`, which it fills.
+def plan_frames(first, last, known, camera, given, made):  # type: ignore[no-untyped-def]
+    """Plans frames `first` to `last` of those that are `given`, and fills in columns.
 
     Args:
         first, last: Frames to plan.
-        scenes, statistics, vignetting: `SCENE` of all scenes, `LightStatistics.columns` and
-            `vignetting_column` of those at rest.
-        states, targets: `STATE`, and (T, S, 2, 4) shot and read noise of their captures.
-        height: Of the frames [pixel].
-        bits: (4,) what each of `BLURS` that runs adds to `modules`, and what is always added.
-        indices, rows, gains: (K,) scene, row, and light relative to the scene's own.
-        blurs, table, error, modules: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, (N,) error of the
-            blurs that are left out, and (N,) sums of `bits`.
+        known: `SCENE` of all scenes, `LightStatistics.columns` and `vignetting_column` of those at
+            rest.
+        camera: `STATE`, (T, S, 2, 4) shot and read noise of its captures, height of the frames
+            [pixel], and (4,) what each of `BLURS` that runs adds to the modules, and what is always
+            added.
+        given: (K,) scenes, rows of the columns, and light relative to the scene's own.
+        made: The columns: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, (N,) error of the blurs that
+            are left out, and (N,) modules, as sums.
     """
+    (scenes, statistics, vignetting), (states, targets, height, bits) = known, camera
+    (indices, rows, gains), (blurs, table, error, modules) = given, made
     extents, errors, runs = np.zeros(3), np.empty(3), np.empty(3, np.bool_)
     for k in range(first, last):
         row, at = rows[k], rows[k] % len(states)
@@ -196,8 +176,7 @@ def plan_frames(  # type: ignore[no-untyped-def]
         blur.num_sorts, blur.mask, blur.behind = scene.num_sorts, scene.mask, scene.behind
         blur.vignetting = vignetting[scene.rest, at]
         modules[row] = bits[3] + runs[1] * bits[0] + runs[2] * bits[1]
-        if blur.vignetting:
-            modules[row] += bits[2]
+        modules[row] += (blur.vignetting > 0) * bits[2]
         left_out = 0.0
         for i in range(1, 3):
             if not runs[i]:
@@ -228,8 +207,9 @@ def plan_sweep(
         return [e.origin for e in exposures], blurs, exposure_table(exposures), shares
     count, rows, height = len(states), np.arange(len(states)), scene.light.shape[-2]
     made = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), np.empty(count), 0 * rows
-    targets, bits = noise_columns(scene.camera, states, scene.box_factor)[None], np.zeros(4, int)
     own = np.array([scene_column(scene, 0, 0)], SCENE), statistics_column(scene)[None]
-    darkened, given = vignetting_column(scene, states)[None], (columns, targets, height, bits)
-    plan_frames(0, count, *own, darkened, *given, 0 * rows, rows, gains.astype(float), *made)
+    known = *own, vignetting_column(scene, states)[None]
+    targets = noise_columns(scene.camera, states, scene.box_factor)[None]
+    camera = columns, targets, height, np.zeros(4, int)
+    plan_frames(0, count, known, camera, (0 * rows, rows, gains.astype(float)), made)
     return [(None, None)] * count, made[0], made[1], None
