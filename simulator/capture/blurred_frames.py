@@ -209,10 +209,9 @@ class BlurredFrames:
         # Places that each scene holds: behind the lens at each aperture, behind each disc, in
         # motion, and of its layout where that is a frame, too.
         self._held = np.zeros((num_scenes, num_apertures + len(discs.DIAMETERS) + 2), np.uintp)
-        self._lens, self._levels = self._held[:, :num_apertures], self._held[:, num_apertures:-2]
-        self._moved, self._layouts = self._held[:, -2], self._held[:, -1]
         # The light, and the diameter of the disc, that they were made of.
-        self._source, self._diameter = np.zeros_like(self._lens), np.zeros(self._lens.shape)
+        shape = num_scenes, num_apertures
+        self._source, self._diameter = np.zeros(shape, np.uintp), np.zeros(shape)
         self._levels_source = np.zeros(num_scenes, np.uintp)
         self._slabs = list[torch.Tensor]()
         # Places, of which the first are free, and how many: an array, which kernels change at once
@@ -274,16 +273,6 @@ class BlurredFrames:
         self._held[indices] = 0  # first: an interrupt may cost memory, but nothing has two owners
         self._give_back(places)
 
-    def _free_others(self, indices: np.ndarray, slots: np.ndarray) -> None:
-        """Frees all of the scenes `indices` but the light at the apertures `slots`, and in motion.
-
-        Their layouts stay, too.
-        """
-        others = self._held[indices]
-        others[np.arange(len(indices)), slots] = others[:, -2:] = 0
-        self._held[indices] -= others
-        self._give_back(others)
-
     def plan(
         self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
     ) -> tuple[np.ndarray, Passes]:
@@ -293,8 +282,11 @@ class BlurredFrames:
         (4, H, W) that they start from. Each stays until its scene blurs another. No two have the
         scene in common; in new memory, where nothing moves, no two the scene and the aperture.
         """
-        if self.is_full:
-            self._free_others(indices, slots)
+        if self.is_full:  # light at these apertures, or in motion, and layouts stay
+            others = self._held[indices]
+            others[np.arange(len(indices)), slots] = others[:, -2:] = 0
+            self._held[indices] -= others
+            self._give_back(others)
         count, done, planned, lacking = len(indices), 0, 0, 0
         light, levels = np.empty(count, np.uintp), np.empty((count, len(discs.DIAMETERS)), np.uintp)
         passes = np.empty(count * (len(discs.DIAMETERS) + 3), PASS)
@@ -318,7 +310,7 @@ class BlurredFrames:
         if kind == WIDE:  # several at once would fill the memory
             for one in passes:
                 light, out = (frame_at(int(one[name]), self._shape) for name in ("source", "to"))
-                discs.wide_disc(light, one["diameter"].item(), discs.LIGHT_LIMIT, out)
+                discs.wide_disc(light, one["diameter"].item(), out)
             return
         # Of few large frames, threads share planes, or rows where there are more threads.
         if (count := len(passes)) < 2 * threads and planes * height * width >= _LARGE:
@@ -370,16 +362,14 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
             return k, planned, lacking - left[0]
         light[k], levels[k, :] = at, at  # levels without a share are read, too, times 0
         if new:
-            _hold(held[scene], slot, free, left)
-            sources[scene, slot], diameters[scene, slot] = at, diameter
             for level in range(len(needed) if blends else 0):
                 if needed[level]:
-                    _hold(held[scene], lens + level, free, left)
-                    to = held[scene, lens + level]
+                    to = _hold(held[scene], lens + level, free, left)
                     planned = _add_disc(passes, planned, k, scene, at, to, _DISCS[level], table)
                 if held[scene, lens + level]:
                     levels[k, level] = held[scene, lens + level]
-            to = held[scene, slot]
+            to = _hold(held[scene], slot, free, left)
+            sources[scene, slot], diameters[scene, slot] = at, diameter
             if blends:
                 planned = _add(passes, planned, BLEND, k, scene, at, to, 200.0)
             else:
@@ -387,8 +377,7 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         if diameter > 0.0:
             light[k] = held[scene, slot]
         if changes:  # what changes by motion, or by the lens, has memory of its own
-            _hold(held[scene], moved, free, left)
-            to = held[scene, moved]
+            to = _hold(held[scene], moved, free, left)
             if blur.motion_px > 0.0:
                 kind = ALONG_ROWS if blur.streaks else ALONG_PATH
                 # Sums of taps take as long as these are many; with a subject there are more.
@@ -412,10 +401,11 @@ def _give_up(held, free, left):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _hold(held, place, free, left):  # type: ignore[no-untyped-def]
-    """Takes a free one for `place`, unless it has one."""
+    """Takes a free one for `place`, unless it has one; returns it."""
     if not held[place]:
         left[0] -= 1
         held[place] = free[left[0]]
+    return held[place]
 
 
 @_jit()

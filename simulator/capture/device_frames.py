@@ -131,11 +131,12 @@ class DeviceFrames(BlurredFrames):
 
     def _layout_frames(self, indices: np.ndarray, blurs: np.ndarray) -> Tensor:
         """(K, 4, H, W) diameters, masks, and pixels behind the subjects."""
+        layouts = self._held[:, -1]
         stale = (blurs["mask"] > 0) & (self._masks[indices] != blurs["mask"])
-        stale |= self._layouts[indices] == 0
+        stale |= layouts[indices] == 0
         if stale.any():
-            lacking = indices[stale & (self._layouts[indices] == 0)]
-            self._layouts[lacking] = self._take(len(lacking))
+            lacking = indices[layouts[indices] == 0]
+            layouts[lacking] = self._take(len(lacking))
             own, plane = blurs[stale], self._shape[1:]
             frames = np.zeros((len(own), *self._shape), np.float32)
             for frame, blur in zip(frames, own, strict=True):
@@ -143,9 +144,9 @@ class DeviceFrames(BlurredFrames):
                 if blur["mask"]:
                     frame[1] = frame_at(blur["mask"].item(), plane)
                     frame[2] = frame_at(blur["behind"].item(), plane).view(np.int32)
-            self._put(self._layouts[indices[stale]], torch.from_numpy(frames))
+            self._put(layouts[indices[stale]], torch.from_numpy(frames))
             self._masks[indices[stale]] = blurs["mask"][stale]
-        return self.at(self._layouts[indices])
+        return self.at(layouts[indices])
 
     def _move(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
         source, to = passes["source"], passes["to"]

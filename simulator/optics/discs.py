@@ -164,12 +164,12 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     return blurred.to(light.dtype).reshape(light.shape)
 
 
-def wide_disc(light: np.ndarray, diameter_px: float, limit: float, out: np.ndarray) -> None:
-    """`disc_blur` (P, H, W) by numpy, whose transforms are safe in a forked process."""
+def wide_disc(light: np.ndarray, diameter_px: float, out: np.ndarray) -> None:
+    """`disc_blur` (P, H, W) by numpy, whose transforms are safe in a forked process; clipped."""
     weights = disc_kernel(diameter_px)
     radius = len(weights) // 2
     for plane, result in zip(light, out, strict=True):  # all at once, large ones fill the memory
-        padded = np.pad(np.clip(plane, -limit, limit).astype(np.float64), radius, mode="edge")
+        padded = np.pad(np.clip(plane, -LIGHT_LIMIT, LIGHT_LIMIT).astype(np.float64), radius, mode="edge")
         spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=padded.shape)
         result[...] = np.fft.irfft2(spectrum, s=padded.shape)[2 * radius :, 2 * radius :]
 
