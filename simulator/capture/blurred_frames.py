@@ -46,8 +46,7 @@ _SLAB, _LARGE = 2**20, 2**16
 _LEVELS = 255
 #: A bit more than half of a level.
 _HALF_STEP = np.float32(0.51 / _LEVELS)
-_DISCS = np.array(discs.DIAMETERS)
-_KNOTS = (_DISCS**2).astype(np.float32)
+_DISCS, _KNOTS = np.array(discs.DIAMETERS), discs.KNOTS
 _MOST = np.float32(discs.LIGHT_LIMIT)  # of its type, lest kernels compile twice
 _jit = functools.partial(kernel, fastmath={"contract"})
 #: What is to be done to a frame, and where: one step of its blur.

@@ -48,7 +48,8 @@ WIDE_PX = 40.0
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
 #: discs is within 2 % of the disc between them.
 DIAMETERS = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6, 32.0)
-_KNOTS = np.array(DIAMETERS) ** 2
+#: Their squares, between which kernels interpolate.
+KNOTS = np.square(DIAMETERS).astype(np.float32)
 #: How far the largest disc reaches, and by how much tiles overlap for it [pixel].
 DISC_REACH, HALO = 16, 20
 #: Pixels from which another thread is worth waking for a blend, and pixels blended together.
@@ -132,10 +133,7 @@ def kernel_energy(motion_px: float, defocus_px: float) -> float:
         n, end = streak_share(motion_px)
         total = 2 * n + 1 + 2.0 * end
         return float((disc.sum(axis=1) ** 2).sum()) * (2 * n + 1 + 2.0 * end**2) / total**2
-    streak = motion_kernel(motion_px)
-    if disc.shape[0] == 1:
-        return float((streak**2).sum())
-    both = np.apply_along_axis(np.convolve, 1, disc, streak)
+    both = np.apply_along_axis(np.convolve, 1, disc, motion_kernel(motion_px))
     return float((both**2).sum())
 
 
@@ -148,19 +146,19 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     taps = weights.shape[0]
     if taps == 1:
         return light
-    height, width = light.shape[-2:]
     if taps <= _DIRECT_TAPS and has_kernels(light):
         return path_blur(light, Taps(*disc_taps(disc_radius(diameter_px, *radius_table()))))
-    radius = taps // 2
-    padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
     disc = torch.from_numpy(weights).to(light.device)
     # float64: a GPU rounds convolutions in float32 to TF32, and in a Fourier transform a lamp a
     # thousand times above white must not leave ringing in the shadows.
+    planes = light.reshape(-1, 1, *light.shape[-2:])
+    padded = F.pad(planes, (taps // 2,) * 4, mode="replicate").double()
     if taps <= _FFT_TAPS:
-        return F.conv2d(padded.double(), disc[None, None]).to(light.dtype).reshape(light.shape)
-    size = [height + 2 * radius, width + 2 * radius]
-    spectrum = torch.fft.rfft2(padded.double()) * torch.fft.rfft2(disc, s=size)
-    blurred = torch.fft.irfft2(spectrum, s=size)[..., 2 * radius :, 2 * radius :]
+        blurred = F.conv2d(padded, disc[None, None])
+    else:
+        size = padded.shape[-2:]
+        spectrum = torch.fft.rfft2(padded) * torch.fft.rfft2(disc, s=size)
+        blurred = torch.fft.irfft2(spectrum, s=size)[..., taps - 1 :, taps - 1 :]
     return blurred.to(light.dtype).reshape(light.shape)
 
 
@@ -226,14 +224,13 @@ class DiscBank:
 
     def _blended(self, diameter: Tensor) -> Tensor:
         """`blurred` by kernels, by `diameter` (H, W)."""
-        diameters, knots = diameter.contiguous().numpy(), _KNOTS.astype(np.float32)
-        used = np.zeros(len(knots), np.bool_)
-        mark_levels(diameters.reshape(-1), _ONE, np.float32(0), knots, used)
+        diameters, used = diameter.contiguous().numpy(), np.zeros(len(KNOTS), np.bool_)
+        mark_levels(diameters.reshape(-1), _ONE, np.float32(0), KNOTS, used)
         light = self._levels[0].contiguous()
         # Levels without a share are read too, times 0: any image does.
-        levels = [self.level(i).contiguous() if used[i] else light for i in range(len(knots))]
+        levels = [self.level(i).contiguous() if used[i] else light for i in range(len(KNOTS))]
         out = new_frame(light)
-        fixed = (diameters, _ONE, knots, addresses(levels), 0, out.numel())
+        fixed = (diameters, _ONE, KNOTS, addresses(levels), 0, out.numel())
         result, (height, width) = out.numpy().reshape(-1, *out.shape[-2:]), out.shape[-2:]
         least = 1 + _WORTH_A_THREAD // width
         parallel_ranges(lambda a, b: blend_rows(a, b, *fixed, result), height, least=least)
@@ -242,7 +239,7 @@ class DiscBank:
 
 def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
     """(index, weight) of every disc that some pixel needs: hat functions of squared diameter."""
-    knots = _KNOTS.tolist()
+    knots = np.square(DIAMETERS).tolist()
     low, high = (float(v) for v in torch.aminmax(squared.detach()))
     for index, knot in enumerate(knots):
         before = knots[index - 1] if index else -1.0
@@ -267,12 +264,11 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
         count = min(int(np.searchsorted(DIAMETERS, float(diameter.max()))) + 1, len(DIAMETERS))
         products, weights = np.zeros_like(products), taps.weights.astype(np.float64)
         _sum_products(correlations[:count], taps.rows, taps.columns, weights, products)
-    ends = np.column_stack([products[:-1], products[1:, 0]])
-    frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
-    out = torch.empty(frame.shape, dtype=torch.float32, device="cpu")
-    fixed = (frame.contiguous().numpy(), _KNOTS.astype(np.float32), ends.astype(np.float32))
-    least = 1 + _WORTH_A_THREAD // frame.shape[1]
-    parallel_ranges(lambda a, b: _evaluate(a, b, *fixed, out.numpy()), len(frame), least=least)
+    ends = np.column_stack([products[:-1], products[1:, 0]]).astype(np.float32)
+    flat = diameter.detach().float().cpu().reshape(-1)
+    out = new_frame(flat)
+    fixed = flat.numpy(), KNOTS, ends, out.numpy()
+    parallel_ranges(lambda a, b: _evaluate(a, b, *fixed), len(flat), least=_WORTH_A_THREAD)
     return out.reshape(diameter.shape).to(diameter)
 
 
@@ -370,14 +366,13 @@ def mark_levels(diameter, scale, spread, knots, used):  # type: ignore[no-untype
 @_blend_jit()
 def _evaluate(first, last, diameter, knots, ends, out):  # type: ignore[no-untyped-def]
     """Quadratic pieces between `knots`: `ends` (K - 1, 3) are their products."""
-    for y in range(first, last):
-        for x in range(diameter.shape[1]):
-            squared = min(diameter[y, x] * diameter[y, x], knots[-1])
-            index = _below(knots, squared)
-            share = (squared - knots[index]) / (knots[index + 1] - knots[index])
-            rest = _ONE - share
-            both = rest * ends[index, 1] + rest * ends[index, 1] + share * ends[index, 2]
-            out[y, x] = rest * rest * ends[index, 0] + share * both
+    for x in range(first, last):
+        squared = min(diameter[x] * diameter[x], knots[-1])
+        index = _below(knots, squared)
+        share = (squared - knots[index]) / (knots[index + 1] - knots[index])
+        rest = _ONE - share
+        both = rest * ends[index, 1] + rest * ends[index, 1] + share * ends[index, 2]
+        out[x] = rest * rest * ends[index, 0] + share * both
 
 
 @_blend_jit()

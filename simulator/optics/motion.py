@@ -477,8 +477,6 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
     down, over = np.abs(rows).max(), np.abs(columns).max()
     top, bottom = max(top - down, 0), min(bottom + down, height)
     left, right = max(left - over, 0), min(right + over, width)
-    if right <= left:  # no subject
-        top = bottom = left = right = 0
     back = np.empty((height, width), np.float32)
     apart = np.zeros((height, right - left), np.float32)
     front, cover = np.empty_like(apart), np.empty_like(apart)
