@@ -37,6 +37,7 @@ _STEPS = (
     *("vignetting", "pixel_response", "noise"),
 )
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
+_BLURRING = sum(_BIT[name] for name in _STEPS[1:5])  # those that change the light
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -127,9 +128,8 @@ class CaptureBatch:
         moved: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
-        self._moved = moved
         self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
-        self._device = device
+        self._moved, self._device = moved, device
         self._columns = columns.state_columns(states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
         self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
@@ -162,7 +162,6 @@ class CaptureBatch:
         # What is added to these for each blur, and always; see `plan_frames`.
         always = (_BIT["noise"] + bool(camera.prnu) * _BIT["pixel_response"]) * (noise is not None)
         self._bits = np.array([*(_BIT[name] for name in columns.BLURS), always])
-        self._blurs = np.zeros(count, bool)  # whether light must be blurred
         self._blurred = np.zeros(count, np.uintp)  # place of the light, blurred where it must be
         # Of captures that are not planned in columns, the light (4, H, W) that they start from,
         # `Exposure.remaining_variance` and the exposure.
@@ -290,7 +289,7 @@ class CaptureBatch:
             if deal_out(planned.passes, indices, self.num_scenes, order, ends):  # NumPy makes some
                 self._frames.run(planned)
                 order, ends = len(planned.passes) + np.arange(count), np.arange(count + 1)
-            given = order, ends, units, (1, planned.shape, *planned[:3]), fixed
+            given = order, ends, units, (1, *planned), fixed
             counter = np.zeros(1, np.int64)
             parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
 
@@ -364,7 +363,6 @@ class CaptureBatch:
                 len(planned),
                 least=_WORTH_A_THREAD,
             )
-            self._blurs[planned] = self._modules[planned] != self._bits[-1]
             self._excess_variance[planned] = 0.0
         self._gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
@@ -373,13 +371,9 @@ class CaptureBatch:
         """Works out a row for a scene with noise of its own, or one whose aperture opens."""
         noisy, settings = self.noise is not None, self.states[row % len(self.states)]
         exposure = decide(scene, settings, gain=gain)
-        blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to
-        self._blurs[row] = blurs or exposure.vignetting is not None
         self._exposure[row], self._any_remaining = exposure, True
         self._blur[row] = columns.blur_column(exposure)
-        remaining = exposure.remaining_variance
-        remaining = None if remaining is None else remaining.float().contiguous()
-        self._remaining_variance[row] = remaining
+        self._remaining_variance[row] = exposure.remaining_variance
         if exposure.opened_to is None:  # else the network runs when the light is made
             self._source[row] = scene.blurred_light.source(exposure.origin).contiguous()
         excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
@@ -400,7 +394,7 @@ class CaptureBatch:
             self._place[shown] = self._frames.places([self._light[i] for i in shown.tolist()])
         if self._any_remaining and len(alone := np.flatnonzero(self._rest[indices] < 0)):
             source[alone] = self._own_light(indices[alone], rows[alone])
-        given = self._blurs, self._rest, self._place
+        given = self._modules, self._rest, self._place
         missing = find_light(indices, rows, *given, self._blurred_row, self._blurred, source)
         if not len(missing):
             return
@@ -511,7 +505,7 @@ def shown_at_rest(indices, rest):  # type: ignore[no-untyped-def]
 
 @kernel()
 def find_light(  # type: ignore[no-untyped-def]
-    indices, rows, blurs, rest, place, blurred_row, blurred, source
+    indices, rows, modules, rest, place, blurred_row, blurred, source
 ):
     """The frames among `rows` (K,) of scenes `indices` whose light has to be blurred.
 
@@ -522,7 +516,7 @@ def find_light(  # type: ignore[no-untyped-def]
     for k in range(len(rows)):
         if rest[indices[k]] >= 0:
             source[k] = place[rest[indices[k]]]
-        if not blurs[rows[k]]:
+        if not modules[rows[k]] & _BLURRING:
             blurred[rows[k]] = source[k]
         elif blurred_row[indices[k]] != rows[k]:
             found[count] = k

@@ -61,12 +61,12 @@ PASS = np.dtype(
 
 
 class Passes(NamedTuple):
-    """What is to be done for K frames, in this order."""
+    """What is to be done for K frames, in this order: arguments of the tasks."""
 
+    shape: tuple[int, ...]  # of all frames
     passes: np.ndarray  # (J,) `PASS`
     blurs: np.ndarray  # (K,) `BLUR`
     levels: np.ndarray  # (K, 13) places that blends read
-    shape: tuple[int, ...]  # of all frames
 
 
 #: Kinds of passes, in the order in which a frame has them.
@@ -296,26 +296,26 @@ class BlurredFrames:
                 self._grow(lacking)
             free, made = (self._free, self._left), (light, levels, passes)
             done, planned, lacking = plan_passes(done, planned, frames, held, free, made)
-        return light, Passes(passes[:planned], blurs, levels, self._shape)
+        return light, Passes(self._shape, passes[:planned], blurs, levels)
 
     def run(self, planned: Passes) -> None:
         """Does all passes, kind by kind, each on all threads."""
         kinds = planned.passes["kind"]
         for kind in np.unique(kinds).tolist():
-            self._run(kind, planned.passes[kinds == kind], planned)
+            self._run(kind, planned._replace(passes=planned.passes[kinds == kind]))
 
-    def _run(self, kind: int, passes: np.ndarray, planned: Passes) -> None:
+    def _run(self, kind: int, alike: Passes) -> None:
         threads, (planes, height, width), parts = torch.get_num_threads(), self._shape, 1
         if kind == WIDE:  # several at once would fill the memory
-            for one in passes:
+            for one in alike.passes:
                 light, out = (frame_at(int(one[name]), self._shape) for name in ("source", "to"))
                 discs.wide_disc(light, one["diameter"].item(), out)
             return
         # Of few large frames, threads share planes, or rows where there are more threads.
-        if (count := len(passes)) < 2 * threads and planes * height * width >= _LARGE:
+        if (count := len(alike.passes)) < 2 * threads and planes * height * width >= _LARGE:
             parts = planes * min(1 + (threads - 1) // (count * planes), height)
-        task, fixed = _TASKS[kind], (parts, self._shape, passes, *planned[1:3])
-        parallel_ranges(lambda first, last: task(first, last, *fixed), count * parts)
+        task = _TASKS[kind]
+        parallel_ranges(lambda first, last: task(first, last, parts, *alike), count * parts)
 
 
 @_jit()

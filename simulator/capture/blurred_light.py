@@ -151,11 +151,8 @@ class MapApertureBlur(ApertureBlur):
                 cache[tile, denoised] = bank
             return bank.blurred(added)[tile.core]
 
-        tiles = make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
-        if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
-            return blurred(tiles[0])
         result = light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT)
-        for tile in tiles:
+        for tile in make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0):
             result[tile.inner] = blurred(tile)
         return result
 
@@ -280,12 +277,8 @@ class BlurredLight:
 
     def with_remaining_noise(self, exposure: Exposure) -> Exposure:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
-        left: Tensor | None = None
+        left, energy = None, 1.0
         path, motion_px, defocus_px = exposure.path, exposure.motion_px, exposure.defocus_px
-        blurs = motion_px or defocus_px or exposure.subject_path
-        if not blurs and exposure.opened_to is None and exposure.vignetting is None:
-            return exposure  # nothing averages it
-        energy = 1.0
         if exposure.layout is not None:
             path = Path(motion_px) if path is None and motion_px else path
             left = _noise_map(exposure.layout, path, exposure.subject_path, defocus_px)
@@ -306,6 +299,7 @@ class BlurredLight:
             # noise, and off by r (1 - r) of the source's read noise (`Transitions.in_bands`).
             share = torch.from_numpy(exposure.vignetting).to(self.light.device)
             left = share if left is None else left * share
+        left = None if left is None else left.float().contiguous()
         return replace(exposure, energy=energy, remaining_variance=left)
 
 

@@ -202,8 +202,7 @@ def plan_sweep(
         pairs = zip(states, gains.tolist(), strict=True)
         exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
         blurs = np.array([*map(blur_column, exposures)], BLUR)
-        left = (exposure.remaining_variance for exposure in exposures)
-        shares = [None if share is None else share.float().contiguous() for share in left]
+        shares = [exposure.remaining_variance for exposure in exposures]
         return [e.origin for e in exposures], blurs, exposure_table(exposures), shares
     count, rows, height = len(states), np.arange(len(states)), scene.light.shape[-2]
     made = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), np.empty(count), 0 * rows

@@ -104,8 +104,8 @@ class Exposure:
     denoised: DenoisedLight | None = None
     #: Effective f-number whose wider aperture blurs what the source shows out of focus, if any.
     opened_to: float | None = None
-    #: (H, W) share of the source's noise variance that the blurs leave, beyond `energy`: of all of
-    #: them with a layout, else of `opened_to`; None for all.
+    #: (H, W) contiguous float32 share of the source's noise variance that the blurs leave, beyond
+    #: `energy`: of all of them with a layout, else of `opened_to`; None for all.
     remaining_variance: torch.Tensor | None = None
     lens: Vignetting | None = None  # that darkens the frame, see `PreparedScene.lens`
     #: (H, W) float32 share of the light that it leaves; None for all.

@@ -22,7 +22,6 @@ from simulator.utils.compute import kernel
 #: holds them; frames that are added at once, at least; taps of a frame that a GPU can read
 #: together, at least; samples of a frame that is moved along the rows alone.
 _SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**20}, 64, 8, 2**20
-_KNOTS = torch.tensor(DIAMETERS, dtype=torch.float32).square()
 
 
 class DeviceFrames(BlurredFrames):
@@ -91,10 +90,10 @@ class DeviceFrames(BlurredFrames):
 
     # -- passes -------------------------------------------------------------------------------
 
-    def _run(self, kind: int, passes: np.ndarray, planned: Passes) -> None:
+    def _run(self, kind: int, alike: Passes) -> None:
         tasks = self._blur, self._blur, self._blend, self._move, self._move, self._darken
-        own = passes["frame"]
-        tasks[kind](passes, planned.blurs[own], planned.levels[own])
+        own = alike.passes["frame"]
+        tasks[kind](alike.passes, alike.blurs[own], alike.levels[own])
 
     # Each does passes (K,) for the frames of `blurs` (K,); blends read `levels` (K, 13).
     def _blur(self, passes: np.ndarray, blurs: np.ndarray, levels: np.ndarray) -> None:
@@ -112,7 +111,7 @@ class DeviceFrames(BlurredFrames):
         for part in self._parts(np.arange(len(passes)), 2 * math.prod(self._shape)):
             maps = self._layout_frames(passes["scene"][part], blurs[part])
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
-            knots = _KNOTS.to(maps.device)
+            knots = torch.tensor(DIAMETERS, dtype=torch.float32, device=maps.device).square_()
             squared = (maps[:, 0].flatten(1) * scale[:, None]).square_()
             squared = squared.clamp_(max=DIAMETERS[-1] ** 2)
             below = torch.searchsorted(knots, squared, right=True).sub_(1).clamp_(0, len(knots) - 2)
@@ -157,18 +156,17 @@ class DeviceFrames(BlurredFrames):
             light = self._clamped(source[[i]])
             self._put(to[[i]], motion_blur(light, float(blurs["motion_px"][i])))
         for part in self._parts(np.flatnonzero(~apart & ~alone), _TOGETHER * samples):
-            light = self._clamped(source[part])
             taps = tap_columns(blurs[part], False, *plane)
-            self._put(to[part], moved_sums(light, self._samples, *taps))
+            self._put(to[part], moved_sums(self._clamped(source[part]), self._samples, taps))
         for part in self._parts(np.flatnonzero(apart), 2 * _TOGETHER * samples):
             # See `simulator.optics.motion.blur_apart`.
             light = self._clamped(source[part])
             maps = self._layout_frames(passes["scene"][part], blurs[part])
             mask, behind = maps[:, 1:2], maps[:, 2:3].long().flatten(2)
             back = light.flatten(2).gather(2, behind.expand(-1, light.shape[1], -1)).view_as(light)
-            back = moved_sums(back, self._samples, *tap_columns(blurs[part], False, *plane))
-            own = self._samples, *tap_columns(blurs[part], True, *plane)
-            front = moved_sums(torch.cat([light * mask, mask], dim=1), *own)
+            taps, own = (tap_columns(blurs[part], own, *plane) for own in (False, True))
+            back = moved_sums(back, self._samples, taps)
+            front = moved_sums(torch.cat([light * mask, mask], dim=1), self._samples, own)
             seen = (1.0 - front[:, -1:]).clamp_(min=0.0)
             self._put(to[part], seen * back + front[:, :-1])
 
@@ -203,19 +201,12 @@ def tap_columns(blurs, own, height, width):  # type: ignore[no-untyped-def]
     return ends, rows, columns, weights
 
 
-def moved_sums(
-    images: Tensor,
-    samples: int,
-    ends: np.ndarray,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    weights: np.ndarray,
-) -> Tensor:
+def moved_sums(images: Tensor, samples: int, taps: tuple[np.ndarray, ...]) -> Tensor:
     """Sums of shifts of `images` (K, C, H, W) by the taps of each; the borders are replicated.
 
-    So many `samples` are read at once as are stated. The taps are those of `tap_columns`.
+    So many `samples` are read at once as are stated. The `taps` are `tap_columns`.
     """
-    (height, width), to = images.shape[-2:], images.device
+    (height, width), to, (ends, rows, columns, weights) = images.shape[-2:], images.device, taps
     counts = np.diff(ends)
     order = np.argsort(-counts, kind="stable")  # those with the most taps first
     given = rows, columns, weights, ends[order], counts[order], order
@@ -228,11 +219,11 @@ def moved_sums(
         active = int((counts > done).sum())
         end = min(most, done + max(1, samples // (active * images[0].numel())))
         steps = torch.arange(done, end, device=to)
-        taps = (first[:active, None] + steps).clamp_(max=len(weight) - 1)
-        looks_at = (down[taps][..., None] + right[taps][:, :, None]).flatten(1)  # (K, taps H W)
+        chosen = (first[:active, None] + steps).clamp_(max=len(weight) - 1)
+        looks_at = (down[chosen][..., None] + right[chosen][:, :, None]).flatten(1)  # (K, taps H W)
         read = light[:active].gather(2, looks_at[:, None].expand(-1, images.shape[1], -1))
         read = read.view(active, images.shape[1], end - done, -1)
-        shares = weight[taps] * (steps < count[:active, None])
+        shares = weight[chosen] * (steps < count[:active, None])
         total[:active] += (read * shares[:, None, :, None]).sum(dim=2)
         done = end
     out = torch.empty_like(total)

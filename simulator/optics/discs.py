@@ -167,7 +167,8 @@ def wide_disc(light: np.ndarray, diameter_px: float, out: np.ndarray) -> None:
     weights = disc_kernel(diameter_px)
     radius = len(weights) // 2
     for plane, result in zip(light, out, strict=True):  # all at once, large ones fill the memory
-        padded = np.pad(np.clip(plane, -LIGHT_LIMIT, LIGHT_LIMIT).astype(np.float64), radius, mode="edge")
+        clipped = np.clip(plane, -LIGHT_LIMIT, LIGHT_LIMIT).astype(np.float64)
+        padded = np.pad(clipped, radius, mode="edge")
         spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=padded.shape)
         result[...] = np.fft.irfft2(spectrum, s=padded.shape)[2 * radius :, 2 * radius :]
 

@@ -335,13 +335,10 @@ def _streak_taps(extent_px, width):  # type: ignore[no-untyped-def]
     """The taps of a streak along the rows, as `motion_kernel` has them."""
     n, end = streak_share(extent_px)
     reach = min(n + 1, width - 1)
-    size = (2 * reach + 8) // 8 * 8
-    rows, columns, weights = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size)
-    for k in range(2 * reach + 1):
-        columns[k], weights[k] = k - reach, 1.0
+    row = np.ones((1, 2 * reach + 1))
     # The border stands for what lies beyond it, of which the last pixel has a share.
-    beyond = n + 1 - reach
-    weights[0] = weights[2 * reach] = end + beyond if reach else 1.0
+    row[0, 0] = row[0, 2 * reach] = end + (n + 1 - reach) if reach else 1.0
+    rows, columns, weights = grid_taps(row, _TOP, -reach, -1.0)
     return rows, columns, (weights / weights.sum()).astype(np.float32)
 
 
