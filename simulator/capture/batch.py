@@ -295,13 +295,11 @@ class CaptureBatch:
 
     def prepared_scene(self, index: int) -> PreparedScene:
         """See `FrameSource`."""
-        scene = self._scenes.get(index)
-        if scene is None:
+        if index not in self._scenes:
             scene = self._prepared(index)
             # Scenes that are shown several times share their light, but not what is blurred of it.
-            scene = scene.changed(blurred_light=scene.blurred_light.copy())
-            self._scenes[index] = scene
-        return scene
+            self._scenes[index] = scene.changed(blurred_light=scene.blurred_light.copy())
+        return self._scenes[index]
 
     # -- planning -----------------------------------------------------------------------------
 
@@ -526,8 +524,6 @@ def find_light(  # type: ignore[no-untyped-def]
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
     """See `FrameStatistics`; NaN where it depends on the pixels."""
-    if exposure.source.is_zero:
-        return 0.0
     source, target = exposure.source_noise, exposure.target
     pairs = zip((*source.shot, *source.read), (*target.shot, *target.read), strict=True)
     if all(present <= wanted for present, wanted in pairs):

@@ -170,8 +170,7 @@ class Layout:
         """
         found = [self.defocus.numpy().copy(), self.shares[0].astype(np.float32)]
         if self.subject is not None:
-            found += [self.subject.numpy().astype(np.float32)]
-            found += [self.behind.numpy().astype(np.int32)]
+            found += [self.subject.numpy().astype(np.float32), self.behind.numpy().astype(np.int32)]
         return tuple(found)
 
 

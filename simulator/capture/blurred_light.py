@@ -36,9 +36,6 @@ from simulator.utils.tiles import TILE, Tile, make_tiles
 CACHE_BYTES, OPENED_BYTES = 512 * 2**20, 256 * 2**20
 
 
-# -- opening the aperture ---------------------------------------------------------------------
-
-
 class ApertureBlur:
     """Opens the aperture of one scene's light; results are cached, as f-numbers are few.
 
@@ -145,11 +142,10 @@ class MapApertureBlur(ApertureBlur):
             added = self._added(self.diameter[tile.outer], f_number)
             # Close f-numbers share most of their discs; on large frames they take too much memory.
             cache = self._banks if self.diameter.numel() <= TILE**2 else {}
-            bank = cache.get((tile, denoised))
-            if bank is None:  # beyond the limit sums would no longer resolve the shadows
+            if (tile, denoised) not in cache:  # sums of more would not resolve the shadows
                 bank = DiscBank(light[tile.outer].clamp(-LIGHT_LIMIT, LIGHT_LIMIT))
                 cache[tile, denoised] = bank
-            return bank.blurred(added)[tile.core]
+            return cache[tile, denoised].blurred(added)[tile.core]
 
         result = light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT)
         for tile in make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0):
@@ -180,9 +176,6 @@ class NetworkApertureBlur(ApertureBlur):
         image = self._denoised.light[None]
         f_numbers = (torch.tensor([n], device=image.device) for n in (self.f_number, f_number))
         return self._module(image, torch.zeros_like(image), *f_numbers)[0]
-
-
-# -- all blur ---------------------------------------------------------------------------------
 
 
 class BlurredLight:
@@ -235,7 +228,8 @@ class BlurredLight:
             return [self.source(origin) for origin in origins]
         lens, fields = np.zeros_like(blurs), ["defocus_px", "diameter", "sorts", "num_sorts"]
         lens[fields] = blurs[fields]
-        changes = _changes(blurs)
+        # Blurs that change what is behind the disc of defocus.
+        changes = (blurs["motion_px"] > 0.0) | (blurs["vignetting"] > 0)
         blurs = np.where(changes, blurs, lens)
         numbers = blurs.view(f"V{BLUR.itemsize}").tolist()
         keys = [(*key, owners) for key in zip(origins, numbers, strict=True)]
@@ -247,17 +241,17 @@ class BlurredLight:
                 lights, own["defocus_px"] = self.lights(origins, lens[some], owners), 0.0
             else:
                 lights = [self.source(origin) for origin in origins]
-            made = self._made(lights, own)
+            made = self._made(lights, own, changes[some])
             found |= zip((keys[row] for row in some), made, strict=True)
             for row, light, before in zip(some, made, lights, strict=True):
                 if light is not before:
                     self._cache.put(keys[row], light, light.nbytes)
         return [found[key] for key in keys]  # type: ignore[misc]
 
-    def _made(self, lights: list[Tensor], blurs: np.ndarray) -> list[Tensor]:
-        """Lights (4, H, W) out of focus, or in motion and darkened; the others as they are."""
+    def _made(self, lights: list[Tensor], blurs: np.ndarray, changes: np.ndarray) -> list[Tensor]:
+        """Lights (4, H, W) out of focus, or that `changes`; the others as they are."""
         result, device = [*lights], self.light.device
-        todo = np.flatnonzero((blurs["defocus_px"] > 0.0) | _changes(blurs))
+        todo = np.flatnonzero((blurs["defocus_px"] > 0.0) | changes)
         if not len(todo):
             return result
         sources = [lights[i].float().contiguous() for i in todo]
@@ -266,19 +260,20 @@ class BlurredLight:
         places = frames.places(sources)
         # One light out of focus shares discs; each motion or vignetting has memory of its own.
         same = np.unique(places, return_inverse=True)[1]
-        indices = np.where(_changes(blurs[todo]), slots, same)
+        indices = np.where(changes[todo], slots, same)
         done, planned = frames.plan(indices, slots, blurs[todo], places)
         frames.run(planned)
         for i, light in zip(todo.tolist(), frames.kept(done), strict=True):
             result[i] = light
         return result
 
-    # -- noise of the source ------------------------------------------------------------------
-
     def with_remaining_noise(self, exposure: Exposure) -> Exposure:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
         left, energy = None, 1.0
         path, motion_px, defocus_px = exposure.path, exposure.motion_px, exposure.defocus_px
+        unblurred = not motion_px and not defocus_px and exposure.opened_to is None
+        if unblurred and exposure.vignetting is None:
+            return exposure  # nothing averages it
         if exposure.layout is not None:
             path = Path(motion_px) if path is None and motion_px else path
             left = _noise_map(exposure.layout, path, exposure.subject_path, defocus_px)
@@ -301,11 +296,6 @@ class BlurredLight:
             left = share if left is None else left * share
         left = None if left is None else left.float().contiguous()
         return replace(exposure, energy=energy, remaining_variance=left)
-
-
-def _changes(blurs: np.ndarray) -> np.ndarray:
-    """(N,) which of the blurs change what is behind the disc of defocus."""
-    return np.asarray((blurs["motion_px"] > 0.0) | (blurs["vignetting"] > 0))
 
 
 def new_frames(

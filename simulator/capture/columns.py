@@ -161,9 +161,8 @@ def plan_frames(first, last, known, camera, given, made):  # type: ignore[no-unt
         blur.direction, blur.turn, blur.streaks = scene.direction, scene.turn * time, scene.streaks
         blur.drift_x = drift * math.cos(scene.subject_direction)
         blur.drift_y = drift * math.sin(scene.subject_direction)
-        if drift > 0.0:
-            own = path_length(moved, blur.direction, blur.turn, blur.drift_x, blur.drift_y)
-            moved = max(moved, own)
+        own = path_length(moved, blur.direction, blur.turn, blur.drift_x, blur.drift_y)
+        moved = max(moved, own)
         extents[1], extents[2] = scene.defocus * 4.0 / state.f_number, moved
         disc = line = math.inf
         if scene.tolerance > 0.0 and extents[1] + moved > 0.0:

@@ -136,9 +136,6 @@ class Exposure:
         return self.denoised, self.opened_to
 
 
-# -- deciding ---------------------------------------------------------------------------------
-
-
 def decide(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
 ) -> Exposure:

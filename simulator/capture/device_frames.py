@@ -68,10 +68,8 @@ class DeviceFrames(BlurredFrames):
 
     def _more(self, count: int) -> np.ndarray:
         # Lights of scenes that are gone come first.
-        gone = {key: place for key, (light, place) in self._known.items() if light() is None}
-        for key in gone:
-            del self._known[key]
-        self._give_back(np.array([*gone.values()], np.uintp))
+        gone = [key for key, (light, _) in self._known.items() if light() is None]
+        self._give_back(np.array([self._known.pop(key)[1] for key in gone], np.uintp))
         lacking, old = count - len(gone), self._frames
         if lacking <= 0:
             return self._free[:0]

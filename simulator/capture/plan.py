@@ -234,9 +234,6 @@ def _planned(step: Step, samples: int) -> Step:
     return step._replace(reason=reason, estimate=0.0, operations=operations)
 
 
-# -- predicted errors -------------------------------------------------------------------------
-
-
 def predict_errors(
     scene: PreparedScene, settings: CameraSettings, exposure: Exposure
 ) -> dict[str, float]:

@@ -67,16 +67,15 @@ class Vignetting:
         Where `source` is the f-number of a capture through the same lens, relative to that.
         """
         key = f_number, shape, source
-        found = self._maps.get(key)
-        if found is None:
+        if key not in self._maps:
             height, width = shape
             y, x = (np.arange(n) + 0.5 - n / 2 for n in shape)
             squared = (y[:, None] ** 2 + x**2) / (height**2 / 4 + width**2 / 4)
             left = _polynomial(self._terms(f_number), squared)
             if source is not None:
                 left /= _polynomial(self._terms(source), squared)
-            found = self._maps[key] = left.astype(np.float32)
-        return found
+            self._maps[key] = left.astype(np.float32)
+        return self._maps[key]
 
     def corner_loss(self, f_number: float) -> float:
         """How much darker the corners are than the centre [EV]."""
