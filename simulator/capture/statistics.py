@@ -241,18 +241,13 @@ class LightStatistics:
 
     @functools.cached_property
     def _bins(self) -> _Bins:
-        picked, (height, width) = self.light, self.light.shape[-2:]
-        rows, step = np.arange(height), max(1, math.ceil(height * width / SAMPLES))
+        light, (height, width) = self.light.cpu().numpy(), self.light.shape[-2:]
         # Whole rows: every column counts alike whatever the width, and a row is read at once.
-        if step > 1:  # of a large frame, some with their neighbours
-            some = torch.arange(min(step, height) // 2, height, step)
-            around = [(some - 1).clamp(min=0), some, (some + 1).clamp(max=height - 1)]
-            picked = picked[:, torch.stack(around, 1).flatten().to(picked.device)]
-            rows = np.arange(1, picked.shape[1], 3)
-        light = picked.cpu().numpy()
-        samples = len(rows) * light.shape[-1]
+        step = math.ceil(height * width / SAMPLES)
+        rows = np.arange(min(step, height) // 2, height, step)
+        samples = len(rows) * width
         step = max(1, samples // _SORTED)
-        while math.gcd(step, light.shape[-1]) > 1:  # every column counts alike
+        while math.gcd(step, width) > 1:  # every column counts alike
             step += 1
         ordered = np.sort(light[:, rows].reshape(4, -1)[:, ::step], axis=1)
         limits = ordered[:, np.arange(1, BINS) * ordered.shape[1] // BINS]
@@ -435,9 +430,6 @@ class ResidualStatistics:
         place = order * _LEVELS // values.shape[1]
         counts = np.stack([np.bincount(p, minlength=_LEVELS) for p in place])
         return error.double().cpu().numpy(), values, place, counts
-
-
-# -- denoised light ---------------------------------------------------------------------------
 
 
 @dataclass(eq=False, repr=False)
