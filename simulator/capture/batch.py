@@ -142,10 +142,10 @@ class CaptureBatch:
         self._scene_columns = np.zeros(num_scenes, columns.SCENE)
         self._rest = np.full(num_scenes, -1)
         # Of scenes at rest, what those that show them in motion share: the light and its place, the
-        # largest defocus, the subject, the vignetting, and the statistics, where they are known.
+        # largest defocus, the vignetting, and the statistics, where they are known.
         self._light: dict[int, torch.Tensor] = {}
         self._widest, self._place = np.zeros(num_scenes), np.zeros(num_scenes, np.uintp)
-        self._height, self._subjects = 0, np.zeros((num_scenes, 2), np.uintp)
+        self._height = 0  # of all lights
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
         # Row of the blurred light that each scene has at present.
@@ -312,8 +312,9 @@ class CaptureBatch:
             inside = (rest >= 0) & (self._rest[rest] >= 0)
             inside &= moves["defocus"] <= self._widest[rest]
             new, rest = indices[inside], rest[inside]
-            own = self._scene_columns[rest], moves[inside], self._subjects[rest]
-            self._scene_columns[new] = columns.moved_columns(*own)
+            self._scene_columns[new] = self._scene_columns[rest]
+            for name in columns.MOVES.names or ():
+                self._scene_columns[name][new] = moves[name][inside]
             for index in np.unique(rest[~self._counted[rest]]).tolist():
                 self._statistics[index] = self._scenes[index].statistics.columns
                 self._counted[index] = True
@@ -338,7 +339,6 @@ class CaptureBatch:
             self._statistics[index] = found = columns.statistics_column(scene)
             self._counted[index] = found.any()
             self._widest[index] = columns.widest_defocus(scene, self._columns)
-            self._subjects[index] = columns.layout_column(scene.layout, subject=True)[3:]
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:

@@ -31,8 +31,7 @@ SCENE = np.dtype(
         *((n, "f8") for n in ("log2_reference", "gain", "tolerance", *_MOVES)),
         ("targets", "i8"),  # which noise of the camera its captures have
         ("rest", "i8"),  # the scene that it shows at rest or in motion
-        ("streaks", "?"),  # whether the whole frame moves along the rows
-        *LAYOUT,
+        *LAYOUT,  # with the subject, whether it moves or not
     ]
 )
 #: The blurs that `plan_frames` decides on.
@@ -78,31 +77,13 @@ def statistics_column(scene: PreparedScene) -> np.ndarray:
 
 def scene_column(scene: PreparedScene, targets: int, rest: int) -> tuple[Any, ...]:
     """The `SCENE` of a scene."""
-    movement, layout = scene.movement, scene.layout
-    apart = layout is not None and layout.subject is not None and movement.subject_speed > 0.0
-    own = movement.subject_speed if apart else 0.0
+    movement = scene.movement
     return (
         *(scene.reference.log2_exposure, scene.gain, scene.tolerance),
         *(scene.defocus, scene.image_speed, movement.direction, movement.turn),
-        *(own, movement.subject_direction),
-        *(targets, rest, movement.along_rows and not apart),
-        *layout_column(layout, apart),
+        *(movement.subject_speed, movement.subject_direction, targets, rest),
+        *layout_column(scene.layout, subject=True),
     )
-
-
-def moved_columns(rest: np.ndarray, moves: np.ndarray, subjects: np.ndarray) -> np.ndarray:
-    """`SCENE` (K,) of scenes in motion, from those at rest.
-
-    `moves` (K,) are `MOVES`, `subjects` (K, 2) the addresses of `LAYOUT` that a subject which moves
-    has, 0 without one.
-    """
-    columns, apart = rest.copy(), (moves["subject_speed"] > 0.0) & (subjects[:, 0] > 0)
-    for name in MOVES.names or ():
-        columns[name] = moves[name]
-    columns["subject_speed"] *= apart
-    columns["streaks"] = (moves["turn"] == 0.0) & (moves["direction"] == 0.0) & ~apart
-    columns["mask"], columns["behind"] = np.where(apart, subjects.T, np.uintp(0))
-    return columns
 
 
 def vignetting_column(scene: PreparedScene, states: Sequence[CameraSettings]) -> np.ndarray:
@@ -156,9 +137,11 @@ def plan_frames(first, last, known, camera, given, made):  # type: ignore[no-unt
         target, time = targets[scene.targets, at], state.time
         ratio = 2.0 ** (state.log2_exposure - scene.log2_reference)
         ratio = min(scene.gain * gains[k] * ratio, decision.RATIO_LIMIT)
-        drift = scene.subject_speed * time * height
+        mask = scene.mask if scene.subject_speed > 0.0 else np.uintp(0)  # of a subject that moves
+        drift = scene.subject_speed * time * height if mask else 0.0
         blur.extent = moved = scene.speed * time * height
-        blur.direction, blur.turn, blur.streaks = scene.direction, scene.turn * time, scene.streaks
+        blur.direction, blur.turn = scene.direction, scene.turn * time
+        blur.streaks = scene.direction == 0.0 and scene.turn == 0.0 and not mask
         blur.drift_x = drift * math.cos(scene.subject_direction)
         blur.drift_y = drift * math.sin(scene.subject_direction)
         own = path_length(moved, blur.direction, blur.turn, blur.drift_x, blur.drift_y)
@@ -167,12 +150,12 @@ def plan_frames(first, last, known, camera, given, made):  # type: ignore[no-unt
         disc = line = math.inf
         if scene.tolerance > 0.0 and extents[1] + moved > 0.0:
             disc, line = curvature(statistics[scene.rest], ratio, target)
-            line = line if scene.streaks else decision.STREAK_TO_DISC * disc
+            line = line if blur.streaks else decision.STREAK_TO_DISC * disc
         decision.weigh_blurs(extents, disc, line, 0.0, scene.tolerance, errors, runs)
         blur.defocus_px = extents[1] if runs[1] else 0.0
         blur.motion_px = moved if runs[2] else 0.0
         blur.diameter, blur.sorts = scene.diameter, scene.sorts
-        blur.num_sorts, blur.mask, blur.behind = scene.num_sorts, scene.mask, scene.behind
+        blur.num_sorts, blur.mask, blur.behind = scene.num_sorts, mask, scene.behind
         blur.vignetting = vignetting[scene.rest, at]
         modules[row] = bits[3] + runs[1] * bits[0] + runs[2] * bits[1]
         modules[row] += (blur.vignetting > 0) * bits[2]
