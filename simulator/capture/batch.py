@@ -141,11 +141,11 @@ class CaptureBatch:
         self._known = np.zeros(num_scenes, bool)
         self._scene_columns = np.zeros(num_scenes, columns.SCENE)
         self._rest = np.full(num_scenes, -1)
+        self._height, self._widest = 0, 0.0  # of all lights, and the largest defocus
         # Of scenes at rest, what those that show them in motion share: the light and its place, the
-        # largest defocus, the vignetting, and the statistics, where they are known.
+        # vignetting, and the statistics, where they are known.
         self._light: dict[int, torch.Tensor] = {}
-        self._widest, self._place = np.zeros(num_scenes), np.zeros(num_scenes, np.uintp)
-        self._height = 0  # of all lights
+        self._place = np.zeros(num_scenes, np.uintp)
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
         # Row of the blurred light that each scene has at present.
@@ -282,15 +282,10 @@ class CaptureBatch:
     def _photograph(self, indices: np.ndarray, units: int, fixed: tuple[Any, ...]) -> None:
         """Makes the light that is planned, and records frames of `indices` (B,)."""
         assert self._pending is not None
-        (count, planned), self._pending = self._pending, None
+        planned, self._pending = self._pending[1], None
         with self._forgetting(indices):
-            order = np.empty(len(planned.passes) + count, np.int64)
-            ends = np.zeros(count + 1, np.int64)
-            if deal_out(planned.passes, indices, self.num_scenes, order, ends):  # NumPy makes some
-                self._frames.run(planned)
-                order, ends = len(planned.passes) + np.arange(count), np.arange(count + 1)
-            given = order, ends, units, (1, *planned), fixed
-            counter = np.zeros(1, np.int64)
+            order = deal_out(planned.passes, indices, self.num_scenes)
+            given, counter = (*order, units, (1, *planned), fixed), np.zeros(1, np.int64)
             parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -309,8 +304,7 @@ class CaptureBatch:
             rest, moves = self._moved(indices)
             for index in np.unique(rest[(rest >= 0) & ~self._known[rest]]).tolist():
                 self._add_alone(index)
-            inside = (rest >= 0) & (self._rest[rest] >= 0)
-            inside &= moves["defocus"] <= self._widest[rest]
+            inside = (rest >= 0) & (self._rest[rest] >= 0) & (moves["defocus"] <= self._widest)
             new, rest = indices[inside], rest[inside]
             self._scene_columns[new] = self._scene_columns[rest]
             for name in columns.MOVES.names or ():
@@ -326,6 +320,7 @@ class CaptureBatch:
     def _add_alone(self, index: int) -> None:
         scene = self.prepared_scene(index)
         self._light[index], self._height = scene.light.contiguous(), scene.light.shape[-2]
+        self._widest = columns.widest_defocus(scene, self._columns)
         box = scene.box_factor
         if box not in self._boxes:
             self._boxes.append(box)
@@ -338,7 +333,6 @@ class CaptureBatch:
             self._scene_columns[index] = columns.scene_column(scene, self._boxes.index(box), index)
             self._statistics[index] = found = columns.statistics_column(scene)
             self._counted[index] = found.any()
-            self._widest[index] = columns.widest_defocus(scene, self._columns)
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -400,6 +394,8 @@ class CaptureBatch:
         slots, blurs = self._slots[rows - indices * len(self.states)], self._blur.take(rows)
         self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, source[missing])
         self._blurred_row[indices], self._pending = rows, (len(source), planned)
+        if (planned.passes["kind"] == blurred_frames.WIDE).any():  # which no kernel does
+            self._finish()
         if self._any_remaining and len(unknown := rows[np.isnan(self._excess_variance[rows])]):
             self._finish()
             for row in unknown.tolist():  # depends on the pixels
@@ -454,20 +450,19 @@ def photograph(counter, order, ends, units, blurring, recording):  # type: ignor
 
 
 @kernel()
-def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untyped-def]
-    """Puts passes (J,), and behind them frames of `scenes` (B,), in `order`; whether one is wide.
+def deal_out(passes, scenes, num_scenes):  # type: ignore[no-untyped-def]
+    """The order of passes (J,), and behind them frames of `scenes` (B,): (J + B,) their numbers.
 
-    They come scene by scene, the costly ones first, the passes of a scene before its frames. `ends`
-    (B + 1,), zeros, get where each scene begins and the last ends; the length where there are less.
+    They come scene by scene, the costly ones first, the passes of a scene before its frames. Also
+    (B + 1,) where each scene begins and the last ends; the length where there are less.
     """
+    order, ends = np.empty(len(passes) + len(scenes), np.int64), np.zeros(len(scenes) + 1, np.int64)
     owner, total = np.empty(len(order), np.int64), num_scenes + len(scenes)
-    cost, counts = np.zeros(total), np.zeros(total, np.int64)
-    wide, spent = False, 0.0
+    cost, counts, spent = np.zeros(total), np.zeros(total, np.int64), 0.0
     for unit in range(len(order)):
         k = unit - len(passes)
         if k < 0:
             one, more = passes[unit].scene, passes[unit].cost
-            wide = wide or passes[unit].kind == blurred_frames.WIDE
         else:  # a frame without passes can be anywhere
             one, more = scenes[k] if counts[scenes[k]] else num_scenes + k, RECORDING
         owner[unit] = one
@@ -486,7 +481,7 @@ def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untype
     for unit in range(len(order)):
         order[begin[owner[unit]]] = unit
         begin[owner[unit]] += 1
-    return wide
+    return order, ends
 
 
 @kernel()
