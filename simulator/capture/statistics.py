@@ -394,28 +394,16 @@ class ResidualStatistics:
         Without `noise` the light alone is wanted, in which noise that is left is an error in full;
         the other arguments are those of `LightStatistics`.
         """
+        wiener, place, counts, level, share = self._measured
         if residual not in self._gathered:  # squared bias and variance, (4, L) each
-            bias, variance = map(self._by_level, residual.at(self._measured[0]))
+            bias, variance = (_by_level(v, place, counts) for v in residual.at(wiener))
             self._gathered[residual] = bias, variance
         noises = noise_numbers(self.nlf), noise_numbers(target)
-        known = *self._gathered[residual], *self._levels
-        return float(_error(*known, float(ratio), *noises, noise))
-
-    def _by_level(self, values: np.ndarray) -> np.ndarray:
-        """(4, L) means of `values` of the blocks, (4, N) or (N,) for all planes."""
-        _, _, place, counts = self._measured
-        each = zip(place, np.broadcast_to(values, place.shape), strict=True)
-        return np.stack([np.bincount(p, v, _LEVELS) for p, v in each]) / np.maximum(counts, 1)
+        return float(_error(*self._gathered[residual], level, share, float(ratio), *noises, noise))
 
     @functools.cached_property
-    def _levels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean light, and share of all samples, by plane and level, (4, L) each."""
-        _, light, _, counts = self._measured
-        return self._by_level(light), counts / counts.sum()
-
-    @functools.cached_property
-    def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Wiener error (N,) and light (4, N) of blocks, their levels, and how many each has."""
+    def _measured(self) -> tuple[np.ndarray, ...]:
+        """Wiener error (N,) and level (4, N) of blocks; number, light and share of each level."""
         (height, width), parts = self.light.shape[-2:], [self.light]
         blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
         if blocks > _BLOCKS and height >= 2 * _WINDOW:  # bands of rows that are sampled
@@ -429,7 +417,14 @@ class ResidualStatistics:
         order = np.argsort(np.argsort(values, axis=1), axis=1)
         place = order * _LEVELS // values.shape[1]
         counts = np.stack([np.bincount(p, minlength=_LEVELS) for p in place])
-        return error.double().cpu().numpy(), values, place, counts
+        known = place, counts, _by_level(values, place, counts), counts / counts.sum()
+        return error.double().cpu().numpy(), *known
+
+
+def _by_level(values: np.ndarray, place: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(4, L) means of `values` of blocks, (4, N) or (N,) for all planes, by their level."""
+    each = zip(place, np.broadcast_to(values, place.shape), strict=True)
+    return np.stack([np.bincount(p, v, _LEVELS) for p, v in each]) / np.maximum(counts, 1)
 
 
 @dataclass(eq=False, repr=False)

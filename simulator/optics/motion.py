@@ -478,8 +478,7 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
     apart = np.zeros((height, right - left), np.float32)
     front, cover = np.empty_like(apart), np.empty_like(apart)
     for y in range(top, bottom):
-        for x in range(right - left):
-            apart[y, x] = mask[y, left + x]
+        copy_row(mask[y, left:right], apart[y])
     blur_rows(top, bottom, apart, rows, columns, weights, limit, cover)
     for plane in range(0, len(planes), height):
         source, result = planes[plane : plane + height], out[plane : plane + height]
