@@ -55,15 +55,10 @@ class ApertureBlur:
     def forget(self) -> None:
         """Drops what is cached."""
         self._opened: LruCache[Tensor] = LruCache(OPENED_BYTES)
-        self._extents: dict[float, float] = {}
 
     def extent(self, f_number: float) -> float:
         """Largest diameter of the blur that opening to `f_number` adds [pixel]; 0 for none."""
-        if f_number >= self.f_number:
-            return 0.0
-        if f_number not in self._extents:
-            self._extents[f_number] = self._largest(f_number)
-        return self._extents[f_number]
+        return math.inf if f_number < self.f_number else 0.0  # unknown before a network ran
 
     def opened(self, f_number: float, denoised: DenoisedLight | None = None) -> Tensor:
         """Light (4, H, W) at a wider aperture, of `denoised` or as recorded, equally exposed."""
@@ -77,9 +72,6 @@ class ApertureBlur:
     def remaining_variance(self, f_number: float) -> Tensor | None:
         """(H, W) share of the recorded noise's variance that the blur leaves; None for all."""
         return None
-
-    def _largest(self, f_number: float) -> float:
-        return math.inf  # unknown before a network ran
 
     def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:
         raise NotImplementedError
@@ -111,12 +103,18 @@ class MapApertureBlur(ApertureBlur):
         """Drops what is cached; the map stays."""
         super().forget()
         self._banks: dict[tuple[Tile, DenoisedLight | None], DiscBank] = {}
-        self._left: dict[float, Tensor] = {}
+        self._extents, self._left = dict[float, float](), dict[float, Tensor]()
 
     @functools.cached_property
     def diameter(self) -> Tensor:
         """(H, W) circle of confusion at the light's own f-number [pixel]."""
         return self._diameter if isinstance(self._diameter, Tensor) else self._diameter()
+
+    def extent(self, f_number: float) -> float:
+        """See `ApertureBlur`."""
+        if f_number < self.f_number and f_number not in self._extents:
+            self._extents[f_number] = float(self._added(self.diameter.max(), f_number))
+        return self._extents.get(f_number, 0.0)
 
     def remaining_variance(self, f_number: float) -> Tensor:
         """See `ApertureBlur`."""
@@ -128,9 +126,6 @@ class MapApertureBlur(ApertureBlur):
     def mean_square_diameter(self) -> float:  # type: ignore[override]
         """See `ApertureBlur`."""
         return float(self.diameter.square().mean())
-
-    def _largest(self, f_number: float) -> float:
-        return float(self._added(self.diameter.max(), f_number))
 
     def _added(self, diameter: Tensor, f_number: float) -> Tensor:
         return discs.added_blur(diameter, self.f_number, f_number)

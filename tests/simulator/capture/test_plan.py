@@ -141,13 +141,11 @@ class Opening(ApertureBlur):
 
     def __init__(self, extent: float, *, needs_denoised: bool = False) -> None:
         super().__init__(16.0)
-        self._extent, self.needs_denoised = extent, needs_denoised
+        self.needs_denoised = needs_denoised
+        self.extent = lambda f_number: extent if f_number < self.f_number else 0.0
 
     def remaining_variance(self, f_number: float) -> None:
         """None: no noise is left out of account here."""
-
-    def _largest(self, f_number: float) -> float:
-        return self._extent
 
     def _open(self, f_number: float, denoised: DenoisedLight | None) -> torch.Tensor:
         return LIGHT
