@@ -22,6 +22,7 @@ from simulator.utils.compute import kernel
 #: holds them; frames that are added at once, at least; taps of a frame that a GPU can read
 #: together, at least; samples of a frame that is moved along the rows alone.
 _SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**20}, 64, 8, 2**20
+_KNOTS = torch.tensor(DIAMETERS, dtype=torch.float32).square()
 
 
 class DeviceFrames(BlurredFrames):
@@ -109,7 +110,7 @@ class DeviceFrames(BlurredFrames):
         for part in self._parts(np.arange(len(passes)), 2 * math.prod(self._shape)):
             maps = self._layout_frames(passes["scene"][part], blurs[part])
             scale = torch.from_numpy(blurs["defocus_px"][part].astype(np.float32)).to(maps.device)
-            knots = torch.tensor(DIAMETERS, dtype=torch.float32, device=maps.device).square_()
+            knots = _KNOTS.to(maps.device)
             squared = (maps[:, 0].flatten(1) * scale[:, None]).square_()
             squared = squared.clamp_(max=DIAMETERS[-1] ** 2)
             below = torch.searchsorted(knots, squared, right=True).sub_(1).clamp_(0, len(knots) - 2)
@@ -202,7 +203,7 @@ def tap_columns(blurs, own, height, width):  # type: ignore[no-untyped-def]
 def moved_sums(images: Tensor, samples: int, taps: tuple[np.ndarray, ...]) -> Tensor:
     """Sums of shifts of `images` (K, C, H, W) by the taps of each; the borders are replicated.
 
-    So many `samples` are read at once as are stated. The `taps` are `tap_columns`.
+    So many `samples` are read at once as are stated. The `taps` are those of `tap_columns`.
     """
     (height, width), to, (ends, rows, columns, weights) = images.shape[-2:], images.device, taps
     counts = np.diff(ends)
