@@ -284,8 +284,10 @@ class CaptureBatch:
         assert self._pending is not None
         planned, self._pending = self._pending[1], None
         with self._forgetting(indices):
-            order = deal_out(planned.passes, indices, self.num_scenes)
-            given, counter = (*order, units, (1, *planned), fixed), np.zeros(1, np.int64)
+            order = np.empty(len(planned.passes) + len(indices), np.int64)
+            counter, ends = np.zeros(1, np.int64), np.zeros(len(indices) + 1, np.int64)
+            deal_out(planned.passes, indices, self.num_scenes, order, ends)
+            given = order, ends, units, (1, *planned), fixed
             parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -450,13 +452,12 @@ def photograph(counter, order, ends, units, blurring, recording):  # type: ignor
 
 
 @kernel()
-def deal_out(passes, scenes, num_scenes):  # type: ignore[no-untyped-def]
-    """The order of passes (J,), and behind them frames of `scenes` (B,): (J + B,) their numbers.
+def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untyped-def]
+    """Puts passes (J,), and behind them frames of `scenes` (B,), in `order` (J + B,).
 
-    They come scene by scene, the costly ones first, the passes of a scene before its frames. Also
-    (B + 1,) where each scene begins and the last ends; the length where there are less.
+    They come scene by scene, the costly ones first, the passes of a scene before its frames. `ends`
+    (B + 1,), zeros, get where each scene begins and the last ends; the length where there are less.
     """
-    order, ends = np.empty(len(passes) + len(scenes), np.int64), np.zeros(len(scenes) + 1, np.int64)
     owner, total = np.empty(len(order), np.int64), num_scenes + len(scenes)
     cost, counts, spent = np.zeros(total), np.zeros(total, np.int64), 0.0
     for unit in range(len(order)):
@@ -481,7 +482,6 @@ def deal_out(passes, scenes, num_scenes):  # type: ignore[no-untyped-def]
     for unit in range(len(order)):
         order[begin[owner[unit]]] = unit
         begin[owner[unit]] += 1
-    return order, ends
 
 
 @kernel()

@@ -574,9 +574,9 @@ def record_units(  # type: ignore[no-untyped-def]
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
 
-    Of `noise` there are keys and the bank. What is None is not compiled: whether the noise is
-    `drawn`, and the `gains` (B, H) of rows. Where there are `means` (of `CodeMeans`) to fill, frames
-    are not divided.
+    Of `noise` there are keys and the bank. What is None is not compiled: whether noise is `drawn`,
+    and the `gains` (B, H) of rows. Where there are `means` (of `CodeMeans`) to fill, frames are not
+    divided.
     """
     (keys, bank), (codes, numbers, signals, counts) = noise, outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
