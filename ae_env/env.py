@@ -169,8 +169,7 @@ class AutoExposure(Task):
         if lighting.within_frame:
             moment: tuple[float, ...] = (episode.frame, episode.phase)
         else:
-            gain = episodes.gains(np.array([env_index]), np.zeros(1))[0].item()
-            moment = (gain,)
+            moment = (gain := episodes.gains(np.array([env_index]), np.zeros(1))[0].item(),)
         # All that a table depends on: tables of episodes that were seen before are cached.
         lens = episodes.lens(env_index)
         key = (episode.scene, episode.speed, episode.defocus, episode.movement, moment, lens)

@@ -331,9 +331,9 @@ class Episodes:
 
         And (B, R) that of each row relative to the frame's, or None (`Lighting.rows`).
         """
-        columns = self.frame[env_indices], exposure_times, self.phase[env_indices]
+        frames, times, phases = self.frame[env_indices], exposure_times, self.phase[env_indices]
         if not self.lighting.within_frame:
-            each = zip(*(values.tolist() for values in columns), strict=True)
+            each = zip(frames.tolist(), times.tolist(), phases.tolist(), strict=True)
             return np.array([self.lighting.gain(*one) for one in each]), None
         gains = np.empty(len(env_indices))
         rows = np.empty((len(env_indices), self.options.resolution))
@@ -341,7 +341,8 @@ class Episodes:
         for factor in np.unique(factors):
             own = np.flatnonzero(factors == factor)
             shutter = RollingShutter(rows.shape[1], self.camera.row_time, 2 * int(factor))
-            gains[own], rows[own] = self.lighting.batch(*(v[own] for v in columns), shutter)
+            given = frames[own], times[own], phases[own]
+            gains[own], rows[own] = self.lighting.batch(*given, shutter)
         return gains, rows if (rows != 1.0).any() else None
 
     def gains_by_state(self, env_index: int) -> tuple[np.ndarray, np.ndarray | None]:

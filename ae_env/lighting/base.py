@@ -122,8 +122,9 @@ class Lighting:
         shutter: RollingShutter,
     ) -> tuple[np.ndarray, np.ndarray]:
         """`rows` of B frames: (B,), and (B, rows), where 1 stands for None."""
-        columns = (values.tolist() for values in (frames, exposure_times, phases))
-        found = [self.rows(*each, shutter) for each in zip(*columns, strict=True)]
+        frame, time, phase = (values.tolist() for values in (frames, exposure_times, phases))
+        each = zip(frame, time, phase, strict=True)
+        found = [self.rows(n, exposed, own, shutter) for n, exposed, own in each]
         alike = np.ones(shutter.rows)
         gains = np.array([gain for gain, _ in found])
         return gains, np.stack([alike if rows is None else rows for _, rows in found])
@@ -345,7 +346,8 @@ class FlickerLighting(Lighting):
         self, frame: int, exposure_time: float, phase: float, shutter: RollingShutter
     ) -> tuple[float, np.ndarray | None]:
         """See `Lighting.rows`: `frame`, `exposure_time`, `phase`, `shutter`."""
-        (gain,), (rows,) = self.batch(*np.array([[frame], [exposure_time], [phase]]), shutter)
+        frames, times, phases = np.array([[frame], [exposure_time], [phase]])
+        (gain,), (rows,) = self.batch(frames, times, phases, shutter)
         return float(gain), rows if np.ptp(rows) else None
 
     def batch(

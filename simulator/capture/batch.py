@@ -244,7 +244,7 @@ class CaptureBatch:
         rows = indices * len(self.states) + states
         read_noise, run = None, None
         apart = self.camera.prnu or self._device or self.noise == "sensor"
-        apart = apart or (row_gain is not None and self._table[rows, 3:].any())
+        apart = apart or (row_gain is not None and bool(self._table[rows, 3:].any()))
         several = len(indices) >= 2 * torch.get_num_threads()
         if self._pending is None or apart or not several or self._pending[0] != len(indices):
             self._finish()

@@ -593,15 +593,14 @@ def record_units(  # type: ignore[no-untyped-def]
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
-        pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
-        frame_light = numba.carray(pointer, (4 * samples,))
+        frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[attr-defined, call-arg]
         shares = samples if remaining[frame] else 0
         share = numba.carray(as_pointer(remaining[frame]), (shares,))
         clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
-            exposed, normals, sign = frame_light[at : at + size], made, _ONE
+            exposed, normals, sign, out = frame_light[at : at + size], made, _ONE, part[:size]
             if gains is not None:
                 _in_bands(start, exposed, samples // gains.shape[1], gains[frame], lit)
                 exposed = lit[:size]
@@ -622,7 +621,6 @@ def record_units(  # type: ignore[no-untyped-def]
                 )
             else:
                 _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, read, body, part)
-            out = part[:size]
             if codes.size:
                 _compand(out, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
             elif counts.size:
