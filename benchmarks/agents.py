@@ -112,7 +112,10 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
             TrainingJob(f"{name}, seed {s}", config.with_seed(s), folder / f"{name}-{s}")
             for s in SEEDS
         ]
-    _train(jobs)
+    everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
+    with progress_bars() as progress, ExitStack() as bars:
+        tasks = {job.name: bars.enter_context(progress(job.name)) for job in everything}
+        train_in_parallel(everything, progress=lambda name, *done: tasks[name](*done[:2]))
     meta: dict[str, Any] = {"training_seeds": list(SEEDS)}
     meta["training"] = {name: own[0].config.card() for name, own in jobs.items()}
     context = context_of({"resolution": 64})
@@ -143,10 +146,3 @@ def _comparators(
         policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
         fit_policies(policies, environment, seed=seed, progress=task)
     return policies
-
-
-def _train(jobs: dict[str, list[TrainingJob]]) -> None:
-    everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
-    with progress_bars() as progress, ExitStack() as bars:
-        tasks = {job.name: bars.enter_context(progress(job.name)) for job in everything}
-        train_in_parallel(everything, progress=lambda name, *done: tasks[name](*done[:2]))

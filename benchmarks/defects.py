@@ -64,16 +64,14 @@ def render(scene: Scene, defect: str, generator: torch.Generator) -> torch.Tenso
     return pictures
 
 
-def generator_of(seed: int, scene: int, defect: str) -> torch.Generator:
-    """Random numbers of one rendering, independent of those of all others and of other seeds."""
-    entropy = np.random.SeedSequence([seed, scene, DEFECTS.index(defect)])
-    return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
-
-
 def signs_of(
     scenes: list[Scene], defect: str, names: list[str], seed: int
 ) -> dict[str, np.ndarray]:
-    pictures = [render(s, defect, generator_of(seed, i, defect)) for i, s in enumerate(scenes)]
+    pictures = []
+    for number, scene in enumerate(scenes):  # each rendering has random numbers of its own
+        entropy = np.random.SeedSequence([seed, number, DEFECTS.index(defect)])
+        generator = torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
+        pictures.append(render(scene, defect, generator))
     return {name: np.stack([SIGNS[name](own).numpy() for own in pictures]) for name in names}
 
 

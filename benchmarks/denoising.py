@@ -86,8 +86,7 @@ def cases(number: int, picture: DetailPicture, seed: int) -> list[tuple[Row, Any
 @torch.no_grad()
 def _by_network(module: Any, raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
     shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
-    result: Tensor = module(raw[None], shot, read)[0]
-    return result
+    return module(raw[None], shot, read)[0]
 
 
 def networks() -> dict[str, Denoiser]:

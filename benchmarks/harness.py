@@ -355,7 +355,7 @@ def correlation(first: np.ndarray, second: np.ndarray, measure: Any = spearmanr)
     return float(measure(first, second).statistic) if varies else 0.0
 
 
-def quartiles(values: Sequence[float]) -> list[float]:
+def quartiles(values: Sequence[float] | np.ndarray) -> list[float]:
     """Lower quartile, median and upper quartile."""
     return [float(value) for value in np.quantile(values, (0.25, 0.5, 0.75))]
 

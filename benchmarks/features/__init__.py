@@ -138,7 +138,10 @@ def measures(first: Features, second: Features, homography: np.ndarray) -> dict[
     mean of both ways; ``accuracy_K``: share of the mutual nearest neighbours within K pixels;
     ``matches``: how many are within 3; ``corner_error``: of the estimated homography [pixel].
     """
-    i, j = mutual_matches(first.descriptors, second.descriptors)
+    descriptors = [own.descriptors.numpy() for own in (first, second)]
+    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)  # each other's nearest
+    found = matcher.match(*descriptors) if all(map(len, descriptors)) else ()
+    i, j = [match.queryIdx for match in found], [match.trainIdx for match in found]
     there, back = (f.points.double().numpy() for f in (first, second))
     a, b = there[i], back[j]
     errors = np.linalg.norm(mapped(a, homography) - b, axis=1)
@@ -148,13 +151,6 @@ def measures(first: Features, second: Features, homography: np.ndarray) -> dict[
     ways = (there, back, homography), (back, there, np.linalg.inv(homography))
     result["repeatability"] = float(np.mean([_repeated(*way) for way in ways]))
     return result | {"corner_error": _corner_error(a, b, homography)}
-
-
-def mutual_matches(first: Tensor, second: Tensor) -> tuple[list[int], list[int]]:
-    """Indices of descriptors (N, D) and (M, D) that are each other's nearest."""
-    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
-    found = matcher.match(first.numpy(), second.numpy()) if len(first) and len(second) else ()
-    return [match.queryIdx for match in found], [match.trainIdx for match in found]
 
 
 def _repeated(points: np.ndarray, found: np.ndarray, homography: np.ndarray) -> float:

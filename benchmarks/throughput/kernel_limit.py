@@ -7,7 +7,6 @@ nothing else at hand draws them as fast (torch's generator takes three times as 
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numba
 import numpy as np
@@ -90,7 +89,7 @@ class KernelLimit:
         self._chosen = self._rng.integers(len(self._lights), size=count)
         self._ratios = self._rng.uniform(0.1, 2.0, count).astype(_F)
         threads = torch.get_num_threads()
-        list(self._pool.map(partial(self._share, threads), range(threads)))
+        list(self._pool.map(self._share, [threads] * threads, range(threads)))
         return self._out
 
     def _share(self, threads: int, thread: int) -> None:

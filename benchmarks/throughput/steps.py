@@ -33,10 +33,8 @@ CACHED: dict[str, Any] = {"motion": "none", "depth": "far"}
 SCENES = "bundled:small"
 #: Rounds, and seconds that a case takes in each.
 QUICK, FULL = (3, 0.08), (9, 0.3)
-#: Numbers of environments, and kinds of light.
-COUNTS, LIGHTS = (1, 8, 64, 512), ("sine", "flicker")
-#: Numbers of threads, which take turns.
-THREADS = tuple(dict.fromkeys((1, CORES)))
+#: Numbers of environments, kinds of light, and numbers of threads, which take turns.
+COUNTS, LIGHTS, THREADS = (1, 8, 64, 512), ("sine", "flicker"), tuple(dict.fromkeys((1, CORES)))
 #: Names of the limits that others are compared with.
 KERNEL = {"bank": "fused kernel, noise bank", "exact": "fused kernel, exact noise"}
 
@@ -86,7 +84,6 @@ class Case:
     num_envs: int
     step: Callable[[], Any]
     noise: str = "bank"
-    close: Callable[[], Any] = lambda: None
     threads: tuple[int, ...] = THREADS
     seconds: dict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
 
@@ -105,11 +102,7 @@ def measure_steps(size: int, seed: int, quick: bool) -> list[Row]:
     cases += _cases(size, seed)
     if size == 64 and not quick:
         cases.append(_ppo(seed))
-    try:
-        _measure(cases, *(QUICK if quick else FULL))
-    finally:
-        for case in cases:
-            case.close()
+    _measure(cases, *(QUICK if quick else FULL))
     return [row | {"size": size} for threads in THREADS[::-1] for row in _rows(cases, threads)]
 
 
@@ -143,8 +136,7 @@ def _cases(size: int, seed: int) -> Iterator[Case]:
 def _ppo(seed: int) -> Case:
     """PPO's whole loop in the environment that it has by default."""
     envs = warm_environments(64, {"scenes": SCENES, "autoreset_mode": "SAME_STEP"}, seed)
-    training = PPOTraining(total_timesteps=1024)
-    train = partial(train_ppo, envs, training)
+    train = partial(train_ppo, envs, PPOTraining(total_timesteps=1024))
     return Case("PPO, motion and defocus", 1024, train, threads=(CORES,))
 
 
@@ -154,8 +146,8 @@ def _copies(count: int, size: int, seed: int) -> Case:
     warm_environments(1, options).close()
     copies, mode = [partial(warm_environments, 1, options)] * count, AutoresetMode.SAME_STEP
     envs = AsyncVectorEnv(copies, context="fork", autoreset_mode=mode)  # on one thread each
-    name = "copies in subprocesses, cached scene"
-    return Case(name, count, _stepper(envs, seed), close=envs.close, threads=(CORES,))
+    name, step = "copies in subprocesses, cached scene", _stepper(envs, seed)
+    return Case(name, count, step, threads=(CORES,))
 
 
 def _stepper(envs: Any, seed: int) -> Callable[[], Any]:
@@ -194,8 +186,7 @@ def _rows(cases: list[Case], threads: int) -> list[Row]:
     limits, rows = {case.name: case.seconds for case in cases}, []
     for case in cases:
         if threads in case.threads:
-            own = np.array(case.seconds[threads])
-            low, middle, high = quartiles(case.seconds[threads])
+            low, middle, high = quartiles(own := np.array(case.seconds[threads]))
             row: Row = {"case": case.name, "num_envs": case.num_envs, "threads": threads}
             row |= {"steps_per_second": 1.0 / middle, "spread": (high - low) / middle}
             row["ratio_to_kernel"] = float(np.median(limits[KERNEL[case.noise]][threads] / own))
