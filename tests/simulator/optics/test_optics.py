@@ -112,11 +112,12 @@ def test_pulsed_light_is_the_exact_overlap(frequency, duty, time):
 
 
 def test_rows_are_exposed_one_after_the_other():
-    lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
-    rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
+    lamp, time, row_time = MainsLamp(100.0, 0.8, phase=0.1), 1 / 1000, 20e-6
+    rows, whole = lamp.row_light([0.5, 0.7], [time, 0.01], 64, row_time, 4, phase=[0.2, 0.9])
     starts = 0.5 + row_time * np.arange(64 * 4).reshape(64, 4)
-    wanted = np.vectorize(lamp.mean_light)(starts, time).mean(1)
+    wanted = np.vectorize(MainsLamp(100.0, 0.8, phase=0.3).mean_light)(starts, time).mean(1)
     np.testing.assert_allclose(rows, wanted, rtol=1e-12)
+    np.testing.assert_allclose(whole, 1.0, rtol=1e-12)
     # Bands of one period: 10 ms are 500 sensor rows of 20 us, 125 rows of four.
     repeated = lamp.row_light(0.5, time, 250, row_time, sensor_rows=4)
     np.testing.assert_allclose(repeated[:125], repeated[125:], rtol=1e-9)
