@@ -121,12 +121,8 @@ class Transitions:
     @classmethod
     def of(cls, lights: Sequence[torch.Tensor], exposures: Sequence[Exposure]) -> Transitions:
         """Those of lights that are blurred already."""
-        shares = [e.remaining_variance for e in exposures]
-        return cls(
-            [light.contiguous() for light in lights],
-            exposure_table(exposures),
-            [None if share is None else share.float().contiguous() for share in shares],
-        )
+        shares = [exposure.remaining_variance for exposure in exposures]
+        return cls([light.contiguous() for light in lights], exposure_table(exposures), shares)
 
     def in_bands(self, row_gain: np.ndarray) -> Transitions:
         """The same where rows have light of their own: the bands of flickering light.
@@ -294,7 +290,7 @@ def record(
     stepwise = transitions.needs_torch or (read_noise is not None and keys is not None)
     if row_gain is not None and (stepwise or transitions.table[:, 3:].any()):
         transitions, row_gain = transitions.in_bands(row_gain), None
-    if stepwise or transitions.needs_torch:
+    if stepwise:
         transitions = transitions.before_rounding(camera)
         kind: Noise = "exact" if noise == "sensor" else noise
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
