@@ -42,7 +42,7 @@ KERNEL = {"bank": "fused kernel, noise bank", "exact": "fused kernel, exact nois
 class LiveScore:
     """Well-exposedness of the recorded pixels (Mertens 2007), in encoded light.
 
-    It is timed alone on `recorded` frames: torch's square root takes ten times as long for zeros.
+    It is timed alone on `recorded` frames: torch's square root takes longer for their zeros.
     """
 
     domain = "raw"
