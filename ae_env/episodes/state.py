@@ -339,10 +339,9 @@ class Episodes:
         rows = np.empty((len(env_indices), self.options.resolution))
         factors = self.box_factor[self.scene[env_indices]]
         for factor in np.unique(factors):
-            own = np.flatnonzero(factors == factor)
+            at = np.flatnonzero(factors == factor)
             shutter = RollingShutter(rows.shape[1], self.camera.row_time, 2 * int(factor))
-            given = frames[own], times[own], phases[own]
-            gains[own], rows[own] = self.lighting.batch(*given, shutter)
+            gains[at], rows[at] = self.lighting.batch(frames[at], times[at], phases[at], shutter)
         return gains, rows if (rows != 1.0).any() else None
 
     def gains_by_state(self, env_index: int) -> tuple[np.ndarray, np.ndarray | None]:

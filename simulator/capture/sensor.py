@@ -653,8 +653,7 @@ def _record_fused(
     """`record` on the CPU."""
     light, remaining = transitions.light, transitions.remaining_variance
     frames, samples = len(light), math.prod(transitions.shape[1:])
-    blocks = -(-samples // BLOCK)
-    pieces = -(-blocks // _UNIT_BLOCKS)
+    pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = None if keys is None or noise == "bank" else True

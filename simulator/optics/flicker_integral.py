@@ -110,9 +110,10 @@ def _periods(
     start: np.ndarray, time: np.ndarray, frequency: float, phase: float, more: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Begin within a period, in [0, 1); whole periods that exposures last; the rest, in [0, 1)."""
-    turns, missing = _product(start, frequency)
+    (turns, missing), phases = _product(start, frequency), phase + more
     # Each exact: what is left of a day of periods must still tell where in one it is.
-    begin = np.mod(np.mod(turns, 1.0) + np.mod(phase + more, 1.0) + missing, 1.0)
+    begin = (turns - np.floor(turns)) + (phases - np.floor(phases)) + missing
+    begin = begin - np.floor(begin)  # as by `np.mod`, which takes longer
     span, missing = _product(time, frequency)
     whole = np.floor(span)
     rest = span - whole + missing
