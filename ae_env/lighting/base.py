@@ -76,6 +76,8 @@ class Lighting:
 
     def __init_subclass__(cls) -> None:
         KINDS.setdefault(cls.name, cls)
+        if "rows" in vars(cls) and "batch" not in vars(cls):
+            cls.batch = Lighting.batch  # type: ignore[method-assign]  # which calls these rows
 
     def __post_init__(self) -> None:
         for option in fields(self):
@@ -121,13 +123,20 @@ class Lighting:
         phases: np.ndarray,
         shutter: RollingShutter,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`rows` of B frames: (B,), and (B, rows), where 1 stands for None."""
+        """`rows` of B frames: (B,), and (B, rows), where 1 stands for None.
+
+        A `ValueError` if `rows` are not as many as those of `shutter`.
+        """
         frame, time, phase = (values.tolist() for values in (frames, exposure_times, phases))
         each = zip(frame, time, phase, strict=True)
         found = [self.rows(n, exposed, own, shutter) for n, exposed, own in each]
-        alike = np.ones(shutter.rows)
-        gains = np.array([gain for gain, _ in found])
-        return gains, np.stack([alike if rows is None else rows for _, rows in found])
+        gains, lights = np.array([gain for gain, _ in found]), np.ones((len(found), shutter.rows))
+        for light, (_, rows) in zip(lights, found, strict=True):
+            if rows is not None and np.shape(rows) != light.shape:
+                rule = f"(shape {np.shape(rows)}) must be of shape ({shutter.rows},), or None"
+                raise ValueError(f"`rows` of lighting {self.name!r} {rule}")
+            light[:] = 1.0 if rows is None else rows
+        return gains, lights
 
 
 KINDS[Lighting.name] = Lighting
@@ -347,7 +356,7 @@ class FlickerLighting(Lighting):
     ) -> tuple[float, np.ndarray | None]:
         """See `Lighting.rows`: `frame`, `exposure_time`, `phase`, `shutter`."""
         frames, times, phases = np.array([[frame], [exposure_time], [phase]])
-        (gain,), (rows,) = self.batch(frames, times, phases, shutter)
+        (gain,), (rows,) = FlickerLighting.batch(self, frames, times, phases, shutter)
         return float(gain), rows if np.ptp(rows) else None
 
     def batch(

@@ -135,7 +135,7 @@ class Transitions:
         """
         shares, (_, height, width) = self.shares(), self.shape
         gains = torch.from_numpy(row_gain).to(self.light[0]).view(-1, height, 1)
-        bands = row_gain.max(axis=1) > row_gain.min(axis=1)
+        bands = (row_gain != 1.0).any(axis=1)
         lights: Lights
         if isinstance(self.light, torch.Tensor):
             lights = self.light * gains[:, None]

@@ -40,16 +40,18 @@ class Lamp:
         """Mean light (...) float64 of exposures, relative to the lamp's long-term mean.
 
         `start` (...) in [-1e9, 1e9] and `exposure_time` (...) in [1e-12, 1e9] are in seconds;
-        `phase` (...) adds to the lamp's.
+        `phase` (...) in [-1e9, 1e9] adds to the lamp's.
         """
-        start, time = np.asarray(start, np.float64), np.asarray(exposure_time, np.float64)
-        for name, values, low in (("start", start, -_LONGEST), ("exposure_time", time, _SHORTEST)):
-            if not ((values >= low) & (values <= _LONGEST)).all():
-                raise ValueError(f"`{name}` must be finite, in [{low:g}, {_LONGEST:g}] s")
-        return self._mean(start, time, np.asarray(phase))
+        given = {"start": start, "exposure_time": exposure_time, "phase": phase}
+        for name, values in given.items():
+            low, array = _SHORTEST if name == "exposure_time" else -_LONGEST, np.asarray(values)
+            if array.dtype.kind not in "fiu" or not ((array >= low) & (array <= _LONGEST)).all():
+                rule = f"in [{low:g}, {_LONGEST:g}]{' s' * (name != 'phase')}"
+                raise ValueError(f"`{name}` (={values!r}) must be a number {rule}, or such numbers")
+        return self._mean(*(np.asarray(values, np.float64) for values in given.values()))
 
     def _mean(self, start: np.ndarray, time: np.ndarray, phase: np.ndarray) -> np.ndarray:
-        return np.ones_like(start)
+        return np.ones(np.broadcast_shapes(start.shape, time.shape, phase.shape))
 
     def row_light(
         self,

@@ -412,6 +412,23 @@ def test_whole_periods_have_no_bands(frequency: float, times, duty: float | None
     assert lighting.rows(0, 1 / 90, 0.0, SHUTTER)[1] is not None
 
 
+def test_a_batch_has_rows_of_ones_own() -> None:
+    flicker = KINDS["flicker"]
+
+    class Dimmed(flicker):  # type: ignore[misc, valid-type]
+        def rows(self, *given):
+            gain, rows = super().rows(*given)
+            return gain / 16, rows
+
+    given = np.array([7, 8]), np.array([1 / 1000, 1 / 30]), np.array([0.3, 0.1])
+    gains, rows = flicker().batch(*given, SHUTTER)
+    for own, wanted in zip(Dimmed().batch(*given, SHUTTER), (gains / 16, rows), strict=True):
+        np.testing.assert_array_equal(own, wanted)
+    Dimmed.rows = lambda self, *given: (1.0, np.ones(3))
+    with pytest.raises(ValueError, match="`rows` of lighting 'flicker'"):
+        Dimmed().batch(*given, SHUTTER)
+
+
 PHASES = np.random.default_rng(0).random(40)
 #: Most stops away from where the light begins (sines begin anywhere), most stops between frames.
 BOUNDS = {"ramps": (6.0, 1.5), "sines": (3.5, np.pi), "tunnels": (7.0, 7.0 / 3.0)}

@@ -139,6 +139,7 @@ def test_bands_come_before_the_noise() -> None:
     (known,) = Transitions.of([light], [blurred]).in_bands(rows).shares()
     assert known[:, 0].tolist() == [0.25, 0.75]
     assert plain.in_bands(np.ones((1, 2))).light[0] is plain.light[0]
+    assert plain.in_bands(np.full((1, 2), 2.0)).light[0].max().item() == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize(
