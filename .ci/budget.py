@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("simulator", "ae_env", "agents")
 #: A function is counted without its docstring.
 MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 42_827, 145, 60, 15
-MAX_LINES_OF = {"benchmarks": 7_200, "tests": 20_301}
+MAX_LINES_OF = {"benchmarks": 7_200, "tests": 20_318}
 
 
 def module_name(path: Path) -> str:

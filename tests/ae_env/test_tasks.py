@@ -18,6 +18,7 @@ from ae_env.lighting import KINDS, MAX_STOPS, Lighting, RollingShutter, make_lig
 from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.merging import log_error, merge
 from ae_env.tasks import move_subject
+from simulator import CameraSettings
 from simulator.camera import get_camera
 from simulator.capture.blurred_frames import Layout
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
@@ -427,6 +428,22 @@ def test_a_batch_has_rows_of_ones_own() -> None:
     Dimmed.rows = lambda self, *given: (1.0, np.ones(3))
     with pytest.raises(ValueError, match="`rows` of lighting 'flicker'"):
         Dimmed().batch(*given, SHUTTER)
+
+
+def test_rows_of_a_batch_average_those_of_their_own_scenes() -> None:
+    light, reference = torch.full((4, 80, 80), 0.1), CameraSettings(400, 1 / 250, 4.0)
+    both = {"1": light[:, :40, :40].contiguous(), "2": light}  # of 2 and 4 sensor rows a row
+    given = {"camera": get_camera("nikon_z6")}
+    scenes = [ae_env.Scene.from_array(v, reference, scene_id=k, **given) for k, v in both.items()]
+    options = {"scenes": scenes, "resolution": 40, "lighting": "flicker"}
+    envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=2, **options).unwrapped
+    envs.reset(seed=0, options={"scene": [0, 1]})
+    episodes = envs.core.episodes
+    _, rows = episodes.gains(np.arange(2), np.full(2, 1 / 1000))
+    for i, sensor_rows in enumerate((2, 4)):
+        shutter = RollingShutter(40, episodes.camera.row_time, sensor_rows)
+        _, wanted = episodes.lighting.rows(0, 1 / 1000, episodes.phase.item(i), shutter)
+        np.testing.assert_array_equal(rows[i], wanted)
 
 
 PHASES = np.random.default_rng(0).random(40)
