@@ -29,8 +29,8 @@ from simulator.utils.compute import kernel, parallel_ranges, take_next
 
 #: What it costs to record a frame, in the unit of `simulator.capture.blurred_frames.PASS`.
 RECORDING = 100.0
-#: Frames that are worth a thread when they are planned.
-_WORTH_A_THREAD = 256
+#: Frames that are worth a thread when they are planned; those of noisy light take longer.
+_WORTH_A_THREAD, _NOISY_WORTH_A_THREAD = 256, 8
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = (
     *("noise_reduction", "aperture", "defocus", "motion_blur"),
@@ -38,6 +38,7 @@ _STEPS = (
 )
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
 _BLURRING = sum(_BIT[name] for name in _STEPS[1:5])  # those that change the light
+_DENOISING = _BIT["noise_reduction"]
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -130,22 +131,24 @@ class CaptureBatch:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
         self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
         self._moved, self._device = moved, device
-        self._columns = columns.state_columns(states)
+        self._columns = columns.state_columns(camera, states)
         apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
         self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
         # Noise of captures, (S, 2, 4) for each of the box factors.
         self._boxes, self._targets = list[int](), np.empty((0, len(states), 2, 4))
         # Scenes as columns, and at rest the one that each shows, whose light it has; -1 where its
-        # captures are planned alone: where the light has noise, or an aperture is opened.
+        # captures are planned alone (`columns.fits_columns`).
         self._scenes: dict[int, PreparedScene] = {}
         self._known = np.zeros(num_scenes, bool)
         self._scene_columns = np.zeros(num_scenes, columns.SCENE)
         self._rest = np.full(num_scenes, -1)
-        self._height, self._widest = 0, 0.0  # of all lights, and the largest defocus
-        # Of scenes at rest, what those that show them in motion share: the light and its place, the
-        # vignetting, and the statistics, where they are known.
-        self._light: dict[int, torch.Tensor] = {}
-        self._place = np.zeros(num_scenes, np.uintp)
+        self._size, self._widest = tuple[int, ...](), 0.0  # of all lights, and the largest defocus
+        # Of scenes at rest, what those that show them in motion share: the light, as recorded and
+        # denoised, and its places, the vignetting, the noise of the light if any scene's has some,
+        # and the statistics, where they are known.
+        self._light: dict[int, list[torch.Tensor]] = {}
+        self._place = np.zeros((num_scenes, 2), np.uintp)
+        self._noises: np.ndarray | None = None
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
         self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
         # Row of the blurred light that each scene has at present.
@@ -159,14 +162,15 @@ class CaptureBatch:
         # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
         self._modules = np.zeros(count, np.int64)
-        # What is added to these for each blur, and always; see `plan_frames`.
-        always = (_BIT["noise"] + bool(camera.prnu) * _BIT["pixel_response"]) * (noise is not None)
-        self._bits = np.array([*(_BIT[name] for name in columns.BLURS), always])
+        # What is added to these for each step, and always; see `plan_frames`.
+        always, response = _BIT["noise"], bool(camera.prnu) * _BIT["pixel_response"]
+        more = np.array([always + response, always]) * (noise is not None)
+        self._bits = np.array([*(_BIT[name] for name in columns.STEPS), *more])
         self._blurred = np.zeros(count, np.uintp)  # place of the light, blurred where it must be
         # Of captures that are not planned in columns, the light (4, H, W) that they start from,
         # `Exposure.remaining_variance` and the exposure.
         self._source, self._remaining_variance, self._exposure = np.empty((3, count), object)
-        self._any_remaining = False
+        self._any_alone = False
         # Blur of so many frames that are prepared, which is still to be done.
         self._pending: tuple[int, blurred_frames.Passes] | None = None
 
@@ -182,7 +186,7 @@ class CaptureBatch:
             indices = np.union1d(indices, pending[1].passes["scene"])
         count, objects = len(self.states), (self._source, self._remaining_variance, self._exposure)
         self._gain.reshape(-1, count)[indices] = np.nan
-        for column in objects if self._any_remaining else ():
+        for column in objects if self._any_alone else ():
             column.reshape(-1, count)[indices] = None
         for index in indices.tolist():
             self._scenes.pop(index, None)
@@ -223,7 +227,7 @@ class CaptureBatch:
 
     def _transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         rows = indices * len(self.states) + states
-        remaining = self._remaining_variance[rows] if self._any_remaining else None
+        remaining = self._remaining_variance[rows] if self._any_alone else None
         light = self._frames.at(self._blurred[rows])
         found = Transitions(light, self._table.take(rows, axis=0), remaining)
         if not self.camera.prnu or self.noise is None:
@@ -251,6 +255,7 @@ class CaptureBatch:
         else:
             run = partial(self._photograph, indices)
         keys, transitions = noise_keys(seeds, frames), self._transitions(indices, states)
+        any_noisy = self._any_alone or self._noises is not None
         if self.noise == "sensor":
             pairs = zip(indices.tolist(), states.tolist(), strict=True)
             boxes = [(self.states[s].iso, self.prepared_scene(i).box_factor) for i, s in pairs]
@@ -275,7 +280,7 @@ class CaptureBatch:
             excess_variance=self._excess_variance[rows],
             predicted_error=self._predicted_error[rows],
             modules=self._modules[rows],
-            source_noise=transitions.averaged_table()[:, 3:] if self._any_remaining else None,
+            source_noise=transitions.averaged_table()[:, 3:] if any_noisy else None,
             keys=keys,
         )
 
@@ -321,7 +326,7 @@ class CaptureBatch:
 
     def _add_alone(self, index: int) -> None:
         scene = self.prepared_scene(index)
-        self._light[index], self._height = scene.light.contiguous(), scene.light.shape[-2]
+        self._light[index], self._size = [scene.light.contiguous()], tuple(scene.light.shape[-2:])
         self._widest = columns.widest_defocus(scene, self._columns)
         box = scene.box_factor
         if box not in self._boxes:
@@ -330,11 +335,16 @@ class CaptureBatch:
             self._targets = np.stack([*self._targets, own])
         self._vignetting[index] = columns.vignetting_column(scene, self.states)
         self._rest[index] = -1
-        if columns.fits_columns(scene, self._columns):
+        if columns.fits_columns(scene, self._columns, noise=self.noise is not None):
             self._rest[index] = index
             self._scene_columns[index] = columns.scene_column(scene, self._boxes.index(box), index)
             self._statistics[index] = found = columns.statistics_column(scene)
             self._counted[index] = found.any()
+            if self._noises is None and not scene.nlf.is_zero:
+                self._noises = np.zeros(self.num_scenes, columns.NOISE)
+            if self._noises is not None:
+                self._noises[index] = columns.noise_column(scene)
+                self._light[index] += [one.light.contiguous() for one in scene.denoised_lights]
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -350,22 +360,22 @@ class CaptureBatch:
             given, planned = (indices[inside], rows[inside], gains[inside]), rows[inside]
         if len(planned):
             known = self._scene_columns, self._statistics, self._vignetting
-            made = self._blur, self._table, self._predicted_error, self._modules
-            camera = self._columns, self._targets, self._height, self._bits
+            made = self._blur, self._table, self._predicted_error, self._excess_variance
+            camera = self._columns, self._targets, self._size, self._bits, columns.blur_tables()
+            fixed = known, self._noises, camera, given, (*made, self._modules)
             parallel_ranges(
-                lambda first, last: columns.plan_frames(first, last, known, camera, given, made),
+                lambda first, last: columns.plan_frames(first, last, *fixed),
                 len(planned),
-                least=_WORTH_A_THREAD,
+                least=_WORTH_A_THREAD if self._noises is None else _NOISY_WORTH_A_THREAD,
             )
-            self._excess_variance[planned] = 0.0
         self._gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
 
     def _plan_alone(self, scene: PreparedScene, row: int, gain: float) -> None:
-        """Works out a row for a scene with noise of its own, or one whose aperture opens."""
+        """Works out a row for a scene that does not fit columns."""
         noisy, settings = self.noise is not None, self.states[row % len(self.states)]
         exposure = decide(scene, settings, gain=gain)
-        self._exposure[row], self._any_remaining = exposure, True
+        self._exposure[row], self._any_alone = exposure, True
         self._blur[row] = columns.blur_column(exposure)
         self._remaining_variance[row] = exposure.remaining_variance
         if exposure.opened_to is None:  # else the network runs when the light is made
@@ -385,8 +395,10 @@ class CaptureBatch:
         """Finds the places of the light of `rows`, and makes what is not there."""
         shown, source = shown_at_rest(indices, self._rest), np.zeros(len(rows), np.uintp)
         if len(shown):
-            self._place[shown] = self._frames.places([self._light[i] for i in shown.tolist()])
-        if self._any_remaining and len(alone := np.flatnonzero(self._rest[indices] < 0)):
+            for one in range(2 if self._noises is not None else 1):
+                lights = [self._light[i][one : one + 1] or self._light[i] for i in shown.tolist()]
+                self._place[shown, one] = self._frames.places([light[0] for light in lights])
+        if self._any_alone and len(alone := np.flatnonzero(self._rest[indices] < 0)):
             source[alone] = self._own_light(indices[alone], rows[alone])
         given = self._modules, self._rest, self._place
         missing = find_light(indices, rows, *given, self._blurred_row, self._blurred, source)
@@ -398,7 +410,7 @@ class CaptureBatch:
         self._blurred_row[indices], self._pending = rows, (len(source), planned)
         if (planned.passes["kind"] == blurred_frames.WIDE).any():  # which no kernel does
             self._finish()
-        if self._any_remaining and len(unknown := rows[np.isnan(self._excess_variance[rows])]):
+        if self._any_alone and len(unknown := rows[np.isnan(self._excess_variance[rows])]):
             self._finish()
             for row in unknown.tolist():  # depends on the pixels
                 light = self._frames.at(self._blurred[[row]])[0].cpu()
@@ -508,7 +520,8 @@ def find_light(  # type: ignore[no-untyped-def]
     found, count = np.empty(len(rows), np.int64), 0
     for k in range(len(rows)):
         if rest[indices[k]] >= 0:
-            source[k] = place[rest[indices[k]]]
+            denoised = 1 if modules[rows[k]] & _DENOISING else 0
+            source[k] = place[rest[indices[k]], denoised]
         if not modules[rows[k]] & _BLURRING:
             blurred[rows[k]] = source[k]
         elif blurred_row[indices[k]] != rows[k]:

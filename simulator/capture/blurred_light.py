@@ -25,7 +25,7 @@ from simulator.capture.decision import Exposure, Origin
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
-from simulator.optics.discs import HALO, LIGHT_LIMIT, DiscBank, kernel_energy
+from simulator.optics.discs import HALO, LIGHT_LIMIT, DiscBank
 from simulator.optics.motion import Path, path_blur, path_taps
 from simulator.optics.vignetting import Vignetting
 from simulator.utils.cache import LruCache
@@ -274,9 +274,10 @@ class BlurredLight:
             left = _noise_map(exposure.layout, path, exposure.subject_path, defocus_px)
             left = left.to(self.light.device)
         elif path is not None:
-            energy = _path_energy(path, defocus_px, *self.light.shape[-2:])
+            taps = path_taps(path, *self.light.shape[-2:])
+            energy = discs.path_energy(tuple(taps), defocus_px, discs.disc_correlations())
         else:
-            energy = kernel_energy(motion_px, defocus_px)
+            energy = discs.kernel_energy(motion_px, defocus_px, *discs.radius_table())
         if exposure.opened_to is not None and self.aperture_blur is not None:
             share = self.aperture_blur.remaining_variance(exposure.opened_to)
             if share is not None:
@@ -322,9 +323,3 @@ def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: 
     subject = path_blur(mask * discs.remaining_variance(diameter, taps_own), taps_own)
     seen = 1.0 - path_blur(mask, taps_own)
     return (seen.square() * left + subject)[0].clamp(max=1.0)
-
-
-@functools.lru_cache(maxsize=4096)
-def _path_energy(path: Path, defocus_px: float, height: int, width: int) -> float:
-    taps = path_taps(path, height, width)
-    return float(discs.remaining_variance(torch.full((1, 1), defocus_px), taps))

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from simulator.camera import get_camera
-from simulator.capture.decision import SIGNAL_LIMIT, Exposure, Step
+from simulator.capture.decision import EXTRAPOLATION_ERROR, SIGNAL_LIMIT, Exposure, Step
 from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
+from simulator.capture.statistics import ROUNDING, hidden_highlights, noise_numbers
 from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction, noise_variance
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
@@ -47,13 +48,6 @@ _OPERATIONS = {
     "noise": 14,
     "clip_and_quantise": 6,
 }
-#: Rounding error of float32 in a transition, as a share of the light.
-ROUNDING = 2.0**-20
-#: Points between white in the source and in a darker capture at which its light is integrated.
-_NODES = 1024
-#: Relative error of the noise's standard deviation for each stop of ISO beyond the calibration:
-#: without their last ISOs the Z6's table is off by 0.03 to 0.05, the 70D's by 0.17 to 0.25.
-EXTRAPOLATION_ERROR = 0.1
 #: Errors of the estimated map of defocus: its relative error of the blur that it adds, the blur
 #: that it cannot see [pixel of diameter], and the factor by which what a blurred picture changes
 #: when it is blurred again understates what it would change if it were sharpened.
@@ -247,28 +241,11 @@ def predict_errors(
     return {
         "left out": exposure.left_out,
         "network": exposure.steps[0].residual,
-        "clipped highlights": _hidden_highlights(ratio, target, *scene.clipped_light),
+        "clipped highlights": hidden_highlights(ratio, noise_numbers(target), *scene.clipped_light),
         "unknown depth": _depth_error(scene, settings, exposure),
         "ISO": EXTRAPOLATION_ERROR * extrapolated,
         "rounding": rounding,
     }
-
-
-def _hidden_highlights(
-    ratio: float, target: NoiseLevelFunction, share: float, estimate: float
-) -> float:
-    """Error of what a `share` of the samples, clipped in the source, would show when darker.
-
-    Light above white is taken to be distributed as natural highlights are, with a density that
-    falls with its square; it is shown as `estimate`. The share `ratio` of it stays white.
-    """
-    if not share or not 0.0 < ratio < 1.0:
-        return 0.0
-    light = ratio ** ((np.arange(_NODES) + 0.5) / _NODES)  # evenly spaced in its logarithm
-    shown, shot, read = min(estimate * ratio, 1.0), sum(target.shot) / 4, sum(target.read) / 4
-    square = (light - shown) ** 2 / np.maximum(shot * light + read, 1e-30) * (ratio / light)
-    white = ratio * (1.0 - shown) ** 2 / max(shot + read, 1e-30)
-    return math.sqrt(share * float(white - math.log(ratio) * square.mean()))
 
 
 def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Exposure) -> float:

@@ -51,8 +51,12 @@ _LEAST = 0.003
 #: A frame of n pixels keeps at least this many nths of its noise, however smooth it is.
 _FEW = 2.0
 #: Levels of light that blocks are gathered into, for quick answers.
-_LEVELS = 24
+LEVELS = 24
 _TABLES = ("wiener_error", "bias", "variance")
+#: Rounding error of float32 in a transition, as a share of the light.
+ROUNDING = 2.0**-20
+#: Points between white in the source and in a darker capture at which its light is integrated.
+_NODES = 1024
 #: Floating-point rules of sums over bins.
 _SUMS = {"reassoc", "nnan", "nsz", "contract"}
 
@@ -107,7 +111,7 @@ def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyp
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _excess_error(share, edges, ratio, source, target):  # type: ignore[no-untyped-def]
+def excess_error(share, edges, ratio, source, target):  # type: ignore[no-untyped-def]
     """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
     total = 0.0
     for plane in range(share.shape[0]):
@@ -143,6 +147,51 @@ def curvature(columns, ratio, target):  # type: ignore[no-untyped-def]
     return abs(ratio) / 32.0 * np.sqrt(discs), abs(ratio) / 24.0 * np.sqrt(rows)
 
 
+@kernel(fastmath=_SUMS, boundscheck=False)
+def relative_level(share, light, ratio, target):  # type: ignore[no-untyped-def]
+    """`LightStatistics.relative_level` of bins; `target` is (2, P) shot and read noise."""
+    total = 0.0
+    for plane in range(share.shape[0]):
+        for index in range(share.shape[1]):
+            signal = light[plane, index] * ratio
+            wanted = max(target[1, plane] + target[0, plane] * signal, _FLOOR)
+            total += share[plane, index] * signal * signal / wanted
+    return np.sqrt(total)
+
+
+@kernel(fastmath=_SUMS, boundscheck=False)
+def relative_excess_variance(share, light, ratio, source, target):  # type: ignore[no-untyped-def]
+    """`LightStatistics.relative_excess_variance` of bins; noises are (2, P) shot and read."""
+    total = 0.0
+    for plane in range(share.shape[0]):
+        for index in range(share.shape[1]):
+            signal = light[plane, index] * ratio
+            wanted = max(target[1, plane] + target[0, plane] * signal, _FLOOR)
+            beyond = (source[1, plane] + source[0, plane] * signal) / wanted - 1.0
+            total += share[plane, index] * max(beyond, 0.0)
+    return total
+
+
+@kernel()
+def hidden_highlights(ratio, target, share, estimate):  # type: ignore[no-untyped-def]
+    """Error of what a `share` of the samples, clipped in the source, would show when darker.
+
+    Light above white is taken to be distributed as natural highlights are, with a density that
+    falls with its square; it is shown as `estimate`. The share `ratio` of it stays white. `target`
+    is (2, P) shot and read noise.
+    """
+    if share == 0.0 or not 0.0 < ratio < 1.0:
+        return 0.0
+    shown, shot, read = min(estimate * ratio, 1.0), target[0].mean(), target[1].mean()
+    step = ratio ** (1.0 / _NODES)  # evenly spaced in the logarithm of light
+    light, square = math.sqrt(step), 0.0
+    for _ in range(_NODES):
+        square += (light - shown) ** 2 / max(shot * light + read, _FLOOR) * (ratio / light)
+        light *= step
+    white = ratio * (1.0 - shown) ** 2 / max(shot + read, _FLOOR)
+    return math.sqrt(share * (white - math.log(ratio) * square / _NODES))
+
+
 # -- the statistics ---------------------------------------------------------------------------
 
 
@@ -175,7 +224,7 @@ class LightStatistics:
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = noise_numbers(source), noise_numbers(target)
-        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises))
+        return float(excess_error(bins.share, bins.edges, float(ratio), *noises))
 
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
@@ -193,6 +242,12 @@ class LightStatistics:
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
         return np.stack([bins.share, bins.edges[0], bins.disc, bins.row])
+
+    @property
+    def noise_columns(self) -> np.ndarray:
+        """(4, P, B): share, least, most and mean light of bins, for errors of a source's noise."""
+        bins = self._bins
+        return np.stack([bins.share, *bins.edges, bins.light])
 
     def blur_change(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction, *, noise: bool
@@ -212,8 +267,8 @@ class LightStatistics:
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
-        signal, wanted = self._signal(ratio, target)
-        return math.sqrt(np.vdot(self._bins.share, signal**2 / wanted))
+        bins = self._bins
+        return float(relative_level(bins.share, bins.light, float(ratio), noise_numbers(target)))
 
     def relative_noise(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
@@ -230,9 +285,8 @@ class LightStatistics:
 
         Here `source` is on the target's scale, averaged by what blur there is.
         """
-        signal, wanted = self._signal(ratio, target)
-        beyond = np.maximum(_variance(signal, source) / wanted - 1.0, 0.0)
-        return float(np.vdot(self._bins.share, beyond))
+        bins, noises = self._bins, (noise_numbers(source), noise_numbers(target))
+        return float(relative_excess_variance(bins.share, bins.light, float(ratio), *noises))
 
     def _signal(self, ratio: float, target: NoiseLevelFunction) -> tuple[np.ndarray, np.ndarray]:
         """Signal of each bin in the capture, and the variance that it should have."""
@@ -356,7 +410,7 @@ class Residual:
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _error(bias, variance, level, share, ratio, source, target, noise):  # type: ignore[no-untyped-def]
+def network_error(bias, variance, level, share, ratio, source, target, noise):  # type: ignore[no-untyped-def]
     """`ResidualStatistics.error`, over levels of light; bias and variance are the network's."""
     total = 0.0
     for plane in range(level.shape[0]):
@@ -384,7 +438,7 @@ class ResidualStatistics:
 
     def __init__(self, light: torch.Tensor, nlf: NoiseLevelFunction) -> None:
         self.light, self.nlf = light, nlf
-        self._gathered: dict[Residual, tuple[np.ndarray, np.ndarray]] = {}
+        self._gathered: dict[Residual, np.ndarray] = {}
 
     def error(
         self, residual: Residual, ratio: float, target: NoiseLevelFunction, *, noise: bool = True
@@ -394,12 +448,16 @@ class ResidualStatistics:
         Without `noise` the light alone is wanted, in which noise that is left is an error in full;
         the other arguments are those of `LightStatistics`.
         """
-        wiener, place, counts, level, share = self._measured
-        if residual not in self._gathered:  # squared bias and variance, (4, L) each
-            bias, variance = (_by_level(v, place, counts) for v in residual.at(wiener))
-            self._gathered[residual] = bias, variance
         noises = noise_numbers(self.nlf), noise_numbers(target)
-        return float(_error(*self._gathered[residual], level, share, float(ratio), *noises, noise))
+        return float(network_error(*self.columns(residual), float(ratio), *noises, noise))
+
+    def columns(self, residual: Residual) -> np.ndarray:
+        """(4, P, L): squared bias and variance of a network, light and share of each level."""
+        if residual not in self._gathered:
+            wiener, place, counts, *levels = self._measured
+            errors = (_by_level(v, place, counts) for v in residual.at(wiener))
+            self._gathered[residual] = np.stack([*errors, *levels])
+        return self._gathered[residual]
 
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, ...]:
@@ -415,8 +473,8 @@ class ResidualStatistics:
         light = torch.cat(means, dim=1).clamp_(min=0.0)
         values = light.double().cpu().numpy()
         order = np.argsort(np.argsort(values, axis=1), axis=1)
-        place = order * _LEVELS // values.shape[1]
-        counts = np.stack([np.bincount(p, minlength=_LEVELS) for p in place])
+        place = order * LEVELS // values.shape[1]
+        counts = np.stack([np.bincount(p, minlength=LEVELS) for p in place])
         known = place, counts, _by_level(values, place, counts), counts / counts.sum()
         return error.double().cpu().numpy(), *known
 
@@ -424,7 +482,7 @@ class ResidualStatistics:
 def _by_level(values: np.ndarray, place: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """(4, L) means of `values` of blocks, (4, N) or (N,) for all planes, by their level."""
     each = zip(place, np.broadcast_to(values, place.shape), strict=True)
-    return np.stack([np.bincount(p, v, _LEVELS) for p, v in each]) / np.maximum(counts, 1)
+    return np.stack([np.bincount(p, v, LEVELS) for p, v in each]) / np.maximum(counts, 1)
 
 
 @dataclass(eq=False, repr=False)

@@ -25,7 +25,6 @@ from simulator.optics.motion import (
     Taps,
     grid_taps,
     has_kernels,
-    motion_kernel,
     path_blur,
     streak_share,
 )
@@ -38,8 +37,6 @@ from simulator.utils.compute import addresses, as_pointer, kernel, parallel_rang
 LIGHT_LIMIT = 1e9
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32
-#: Streaks longer than this [pixel] are not written out: they leave next to no noise in any case.
-_LONGEST_KERNEL = 4096.0
 #: Kernels wider than this are applied in the Fourier domain; and where the kernel for the CPU does
 #: the sum of a single image.
 _FFT_TAPS, _DIRECT_TAPS = 11, 41
@@ -125,16 +122,24 @@ def disc_kernel(diameter_px: float) -> np.ndarray:
     return np.asarray(coverage(disc_radius(diameter, *radius_table())))
 
 
-@functools.lru_cache(maxsize=4096)
-def kernel_energy(motion_px: float, defocus_px: float) -> float:
-    """Sum of squared weights of both blurs together: the share of white noise's variance left."""
-    disc = disc_kernel(defocus_px)
-    if motion_px > _LONGEST_KERNEL:  # as if it were much longer than the disc is wide
-        n, end = streak_share(motion_px)
-        total = 2 * n + 1 + 2.0 * end
-        return float((disc.sum(axis=1) ** 2).sum()) * (2 * n + 1 + 2.0 * end**2) / total**2
-    both = np.apply_along_axis(np.convolve, 1, disc, motion_kernel(motion_px))
-    return float((both**2).sum())
+@_jit()
+def kernel_energy(motion_px, defocus_px, moments, radii):  # type: ignore[no-untyped-def]
+    """Sum of squared weights of a streak and a disc: the share of white noise's variance left.
+
+    The others are `radius_table`.
+    """
+    disc = coverage(disc_radius(defocus_px, moments, radii))
+    n, end = streak_share(motion_px)
+    energy = 0.0
+    for shift in range(len(disc)):  # correlations of both with themselves, along the rows
+        ends = end * end * (2.0 * (shift == 0) + (shift == 2 * n + 2))
+        streak = max(2.0 * n + 1.0 - shift, 0.0) + ends + 2.0 * end * (0 < shift <= 2 * n + 1)
+        products = 0.0
+        for y in range(len(disc)):
+            for x in range(len(disc) - shift):
+                products += disc[y, x] * disc[y, x + shift]
+        energy += (2.0 if shift else 1.0) * streak * products
+    return energy / (2.0 * n + 1.0 + 2.0 * end) ** 2
 
 
 # -- uniform discs ----------------------------------------------------------------------------
@@ -259,7 +264,7 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
 
     `taps` are those of a motion behind the discs; `diameter` is (..., H, W) [pixel].
     """
-    correlations = _correlations()
+    correlations = disc_correlations()
     products = correlations[..., correlations.shape[-1] // 2, correlations.shape[-1] // 2]
     if taps is not None:
         count = min(int(np.searchsorted(DIAMETERS, float(diameter.max()))) + 1, len(DIAMETERS))
@@ -273,8 +278,20 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
     return out.reshape(diameter.shape).to(diameter)
 
 
+@_blend_jit()
+def path_energy(taps, diameter, correlations):  # type: ignore[no-untyped-def]
+    """`remaining_variance` of one `diameter`, and of `Taps` behind it."""
+    squared = min(diameter * diameter, np.float64(KNOTS[-1]))
+    index, products = _below(KNOTS, squared), np.zeros((2, 2))
+    weights = taps[2].astype(np.float64)
+    _sum_products(correlations[index : index + 2], taps[0], taps[1], weights, products)
+    share = (squared - KNOTS[index]) / (KNOTS[index + 1] - KNOTS[index])
+    both = 2.0 * (1.0 - share) * products[0, 1] + share * products[1, 0]
+    return (1.0 - share) ** 2 * products[0, 0] + share * both
+
+
 @functools.cache
-def _correlations() -> np.ndarray:
+def disc_correlations() -> np.ndarray:
     """(K, 2, R, R) correlations of a disc with itself and with the next; the middle is no shift."""
     discs = [disc_kernel(diameter) for diameter in DIAMETERS]
     size = 2 * len(discs[-1]) - 1
@@ -381,9 +398,10 @@ def _sum_products(correlations, rows, columns, weights, products):  # type: igno
     """Sums (K, 2) of correlations over all pairs of taps, by their products of weights."""
     middle = correlations.shape[2] // 2
     for k in range(len(weights)):
-        for n in range(len(weights)):
+        for n in range(k + 1):  # correlations are even: each pair counts twice
             y, x = rows[k] - rows[n] + middle, columns[k] - columns[n] + middle
             if 0 <= y <= 2 * middle and 0 <= x <= 2 * middle:
+                weight = weights[k] * weights[n] * (1.0 if n == k else 2.0)
                 for i in range(len(correlations)):
                     for j in range(2):
-                        products[i, j] += weights[k] * weights[n] * correlations[i, j, y, x]
+                        products[i, j] += weight * correlations[i, j, y, x]
