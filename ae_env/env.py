@@ -217,7 +217,8 @@ class AutoExposure(Task):
     ) -> dict[str, np.ndarray]:
         """Scores (B,) in static light of the parts that look at no frame."""
         episodes, env_indices = self.episodes, frames.env_indices
-        if source_noise is None and len(self._of_light) + len(self._sharp) == len(self._known):
+        clean = source_noise is None or self._terms.ignores_noise
+        if clean and len(self._of_light) + len(self._sharp) == len(self._known):
             return self._clean_scores(frames, env_indices)
         lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
         new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]

@@ -86,6 +86,9 @@ class TermScores:
         #: Names of the parts of `torch_terms` that depend on blur, if all are `Sharpness`.
         of_blur = [n for n, part in others.items() if depends_on(part) == "blur"]
         self.only_sharpness = of_blur if all(type(others[n]) is Sharpness for n in of_blur) else []
+        #: Whether those of `torch_terms` that look at no frame take no account of a source's noise.
+        seen = [part for part in others.values() if depends_on(part) != "image"]
+        self.ignores_noise = all(type(part) in _WITHOUT_PIXELS for part in seen)
         self.captures = SceneCaptures(camera, states, noisy=noise)
         noises = [*dict.fromkeys(each := camera.nlfs(states))]
         self._which = np.array([noises.index(nlf) for nlf in each])
