@@ -85,13 +85,13 @@ def fits_columns(scene: PreparedScene, states: np.ndarray, *, noise: bool) -> bo
     """Whether `plan_frames` can plan captures of a scene at `STATE` (S,), with `noise`.
 
     It has no aperture to open. Noise of its light is in captures, which neither a layout nor a lens
-    averages differently from pixel to pixel, and at most one network removes it. Discs that are too
-    wide do not fit: `decide` raises an error for these.
+    averages differently from pixel to pixel, and at most one network, which has run, removes it.
+    Discs that are too wide do not fit: `decide` raises an error for these.
     """
     if scene.aperture_blur is not None or scene.defocus > widest_defocus(scene, states):
         return False
     networks, alike = scene.denoised_lights, scene.layout is None and scene.lens is None
-    known = len(networks) < 2 and all(network.rounding is None for network in networks)
+    known = len(networks) < 2 and all(n.shape and n.rounding is None for n in networks)
     return scene.nlf.is_zero or (noise and alike and known)
 
 

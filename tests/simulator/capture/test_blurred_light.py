@@ -17,9 +17,9 @@ from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.decision import Exposure
-from simulator.capture.plan import noise_balance
+from simulator.capture.plan import noise_balance, predict_errors
 from simulator.capture.sensor import Transitions, record
-from simulator.capture.statistics import DenoisedLight
+from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.noise.generator import noise_keys
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
@@ -271,12 +271,16 @@ KEYS = noise_keys(SCENES, SCENES + 5)
 
 def prepared(index: int) -> PreparedScene:
     """Two at rest, one that moves, one also out of focus, one whose aperture opens, two with a
-    layout and a subject that moves; three of these without noise, as are the first and third."""
+    layout and a subject that moves; three of these without noise, as are the first and third. A
+    network denoised the second, and parts of it are clipped."""
     light, noisy = LIGHTS[index], index not in (0, 2) and index < 7
     index = {7: 3, 8: 5, 9: 6}.get(index, index)
     changes = {"image_speed": 0.3} if index in (2, 3) else {}
+    if index == 1:
+        network = DenoisedLight(0.9 * light, residual=Residual.alike(0.2))
+        changes |= {"denoised_lights": (network,), "saturated": light.amax(dim=0) > 1.9}
     if index == 3:
-        changes["defocus"] = 2.0
+        changes |= {"defocus": 2.0, "movement": Movement(0.6, 2.0)}
     if index == 4:
         found = torch.full((24, 20), 1.0)
         changes["aperture_blur"] = MapApertureBlur(light, found, 4.0)
@@ -328,7 +332,8 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
             clipped = found.clipped_low[i], found.clipped_high[i]
             assert clipped == tuple(counts / wanted.size)
             assert clipped == ((wanted <= 2.0**-10).mean(), (wanted == 1.0).mean())
-            modules = ["exposure", *["aperture"] * (exposure.opened_to is not None)]
+            modules = ["exposure", *["noise_reduction"] * (exposure.denoised is not None)]
+            modules += ["aperture"] * (exposure.opened_to is not None)
             modules += ["defocus"] * (exposure.defocus_px > 0)
             modules += ["motion_blur"] * (exposure.motion_px > 0) + ["noise"] * bool(noise)
             assert MODULES[found.modules[i]] == "+".join(modules)
@@ -337,7 +342,10 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
             excess = balance[0] if noise else 0.0
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
-    assert seen >= {"aperture", "defocus", "motion_blur"}
+            if noise and not prepared(i).nlf.is_zero:
+                errors = predict_errors(prepared(i), STATES[states[i]], exposure)
+                assert found.predicted_error[i] == pytest.approx(math.hypot(*errors.values()))
+    assert seen >= {"noise_reduction", "aperture", "defocus", "motion_blur"}
     assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(10))
     assert noise is None or seen >= {"noise", "excess"}
 
@@ -380,7 +388,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
 
     def fail(*args, **kwargs):
         calls.append(args)
-        if stage == "decide" and len(calls) < 4:
+        if stage == "decide" and len(calls) < 3:
             return original(*args, **kwargs)
         if stage == "plan_passes":
             original(*args)
