@@ -261,7 +261,7 @@ def test_many_images_are_scipys_correlation(threads, most_bytes, monkeypatch):
 # -- batches ---------------------------------------------------------------------------------------
 
 STATES = [CameraSettings(iso, time, 4) for iso in (100, 6400) for time in (1 / 500, 1 / 8)]
-STATES += [CameraSettings(400, 1 / 30, 8), CameraSettings(200, 1 / 30, 2)]
+STATES += [CameraSettings(400, 1 / 30, 8), CameraSettings(204800, 1 / 30, 2)]
 LIGHTS = [
     torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(10)
 ]
@@ -279,6 +279,7 @@ def prepared(index: int) -> PreparedScene:
     if index == 1:
         network = DenoisedLight(0.9 * light, residual=Residual.alike(0.2))
         changes |= {"denoised_lights": (network,), "saturated": light.amax(dim=0) > 1.9}
+        changes |= {"image_speed": 0.1, "defocus": 0.5, "tolerance": 0.3}
     if index == 3:
         changes |= {"defocus": 2.0, "movement": Movement(0.6, 2.0)}
     if index == 4:
