@@ -279,7 +279,7 @@ def prepared(index: int) -> PreparedScene:
     if index == 1:
         network = DenoisedLight(0.9 * light, residual=Residual.alike(0.2))
         changes |= {"denoised_lights": (network,), "saturated": light.amax(dim=0) > 1.9}
-        changes |= {"image_speed": 0.1, "defocus": 0.5, "tolerance": 0.3}
+        changes |= {"image_speed": 0.02, "defocus": 0.1, "tolerance": 0.3}
     if index == 3:
         changes |= {"defocus": 2.0, "movement": Movement(0.6, 2.0)}
     if index == 4:
