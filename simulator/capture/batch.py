@@ -24,6 +24,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import CodeMeans, Transitions, exposure_table, record, record_units
 from simulator.capture.statistics import BINS, LightStatistics
 from simulator.noise.generator import Noise, noise_keys
+from simulator.noise.noise_level_function import ReadNoises
 from simulator.settings import CameraSettings
 from simulator.utils.compute import kernel, parallel_ranges, take_next
 
@@ -136,6 +137,7 @@ class CaptureBatch:
         self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
         # Noise of captures, (S, 2, 4) for each of the box factors.
         self._boxes, self._targets = list[int](), np.empty((0, len(states), 2, 4))
+        self._read_noise: ReadNoises | None = None  # of captures: box by box, those of the states
         # Scenes as columns, and at rest the one that each shows, whose light it has; -1 where its
         # captures are planned alone (`columns.fits_columns`).
         self._scenes: dict[int, PreparedScene] = {}
@@ -246,20 +248,18 @@ class CaptureBatch:
     ) -> FrameStatistics:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
-        read_noise, run = None, None
-        apart = self.camera.prnu or self._device or self.noise == "sensor"
-        apart = apart or (row_gain is not None and bool(self._table[rows, 3:].any()))
-        several = len(indices) >= 2 * torch.get_num_threads()
-        if self._pending is None or apart or not several or self._pending[0] != len(indices):
+        read_noise, run = self._read_noise, None
+        together = len(indices) >= 2 * torch.get_num_threads()
+        together = together and not self.camera.prnu and not self._device
+        if self._pending is None or not together or self._pending[0] != len(indices):
             self._finish()
         else:
             run = partial(self._photograph, indices)
         keys, transitions = noise_keys(seeds, frames), self._transitions(indices, states)
         any_noisy = self._any_alone or self._noises is not None
-        if self.noise == "sensor":
-            pairs = zip(indices.tolist(), states.tolist(), strict=True)
-            boxes = [(self.states[s].iso, self.prepared_scene(i).box_factor) for i, s in pairs]
-            read_noise = [self.camera.read_noise(iso, box) for iso, box in boxes]
+        if read_noise is not None:
+            boxes = self._scene_columns["targets"][indices]
+            read_noise = read_noise.part(boxes * len(self.states) + states)
         counts = record(
             transitions,
             self.camera,
@@ -333,11 +333,15 @@ class CaptureBatch:
             self._boxes.append(box)
             own = columns.noise_columns(self.camera, self.states, box)
             self._targets = np.stack([*self._targets, own])
+            if self.noise == "sensor":
+                each = [self.camera.read_noise(s.iso, b) for b in self._boxes for s in self.states]
+                self._read_noise = ReadNoises.of(each)
+        self._scene_columns["targets"][index] = number = self._boxes.index(box)
         self._vignetting[index] = columns.vignetting_column(scene, self.states)
         self._rest[index] = -1
         if columns.fits_columns(scene, self._columns, noise=self.noise is not None):
             self._rest[index] = index
-            self._scene_columns[index] = columns.scene_column(scene, self._boxes.index(box), index)
+            self._scene_columns[index] = columns.scene_column(scene, number, index)
             self._statistics[index] = found = columns.statistics_column(scene)
             self._counted[index] = found.any()
             if self._noises is None and not scene.nlf.is_zero:

@@ -20,7 +20,7 @@ from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
 from simulator.capture.sensor import Transitions, exposed_light, pixel_response, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.generator import Noise
-from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
+from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoises
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.optics.vignetting import Vignetting
 from simulator.raw.image import check_packed, new_frame
@@ -261,16 +261,18 @@ class PreparedScene:
         _check_light("row_gain", row_gain, (len(states), self.light.shape[-2]))
         frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed raises before any work
-        read_noise: list[ReadNoise] | None = None
+        read_noise: ReadNoises | None = None
         if noise == "sensor":
-            read_noise = [self.camera.read_noise(s.iso, self.box_factor) for s in states]
+            read_noise = ReadNoises.of(
+                [self.camera.read_noise(s.iso, self.box_factor) for s in states]
+            )
         for some, transitions in self.transitions(states, noise=noise is not None, gain=gain):
             record(
                 transitions,
                 self.camera,
                 keys=keys[some] if noise is not None and transitions.lacks_noise else None,
                 noise=noise or "exact",
-                read_noise=None if read_noise is None else read_noise[some],
+                read_noise=None if read_noise is None else read_noise.part(some),
                 row_gain=None if row_gain is None else row_gain[some],
                 signals=frames[some],
             )

@@ -18,8 +18,8 @@ A blur averages the source's noise: where it leaves only a share r of the varian
 *The noise of a frame* is a function of its key and of nothing else (`simulator.noise.generator`).
 
 `record` is the one way from light to frames. On the CPU it is one fused kernel, which works in
-blocks of 256 samples that stay in the first-level cache, vectorised by the compiler. Elsewhere, and
-where the read noise has rows and tails, the steps run one by one.
+blocks of 256 samples that stay in the first-level cache, vectorised by the compiler. Elsewhere the
+steps run one by one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from simulator.noise.generator import (
     noise_bank,
     noise_keys,
 )
-from simulator.noise.noise_level_function import ReadNoise, plane_tensor
+from simulator.noise.noise_level_function import TAIL_STEPS, ReadNoises, plane_tensor, tail_tables
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
 from simulator.utils.compute import (
@@ -255,7 +255,7 @@ def record(
     *,
     keys: np.ndarray | None = None,
     noise: Noise = "exact",
-    read_noise: Sequence[ReadNoise] | None = None,
+    read_noise: ReadNoises | None = None,
     row_gain: np.ndarray | None = None,
     count: bool = False,
     means: CodeMeans | None = None,
@@ -287,19 +287,17 @@ def record(
         raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
     if len(transitions.light) == 0:
         return np.zeros((0, 2), np.int64)
-    stepwise = transitions.needs_torch or (read_noise is not None and keys is not None)
-    if row_gain is not None and (stepwise or transitions.table[:, 3:].any()):
-        transitions, row_gain = transitions.in_bands(row_gain), None
-    if stepwise:
+    if transitions.needs_torch:
+        transitions = transitions if row_gain is None else transitions.in_bands(row_gain)
         transitions = transitions.before_rounding(camera)
-        kind: Noise = "exact" if noise == "sensor" else noise
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
-        counts = record_stepwise(transitions, camera, keys, kind, tensors, read_noise, count=count)
+        counts = record_stepwise(transitions, camera, keys, noise, tensors, read_noise, count=count)
         if means is not None:
             means.fill(tensors["codes"].numpy())
-        return counts if transitions.needs_torch else counts.numpy()
+        return counts
     arrays = {name: np.asarray(out) for name, out in outputs.items()}
-    return _record_fused(transitions, camera, keys, noise, row_gain, arrays, count, means, run)
+    kinds = keys, noise, read_noise
+    return _record_fused(transitions, camera, kinds, row_gain, arrays, count, means, run)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -316,7 +314,7 @@ def record_stepwise(
     keys: np.ndarray | None,
     noise: Noise,
     outputs: Mapping[str, torch.Tensor],
-    read_noise: Sequence[ReadNoise] | None = None,
+    read_noise: ReadNoises | None = None,
     *,
     count: bool = False,
 ) -> torch.Tensor:
@@ -327,8 +325,7 @@ def record_stepwise(
     lights, device = transitions.light, transitions.light[0].device
     span, black, low, high = (plane_tensor(row, device) for row in camera.digits[:4])
     counts = torch.zeros(len(lights), 2, dtype=torch.int64, device=device)
-    batched = isinstance(lights, torch.Tensor)
-    together = len(lights) if batched and read_noise is None else 1
+    together = len(lights) if isinstance(lights, torch.Tensor) else 1
     shares = transitions.shares()
     for first in range(0, len(lights), together):
         part = slice(first, first + together)
@@ -339,8 +336,8 @@ def record_stepwise(
             share = _stacked(shares[part], signal)
             missing = missing_variance(signal, table[:, 1:].unbind(1), share).clamp_(min=0.0)
             if read_noise is not None:
-                own = None if share is None else share[0, 0], int(keys[first]), read_noise[first]
-                signal = signal + _read_part(missing[0], transitions.table[first], *own)
+                some = keys[part], read_noise.part(part)
+                signal = signal + _read_part(missing, table[:, 1:], share, *some)
             normals = batch_normals(keys[part], tuple(light.shape[1:]), noise, device)
             signal = missing.sqrt_().mul_(normals).add_(signal)
         numbers = signal.mul_(span).add_(black).round_().clamp_(0.0, camera.white_level)
@@ -371,25 +368,28 @@ def _stacked(shares: Sequence[torch.Tensor | None], like: torch.Tensor) -> torch
 
 def _read_part(
     missing: torch.Tensor,
-    table: np.ndarray,
+    table: torch.Tensor,
     remaining_variance: torch.Tensor | None,
-    key: int,
-    read_noise: ReadNoise,
+    keys: np.ndarray,
+    read_noise: ReadNoises,
 ) -> torch.Tensor:
-    """Read noise with rows and tails; its variance is taken out of `missing` (4, H, W), in place.
+    """Read noise with rows and tails, (B, 4, H, W); its variance is taken out of `missing`.
 
     A source's read noise counts as having rows and tails of the same kind.
     """
-    planes, height, width = missing.shape
-    dark = missing_variance(missing.new_zeros(planes, 1, 1), table[1:], remaining_variance)
+    dark = missing_variance(torch.zeros_like(table[:, 0]), table.unbind(1), remaining_variance)
     read = torch.minimum(dark.clamp(min=0.0), missing)
     missing -= read
-    row_key, pixel_key = (int(noise_keys(np.array([key], np.uint64), n)[0]) for n in (1, 2))
-    rows = torch.from_numpy(frame_normals(row_key, (1, 2, height))[0]).to(missing)
-    pixels = torch.from_numpy(frame_normals(pixel_key, (planes, height, width))).to(missing)
-    shared = plane_tensor(table[2].clip(min=0.0), missing.device)
-    own = read_noise.pixel_part((1.0 - read_noise.row**2) * read, pixels)
-    return read_noise.row_part(shared, rows) + own
+    rows, pixels = (
+        batch_normals(noise_keys(keys, number), shape, "exact", missing.device)
+        for number, shape in enumerate(((1, 2, missing.shape[2]), tuple(missing.shape[1:])), 1)
+    )
+    shared = table[:, 1].clamp(min=0.0)
+    for number in np.unique(read_noise.which).tolist():
+        kind, (some,) = read_noise.kinds[number], np.nonzero(read_noise.which == number)
+        own = kind.pixel_part((1.0 - kind.row**2) * read[some], pixels[some])
+        read[some] = own.add_(kind.row_part(shared[some], rows[some, 0]))
+    return read
 
 
 def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tensor:
@@ -515,6 +515,59 @@ def _digitise_averaged(  # type: ignore[no-untyped-def]
 
 
 @_jit()
+def _digitise_with_rows(  # type: ignore[no-untyped-def]
+    size, light, normals, rows, tails, shares, bound, ratio, noise, parts, sensor, out
+):
+    """The same with read noise that has `rows` and `tails`: draws whose variance is 1.
+
+    Of its variance, rows and the rest have the `parts` (2,) of `tail_tables`.
+    """
+    (shot, read, source_shot, source_read), (span, black, white) = noise, sensor
+    deviation, rest = parts[0] * np.sqrt(read if read > _ZERO else _ZERO), parts[1]
+    for j in range(size):
+        x = _exposed(light[j], ratio, bound)
+        bright, lacking = x if x > _ZERO else _ZERO, _ONE - shares[j]
+        missing = bright * shot + read
+        missing += lacking * (bright * source_shot + source_read)
+        missing = missing if missing > _ZERO else _ZERO
+        dark = read + lacking * source_read
+        dark = dark if dark > _ZERO else _ZERO
+        dark = dark if dark < missing else missing
+        x += deviation * rows[j] + tails[j] * np.sqrt(rest * dark)
+        out[j] = _rounded(_noisy(x, normals[j], missing - dark), span, black, white)
+
+
+@_jit()
+def _draw_tails(key, block, table, words, out):  # type: ignore[no-untyped-def]
+    """`tukey_lambda` of a block of normals, by its row of `tail_tables`."""
+    draw_block(key, block, words, out)
+    for j in range(BLOCK):
+        place = abs(out[j]) * np.float32(TAIL_STEPS)
+        step = np.int32(place)
+        low, high = table[np.uint32(step)], table[np.uint32(step + 1)]
+        value = low + (place - np.float32(step)) * (high - low)
+        out[j] = value if out[j] > _ZERO else -value
+
+
+@_jit()
+def _draw_rows(key, place, held, words, normals, out):  # type: ignore[no-untyped-def]
+    """Normals that rows share, of a piece of a plane, behind those of so many rows `before`.
+
+    `normals` are the block of the key whose number is `held`. Returns that of the last one used.
+    """
+    (start, size, width, before), first = place, 0
+    while first < size:
+        row = (start + first) // width
+        last, number = min(size, (row + 1) * width - start), before + row
+        if number // BLOCK != held:
+            held = number // BLOCK
+            draw_block(key, held, words, normals)
+        out[first:last] = normals[number % BLOCK]
+        first = last
+    return held
+
+
+@_jit()
 def _count(numbers, low, high, counts):  # type: ignore[no-untyped-def]
     """Counts clipped samples by their index in the block: low ones as 1, high ones as 2^16.
 
@@ -565,41 +618,80 @@ def _in_bands(start, light, width, gain, out):  # type: ignore[no-untyped-def]
 
 
 @_jit()
+def _write(made, frame, plane, start, body, limits, clipped, outputs):  # type: ignore[no-untyped-def]
+    """Writes a block's digital numbers to the outputs, and counts those that are clipped."""
+    (codes, numbers, signals, counts), end = outputs, start + len(made)
+    (span, black, _), (low, high, darkest, scale) = body, limits
+    if codes.size:
+        _compand(made, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
+    elif counts.size:
+        _count(made, low, high, clipped)
+    if numbers.size:
+        _as_integers(made, numbers[frame, plane, start:end])
+    for k in range(len(signals)):
+        if signals[k].size:
+            _as_signals(made, black, span, _LEAST[k], signals[k][frame, plane, start:end])
+
+
+@_jit()
 def record_units(  # type: ignore[no-untyped-def]
-    first, last, samples, light, remaining, exposure, noise, sensor, outputs, means, drawn, gains
+    first,
+    last,
+    samples,
+    light,
+    remaining,
+    exposure,
+    noise,
+    sensor,
+    outputs,
+    means,
+    drawn,
+    read,
+    gains,
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
 
     Of `noise` there are keys and the bank. What is None is not compiled: whether noise is `drawn`,
-    and the `gains` (B, H) of rows. Where there are `means` (of `CodeMeans`) to fill, frames are not
-    divided.
+    what `read` noise with rows and tails is drawn by, and the `gains` (B, H) of rows. Where there
+    are `means` (of `CodeMeans`) to fill, frames are not divided.
     """
-    (keys, bank), (codes, numbers, signals, counts) = noise, outputs
+    (keys, bank), (codes, _, _, counts) = noise, outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    lit = np.empty(BLOCK, np.float32)
+    lit, varied = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    tails, rows = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    row_normals, everything = np.empty(BLOCK, np.float32), np.ones(BLOCK, np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
     for unit in range(first, last):
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
-        ratio, shot, read, source_shot, source_read = exposure[frame, :, plane]
+        ratio, shot, dark, source_shot, source_read = exposure[frame, :, plane]
         span, black, low, high, white, rounding = sensor[:, plane]
-        body, read = (span, black, white), read - rounding
+        dark, body = dark - rounding, (span, black, white)
+        variance = shot, dark, source_shot, source_read
         # A light beyond it is white; one of an exposure of 0 has no bound.
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
+        limits = low, high, darkest, scale
         frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[attr-defined, call-arg]
         shares = samples if remaining[frame] else 0
         share = numba.carray(as_pointer(remaining[frame]), (shares,))
-        clipped[:] = 0
+        averaged, held, clipped[:] = shares > 0, -1, 0
+        if gains is not None:
+            averaged = averaged or source_shot > _ZERO or source_read > _ZERO
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
-            exposed, normals, sign, out = frame_light[at : at + size], made, _ONE, part[:size]
+            exposed, normals, sign = frame_light[at : at + size], made, _ONE
+            left = share[start:end] if shares else everything[:size]
             if gains is not None:
-                _in_bands(start, exposed, samples // gains.shape[1], gains[frame], lit)
+                width = samples // gains.shape[1]
+                _in_bands(start, exposed, width, gains[frame], lit)
                 exposed = lit[:size]
+                if averaged:
+                    _in_bands(start, left, width, gains[frame], varied)
+                    left = varied[:size]
             if drawn is not None:
                 draw_block(keys[frame], number, words, made)
             elif keys.size:
@@ -608,24 +700,22 @@ def record_units(  # type: ignore[no-untyped-def]
                 coming = bank_block(keys[frame], number + 1)[0]
                 for line in range(coming, coming + BLOCK, STRIDE):
                     prefetch(bank, line)
-            if not keys.size:
+            if read is not None:
+                row_keys, pixel_keys, width, which, parts, tables = read
+                before, kind = plane // 2 * (samples // width), which[frame]
+                place = start, size, width, before
+                held = _draw_rows(row_keys[frame], place, held, words, row_normals, rows)
+                _draw_tails(pixel_keys[frame], number, tables[kind], words, tails)
+                own = left, bound, ratio, variance, parts[kind], body
+                _digitise_with_rows(size, exposed, made, rows, tails, *own, part)
+            elif not keys.size:
                 _digitise(size, exposed, bound, ratio, body, part)
-            elif shares:
-                noise, left = (shot, read, source_shot, source_read), share[start:end]
-                _digitise_averaged(
-                    size, exposed, normals, sign, left, bound, ratio, noise, body, part
-                )
+            elif averaged:
+                own = left, bound, ratio, variance, body
+                _digitise_averaged(size, exposed, normals, sign, *own, part)
             else:
-                _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, read, body, part)
-            if codes.size:
-                _compand(out, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
-            elif counts.size:
-                _count(out, low, high, clipped)
-            if numbers.size:
-                _as_integers(out, numbers[frame, plane, start:end])
-            for k in range(len(signals)):
-                if signals[k].size:
-                    _as_signals(out, black, span, _LEAST[k], signals[k][frame, plane, start:end])
+                _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, dark, body, part)
+            _write(part[:size], frame, plane, start, body, limits, clipped, outputs)
         if counts.size:
             counts[unit, 0] = (clipped & (_HIGH - 1)).sum()
             counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
@@ -642,21 +732,25 @@ def is_compiled() -> bool:
 def _record_fused(
     transitions: Transitions,
     camera: CameraProfile,
-    keys: np.ndarray | None,
-    noise: Noise,
+    noises: tuple[np.ndarray | None, Noise, ReadNoises | None],
     row_gain: np.ndarray | None,
     given: Mapping[str, np.ndarray],
     count: bool,
     means: CodeMeans | None,
     run: Callable[[int, tuple[Any, ...]], None] | None,
 ) -> np.ndarray:
-    """`record` on the CPU."""
+    """`record` on the CPU; the `noises` are keys, how they become noise, and the read noise."""
+    (keys, noise, read_noise), read = noises, None
     light, remaining = transitions.light, transitions.remaining_variance
     frames, samples = len(light), math.prod(transitions.shape[1:])
     pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = None if keys is None or noise == "bank" else True
+    if keys is not None and read_noise is not None:
+        of_rows, of_pixels = (noise_keys(keys, number) for number in (1, 2))
+        tables = tail_tables(read_noise.kinds)
+        read = of_rows, of_pixels, transitions.shape[2], read_noise.which, *tables
     codes, numbers, *signals = (
         given[name].reshape(frames, 4, samples) if name in given else np.empty((0, 4, 0), dtype)
         for name, dtype in _KINDS.items()
@@ -674,7 +768,8 @@ def _record_fused(
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
     gains = None if row_gain is None else row_gain.astype(np.float32)
-    whole = *fixed, tuple(_NO_MEANS if means is None or size == 1 else means), drawn, gains
+    filled = tuple(_NO_MEANS if means is None or size == 1 else means)
+    whole = *fixed, filled, drawn, read, gains
     if run is None:
         parallel_ranges(
             lambda first, last: record_units(first * size, last * size, *whole),

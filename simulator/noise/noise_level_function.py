@@ -13,7 +13,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from torch import Tensor
 VARIANCE_LIMIT = 1e24
 #: Tukey's lambda whose excess kurtosis is 0, that of the normal distribution.
 _NORMAL_SHAPE = 0.13491
+#: Steps of `tail_tables` in a standard deviation, and their number: no draw reaches beyond 6.7.
+TAIL_STEPS = 512
+_TAIL_SIZE = int(6.7 * TAIL_STEPS) + 2
 #: The planes R, G1 lie in one row of the sensor, G2, B in the other.
 _ROW_OF_PLANE = (0, 0, 1, 1)
 
@@ -120,8 +123,9 @@ class ReadNoise:
     def row_part(self, variance: Tensor, normals: Tensor) -> Tensor:
         """The part that rows share, (..., 4, H, 1), of `normals` (..., 2, H).
 
-        `variance` (4, 1, 1) is that of all read noise of the averages, as independent noise has it;
-        an average over k x k pixels keeps 1/k of that of its k rows, of independent noise 1/k^2.
+        `variance` (..., 4, 1, 1) is that of all read noise of the averages, as if it were
+        independent: an average over k x k pixels keeps 1/k of that of its k rows, of independent
+        noise 1/k^2.
         """
         return (variance * self.box_factor).sqrt() * self.row * normals[..., _ROW_OF_PLANE, :, None]
 
@@ -131,6 +135,43 @@ class ReadNoise:
         Its `variance` is ``1 - row ** 2`` of that of all read noise.
         """
         return variance.sqrt() * tukey_lambda(normals, averaged_shape(self.shape, self.box_factor))
+
+
+class ReadNoises(NamedTuple):
+    """The read noise of each of B frames, which share a few kinds."""
+
+    kinds: tuple[ReadNoise, ...]
+    which: np.ndarray  # (B,) the one of each frame
+
+    @classmethod
+    def of(cls, each: Sequence[ReadNoise]) -> ReadNoises:
+        """Those of frames that have `each`."""
+        numbers = {kind: number for number, kind in enumerate(dict.fromkeys(each))}
+        return cls(tuple(numbers), np.array([numbers[kind] for kind in each], np.int64))
+
+    def part(self, frames: slice | np.ndarray) -> ReadNoises:
+        """Those of some of the frames."""
+        return ReadNoises(self.kinds, self.which[frames])
+
+
+@functools.lru_cache(maxsize=8)
+def tail_tables(kinds: tuple[ReadNoise, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Of K kinds of read noise, what a kernel draws them by, float32.
+
+    Returns:
+        (K, 2) deviation of the part that rows share and variance of the rest, where all read noise
+        of the averages would have 1 if it were independent; (K, N) `tukey_lambda` of the normals 0,
+        1/512, 2/512, ...: of their negatives it is the negative.
+    """
+    parts = [(kind.row * math.sqrt(kind.box_factor), 1.0 - kind.row**2) for kind in kinds]
+    tables = [_tail_table(averaged_shape(kind.shape, kind.box_factor)) for kind in kinds]
+    return np.array(parts, np.float32), np.stack(tables)
+
+
+@functools.lru_cache(maxsize=256)
+def _tail_table(shape: float) -> np.ndarray:
+    normals = torch.arange(_TAIL_SIZE, dtype=torch.float64) / TAIL_STEPS
+    return tukey_lambda(normals, shape).float().numpy()
 
 
 def tukey_lambda(normals: Tensor, shape: float) -> Tensor:

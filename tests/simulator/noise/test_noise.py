@@ -24,7 +24,12 @@ from simulator.capture.sensor import Transitions, record, sweep_keys
 from simulator.noise import generator
 from simulator.noise import noise_level_function as nlfs
 from simulator.noise.generator import BLOCK, drawn_normals, noise_generator, noise_keys, philox
-from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
+from simulator.noise.noise_level_function import (
+    NoiseLevelFunction,
+    ReadNoise,
+    ReadNoises,
+    noise_variance,
+)
 from simulator.optics.discs import disc_kernel
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
@@ -189,7 +194,7 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     assert torch.equal(simulated, scenes[0].expose([BASE], seed=3, noise="sensor")[0])
     transitions = Transitions.of([light], [scenes[0].exposure(BASE)])
     signals, numbers = torch.empty(1, 4, 9, 70), np.empty((1, 4, 9, 70), np.uint16)
-    given = {"keys": np.array([7], np.uint64), "read_noise": [ReadNoise(ROW, -0.05)]}
+    given = {"keys": np.array([7], np.uint64), "read_noise": ReadNoises.of([ReadNoise(ROW, -0.05)])}
     both = {"signals": signals, "numbers": numbers}
     ((low, high),) = record(transitions, known, **both, count=True, **given)
     np.testing.assert_array_equal(numbers, np.rint(signals.numpy() * SPAN + 3000))
