@@ -516,13 +516,14 @@ def _digitise_averaged(  # type: ignore[no-untyped-def]
 
 @_jit()
 def _digitise_with_rows(  # type: ignore[no-untyped-def]
-    size, light, normals, rows, tails, shares, bound, ratio, noise, parts, sensor, out
+    size, light, normals, read_part, shares, bound, ratio, noise, sensor, out
 ):
     """The same with read noise that has `rows` and `tails`: draws whose variance is 1.
 
     Of its variance, rows and the rest have the `parts` (2,) of `tail_tables`.
     """
     (shot, read, source_shot, source_read), (span, black, white) = noise, sensor
+    rows, tails, parts = read_part
     deviation, rest = parts[0] * np.sqrt(read if read > _ZERO else _ZERO), parts[1]
     for j in range(size):
         x = _exposed(light[j], ratio, bound)
@@ -535,6 +536,20 @@ def _digitise_with_rows(  # type: ignore[no-untyped-def]
         dark = dark if dark < missing else missing
         x += deviation * rows[j] + tails[j] * np.sqrt(rest * dark)
         out[j] = _rounded(_noisy(x, normals[j], missing - dark), span, black, white)
+
+
+@_jit()
+def _draw_read(read, place, size, held, words, made):  # type: ignore[no-untyped-def]
+    """Rows and tails of a block, and their `parts`; see `_draw_rows` for what is `held`.
+
+    `read` is what `record_units` has; there is memory for them, and for normals of rows, in `made`.
+    """
+    row_keys, pixel_keys, width, which, parts, tables = read
+    (frame, plane, start, number, samples), kind = place, which[place[0]]
+    where = start, size, width, plane // 2 * (samples // width)
+    held = _draw_rows(row_keys[frame], where, held, words, made[2], made[0])
+    _draw_tails(pixel_keys[frame], number, tables[kind], words, made[1])
+    return held, (made[0], made[1], parts[kind])
 
 
 @_jit()
@@ -618,48 +633,32 @@ def _in_bands(start, light, width, gain, out):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _write(made, frame, plane, start, body, limits, clipped, outputs):  # type: ignore[no-untyped-def]
-    """Writes a block's digital numbers to the outputs, and counts those that are clipped."""
-    (codes, numbers, signals, counts), end = outputs, start + len(made)
-    (span, black, _), (low, high, darkest, scale) = body, limits
-    if codes.size:
-        _compand(made, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
-    elif counts.size:
-        _count(made, low, high, clipped)
-    if numbers.size:
-        _as_integers(made, numbers[frame, plane, start:end])
-    for k in range(len(signals)):
-        if signals[k].size:
-            _as_signals(made, black, span, _LEAST[k], signals[k][frame, plane, start:end])
+def _band(start, light, shares, own, gain, width, lit, varied):  # type: ignore[no-untyped-def]
+    """Light of a block in bands, and in `varied` what of the source's variance is left there."""
+    _in_bands(start, light, width, gain, lit)
+    if own:  # the source has noise of its own
+        _in_bands(start, shares, width, gain, varied)
+    return lit[: len(light)]
 
 
 @_jit()
 def record_units(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    samples,
-    light,
-    remaining,
-    exposure,
-    noise,
-    sensor,
-    outputs,
-    means,
-    drawn,
-    read,
-    gains,
+    first, last, samples, scenes, noise, sensor, outputs, means, drawn, read, gains
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
 
-    Of `noise` there are keys and the bank. What is None is not compiled: whether noise is `drawn`,
-    what `read` noise with rows and tails is drawn by, and the `gains` (B, H) of rows. Where there
-    are `means` (of `CodeMeans`) to fill, frames are not divided.
+    Of `scenes` there are addresses of light and of shares of variance, and the table of
+    `Transitions`; of `noise` keys and the bank. What is None is not compiled: whether noise is
+    `drawn`, what `read` noise with rows and tails is drawn by, and the `gains` (B, H) of rows.
+    Where there are `means` (of `CodeMeans`) to fill, frames are not divided.
+
+    It is one function: calls with arrays in tuples, once a block, take a tenth of its time.
     """
-    (keys, bank), (codes, _, _, counts) = noise, outputs
+    (light, remaining, exposure), (keys, bank) = scenes, noise
+    codes, numbers, signals, counts = outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     lit, varied = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    tails, rows = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    row_normals, everything = np.empty(BLOCK, np.float32), np.ones(BLOCK, np.float32)
+    all_left, of_read = np.ones(BLOCK, np.float32), np.empty((3, BLOCK), np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
@@ -667,31 +666,22 @@ def record_units(  # type: ignore[no-untyped-def]
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
         ratio, shot, dark, source_shot, source_read = exposure[frame, :, plane]
         span, black, low, high, white, rounding = sensor[:, plane]
-        dark, body = dark - rounding, (span, black, white)
-        variance = shot, dark, source_shot, source_read
+        body, dark, held = (span, black, white), dark - rounding, -1
         # A light beyond it is white; one of an exposure of 0 has no bound.
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
-        limits = low, high, darkest, scale
         frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[attr-defined, call-arg]
         shares = samples if remaining[frame] else 0
         share = numba.carray(as_pointer(remaining[frame]), (shares,))
-        averaged, held, clipped[:] = shares > 0, -1, 0
-        if gains is not None:
-            averaged = averaged or source_shot > _ZERO or source_read > _ZERO
+        clipped[:], own = 0, source_shot > _ZERO or source_read > _ZERO
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
-            exposed, normals, sign = frame_light[at : at + size], made, _ONE
-            left = share[start:end] if shares else everything[:size]
+            exposed, normals, sign, out = frame_light[at : at + size], made, _ONE, part[:size]
             if gains is not None:
-                width = samples // gains.shape[1]
-                _in_bands(start, exposed, width, gains[frame], lit)
-                exposed = lit[:size]
-                if averaged:
-                    _in_bands(start, left, width, gains[frame], varied)
-                    left = varied[:size]
+                left, width = share[start:end] if shares else all_left, samples // gains.shape[1]
+                exposed = _band(start, exposed, left[:size], own, gains[frame], width, lit, varied)
             if drawn is not None:
                 draw_block(keys[frame], number, words, made)
             elif keys.size:
@@ -700,22 +690,31 @@ def record_units(  # type: ignore[no-untyped-def]
                 coming = bank_block(keys[frame], number + 1)[0]
                 for line in range(coming, coming + BLOCK, STRIDE):
                     prefetch(bank, line)
-            if read is not None:
-                row_keys, pixel_keys, width, which, parts, tables = read
-                before, kind = plane // 2 * (samples // width), which[frame]
-                place = start, size, width, before
-                held = _draw_rows(row_keys[frame], place, held, words, row_normals, rows)
-                _draw_tails(pixel_keys[frame], number, tables[kind], words, tails)
-                own = left, bound, ratio, variance, parts[kind], body
-                _digitise_with_rows(size, exposed, made, rows, tails, *own, part)
-            elif not keys.size:
+            banded = gains is not None and own
+            if not keys.size:
                 _digitise(size, exposed, bound, ratio, body, part)
-            elif averaged:
-                own = left, bound, ratio, variance, body
-                _digitise_averaged(size, exposed, normals, sign, *own, part)
+            elif read is not None or banded or shares:
+                left = varied if banded else share[start:end] if shares else all_left
+                noises = shot, dark, source_shot, source_read
+                if read is not None:
+                    place = frame, plane, start, number, samples
+                    held, of_frame = _draw_read(read, place, size, held, words, of_read)
+                    made_of = exposed, made, of_frame, left
+                    _digitise_with_rows(size, *made_of, bound, ratio, noises, body, part)
+                else:
+                    made_of = exposed, normals, sign, left
+                    _digitise_averaged(size, *made_of, bound, ratio, noises, body, part)
             else:
                 _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, dark, body, part)
-            _write(part[:size], frame, plane, start, body, limits, clipped, outputs)
+            if codes.size:
+                _compand(out, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
+            elif counts.size:
+                _count(out, low, high, clipped)
+            if numbers.size:
+                _as_integers(out, numbers[frame, plane, start:end])
+            for k in range(len(signals)):
+                if signals[k].size:
+                    _as_signals(out, black, span, _LEAST[k], signals[k][frame, plane, start:end])
         if counts.size:
             counts[unit, 0] = (clipped & (_HIGH - 1)).sum()
             counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
@@ -746,6 +745,7 @@ def _record_fused(
     pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
+    shares = np.zeros(frames, np.uintp) if remaining is None else addresses(remaining)
     drawn = None if keys is None or noise == "bank" else True
     if keys is not None and read_noise is not None:
         of_rows, of_pixels = (noise_keys(keys, number) for number in (1, 2))
@@ -757,9 +757,7 @@ def _record_fused(
     )
     fixed = (
         samples,
-        addresses(light),
-        np.zeros(frames, np.uintp) if remaining is None else addresses(remaining),
-        transitions.table,
+        (addresses(light), shares, transitions.table),
         (_NO_KEYS, _NO_BANK) if keys is None else (keys, _NO_BANK if drawn else noise_bank()),
         camera.digits,
         (codes, numbers, tuple(signals), counts),
