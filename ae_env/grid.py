@@ -74,8 +74,7 @@ class ExposureGrid:
     def third_stop(cls) -> ExposureGrid:
         """The same ranges in third stops of ISO and time, full stops of aperture: 2128 states."""
         isos = tuple(100.0 * 2 ** (i / 3) for i in range(19))
-        times = tuple(2.0 ** (-i / 3) for i in range(30, 2, -1))
-        return cls(isos, times, (4, 5.6, 8, 11))
+        return cls(isos, tuple(2.0 ** (-i / 3) for i in range(30, 2, -1)), (4, 5.6, 8, 11))
 
     @classmethod
     def video(cls) -> ExposureGrid:
@@ -95,8 +94,7 @@ class ExposureGrid:
             return spec
         named = ("bracket", "default", "third_stop", "video")
         if isinstance(spec, str) and spec in named:
-            grid: ExposureGrid = getattr(cls, spec)()
-            return grid
+            return getattr(cls, spec)()
         names = ("isos", "exposure_times", "f_numbers")
         if isinstance(spec, Mapping) and set(spec) == set(names):
             try:

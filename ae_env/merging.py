@@ -59,5 +59,4 @@ def log_error(
     """
     dark = floor[:, None, None, None].to(light)
     ratio = (light.clamp(min=0.0) + dark) / (truth.clamp(min=0.0) + dark)
-    error = ratio.log2_().abs_().clamp_(max=WORST_EV)
-    return error.masked_fill_(precision <= 0.0, WORST_EV)
+    return ratio.log2_().abs_().clamp_(max=WORST_EV).masked_fill_(precision <= 0.0, WORST_EV)

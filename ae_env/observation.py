@@ -159,5 +159,4 @@ def decode_sensors(sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A speed at the lower end of the range is returned as 0.
     """
     values = 2.0 ** _from_unit(sensors, SENSOR_RANGES)
-    speed = np.where(np.asarray(sensors)[..., 0] <= -1.0, 0.0, values[..., 0])
-    return speed, values[..., 1]
+    return np.where(np.asarray(sensors)[..., 0] <= -1.0, 0.0, values[..., 0]), values[..., 1]

@@ -55,8 +55,7 @@ class SpecProperty:
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None and not _is_json(spec.kwargs):
-            known = {f.name: getattr(spec, f.name) for f in fields(spec) if f.init}
-            spec = InProcessSpec(**known)
+            spec = InProcessSpec(**{f.name: getattr(spec, f.name) for f in fields(spec) if f.init})
         self._spec = spec
 
 

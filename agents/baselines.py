@@ -38,8 +38,7 @@ class Random(Policy):
     def act(self, observations: Observations, action_masks: Bools | None = None) -> Ints:
         """Draw a state per camera."""
         count = len(self.context.grid) if action_masks is None else action_masks.shape[1]
-        draws = self._rng.random((len(observations["raw"]), count))
-        return masked_argmax(draws, action_masks)
+        return masked_argmax(self._rng.random((len(observations["raw"]), count)), action_masks)
 
 
 class BestFixed(Policy):

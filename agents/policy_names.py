@@ -272,8 +272,7 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     if head.endswith(".py"):
         return load_from_file(head, tail, f"`policy` (={name!r})", example="MyPolicy"), {}
     built_in = {known.partition(":")[0] for known in (*_POLICIES, *_BRACKETS)}
-    named = all(part.isidentifier() for part in (*head.split("."), tail))
-    if head in built_in or not named:
+    if head in built_in or not all(part.isidentifier() for part in (*head.split("."), tail)):
         raise _refusal(name, _known(base, head))
     try:
         loaded = importlib.import_module(head)

@@ -180,8 +180,7 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
         shown = {key: np.asarray(value)[None] for key, value in observation.items()}
         masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
         told = {name: np.array([info.get(name)]) for name in ("oracle_state", "subject")}
-        actions = choose(name, policy, shown, masks, told)
-        state = checked_states(name, actions, masks)[0]
+        state = checked_states(name, choose(name, policy, shown, masks, told), masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)
         done = terminated or truncated
         steps.append((state, reward, terminated, truncated))

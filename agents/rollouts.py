@@ -38,13 +38,11 @@ def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[st
     if isinstance(scenes, str) and scenes in (*BUNDLED, *REAL):
         return {"scenes": scenes}, False
     options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
-    groups = {scene.group for scene in options.load_scenes()}
-    if len(groups) >= FEWEST_GROUPS_TO_SPLIT:
+    if len({scene.group for scene in options.load_scenes()}) >= FEWEST_GROUPS_TO_SPLIT:
         return {"scenes": scenes}, False
     found: dict[str, Any] = {"scenes": "bundled"}
     if options.recorded is not None:
-        grid = options.make_grid()
-        found["grid"] = {name: list(values) for name, values in asdict(grid).items()}
+        found["grid"] = {name: list(values) for name, values in asdict(options.make_grid()).items()}
     return found, True
 
 
@@ -123,8 +121,7 @@ class RolloutPlan:
         """
         used = len(scenes) if most is None else min(most, len(scenes))
         scene = np.tile(np.arange(used) * len(scenes) // used, count)
-        seeds = range(seed, seed + len(scene))
-        return cls(scenes, seeds, scene, [None] * len(scene))
+        return cls(scenes, range(seed, seed + len(scene)), scene, [None] * len(scene))
 
     def __len__(self) -> int:
         return len(self.seeds)

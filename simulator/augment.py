@@ -189,8 +189,7 @@ def _in_pieces(
     function: Callable[[torch.Tensor], torch.Tensor], image: torch.Tensor
 ) -> torch.Tensor:
     """A function of single pixels of (C, H, W), some rows at a time."""
-    rows = max(1, _PIECE // (4 * image.shape[-1]))
-    pieces = torch.split(image, rows, dim=1)
+    pieces = torch.split(image, max(1, _PIECE // (4 * image.shape[-1])), dim=1)
     return torch.cat([function(piece.contiguous()) for piece in pieces], dim=1)
 
 
@@ -247,8 +246,7 @@ class AugmentedDataset(Dataset[Any]):
         if not isinstance(image, torch.Tensor) or image.ndim != 3:
             rule = "must hold tensors (C, H, W), or tuples that begin with one"
             raise ValueError(f"`dataset` ({type(image).__name__} at {number}) {rule}")
-        seeds = sample_seeds(self.seed, self.epoch, [number])
-        (augmented,) = self.augmentation(image[None], seeds)
+        (augmented,) = self.augmentation(image[None], sample_seeds(self.seed, self.epoch, [number]))
         if sample is image:
             return augmented
         named = hasattr(sample, "_fields")  # a named tuple

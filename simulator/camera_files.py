@@ -179,12 +179,10 @@ def _colour_matrix(blocks: Mapping[str, Any]) -> tuple[tuple[float, ...], ...] |
     """XYZ to camera RGB in daylight; None of a monochrome sensor."""
     if "rpi.ccm" not in blocks or "ct_curve" not in blocks.get("rpi.awb", {}):
         return None
-    known = blocks["rpi.ccm"]["ccms"]
-    nearest = min(known, key=lambda entry: abs(entry["ct"] - _DAYLIGHT))
+    nearest = min(blocks["rpi.ccm"]["ccms"], key=lambda entry: abs(entry["ct"] - _DAYLIGHT))
     curve = np.reshape(blocks["rpi.awb"]["ct_curve"], (-1, 3))  # of grey: K, red/green, blue/green
     red, blue = (np.interp(nearest["ct"], curve[:, 0], curve[:, i]) for i in (1, 2))
-    srgb_from_balanced = np.reshape(nearest["ccm"], (3, 3))
-    camera_from_srgb = np.diag([red, 1.0, blue]) @ np.linalg.inv(srgb_from_balanced)
+    camera_from_srgb = np.diag([red, 1.0, blue]) @ np.linalg.inv(np.reshape(nearest["ccm"], (3, 3)))
     return tuple(map(tuple, (camera_from_srgb @ np.linalg.inv(XYZ_FROM_SRGB)).tolist()))
 
 

@@ -529,8 +529,7 @@ class CameraSimulator:
             if noise != "exact":
                 raise ValueError(f"`noise` (={noise!r}) needs a `tolerance`: not in the full run")
             scene.setdefault("depth", "far")
-            stages = self.stages(source, settings, seed=seed, **scene)
-            data, excess_noise = stages.capture, 0.0
+            data, excess_noise = self.stages(source, settings, seed=seed, **scene).capture, 0.0
             prepared = prepared_of(source, self.device)
             zero = NoiseLevelFunction.zero()
             clean = replace(prepared, nlf=zero, denoised_lights=(), aperture_blur=None)

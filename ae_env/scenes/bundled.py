@@ -218,8 +218,7 @@ def cached_scenes(
 
 def _rounded(scene: Scene) -> Scene:
     layout = None if scene.layout is None else _from_bytes(_to_bytes(scene.layout))
-    light = scene.light.clamp(max=65504.0).half().float()
-    return replace(scene, light=light, layout=layout)
+    return replace(scene, light=scene.light.clamp(max=65504.0).half().float(), layout=layout)
 
 
 def _to_bytes(layout: Layout) -> torch.Tensor:

@@ -133,8 +133,7 @@ def load_scenes(
             for scene in scenes
         ]
     check_word("split", split, get_args(Split))
-    named = isinstance(spec, str | Path | Mapping)
-    if split == "validation" and named and spec not in REAL[:2]:
+    if split == "validation" and isinstance(spec, str | Path | Mapping) and spec not in REAL[:2]:
         raise ValueError(
             f"`split` (={split!r}) needs `scenes='polyhaven'`: no others have places for it"
         )
@@ -344,9 +343,8 @@ def simulate_source_raw(
     settings = replace(unit, exposure_time=float(2.0 ** (exposure - unit.log2_exposure)))
     k, camera = scene.box_factor, scene.camera
     light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
-    noise = noise_generator(seed, number, iso, ev)
     taken = ReferenceCamera(camera, box_factor=k).record(
-        light, settings.iso, noise, settings.exposure_time
+        light, settings.iso, noise_generator(seed, number, iso, ev), settings.exposure_time
     )
     raw = RawImage(taken, settings, camera, white_balance=scene.white_balance, box_factor=k)
     known = Scene.from_raw(raw, scene_id=scene.scene_id)
@@ -402,8 +400,7 @@ class SceneNetworks:
         def make() -> torch.Tensor:  # at tolerance 0, so that it serves every tolerance
             return self._simulator.denoise(replace(scene.prepared, tolerance=0.0))
 
-        shape = scene.light.shape
-        denoised = self._cached("denoised", scene, make, shape=shape, everywhere=True)
+        denoised = self._cached("denoised", scene, make, shape=scene.light.shape, everywhere=True)
         noise = self._simulator.noise
         return replace(scene, denoised=denoised, residual=None if noise is None else noise.residual)
 

@@ -213,9 +213,8 @@ def asset_views(
         angle = float(rng.choice(_FIELDS_OF_VIEW))
         lux = math.exp(rng.uniform(low, high))
         light = read(seen, azimuth + 180.0, -pitch)
-        view = perspective(panorama, azimuth, 2 * size, angle, pitch)
         yield Scene.from_radiance(
-            view * np.float32(math.pi / light),
+            perspective(panorama, azimuth, 2 * size, angle, pitch) * np.float32(math.pi / light),
             camera,
             scene_id=f"{asset.name}-{index:02d}",
             group=asset.place,
@@ -310,5 +309,4 @@ def mixed_scenes(
     views = math.ceil(len(procedural) / len(assets))
     real = polyhaven_scenes(request, views=views, assets=assets)
     by_view = sorted(range(len(real)), key=lambda i: (i % views, i // views))
-    kept = sorted(by_view[: len(procedural)])
-    return [*procedural, *(real[i] for i in kept)]
+    return [*procedural, *(real[i] for i in sorted(by_view[: len(procedural)]))]

@@ -54,8 +54,7 @@ def colour_cast(images: torch.Tensor) -> torch.Tensor:
         logs = srgb_decode(part).clamp_(min=DARK).log2_()
         return torch.stack([logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1]], dim=1).flatten(2)
 
-    medians = by_parts(ratios, images).median(dim=2).values.double()
-    return medians.square().sum(dim=1).sqrt()
+    return by_parts(ratios, images).median(dim=2).values.double().square().sum(dim=1).sqrt()
 
 
 def colourfulness(images: torch.Tensor) -> torch.Tensor:
@@ -114,8 +113,7 @@ def _row_blur(luma: torch.Tensor) -> torch.Tensor:
         wide = avg_pool2d(padded, (1, 9), stride=1)[:, 0]
         sharp, blurred = part.diff(dim=2).abs_(), wide.diff(dim=2).abs_()
         lost = (sharp - blurred).clamp_(min=0.0)
-        total = [x.sum(dim=(1, 2), dtype=torch.float64) for x in (lost, sharp)]
-        return torch.stack(total, dim=1)
+        return torch.stack([x.sum(dim=(1, 2), dtype=torch.float64) for x in (lost, sharp)], dim=1)
 
     lost, sharp = by_parts(sums, luma).unbind(dim=1)
     return 1.0 - lost / sharp.clamp(min=1e-6)
@@ -123,8 +121,7 @@ def _row_blur(luma: torch.Tensor) -> torch.Tensor:
 
 def percentile(rows: torch.Tensor, share: float) -> torch.Tensor:
     """Nearest-rank percentile (B,) float64 of `rows` (B, N); `share` in [0, 1]."""
-    rank = 1 + round(share * (rows.shape[1] - 1))
-    return rows.kthvalue(rank, dim=1).values.double()
+    return rows.kthvalue(1 + round(share * (rows.shape[1] - 1)), dim=1).values.double()
 
 
 # -- severities: signs mapped to [0, 1] -----------------------------------------------------------
@@ -280,5 +277,4 @@ class Defects(CompositeScorer):
         worst, mean = values[0], sum(values) / len(values)
         for value in values[1:]:
             worst = worst - (worst - value).clip(0.0, None)  # the smaller, of arrays or tensors
-        total = self.worst_share * worst + (1.0 - self.worst_share) * mean
-        return total.clip(0.0, 1.0)
+        return (self.worst_share * worst + (1.0 - self.worst_share) * mean).clip(0.0, 1.0)

@@ -63,10 +63,9 @@ class ConvNormReLU6(nn.Sequential):
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1):
         padding = (kernel - 1) // 2 if stride == 1 else 0
-        convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
         super().__init__(
             nn.ZeroPad2d((0, 1, 0, 1)) if stride == 2 else nn.Identity(),
-            convolution,
+            nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False),
             nn.BatchNorm2d(outputs, eps=_EPS),
             nn.ReLU6(),
         )
@@ -102,8 +101,7 @@ class NimaMobileNet(nn.Module):
     def forward(self, pictures: Tensor) -> Tensor:
         """Shares (B, 10) of the ratings of `pictures` (B, 3, 224, 224) in [-1, 1]; summing to 1."""
         features = self.features(pictures).mean(dim=(2, 3))
-        ratings: Tensor = self.head(features).softmax(dim=1)
-        return ratings
+        return self.head(features).softmax(dim=1)
 
 
 #: Git blob ids of the published Keras files, by the scorer that they make.
@@ -187,8 +185,7 @@ class Nima:
         _network(self.file, self.digest)  # raises now, not at the first score
 
     def __call__(self, images: Tensor, captures: Captures) -> Tensor:
-        found = mean_rating(_network(self.file, self.digest), images.cpu())
-        return (found - 1.0) / (RATINGS - 1.0)
+        return (mean_rating(_network(self.file, self.digest), images.cpu()) - 1.0) / (RATINGS - 1.0)
 
 
 class NimaAesthetic(Nima):
@@ -317,8 +314,7 @@ class Classifier:
             outputs = session.run(None, {session.get_inputs()[0].name: pictures.numpy()})[0]
             return outputs[: len(outputs) - missing]
         except Exception as error:  # whatever a user's network raises
-            text = f"the classifier raised {type(error).__name__}: {error}"
-            raise UserCodeError(text) from error
+            raise UserCodeError(f"the classifier raised {type(error).__name__}: {error}") from error
 
 
 def _probabilities(outputs: Any, count: int) -> Tensor:

@@ -128,8 +128,7 @@ def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
     codes += LEVELS * torch.arange(count, device=luma.device)[:, None]
     bins = torch.bincount(codes.flatten(), minlength=LEVELS * count).reshape(count, LEVELS)
     shares = bins.double() / codes.shape[1]
-    bits: torch.Tensor = torch.special.entr(shares).sum(dim=1).div_(math.log(2.0))
-    return bits.clamp_(min=0.0)
+    return torch.special.entr(shares).sum(dim=1).div_(math.log(2.0)).clamp_(min=0.0)
 
 
 def shim_response(luma: torch.Tensor) -> torch.Tensor:
@@ -178,8 +177,7 @@ def zhang_gradient(luma: torch.Tensor, mask: Any = None) -> torch.Tensor:
     else:
         ascending = squares.sort(dim=1).values
     weights = _percentile_weights(squares.shape[1]).to(squares)
-    scale = (255.0 / _SCHARR_SUM) ** 2
-    return (ascending * weights).sum(dim=1, dtype=torch.float64).mul_(scale)
+    return (ascending * weights).sum(dim=1, dtype=torch.float64).mul_((255.0 / _SCHARR_SUM) ** 2)
 
 
 def _percentile_weights(samples: int) -> torch.Tensor:
@@ -420,8 +418,7 @@ class WellExposedness:
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         squares = (images - self.centre).square_().sum(dim=1)  # of the product: a sum of exponents
-        weights = squares.mul_(-0.5 / self.sigma**2).exp_()
-        return weights.mean(dim=(1, 2), dtype=torch.float64)
+        return squares.mul_(-0.5 / self.sigma**2).exp_().mean(dim=(1, 2), dtype=torch.float64)
 
 
 class Entropy:

@@ -178,8 +178,7 @@ class ScoreTables:
             captures = terms.captures.describe(scene, prepared, part)
             found: dict[str, np.ndarray] = {}
             if terms.parts:
-                codes = encode_observation(shown).numpy()
-                means = terms.measured(codes, states)
+                means = terms.measured(encode_observation(shown).numpy(), states)
                 found = terms.score(means, captures)
             if not terms.closed_form:
                 found |= terms.torch_scores(shown.clamp(0.0, 1.0), captures, "image")

@@ -32,8 +32,7 @@ _slow: set[str] = set()  # those that were found in this process
 
 def depends_on(scorer: Scorer) -> DependsOn:
     """The `DependsOn` of `scorer`; ``"image"`` unless it says otherwise."""
-    found: DependsOn = getattr(scorer, "depends_on", "image")
-    return found
+    return getattr(scorer, "depends_on", "image")
 
 
 class CompositeScorer:
@@ -77,8 +76,7 @@ class CompositeScorer:
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of raw `images` (B, 4, H, W) in [0, 1]."""
-        scores: torch.Tensor = self.combine(self.score_parts(images, captures))
-        return scores
+        return self.combine(self.score_parts(images, captures))
 
     def score_parts(
         self,

@@ -360,8 +360,7 @@ def measure_latitude(
         wanted = _found(detector, next(_frames(scene, "EV", (0.0,), noise=False)))
         left_out += not len(wanted)
         for (axis, values), noise in product(AXES.items() if len(wanted) else (), (True, False)):
-            frames = _frames(scene, axis, values, noise=noise)
-            for value, frame in zip(values, frames, strict=True):
+            for value, frame in zip(values, _frames(scene, axis, values, noise=noise), strict=True):
                 key = axis, value, noise
                 successes.setdefault(key, []).extend(_kept(wanted, _found(detector, frame)))
                 ends.setdefault(key, []).append(((frame == 0).mean(), (frame == 255).mean()))

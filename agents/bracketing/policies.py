@@ -287,8 +287,7 @@ class Hasinoff(Bracketing):
         def quality(headroom: float, longest: float) -> float:
             tried = copy.copy(self)
             tried.headroom, tried.longest = headroom, longest
-            found = run_brackets(tried, envs, seed=seed, most=_FIT_SCENES)
-            return float(found["quality"].mean())
+            return float(run_brackets(tried, envs, seed=seed, most=_FIT_SCENES)["quality"].mean())
 
         headroom, longest = self.headroom, self.longest
         times = self.context.grid.exposure_times
@@ -316,8 +315,7 @@ class Hasinoff(Bracketing):
             fits &= self.schedules.longest <= self.longest * (1.0 + 1e-6)
             self._plans[camera] = int(np.where(fits, worst, -1.0).argmax())
         plan = self._plans[camera]
-        exposed = self.context.grid.ev100
-        state = self.schedules.next_state(plan, taken, np.abs(exposed - reference))
+        state = self.schedules.next_state(plan, taken, np.abs(self.context.grid.ev100 - reference))
         return self.stop if state < 0 else state
 
     def _range(self, camera: int) -> tuple[float, float]:
@@ -362,8 +360,7 @@ class Planner(Bracketing):
         reference, taken = float(self._reference[camera]), self.taken(camera)
         blur = blur_error(64.0 * speed * self._times) if self.blur else np.zeros(self.stop)
         errors = self.schedules.errors(reference, reference + _FLOOR, self.light(camera), blur)
-        fits = self.schedules.completions(taken, time_left)
-        best = int(np.where(fits, errors, np.inf).argmin())
+        best = int(np.where(self.schedules.completions(taken, time_left), errors, np.inf).argmin())
         alone = np.full(self.stop, np.inf)  # error of single frames; inf where none fits
         single = np.flatnonzero(self.schedules.frames == 1)
         alone[self.schedules.states[single, 0]] = errors[single]

@@ -240,8 +240,7 @@ def _arguments(env: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
         EnvOptions.from_kwargs(arguments)
     except ValueError as error:
         raise ValueError(f"`env` (={env!r}): {error}") from error
-    condition = {k: arguments.pop(k) for k in _CONDITION if k in arguments}
-    return arguments, condition
+    return arguments, {k: arguments.pop(k) for k in _CONDITION if k in arguments}
 
 
 def _check_changes(base: "EvaluationPlan", changed: list[str]) -> None:

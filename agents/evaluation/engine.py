@@ -488,8 +488,7 @@ def _milliseconds_alone(
     if oracle is not None:
         last = np.repeat(oracle[:, -1:], TIMED_FRAMES, axis=1)
         oracle = np.concatenate([oracle, last], axis=1)
-    batch = next(episodes.batches(envs))
-    found = run_batch(name, policy, envs, batch, TIMED_FRAMES, oracle=oracle)
+    found = run_batch(name, policy, envs, next(episodes.batches(envs)), TIMED_FRAMES, oracle=oracle)
     return 1000.0 * float(np.median(found["seconds"][_WARM_UP:]))
 
 

@@ -110,8 +110,7 @@ def rank_agreement(first: Floats, second: Floats) -> Interval:
     value = float(tau(np.full((1, groups), 1.0 / groups))[0])
     if groups < MIN_GROUPS:
         return Interval(value, None, None, groups)
-    drawn = tau(group_weights(groups, RESAMPLES, 0) / groups)
-    low, high = np.quantile(drawn, ENDS).tolist()
+    low, high = np.quantile(tau(group_weights(groups, RESAMPLES, 0) / groups), ENDS).tolist()
     return Interval(value, low, high, groups)
 
 
@@ -119,8 +118,7 @@ def rank_agreement(first: Floats, second: Floats) -> Interval:
 def group_weights(groups: int, resamples: int, seed: int) -> Floats:
     """How often each group is drawn, ``(R, G)``; the same for all that are compared."""
     rng = np.random.default_rng(seed)
-    weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)
-    return weights.astype(np.float64)
+    return rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples).astype(np.float64)
 
 
 def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Floats:

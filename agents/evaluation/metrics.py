@@ -63,8 +63,7 @@ def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: Bools) -> Flo
     Zero wherever the brightness is right, however it is split.
     """
     good = (scores >= oracle_score(scores, allowed)[..., None] - NEAR_BEST) & allowed
-    distance = np.abs(ev100 - ev100[states][..., None])
-    return np.where(good, distance, np.inf).min(axis=-1)
+    return np.where(good, np.abs(ev100 - ev100[states][..., None]), np.inf).min(axis=-1)
 
 
 def settling(scores: Floats) -> Ints:

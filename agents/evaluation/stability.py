@@ -178,8 +178,7 @@ class PolicyLoop:
     def reset(self, start: Request) -> None:
         """Begin new episodes at `start`."""
         self._rng = np.random.default_rng(self._seed)
-        shape = 4, *self._zones.shape
-        self._noise = self._rng.standard_normal(shape).astype(np.float32)
+        self._noise = self._rng.standard_normal((4, *self._zones.shape)).astype(np.float32)
         with errors_of(self.name, "reset"):
             self.policy.reset(len(start.time), seed=self._seed)
 
@@ -318,8 +317,7 @@ def judge_stability(
 ) -> Stability:
     """Runs the controller called `name` through all cases."""
     controller = make_controller(name)
-    law = isinstance(controller, Proportional)
-    cases = all_cases(LAW_GAINS if law else GAINS, seed)
+    cases = all_cases(LAW_GAINS if isinstance(controller, Proportional) else GAINS, seed)
     evs, begun, done = np.empty((len(cases.step), LEAD + frames)), perf_counter(), 0
     for rows, delay in _batches(cases, controller):
         evs[rows] = run_loop(make_controller(name, delay, seed), cases.take(rows), frames)

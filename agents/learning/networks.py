@@ -126,8 +126,7 @@ class ExposureFeatures(nn.Module):
         features = [pool(found, _QUARTERS).flatten(1), found.amax(dim=(2, 3))]
         features += [zones.flatten(1), clipped.flatten(1)]
         numbers = [n for n in (settings, sensors, history) if n is not None]
-        joint: torch.Tensor = self.head(torch.cat([*features, *numbers], dim=1))
-        return joint
+        return self.head(torch.cat([*features, *numbers], dim=1))
 
     def light(
         self, codes: torch.Tensor, settings: torch.Tensor, histogram: torch.Tensor | None = None
@@ -167,8 +166,7 @@ def _count(codes: torch.Tensor) -> torch.Tensor:
     """Shares (B, 256) of the codes (B, ...) int64 of each frame."""
     flat = codes.flatten(1)
     counts = torch.zeros(flat.shape[0], 256, device=flat.device)
-    ones = torch.ones_like(flat, dtype=counts.dtype)
-    return counts.scatter_add(1, flat, ones) / flat.shape[1]
+    return counts.scatter_add(1, flat, torch.ones_like(flat, dtype=counts.dtype)) / flat.shape[1]
 
 
 def _spread(shares: torch.Tensor, luminance: torch.Tensor) -> torch.Tensor:
@@ -268,8 +266,7 @@ class StateHead(nn.Module):
         shares = torch.einsum("bhi,isl->bshl", histograms, self.exposed).flatten(2)
         of_state = self.from_state(states) + self.from_light(torch.cat([shares, exposure], dim=2))
         hidden = torch.relu(self.from_features(features)[:, None] + of_state)
-        values: torch.Tensor = self.values(torch.relu(self.hidden(hidden)))
-        return values
+        return self.values(torch.relu(self.hidden(hidden)))
 
     def _blur(self, sensors: torch.Tensor) -> torch.Tensor:
         """log2 of each state's blur in 64ths of the frame, and its loss of sharpness; scaled."""
@@ -279,8 +276,7 @@ class StateHead(nn.Module):
         motion_px = torch.exp2(speed + 6.0 + self.log2_time)  # (B, S): 64 pixels a frame height
         defocus_px = torch.exp2(defocus + self.log2_opening)
         squared = motion_px.square() + defocus_px.square()
-        loss = torch.log1p(squared)
-        return torch.stack([squared.log2() / 8.0, loss / 2.0], dim=2)
+        return torch.stack([squared.log2() / 8.0, torch.log1p(squared) / 2.0], dim=2)
 
 
 def exposure_loss(ev100: torch.Tensor, spread: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
@@ -320,8 +316,7 @@ class MeterHistory:
         self._frames[which] = shifted[which]
         shown = self._frames.copy()
         shown[:, :, 0] = (shown[:, :, 0] - shown[:, :1, 0]) / 2.0
-        flat = np.clip(shown, -_LARGEST, _LARGEST).reshape(len(shown), -1)
-        return flat.astype(np.float32)
+        return np.clip(shown, -_LARGEST, _LARGEST).reshape(len(shown), -1).astype(np.float32)
 
     def record_action(self, states: Ints) -> None:
         """Remembers the states that were asked for after the frame in hand, ``(N,)``."""

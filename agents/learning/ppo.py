@@ -63,8 +63,7 @@ class _StateLogits(nn.Module):
     def forward(self, extracted: torch.Tensor) -> torch.Tensor:
         """Logits (B, S)."""
         features, light, sensors = torch.split(extracted, self.sizes, dim=1)
-        values: torch.Tensor = self.head(features, light, sensors if sensors.shape[1] else None)
-        return values[..., 0]
+        return self.head(features, light, sensors if sensors.shape[1] else None)[..., 0]
 
     def loss(self, extracted: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         """Loss of what the head says of the right exposure, whose EV100 is `right` (B,)."""

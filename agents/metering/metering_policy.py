@@ -260,8 +260,7 @@ class MeteringPolicy(Policy):
             self.reset(envs.num_envs)
             shown = shown_to(self, batch.observations, batch.info)
             for _ in range(FIT_FRAMES - 1):
-                actions = self.act(shown, batch.action_masks)
-                observations, _, _, _, info = envs.step(actions)
+                observations, _, _, _, info = envs.step(self.act(shown, batch.action_masks))
                 shown = shown_to(self, observations, info)
             columns = self.observe(shown), expected_scores(envs), batch.groups
             found.append([column[batch.valid] for column in columns])
@@ -337,8 +336,7 @@ class ScoreRegression:
         taken to be at its end: a local fit must not extrapolate.
         """
         features = np.clip(features, self.features.min(axis=0), self.features.max(axis=0))
-        mean = self.scores.mean(axis=0)
-        prior = np.broadcast_to(mean, (len(features), self.scores.shape[1]))
+        prior = np.broadcast_to(self.scores.mean(axis=0), (len(features), self.scores.shape[1]))
         for widen in (WIDER, 1.0):
             prior = self._local_fit(features, self.bandwidths * widen, prior)
         return prior

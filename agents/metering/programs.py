@@ -85,8 +85,7 @@ class StateChooser:
         self.hysteresis = HYSTERESIS_STEPS * self.step
         #: Stops by which each state is slower than its cap and has more gain, ``(S,)``.
         self.over_cap = np.zeros(len(grid))
-        caps = {"exposure_time": options.shutter_cap, "iso": options.iso_cap}
-        for name, cap in caps.items():
+        for name, cap in {"exposure_time": options.shutter_cap, "iso": options.iso_cap}.items():
             if cap is not None:
                 values = np.array([getattr(s, name) for s in grid.states])
                 if name == "iso" and cap < (least := values.min()) * (1.0 - 1e-6):

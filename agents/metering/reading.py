@@ -175,8 +175,7 @@ def read_part(
 ) -> Reading:
     """The reading of a part of each frame: the box around it is the meter's frame."""
     found = [meter(cut, estimate[cameras]) for cameras, cut in parts_of(observations, masks)]
-    columns = zip(*(vars(one).values() for one in found), strict=True)
-    return Reading(*map(np.concatenate, columns))
+    return Reading(*map(np.concatenate, zip(*(vars(one).values() for one in found), strict=True)))
 
 
 def inside(observations: Observations) -> NDArray[Any]:
@@ -259,8 +258,7 @@ class ReferenceFrames:
             green, count = np.where(seen, green, np.int16(-1)), seen.sum(axis=1, keepdims=True)
         ranks = green.shape[1] - count + np.rint(_QUANTILES * (count - 1)).astype(np.intp)
         quantiles = CODE_SIGNALS[np.take_along_axis(np.sort(green, axis=1), ranks, axis=1)]
-        white = np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)
-        saturated = (green >= white).sum(axis=1) / count[:, 0]
+        saturated = (green >= np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)).sum(axis=1) / count[:, 0]
         if self._best is None:
             self._best = (raw.copy(), settings.copy(), quantiles, saturated, ev)
         else:

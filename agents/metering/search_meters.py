@@ -234,12 +234,10 @@ def zhang_reading(
     zero = np.zeros(len(frame.ev))
     here = metric(zero)
     brighter, darker = metric(zero + ZHANG_DELTA_EV), metric(zero - ZHANG_DELTA_EV)
-    both = frame.shows(zero - ZHANG_DELTA_EV)
-    rise = np.where(both, 0.5 * (brighter - darker), brighter - here)
+    rise = np.where(frame.shows(zero - ZHANG_DELTA_EV), 0.5 * (brighter - darker), brighter - here)
     slope = rise / (ZHANG_DELTA_EV * np.maximum(here, _NO_GRADIENT))
     step = np.clip(ZHANG_RATE * slope, -ZHANG_LIMIT_EV, ZHANG_LIMIT_EV)
-    rising = frame.rising(step, here, metric)
-    return frame.reading(frame.lifted(rising, np.maximum(here, brighter)))
+    return frame.reading(frame.lifted(frame.rising(step, here, metric), np.maximum(here, brighter)))
 
 
 class _Frame:

@@ -277,8 +277,7 @@ class Controller:
             return np.full(self.frame_shape, reason, object)
         pedestal = self.card.pedestal
         shown = np.clip(averaged, -pedestal, 1.0)
-        root = np.sqrt((shown + pedestal) / (1.0 + pedestal))
-        return np.rint(255.0 * root).astype(np.uint8)
+        return np.rint(255.0 * np.sqrt((shown + pedestal) / (1.0 + pedestal))).astype(np.uint8)
 
     def encode_settings(self, state: ExposureState) -> NDArray[np.float32]:
         """The observed settings (3,) of a state: Av, Tv and Sv in [-1, 1].

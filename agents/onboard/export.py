@@ -61,8 +61,7 @@ class _PPOGraph(nn.Module):
         shown = {"raw": raw.float() / 255.0, "settings": settings}
         if sensors is not None:
             shown["sensors"] = sensors
-        logits: torch.Tensor = self.logits(self.latent.forward_actor(self.extractor(shown)))
-        return logits
+        return self.logits(self.latent.forward_actor(self.extractor(shown)))
 
 
 def export_agent(policy: Policy, path: str | Path) -> Path:

@@ -228,9 +228,8 @@ def append_rows(
         order, value = both.task.map(_TASKS.index), -both.score.astype(float)
         both = both.assign(order=order, value=value).sort_values(["order", "value"], kind="stable")
         both = both[list(COLUMNS)]
-        content = both.to_csv(index=False, lineterminator="\n")
         return {
-            table.name: write_atomically(table, content),
+            table.name: write_atomically(table, both.to_csv(index=False, lineterminator="\n")),
             page.name: write_atomically(page, table_page(plan, both)),
         }
 

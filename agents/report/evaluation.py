@@ -168,8 +168,7 @@ def code_block(*lines: str) -> str:
 
 def _fence(text: str, least: int) -> str:
     """Backticks, `least` or more, that `text` does not end."""
-    longest = max(map(len, re.findall("`+", text)), default=0)
-    return "`" * max(least, longest + 1)
+    return "`" * max(least, max(map(len, re.findall("`+", text)), default=0) + 1)
 
 
 def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
@@ -371,8 +370,7 @@ def _condition_tables(
 
 
 def _pivot(by: pd.DataFrame, key: str) -> pd.DataFrame:
-    table = by.pivot(index="condition", columns="policy", values=key)
-    return table.loc[by.condition.unique()]
+    return by.pivot(index="condition", columns="policy", values=key).loc[by.condition.unique()]
 
 
 def _clipping(by: pd.DataFrame, static: str, policies: pd.Index[Any]) -> pd.DataFrame:

@@ -95,8 +95,7 @@ def _panel(recording: Recording, frame: int) -> Image.Image:
     draw = ImageDraw.Draw(panel)
     score = float(np.mean(recording.scores[1 : frame + 1])) if frame else recording.scores[0]
     for i, text in enumerate((recording.name, f"mean score so far {score:.2f}")):
-        font = fitting_font(draw, text, 12, PICTURE, least=7)
-        draw.text((0, 2 + 15 * i), text, _INK, font)
+        draw.text((0, 2 + 15 * i), text, _INK, fitting_font(draw, text, 12, PICTURE, least=7))
     panel.paste(Image.fromarray(recording.pictures[frame]).resize((PICTURE, PICTURE)), (0, TITLE))
     bottom, height = TITLE + PICTURE + CHART - 4, CHART - 8
     low, high = min(recording.best + recording.ev100), max(recording.best + recording.ev100)

@@ -82,8 +82,7 @@ def plot_convergence(
         for i, policy in enumerate(order):
             errors = result.episode_metrics(policy)["ev_error"].mean(axis=0)  # (E, T)
             means = metrics.group_means(errors.T, result.groups).mean(axis=-1)
-            frames = np.arange(1, len(means) + 1)
-            panel.plot(frames, means, lw=1.3, **line_style(i))
+            panel.plot(np.arange(1, len(means) + 1), means, lw=1.3, **line_style(i))
         panel.set_title(name, fontsize=9)
         panel.set_yscale("symlog", linthresh=1.0, linscale=1.0)
         panel.set_yticks([0, 1, 2, 4, 8, 16], ["0", "1", "2", "4", "8", "16"], fontsize=8)

@@ -204,8 +204,7 @@ class OneRawPage(Tab):
         if self.viewed is not None and ending in self._results:
             result = "opened" if ending == "dng" else "hdr"
             name = f"{Path(self.viewed.scene.scene_id).stem}-{result}.{ending}"
-            write = self._results[ending].files[ending]
-            await self.download(self._saves[ending], name, write)
+            await self.download(self._saves[ending], name, self._results[ending].files[ending])
 
 
 async def _in_background(function: Callable[..., RenderedImage], *arguments: Any) -> RenderedImage:

@@ -287,5 +287,4 @@ class Page:
         viewed, view = self._exposure.viewed, self._exposure.view
         if viewed is not None:
             name = f"{Path(viewed.scene.scene_id).stem}-simulated.dng"
-            write = partial(viewed.write_dng, view=view)
-            await self._exposure.download(self._save, name, write)
+            await self._exposure.download(self._save, name, partial(viewed.write_dng, view=view))

@@ -267,8 +267,7 @@ class ViewedScene:
         """The capture that `view` asks for."""
         with self._lock:
             begun = perf_counter()
-            prepared = self._part(view)
-            (capture,) = prepared.expose([view.settings])
+            (capture,) = self._part(view).expose([view.settings])
             taken = perf_counter()
             with _one_thread():
                 image = self._to_srgb(capture, view)
@@ -356,8 +355,7 @@ class ViewedScene:
         with self._lock:
             defocus = view.defocus * self.scene.light.shape[1] / SCORED_PIXELS
             moves: dict[str, Any] = {"image_speed": view.speed, "defocus": defocus}
-            prepared = self._prepare(self.scene)
-            raw = self._simulator.simulate(prepared, view.settings, **moves)
+            raw = self._simulator.simulate(self._prepare(self.scene), view.settings, **moves)
         write_dng(path, raw)
         return path
 
@@ -366,8 +364,7 @@ class ViewedScene:
         grid = ExposureGrid.default()
         settings = grid[grid.nearest(self.scene.ev100)]
         factor = max(1, min(self.scene.light.shape[1:]) // _THUMBNAIL[1])
-        small = self.scene.averaged(factor)
-        capture = replace(small, denoised=None).prepared.expected(settings)
+        capture = replace(self.scene.averaged(factor), denoised=None).prepared.expected(settings)
         return encoded(self._to_srgb(capture.clamp(0.0, 1.0), View(settings)), quality=80)
 
     def _prepare(self, scene: Scene) -> PreparedScene:

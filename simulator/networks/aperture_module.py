@@ -179,8 +179,7 @@ class DefocusMap(nn.Module):
         for block in self.blocks:
             x = block(x)
         coarse = self.tail(x).float()
-        size = features.shape[-2:]
-        fine = F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+        fine = F.interpolate(coarse, size=features.shape[-2:], mode="bilinear", align_corners=False)
         return fine[:, 0, :height, :width]
 
 

@@ -177,8 +177,7 @@ class Denoiser(nn.Module):
         for block, up in zip(reversed(self.decode), reversed(self.up), strict=True):
             x = up(x).add_(skips.pop())  # on large frames these are most of the memory
             x = block(x)
-        residual: Tensor = self.tail(x)
-        return residual
+        return self.tail(x)
 
 
 def _asinh(x: Tensor) -> Tensor:
@@ -211,8 +210,7 @@ class ResidualBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape."""
         # In place where autograd allows it: on large frames fresh memory costs as much as the sums.
-        inner: Tensor = self.second(F.relu_(self.first(x)))
-        return inner.add_(x)
+        return self.second(F.relu_(self.first(x))).add_(x)
 
 
 class NoiseModule(nn.Module):
@@ -303,8 +301,7 @@ def box_mean(x: Tensor, window: int) -> Tensor:
     where pooling would read every pixel `window` times.
     """
     height, width = x.shape[-2:]
-    padded = F.pad(x, (window // 2,) * 4, mode="replicate")
-    rows = _running_sum(padded, window, -2, height)
+    rows = _running_sum(F.pad(x, (window // 2,) * 4, mode="replicate"), window, -2, height)
     return _running_sum(rows, window, -1, width) / (window * window)
 
 

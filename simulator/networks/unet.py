@@ -154,8 +154,7 @@ class UNet(nn.Module):
             else:
                 x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=True)
                 x = level(torch.cat([skip, x], dim=1))
-        residual: Tensor = self.tail(x)
-        return residual[..., :height, :width]
+        return self.tail(x)[..., :height, :width]
 
 
 # -- the attention U-Net --------------------------------------------------------------------------
@@ -219,8 +218,7 @@ class NormalisedConvolution(nn.Module):
 
     def forward(self, x: Tensor, aperture: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H, W)."""
-        result: Tensor = self.norm(self.convolution(x), aperture)
-        return result
+        return self.norm(self.convolution(x), aperture)
 
 
 class _ApertureLevel(nn.Module):
@@ -287,8 +285,7 @@ class SkipAttention(nn.Module):
 
     def channel_attention(self, aperture: Tensor) -> Tensor:
         """The paper's beta_c in (0, 1), (B, C), from the f-numbers (B, 2) alone."""
-        result: Tensor = self.excite(self.average(aperture))
-        return result
+        return self.excite(self.average(aperture))
 
 
 class AttentionUNet(nn.Module):
@@ -369,5 +366,4 @@ class AttentionUNet(nn.Module):
                 x = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = F.relu(upward(x, aperture))
             x = level(torch.cat([attention(skip, x, aperture), x], dim=1), aperture)
-        residual: Tensor = self.tail(x)
-        return residual[..., :height, :width]
+        return self.tail(x)[..., :height, :width]

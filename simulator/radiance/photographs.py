@@ -95,8 +95,7 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     shown = np.clip((codes + rng.uniform(-0.5, 0.5, codes.shape)) / 255.0, 0.0, 1.0)
     flat = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * shown) / 3.0)
     linear = np.where(flat <= 0.04045, flat / 12.92, ((flat + 0.055) / 1.055) ** 2.4)
-    peak = shown.max(axis=0)
-    blown = np.clip((peak - _CLIPPED) / (1.0 - _CLIPPED), 0.0, 1.0) ** 2
+    blown = np.clip((shown.max(axis=0) - _CLIPPED) / (1.0 - _CLIPPED), 0.0, 1.0) ** 2
     return np.asarray((linear * np.exp2(blown * rng.uniform(0.0, 2.5))).astype(np.float32))
 
 

@@ -105,8 +105,7 @@ def _draw_leaves(
     centre_y = rng.uniform(-margin, size + margin, number)
     centre_x = rng.uniform(-margin, size + margin, number)
     angle, elongation = rng.uniform(0.0, np.pi, number), np.exp2(rng.uniform(-0.7, 0.7, number))
-    is_box = rng.random(number) < 0.3
-    return radius, centre_y, centre_x, np.stack([angle, elongation, is_box])
+    return radius, centre_y, centre_x, np.stack([angle, elongation, rng.random(number) < 0.3])
 
 
 def paint_leaves(
@@ -216,8 +215,7 @@ def day(rng: Generator, size: int) -> Drawing:
         depth = rng.uniform(0.12, 0.5)
         light = light * _shadows(rng, size, share=rng.uniform(0.05, 0.4), depth=depth)
     if rng.random() < 0.5:
-        number = int(rng.integers(1, 9))
-        _add_lamps(rng, light, number, radius=(0.003, 0.008), value=(2.0, 60.0))
+        _add_lamps(rng, light, int(rng.integers(1, 9)), radius=(0.003, 0.008), value=(2.0, 60.0))
     return Drawing(light, illuminance, temperature_tint(rng.normal(0.05, 0.12)))
 
 
@@ -226,8 +224,7 @@ def indoor(rng: Generator, size: int) -> Drawing:
     style = _varied_style(rng)
     light = dead_leaves(rng, size, style) * _falloff(rng, size, stops=rng.uniform(0.3, 1.5))
     if rng.random() < 0.7:
-        number = int(rng.integers(1, 5))
-        _add_lamps(rng, light, number, radius=(0.01, 0.035), value=(5.0, 120.0))
+        _add_lamps(rng, light, int(rng.integers(1, 5)), radius=(0.01, 0.035), value=(5.0, 120.0))
     tint = temperature_tint(rng.uniform(0.1, 1.1))
     return Drawing(light, draw_lux(rng, 10.0, 2000.0), tint)
 

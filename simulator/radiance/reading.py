@@ -100,8 +100,7 @@ def _check_aspect(aspect: float) -> None:
 
 
 def _refuse_lies(path: Path, height: int, width: int) -> None:
-    size = path.stat().st_size
-    bomb = refuse_bomb(height, width, size, per_byte=MAX_RADIANCE_PIXELS_PER_BYTE)
+    bomb = refuse_bomb(height, width, path.stat().st_size, per_byte=MAX_RADIANCE_PIXELS_PER_BYTE)
     if bomb:
         raise RadianceError(bomb)
 

@@ -140,8 +140,7 @@ def render_srgb(
         rgb = demosaic_half(packed).repeat_interleave(2, 2).repeat_interleave(2, 3)
     else:
         rgb = demosaic_malvar(packed, raw.camera.cfa)
-    encoded = _finish(rgb, raw.camera.colour_matrix, tone)[0]
-    return encoded.mul_(255.0).round_().to(torch.uint8)
+    return _finish(rgb, raw.camera.colour_matrix, tone)[0].mul_(255.0).round_().to(torch.uint8)
 
 
 def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
@@ -254,8 +253,7 @@ def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
         rule = "must see white in every channel, and be invertible"
         raise ValueError(f"`colour_matrix` (={rows}) {rule}")
     camera_from_srgb /= white
-    inverse: list[list[float]] = np.linalg.inv(camera_from_srgb).tolist()
-    return inverse
+    return np.linalg.inv(camera_from_srgb).tolist()
 
 
 def apply_tone(linear: torch.Tensor, tone: str) -> torch.Tensor:

@@ -194,8 +194,7 @@ def missing_bytes(directories: Sequence[Directory], size: int) -> int:
             end = max(end, int(begin + math.prod(sides) * 16 / 14))
         for offsets, counts in (_POSITIONS[:2], _POSITIONS[2:]):
             pairs = zip(numbers(tags, offsets), numbers(tags, counts), strict=False)
-            ends = (int(a + b) for a, b in pairs if b and a != _NO_POSITION)
-            end = max([end, *ends])
+            end = max([end, *(int(a + b) for a, b in pairs if b and a != _NO_POSITION)])
     return end - size
 
 

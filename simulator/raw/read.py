@@ -356,8 +356,7 @@ def _profile(
         "colour_matrix_source": source if matrix is not None else "",
     }
     if base is not None:
-        found = base.with_levels(decoded.black_level, decoded.white_level, depth)
-        return replace(found, **colours)
+        return replace(base.with_levels(decoded.black_level, decoded.white_level, depth), **colours)
     repeated = make == "unknown" or model.lower().startswith(make.lower())
     name = model if repeated else f"{make} {model}".strip()
     return CameraProfile(

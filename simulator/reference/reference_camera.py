@@ -339,8 +339,7 @@ class ReferenceCamera:
 
     def clip(self, signal: Tensor, iso: float) -> Tensor:
         """The mean of a capture of `signal` (..., 4, H, W): clipped to [-pedestal, 1], averaged."""
-        black = self._black_offset(signal)
-        held = torch.minimum(signal, self._well(signal, iso) + black)
+        held = torch.minimum(signal, self._well(signal, iso) + self._black_offset(signal))
         pedestal = torch.tensor(self.camera.pedestal).to(signal)[:, None, None]
         return average_planes(torch.maximum(held, -pedestal).clamp(max=1.0), self.box_factor)
 

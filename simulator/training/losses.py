@@ -98,8 +98,7 @@ class ApertureLoss(nn.Module):
         values: dict[str, Tensor] = {}
         if isinstance(self.aperture.network, DefocusMap):
             log_blur = self.aperture.network(denoised, deviation)
-            truth = torch.log(batch.defocus + LOG_OFFSET)
-            values["map"] = (log_blur - truth).abs().mean()
+            values["map"] = (log_blur - torch.log(batch.defocus + LOG_OFFSET)).abs().mean()
             diameter = dead_zone(to_diameter(log_blur))
             stops = (f[:, None, None] for f in (batch.f_source, batch.f_target))
             output = DiscBank(denoised).blurred(added_blur(diameter, *stops)[:, None])
@@ -138,5 +137,4 @@ def expose(exposure: ExposureModule, batch: Batch) -> tuple[Tensor, Tensor, Tens
 def away_from_clipping(source: Tensor, target: Tensor) -> Tensor:
     """(B, 1, H, W) bool: no plane is clipped within 7 pixels, before or after."""
     clipped = ((source > OVER_EXPOSED) | (target >= 1.0)).any(dim=1, keepdim=True).float()
-    near = F.max_pool2d(clipped, 2 * _CLIP_MARGIN + 1, stride=1, padding=_CLIP_MARGIN)
-    return near == 0
+    return F.max_pool2d(clipped, 2 * _CLIP_MARGIN + 1, stride=1, padding=_CLIP_MARGIN) == 0

@@ -535,8 +535,7 @@ def draped_scenes(
         blur = drawn.blur[:height, :width]
         distance, depth = lens_and_depth(blur, drawn.far, packed_pitch(camera))
         name, lens = f"{scene.scene_id}-draped-{copy}", Lens(FOCAL_LENGTH, distance)
-        depths = torch.from_numpy(depth)
-        yield replace(scene, scene_id=name, kind=DRAPED, depth=depths, lens=lens)
+        yield replace(scene, scene_id=name, kind=DRAPED, depth=torch.from_numpy(depth), lens=lens)
 
 
 # -- photographs with depth -----------------------------------------------------------------------

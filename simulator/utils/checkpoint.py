@@ -42,8 +42,7 @@ class Checkpoint:
     ) -> None:
         self.path, self.state, self.writes = path, state, writes
         # Through JSON, as tuples compare unequal to the lists that they come back as.
-        described = {"version": __version__, "training": identity}
-        self.identity = json.dumps(described, sort_keys=True)
+        self.identity = json.dumps({"version": __version__, "training": identity}, sort_keys=True)
         self._saved = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:

@@ -74,8 +74,7 @@ def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -
     if any(value is other for other in others) or (isinstance(value, str) and value in known):
         return
     rule = ", ".join(map(repr, (*others, *known)))
-    hint = did_you_mean(value, known)
-    raise ValueError(f"`{name}` (={value!r}) must be one of {rule}{hint}")
+    raise ValueError(f"`{name}` (={value!r}) must be one of {rule}{did_you_mean(value, known)}")
 
 
 def check_key(name: str, key: Any, known: tuple[str, ...]) -> None:
@@ -101,8 +100,7 @@ def parse_options(name: str, query: str, known: tuple[str, ...]) -> dict[str, st
 
 def check_type(name: str, value: Any, *kinds: type | None, more: str = "") -> None:
     """Raises a `ValueError`, which `more` ends, unless `value` is of a type in `kinds`, or None."""
-    known = tuple(type(None) if kind is None else kind for kind in kinds)
-    if not isinstance(value, known):
+    if not isinstance(value, tuple(type(None) if kind is None else kind for kind in kinds)):
         rule = " or ".join("None" if kind is None else kind.__name__ for kind in kinds)
         found = f"={' '.join(reprlib.repr(value).split())}, of type {type(value).__name__}"
         raise ValueError(f"`{name}` ({found}) must be of type {rule}{more}")

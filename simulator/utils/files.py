@@ -272,8 +272,7 @@ def write_results(
     Scalars and arrays of numpy and torch become numbers and lists; NaN and infinity, which JSON
     does not have, raise a `ValueError`. `meta` is that of `result_meta` and whatever else.
     """
-    plain = operator.methodcaller("tolist")
-    encode = functools.partial(json.dumps, allow_nan=False, default=plain)
+    encode = functools.partial(json.dumps, allow_nan=False, default=operator.methodcaller("tolist"))
     try:
         lines = ",\n".join(encode(dict(row)) for row in rows)  # a row a line: differences are short
         text = f'{{"meta": {encode(dict(meta))},\n"rows": [\n{lines}\n]}}'
