@@ -1,6 +1,5 @@
 """Trained agents on disk: safetensors for the numbers, JSON for everything else; no pickle."""
 
-import hashlib
 import reprlib
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -9,12 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from pydantic import AliasPath, BaseModel, Field, ValidationError
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from ae_env.grid import ExposureGrid
 from agents.policy import Bools, Floats, Ints, Policy, PolicyContext, masked_argmax
-from simulator.networks.weights import check_finite, load_into, read_pair, write_pair
+from simulator.networks.weights import load_into, read_pair, write_pair
 from simulator.utils.checks import check_type
 from simulator.utils.config_file import one_line
 from simulator.utils.files import sibling
@@ -70,15 +68,12 @@ def save_agent(
     for name, value in module.state_dict().items():
         source = stored.setdefault((value.data_ptr(), value.shape), name)
         if source == name:
-            tensors[name] = value.detach().cpu().contiguous()
+            tensors[name] = value
         else:
             aliases[name] = source
-    check_finite(tensors)
-    content = save(tensors)
-    card = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
     described = {} if context is None else describe_context(context)
-    card |= {"width": width, "context": described, "training": training, "aliases": aliases}
-    write_pair(path, content, card)
+    card = {"format": FORMAT_VERSION, "kind": kind, "width": width, "context": described}
+    write_pair(path, tensors, {**card, "training": training, "aliases": aliases})
 
 
 def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:

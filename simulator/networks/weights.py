@@ -66,22 +66,19 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
     say how they were trained and what they score. A `ValueError` if the weights are not finite;
     nothing is written then.
     """
-    check_finite(modules.state_dict())
-    content = save({k: v.detach().cpu().contiguous() for k, v in modules.state_dict().items()})
-    head = {
-        "format": FORMAT_VERSION,
-        "preset": preset,
-        "sha256": hashlib.sha256(content).hexdigest(),
-        "parameters": sum(p.numel() for p in modules.parameters()),
-    }
-    write_pair(path, content, {**head, **card})
+    head = {"format": FORMAT_VERSION, "preset": preset}
+    head["parameters"] = sum(p.numel() for p in modules.parameters())
+    write_pair(path, modules.state_dict(), {**head, **card})
 
 
-def write_pair(path: Path, content: bytes, card: dict[str, Any]) -> None:
-    """Writes the card, then the weights whose hash it holds; `read_pair` reads them in reverse.
+def write_pair(path: Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any]) -> None:
+    """Writes the card, then the weights whose hash it gets; `read_pair` reads them in reverse.
 
     Whatever other processes write in between, weights never come with an older card.
     """
+    check_finite(tensors)
+    content = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
+    card = {**card, "sha256": hashlib.sha256(content).hexdigest()}
     write_atomically(sibling(path, ".json"), json.dumps(card, indent=1) + "\n")
     write_atomically(sibling(path, ".safetensors"), content)
 
