@@ -291,8 +291,7 @@ class _Sheet:
         from matplotlib.figure import Figure
 
         names = [name if len(name) < 45 else f"…{name[-43:]}" for name in self.paths]
-        controls = self.grid.controls(np.arange(len(self.grid))).T
-        values = self.table.mean, self.grid.ev100, *controls
+        values = self.table.mean, self.grid.ev100, *self.grid.controls(np.arange(len(self.grid))).T
         look: dict[str, Any] = dict.fromkeys(("figure.facecolor", "axes.facecolor"), "#1b1b1b")
         look |= {"text.parse_math": False, "axes.titlelocation": "left", "legend.frameon": False}
         look |= {"axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "0.5"}

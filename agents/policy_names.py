@@ -14,8 +14,7 @@ from agents.policy import Policy, PolicyContext
 from simulator.utils.checks import did_you_mean
 from simulator.utils.config_file import MAX_LENGTH
 
-#: Light meters: those that weigh pixels or zones, and all; the others look at the histogram or at
-#: gradients.
+#: Light meters: those that weigh pixels or zones, and all; others look at histograms or gradients.
 CLASSIC_METERS = ("average", "centre_weighted", "matrix", "spot")
 METERS = (*CLASSIC_METERS, "highlight_weighted", "skewness", "entropy", "shim", "zhang")
 #: The programs that nothing has to be learnt for, and all.

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import gymnasium as gym
 import numpy as np
@@ -57,20 +57,17 @@ def fitting_arguments(environment: Mapping[str, Any], resolution: int) -> dict[s
 
 def scenes_of(envs: VectorEnv) -> list[Scene]:
     """The scenes that the episodes of `envs` draw from."""
-    base: Any = envs.unwrapped
-    return list(base.scenes)
+    return list(cast(Any, envs.unwrapped).scenes)
 
 
 def expected_scores(envs: VectorEnv) -> Floats:
     """q of every state in the current frame of each episode, ``(N, S)``."""
-    base: Any = envs.unwrapped
-    return np.array(base.expected_scores(), dtype=np.float64)
+    return np.array(cast(Any, envs.unwrapped).expected_scores(), dtype=np.float64)
 
 
 def action_masks(envs: VectorEnv) -> Bools:
     """States that the scene of each episode allows, ``(N, S)``."""
-    base: Any = envs.unwrapped
-    return np.array(base.action_masks(), dtype=np.bool_)
+    return np.array(cast(Any, envs.unwrapped).action_masks(), dtype=np.bool_)
 
 
 class WatchedEnvs(gym.vector.VectorWrapper):

@@ -336,9 +336,8 @@ def radiance_scenes(
     for (ending, view), level in zip(views.items(), levels, strict=True):
         if ev100 is not None:  # one scale for the whole map: a darker view stays darker
             fields["ev100"] = ev100 + level - float(np.mean(levels))
-        scene_id = name + ending
         scene = Scene.from_radiance(
-            view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
+            view, request.camera, scene_id=name + ending, group=group, sampled=sampled, **fields
         )
         yield request.sized(scene)
 

@@ -59,8 +59,7 @@ class Scene:
     #: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
     nlf: NoiseLevelFunction
     #: Light on the subject as an incident-light meter with a dome reads it there, in the lux of a
-    #: flat receptor that asks for the same (`simulator.radiance.incident_light`); None where
-    #: unknown.
+    #: flat receptor that asks for the same (`simulator.radiance.incident_light`); None if unknown.
     illuminance: float | None
     white_balance: tuple[float, float, float]  #: gains of R, G, B that make a grey card grey
     kind: str  #: sort of scene, such as ``"snow"``

@@ -100,8 +100,7 @@ class NimaMobileNet(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Shares (B, 10) of the ratings of `pictures` (B, 3, 224, 224) in [-1, 1]; summing to 1."""
-        features = self.features(pictures).mean(dim=(2, 3))
-        return self.head(features).softmax(dim=1)
+        return self.head(self.features(pictures).mean(dim=(2, 3))).softmax(dim=1)
 
 
 #: Git blob ids of the published Keras files, by the scorer that they make.

@@ -266,8 +266,7 @@ class Banding:
         if captures.row_gain is None:
             return torch.ones(len(captures), dtype=torch.float64)
         stops = captures.row_gain.clamp(min=2.0**-64).log2()  # dark between pulses
-        spread = stops.std(dim=1, correction=0)
-        return 1.0 / (1.0 + (spread / self.scale) ** 2)
+        return 1.0 / (1.0 + (stops.std(dim=1, correction=0) / self.scale) ** 2)
 
 
 def code_signals() -> torch.Tensor:

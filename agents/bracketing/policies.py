@@ -78,8 +78,7 @@ class Schedules:
         weight = np.concatenate([weight, np.zeros((1, len(BINS)))])  # of no frame
         each = weight[self.states]  # (M, K, L); -1 is the last
         total = each.sum(axis=1)
-        share = each / np.maximum(total, 1e-300)[:, None]
-        return total, share.astype(np.float32)
+        return total, (each / np.maximum(total, 1e-300)[:, None]).astype(np.float32)
 
     def _noise_error(self, reference: float, floor: float) -> Floats:
         """(M, L) expected error of merged samples [EV]; `WORST_EV` where all frames are white.
@@ -116,8 +115,7 @@ class Schedules:
         counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
         more = self.frames - len(taken)
         needed = (self.counts - counts) @ self._exposures + FRAME_GAP * np.maximum(more - 1, 0)
-        fits = needed <= time_left + _SLACK
-        return np.asarray((self.counts >= counts).all(axis=1) & fits)
+        return np.asarray((self.counts >= counts).all(axis=1) & (needed <= time_left + _SLACK))
 
     def next_state(self, schedule: int, taken: Ints, alone: Floats) -> int:
         """The next state of `schedule`, of the least error `alone` (S,); -1 when all are taken."""
@@ -213,8 +211,7 @@ class Bracketing(Policy):
         for i in np.flatnonzero(~self._done).tolist():
             actions[i] = self.choose(i, float(left[i]), float(speeds[i]))
         if action_masks is not None:
-            allowed = action_masks[np.arange(len(actions)), actions]
-            actions = np.where(allowed, actions, self.stop)
+            actions = np.where(action_masks[np.arange(len(actions)), actions], actions, self.stop)
         self._done |= actions == self.stop
         return actions
 

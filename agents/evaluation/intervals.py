@@ -97,8 +97,7 @@ def rank_agreement(first: Floats, second: Floats) -> Interval:
     """Kendall's tau-b of the rankings of P policies by two measures, with its interval.
 
     A ranking is by the mean over all groups. Both measures, ``(P, G)``, are of the same groups,
-    which are resampled together. 1: the same ranking; 0: unrelated ones; -1: one is the other
-    turned around.
+    which are resampled together. 1: the same ranking; 0: unrelated ones; -1: one reversed.
     """
     (one, other), groups = np.triu_indices(len(first), 1), first.shape[1]
 

@@ -417,9 +417,7 @@ def difference_rows(
 
 
 def overall_ranking(results: Results, *, resamples: int = intervals.RESAMPLES) -> pd.DataFrame:
-    """`rank` of policies by their score over all conditions, each with the same weight; none that
-    is privileged.
-    """
+    """`rank` of unprivileged policies by score over all conditions, each of the same weight."""
     first = next(iter(results.values()))
     names = [name for name, track in first.tracks.items() if not track.privileged]
     if not names:

@@ -72,8 +72,7 @@ class Cases(NamedTuple):
 
     def take(self, rows: Ints) -> "Cases":
         """The cases of these indices."""
-        columns: Any = (column[rows] for column in self)
-        return Cases(*columns)
+        return Cases._make(column[rows] for column in self)
 
 
 def all_cases(gains: Sequence[float] = GAINS, seed: int = 0) -> Cases:

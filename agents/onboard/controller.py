@@ -104,10 +104,9 @@ class Controller:
 
     The predictions of frames of the same light count together, weighted by their precision; when
     the metered light moves by more than the agent's tolerance, the earlier ones are forgotten.
-    (Of PPO only the last state.) A bad reading counts for nothing: the camera keeps
-    the state that was chosen last, or before the first choice the nearest to its own settings.
-    Use `decide` for one camera, and `act` with the three `encode_` methods for several: the rules
-    are the same.
+    (Of PPO only the last state.) A bad reading counts for nothing: the camera keeps the state that
+    was chosen last, or before the first choice the nearest to its own settings. Use `decide` for
+    one camera, and `act` with the three `encode_` methods for several: the rules are the same.
 
     Args:
         path: An ``.onnx`` file of `agents.onboard.export.export_agent`.

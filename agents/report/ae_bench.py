@@ -134,7 +134,7 @@ def check_append(
     table = _followed(table)
     if plan.task not in _TASKS:
         raise _refusal(table, f"takes no rows of {plan.name}, which is no task of AE-Bench")
-    rows, page = _read_own(table, plan), page_of(table)
+    rows, page = _read_own(table, plan), table.with_suffix(".md")
     if table.suffix.lower() != ".csv":
         raise _refusal(table, "must be a CSV file, such as mine.csv")
     if page.is_file() and _MARK not in page.read_text(encoding="utf-8", errors="replace"):
@@ -217,7 +217,8 @@ def append_rows(
     text = found.reindex(columns=COLUMNS).to_csv(index=False, float_format="%.4f")
     table = _followed(table)
     table.parent.mkdir(parents=True, exist_ok=True)
-    new, page = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False), page_of(table)
+    new = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False)
+    page = table.with_suffix(".md")
     with FileLock(table.with_name(f".{table.name}.lock")):
         known = _read_own(table, plan)
         for name in new.policy:  # whoever began at the same time may have added it meanwhile
@@ -268,11 +269,6 @@ def read_rows(table: Path) -> pd.DataFrame:
             rule = f"`task` (={task!r}) must be one of {', '.join(_TASKS)}"
             raise ValueError(f"{table}, line {line + 2}: {rule}")
     return rows
-
-
-def page_of(table: Path) -> Path:
-    """The page of a table, beside it."""
-    return table.with_suffix(".md")
 
 
 def bench_rows(results: Results, ranking: pd.DataFrame) -> pd.DataFrame:

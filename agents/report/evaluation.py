@@ -231,7 +231,7 @@ def write_report(
         compared = rows.assign(best=apart.where(rows.policy != rows.policy[0], "-"))
         text = fill("brackets.md", plan=result.plan, rows=compared, meta=meta, scenes=scenes)
         return {
-            "results.json": write_results(folder / "results.json", _records(rows), meta),
+            "results.json": write_results(folder / "results.json", rows.to_dict("records"), meta),
             "report.md": write_atomically(folder / "report.md", text),
         }
     rows = result_rows(results, source=source, split=split, resamples=resamples)
@@ -240,7 +240,7 @@ def write_report(
     table = rows.assign(ci95_low=ends[0], ci95_high=ends[1])
     columns = [name for name in ROW_COLUMNS if name != "ci95"]
     table = table[[*columns, "ci95_low", "ci95_high", *MORE_COLUMNS]]
-    contents = _records(rows[list(ROW_COLUMNS)])
+    contents = rows[list(ROW_COLUMNS)].to_dict("records")
     files = {"results.json": write_results(folder / "results.json", contents, meta)}
     for name, frame in (("scenes.csv", scene_rows(result)), ("metrics.csv", table)):
         text = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
@@ -278,29 +278,24 @@ def _write_pictures(
     return pictures | plots.path_sheets(folder, results, order)
 
 
-def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows as JSON values."""
-    return [{str(key): value for key, value in row.items()} for row in rows.to_dict("records")]
-
-
 def _meta(results: Results, ranking: pd.DataFrame, command: str, resamples: int) -> dict[str, Any]:
     result = results[static_condition(results)]
     best, described, differences = best_meter(result), result.plan.describe(), []
     protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
     if best is not None:
-        differences = _records(difference_rows(result, best, resamples=resamples))
+        differences = difference_rows(result, best, resamples=resamples).to_dict("records")
     return {
         **result_meta(command, result.plan.seeds[0]),
         "plan": described | {"sha256": digest(protocol)},
         "episodes": len(result.scene_ids),
         "scenes": len(set(result.scene_ids.tolist())),
         "frames": result.scores.shape[1],
-        "ranking": _records(ranking),
+        "ranking": ranking.to_dict("records"),
         "by_kind": scores_by_kind(result),
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
         "differences_to_best_meter": differences,
-        "training_seeds": _records(training_seed_rows(result)),
+        "training_seeds": training_seed_rows(result).to_dict("records"),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
     }
@@ -496,10 +491,10 @@ def write_stability(
         own = {"faults": faults, "third": THIRD_EV, "picture": picture}
         shown.append({"name": one.name, **own})
         meta["frames_per_second"][one.name] = one.speed
-        tables.append(rows.astype(object).where(rows.notna(), None))
+        tables += rows.astype(object).where(rows.notna(), None).to_dict("records")
     text = fill("stability.md", controllers=shown, meta=meta, shown=SHOWN_DELAY)
     return {
-        "results.json": write_results(out / "results.json", _records(pd.concat(tables)), meta),
+        "results.json": write_results(out / "results.json", tables, meta),
         **pictures,
         "report.md": write_atomically(out / "report.md", text),
     }
@@ -507,7 +502,7 @@ def write_stability(
 
 def _fault_row(own: pd.DataFrame) -> dict[str, Any]:
     """What all delays of one fault come to; of the first `reach` delays every step settles."""
-    at = _records(own)  # in the order of the delays
+    at: Any = own.to_dict("records")  # in the order of the delays
     largest = max(at, key=lambda row: row["amplitude"])
     reach = [*(row["settled"] == 1.0 for row in at), False].index(False)
     return {

@@ -36,12 +36,7 @@ class Recording:
 
 
 def record(
-    name: str,
-    policy: Policy,
-    envs: VectorEnv,
-    frames: int,
-    seed: int,
-    scene: str | None = None,
+    name: str, policy: Policy, envs: VectorEnv, frames: int, seed: int, scene: str | None = None
 ) -> Recording:
     """Runs `policy`, which is fitted, through one episode of so many actions.
 
@@ -57,8 +52,7 @@ def record(
         if frame:
             actions = choose(name, policy, observations, base.action_masks(), info)
             observations, _, _, _, info = envs.step(actions)
-        pictures: Any = envs.render()
-        found.pictures.append(pictures[0])
+        found.pictures.append(base.render()[0])
         found.ev100.append(float(info["ev100"][0]))
         found.best.append(float(base.grid.ev100[info["oracle_state"][0]]))
         found.scores.append(float(info["rewards.score"][0]))

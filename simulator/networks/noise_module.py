@@ -30,7 +30,6 @@ _LARGEST = 5.0
 #: The network's inputs, detail and level, are compressed beyond this many standard deviations.
 _LEVEL = 8.0
 
-
 #: The family: channels of each level, the finest first, each with half the resolution of the one
 #: before.
 SIZES = {"nano": (16, 24, 32), "compact": (32, 48, 80, 96), "large": (48, 96, 176, 256)}
@@ -71,8 +70,7 @@ class Stabiliser(NamedTuple):
         Algebraically, ``sqrt(c) z + shot z^2 / 4``. That the mean of a square is more than the
         square of the mean is left to the network, whose error is measured after this step.
         """
-        positive = z.clamp(min=0.0)
-        return self.root * z + 0.25 * self.shot * positive.square()
+        return self.root * z + 0.25 * self.shot * z.clamp(min=0.0).square()
 
     @property
     def linearity(self) -> Tensor:

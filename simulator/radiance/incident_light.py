@@ -84,8 +84,7 @@ def bounded(ev100: float | np.ndarray, reflected_ev100: float | None) -> float |
     """
     if reflected_ev100 is None:
         return ev100
-    gap = np.clip(ev100 - reflected_ev100, -LARGEST_GAP, LARGEST_GAP)
-    return reflected_ev100 + gap
+    return reflected_ev100 + np.clip(ev100 - reflected_ev100, -LARGEST_GAP, LARGEST_GAP)
 
 
 @dataclass(frozen=True)

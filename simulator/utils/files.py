@@ -265,7 +265,7 @@ def result_meta(command: str, seed: int | None) -> dict[str, Any]:
 
 
 def write_results(
-    path: str | os.PathLike[str], rows: Iterable[Mapping[str, Any]], meta: Mapping[str, Any]
+    path: str | os.PathLike[str], rows: Iterable[Mapping[Any, Any]], meta: Mapping[str, Any]
 ) -> Path:
     """Write ``{"meta": meta, "rows": rows}`` as JSON, whole or not at all.
 
