@@ -8,6 +8,7 @@ import itertools
 import math
 import struct
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture.blurred_frames import Layout
+from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, record, sweep_keys
 from simulator.noise import generator
@@ -204,6 +206,43 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     assert record(transitions, known, codes=codes, **given).tolist() == [[0, 0]]
     np.testing.assert_array_equal(codes, encode_observation(signals))
     assert record(transitions, known, signals=signals, **given).tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize("shape", [-0.2, 0.0, 0.3])
+def test_tails_in_kernels_are_quantiles(shape: float) -> None:
+    table = nlfs.tail_tables((ReadNoise(0.1, shape), ReadNoise(0.1, 0.1)))[1][0].astype(float)
+    z = np.random.default_rng(0).uniform(0.0, 5.0, 1000)
+    found = np.interp(z * nlfs.TAIL_STEPS, np.arange(len(table)), table)
+    wanted = np.array([quantile(norm.cdf(x), shape) for x in z]) / math.sqrt(moment(shape, 2))
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
+    assert len(table) > 6.7 * nlfs.TAIL_STEPS + 1
+
+
+@pytest.mark.parametrize("bands", [False, True])
+@pytest.mark.parametrize("size", [(9, 70), (300, 250)])  # the second in two pieces a plane
+def test_the_kernel_draws_rows_and_tails_as_torch_does(size, bands) -> None:
+    """Frames of two kinds, with and without noise of the source, and what a blur left of it."""
+    light = torch.rand(4, 4, *size, generator=torch.Generator().manual_seed(0))
+    target, source = (
+        NoiseLevelFunction((s,) * 4, (r,) * 4) for s, r in ((SHOT, READ), (4e-4, 6e-5))
+    )
+    share = torch.rand(size, generator=torch.Generator().manual_seed(1))
+    exposures = [Exposure(0.8, source if i % 2 else ZERO, target) for i in range(3)]
+    exposures += [Exposure(0.8, source, target, remaining_variance=share)]
+    known, gains = Transitions.of([*light], exposures), None
+    if bands:
+        gains = np.random.default_rng(0).uniform(0.5, 1.5, (4, size[0]))
+    kinds = ReadNoises.of([ReadNoise(ROW, -0.1), ReadNoise(0.2, 0.3, 2)] * 2)
+    given = {"keys": np.arange(4, dtype=np.uint64), "read_noise": kinds, "row_gain": gains}
+    each: dict[str, Any] = {"codes": np.uint8, "numbers": np.uint16}
+    first, second = ({n: np.empty(light.shape, t) for n, t in each.items()} for _ in range(2))
+    record(known, camera(), **first, **given)
+    record(replace(known, light=light), camera(), **second, **given)
+    # float32 resolves a thousandth of a digital number.
+    for name, most in {"codes": 1e-4, "numbers": 1e-3}.items():
+        differ = np.abs(first[name].astype(int) - second[name])
+        assert differ.max() <= 1
+        assert (differ > 0).mean() < most
 
 
 def test_what_is_not_calibrated_is_refused() -> None:
