@@ -57,8 +57,8 @@ NOISE = np.dtype(
         # `ResidualStatistics.columns`, 0 where its error was not measured.
         ("denoised", "f8", (4, 4, BINS)),
         ("residual", "f8", (4, 4, LEVELS)),
-        ("has_network", "?"),
-        ("noisy", "?"),  # whether there is any noise
+        ("has_network", "i8"),  # no bool: every element is aligned
+        ("noisy", "i8"),  # whether there is any noise
     ]
 )
 #: The steps that `plan_frames` decides on, in the order of their bits.
