@@ -258,6 +258,7 @@ def _use_rest() -> None:
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
     from simulator.capture.blurred_frames import BLUR, BlurredFrames
+    from simulator.capture.prepared_scene import PreparedScene
     from simulator.noise.generator import frame_normals
     from simulator.optics.discs import disc_blur
     from simulator.optics.motion import motion_blur
@@ -274,6 +275,8 @@ def _use_rest() -> None:
     light = RawImage.from_mosaic(numbers, raw.settings, raw.camera).data
     disc_blur(motion_blur(light, 2.5), 2.5)
     frame_normals(0, (1, 1, 1))
+    noise = raw.camera.nlf(raw.settings.iso)
+    PreparedScene(light, raw.settings, raw.camera, noise).expose([raw.settings] * 2)
     vignetting = np.ones(light.shape[1:], np.float32)
     blurs = np.array([(0.0, 2.5, True, *[0] * 10, vignetting.ctypes.data)], BLUR)
     first = np.zeros(1, np.int64)
