@@ -99,7 +99,8 @@ class FrameSource(Protocol):
             row_gain: (B, H) light of each row relative to the gain that was prepared for; None
                 where all rows have the same.
             means, outputs: Those of `simulator.capture.sensor.record`, arrays or, where there is
-                a device, tensors on it, but then no `means`.
+                a device, tensors on it, but then no `means`. These stay empty where there is
+                `FrameStatistics.source_noise`, on which what they should sum depends.
         """
 
     def prepared_scene(self, index: int) -> PreparedScene:
@@ -148,7 +149,7 @@ class CaptureBatch:
         # Of scenes at rest, what those that show them in motion share: the light, as recorded and
         # denoised, and its places, the vignetting, the noise of the light if any scene's has some,
         # and the statistics, where they are known.
-        self._light: dict[int, list[torch.Tensor]] = {}
+        self._light: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
         self._place = np.zeros((num_scenes, 2), np.uintp)
         self._noises: np.ndarray | None = None
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
@@ -256,7 +257,9 @@ class CaptureBatch:
         else:
             run = partial(self._photograph, indices)
         keys, transitions = noise_keys(seeds, frames), self._transitions(indices, states)
-        any_noisy = self._any_alone or self._noises is not None
+        source_noise = None
+        if (self._any_alone or self._noises is not None) and transitions.table[:, 3:].any():
+            source_noise, means = transitions.averaged_table()[:, 3:], None
         if read_noise is not None:
             boxes = self._scene_columns["targets"][indices]
             read_noise = read_noise.part(boxes * len(self.states) + states)
@@ -280,7 +283,7 @@ class CaptureBatch:
             excess_variance=self._excess_variance[rows],
             predicted_error=self._predicted_error[rows],
             modules=self._modules[rows],
-            source_noise=transitions.averaged_table()[:, 3:] if any_noisy else None,
+            source_noise=source_noise,
             keys=keys,
         )
 
@@ -326,7 +329,8 @@ class CaptureBatch:
 
     def _add_alone(self, index: int) -> None:
         scene = self.prepared_scene(index)
-        self._light[index], self._size = [scene.light.contiguous()], tuple(scene.light.shape[-2:])
+        light, self._size = scene.light.contiguous(), tuple(scene.light.shape[-2:])
+        self._light[index] = light, light
         self._widest = columns.widest_defocus(scene, self._columns)
         box = scene.box_factor
         if box not in self._boxes:
@@ -348,7 +352,8 @@ class CaptureBatch:
                 self._noises = np.zeros(self.num_scenes, columns.NOISE)
             if self._noises is not None:
                 self._noises[index] = columns.noise_column(scene)
-                self._light[index] += [one.light.contiguous() for one in scene.denoised_lights]
+                for network in scene.denoised_lights:
+                    self._light[index] = light, network.light.contiguous()
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -399,9 +404,9 @@ class CaptureBatch:
         """Finds the places of the light of `rows`, and makes what is not there."""
         shown, source = shown_at_rest(indices, self._rest), np.zeros(len(rows), np.uintp)
         if len(shown):
-            for one in range(2 if self._noises is not None else 1):
-                lights = [self._light[i][one : one + 1] or self._light[i] for i in shown.tolist()]
-                self._place[shown, one] = self._frames.places([light[0] for light in lights])
+            for kind in range(1 if self._noises is None else 2):
+                lights = [self._light[i][kind] for i in shown.tolist()]
+                self._place[shown, kind] = self._frames.places(lights)
         if self._any_alone and len(alone := np.flatnonzero(self._rest[indices] < 0)):
             source[alone] = self._own_light(indices[alone], rows[alone])
         given = self._modules, self._rest, self._place

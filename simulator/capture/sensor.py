@@ -272,7 +272,7 @@ def record(
         read_noise: Rows and tails of each frame's read noise, for the noise ``"sensor"``.
         row_gain: See `Transitions.in_bands`; None where all rows have the frame's light.
         count: Whether clipped samples are counted.
-        means: Of the output ``codes``, an array, to fill.
+        means: Of the output ``codes``, an array, to fill; None where torch records.
         run: Calls `record_units` for all frames, of which each has so many units, with these
             arguments, once their light is made; there is no light before, and nothing reads it.
         outputs: What to fill, each (B, 4, H, W) and contiguous: ``codes``, uint8, companded;
@@ -291,13 +291,10 @@ def record(
         transitions = transitions if row_gain is None else transitions.in_bands(row_gain)
         transitions = transitions.before_rounding(camera)
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
-        counts = record_stepwise(transitions, camera, keys, noise, tensors, read_noise, count=count)
-        if means is not None:
-            means.fill(tensors["codes"].numpy())
-        return counts
+        return record_stepwise(transitions, camera, keys, noise, tensors, read_noise, count=count)
     arrays = {name: np.asarray(out) for name, out in outputs.items()}
-    kinds = keys, noise, read_noise
-    return _record_fused(transitions, camera, kinds, row_gain, arrays, count, means, run)
+    noises = keys, noise, read_noise
+    return _record_fused(transitions, camera, noises, row_gain, arrays, count, means, run)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -380,10 +377,9 @@ def _read_part(
     dark = missing_variance(torch.zeros_like(table[:, 0]), table.unbind(1), remaining_variance)
     read = torch.minimum(dark.clamp(min=0.0), missing)
     missing -= read
-    rows, pixels = (
-        batch_normals(noise_keys(keys, number), shape, "exact", missing.device)
-        for number, shape in enumerate(((1, 2, missing.shape[2]), tuple(missing.shape[1:])), 1)
-    )
+    shape, device = tuple(missing.shape[1:]), missing.device
+    rows = batch_normals(noise_keys(keys, 1), (1, 2, shape[1]), "exact", device)
+    pixels = batch_normals(noise_keys(keys, 2), shape, "exact", device)
     shared = table[:, 1].clamp(min=0.0)
     for number in np.unique(read_noise.which).tolist():
         kind, (some,) = read_noise.kinds[number], np.nonzero(read_noise.which == number)

@@ -295,8 +295,8 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
 
-def made(noise="bank", *, light_bytes=2**30, scenes=prepared):
-    return CaptureBatch(scenes, 10, STATES, Z6, noise=noise, light_bytes=light_bytes)
+def made(noise="bank", *, light_bytes=2**30, scenes=prepared, camera=Z6):
+    return CaptureBatch(scenes, 10, STATES, camera, noise=noise, light_bytes=light_bytes)
 
 
 def photographed(batch, states, gains=(1.0,) * 10, **options):
@@ -306,11 +306,12 @@ def photographed(batch, states, gains=(1.0,) * 10, **options):
     return frames, batch.record(SCENES, chosen, SCENES, SCENES + 5, signals=frames, **options)
 
 
-def alone(index, state, gain, key, noise="bank"):
-    scene, frame = prepared(index), torch.empty(1, 4, 24, 20)
-    exposure = scene.exposure(STATES[state], gain=gain)
+def alone(scene, state, gain, key, noise="bank"):
+    exposure, frame = scene.exposure(STATES[state], gain=gain), torch.empty(1, 4, 24, 20)
     transitions = Transitions.of([scene.blurred_light.blurred(exposure)], [exposure])
     keys = None if key is None else np.array([key], np.uint64)
+    if key is not None:
+        transitions = transitions.seen_by([scene.response])
     counts = record(transitions, Z6, keys=keys, noise=noise, signals=frame, count=True)
     return frame[0].numpy(), counts[0], exposure
 
@@ -321,14 +322,16 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
     monkeypatch.setattr(blurred_frames, "_LARGE", light_bytes)  # at 0, rows are shared out
     # All that a scene needs at once, or each kind of pass on threads that share rows.
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2 if light_bytes else 61)
-    scenes, rng, seen = Mock(side_effect=prepared), np.random.default_rng(0), set()
-    batch = made(noise, light_bytes=light_bytes, scenes=scenes)
+    camera = Z6 if light_bytes else replace(Z6, prnu=0.02)
+    shown = [replace(prepared(i), camera=camera) for i in range(10)]
+    scenes, rng, seen = Mock(side_effect=shown.__getitem__), np.random.default_rng(0), set()
+    batch = made(noise, light_bytes=light_bytes, scenes=scenes, camera=camera)
     for _ in range(12):
         states, gains = rng.integers(len(STATES), size=10), rng.choice([1e-6, 0.25, 1.0, 3.0], 10)
         frames, found = photographed(batch, states, gains)
         for i in range(10):
             key = None if noise is None else int(KEYS[i])
-            wanted, counts, exposure = alone(i, states[i], gains[i], key, noise or "bank")
+            wanted, counts, exposure = alone(shown[i], states[i], gains[i], key, noise or "bank")
             np.testing.assert_array_equal(frames[i], wanted)
             clipped = found.clipped_low[i], found.clipped_high[i]
             assert clipped == tuple(counts / wanted.size)
@@ -336,15 +339,17 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
             modules = ["exposure", *["noise_reduction"] * (exposure.denoised is not None)]
             modules += ["aperture"] * (exposure.opened_to is not None)
             modules += ["defocus"] * (exposure.defocus_px > 0)
-            modules += ["motion_blur"] * (exposure.motion_px > 0) + ["noise"] * bool(noise)
+            modules += ["motion_blur"] * (exposure.motion_px > 0)
+            modules += ["pixel_response"] * (noise is not None and shown[i].response is not None)
+            modules += ["noise"] * bool(noise)
             assert MODULES[found.modules[i]] == "+".join(modules)
             seen |= set(modules)
-            balance = noise_balance(prepared(i).blurred_light.blurred(exposure), exposure)
+            balance = noise_balance(shown[i].blurred_light.blurred(exposure), exposure)
             excess = balance[0] if noise else 0.0
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
-            if noise and not prepared(i).nlf.is_zero:
-                errors = predict_errors(prepared(i), STATES[states[i]], exposure)
+            if noise and not shown[i].nlf.is_zero:
+                errors = predict_errors(shown[i], STATES[states[i]], exposure)
                 assert found.predicted_error[i] == pytest.approx(math.hypot(*errors.values()))
     assert seen >= {"noise_reduction", "aperture", "defocus", "motion_blur"}
     assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(10))
