@@ -134,6 +134,8 @@ def kernel_energy(motion_px, defocus_px, moments, radii):  # type: ignore[no-unt
     for shift in range(len(disc)):  # correlations of both with themselves, along the rows
         ends = end * end * (2.0 * (shift == 0) + (shift == 2 * n + 2))
         streak = max(2.0 * n + 1.0 - shift, 0.0) + ends + 2.0 * end * (0 < shift <= 2 * n + 1)
+        if streak == 0.0:
+            break
         products = 0.0
         for y in range(len(disc)):
             for x in range(len(disc) - shift):
