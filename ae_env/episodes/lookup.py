@@ -10,7 +10,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from simulator.camera import LOW_CLIP, CameraProfile
-from simulator.capture.batch import MODULES, FrameStatistics
+from simulator.capture.batch import MODULES, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import LEAST_SIGNALS, CodeMeans
 from simulator.noise.generator import noise_keys
@@ -19,7 +19,7 @@ from simulator.noise.generator import noise_keys
 RECORDED, _MODULE = "recorded", len(MODULES)
 
 
-class LookupBatch:
+class LookupBatch(FrameSource):
     """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
 
     The scenes have `Scene.recorded`; `prepared` returns the merged light of one by its index.
@@ -34,12 +34,6 @@ class LookupBatch:
         self._scenes, self._prepared = scenes, prepared
         self._span, self._black = camera.digits[:2, :, None, None]
         self._white = camera.white_level
-
-    def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
-        """Does nothing: recorded frames are there already."""
-
-    def forget(self, indices: np.ndarray) -> None:
-        """Does nothing: nothing is worked out."""
 
     def prepared_scene(self, index: int) -> PreparedScene:
         """The merged light of the scene `index`."""

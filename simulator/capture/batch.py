@@ -72,13 +72,15 @@ class FrameSource(Protocol):
     """
 
     def forget(self, indices: np.ndarray) -> None:
-        """Drops all that is cached for the scenes `indices`."""
+        """Drops all that is cached for the scenes `indices`, if any is."""
+        return
 
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
         """Plans the next frames, and makes their light.
 
         All are (B,): scenes, the state of each, and its light relative to the scene's own.
         """
+        return
 
     def record(
         self,

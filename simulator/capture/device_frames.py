@@ -16,12 +16,13 @@ from torch import Tensor
 from simulator.capture.blurred_frames import BlurredFrames, Passes, frame_at
 from simulator.optics.discs import DIAMETERS, LIGHT_LIMIT, disc_blur
 from simulator.optics.motion import motion_blur, taps_of
-from simulator.utils.compute import kernel
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: Samples that are read or added to the memory at once, on a GPU and elsewhere, where the cache
 #: holds them; frames that are added at once, at least; taps of a frame that a GPU can read
-#: together, at least; samples of a frame that is moved along the rows alone.
-_SAMPLES, _FRAMES, _TOGETHER, _ALONE = {"cuda": 2**27, "": 2**20}, 64, 8, 2**20
+#: together, at least; samples of a frame that is moved along the rows alone; paths that are worth
+#: a thread when their taps are made.
+_SAMPLES, _FRAMES, _TOGETHER, _ALONE, _PATHS = {"cuda": 2**27, "": 2**20}, 64, 8, 2**20, 64
 _KNOTS = torch.tensor(DIAMETERS, dtype=torch.float32).square()
 
 
@@ -57,9 +58,7 @@ class DeviceFrames(BlurredFrames):
         """The frames at `places` (B,), a copy (B, 4, H, W)."""
         return self._frames[self._numbers(places)]
 
-    def kept(self, places: np.ndarray) -> list[Tensor]:
-        """The same, one by one."""
-        return list(self.at(places))
+    kept = at
 
     def _numbers(self, places: np.ndarray) -> Tensor:
         return torch.from_numpy(places.astype(np.int64) - 1).to(self._frames.device)
@@ -177,27 +176,40 @@ class DeviceFrames(BlurredFrames):
             self._put(to[same], self.at(source[same]) * left)
 
 
-@kernel()
-def tap_columns(blurs, own, height, width):  # type: ignore[no-untyped-def]
+def tap_columns(
+    blurs: np.ndarray, own: bool, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Taps of the paths of `BLUR` (K,), those of the subjects' `own` or of the backgrounds.
 
     Returns:
-        (K,) int64 where the taps of each begin, and behind them the end of all; and the taps one
-        behind the other: (T,) int64 rows and columns, (T,) float32 weights.
+        (K,) int64 how many each has; and the taps one behind the other: (T,) int64 rows and
+        columns, (T,) float32 weights.
     """
+    found: dict[int, tuple[np.ndarray, ...]] = {}
+    fixed = own, height, width
+    parallel_ranges(
+        lambda a, b: found.update({a: _taps(blurs[a:b], *fixed)}), len(blurs), least=_PATHS
+    )
+    parts = zip(*(found[first] for first in sorted(found)), strict=True)
+    counts, rows, columns, weights = map(np.concatenate, parts)
+    return counts, rows, columns, weights
+
+
+@kernel()
+def _taps(blurs, own, height, width):  # type: ignore[no-untyped-def]
+    """`tap_columns` on one thread."""
     found = []
     for blur in blurs:
         x, y = (blur.drift_x, blur.drift_y) if own else (0.0, 0.0)
         found.append(taps_of(blur.extent, blur.direction, blur.turn, x, y, height, width))
-    ends = np.zeros(len(found) + 1, np.int64)
-    for i, taps in enumerate(found):
-        ends[i + 1] = ends[i] + len(taps[0])
-    rows, columns = np.empty(ends[-1], np.int64), np.empty(ends[-1], np.int64)
-    weights = np.empty(ends[-1], np.float32)
-    for i, taps in enumerate(found):
-        begin, end = ends[i], ends[i + 1]
+    counts = np.array([len(taps[0]) for taps in found])
+    total, end = counts.sum(), 0
+    rows, columns = np.empty(total, np.int64), np.empty(total, np.int64)
+    weights = np.empty(total, np.float32)
+    for taps in found:
+        begin, end = end, end + len(taps[0])
         rows[begin:end], columns[begin:end], weights[begin:end] = taps
-    return ends, rows, columns, weights
+    return counts, rows, columns, weights
 
 
 def moved_sums(images: Tensor, samples: int, taps: tuple[np.ndarray, ...]) -> Tensor:
@@ -205,10 +217,10 @@ def moved_sums(images: Tensor, samples: int, taps: tuple[np.ndarray, ...]) -> Te
 
     So many `samples` are read at once as are stated. The `taps` are those of `tap_columns`.
     """
-    (height, width), to, (ends, rows, columns, weights) = images.shape[-2:], images.device, taps
-    counts = np.diff(ends)
+    (height, width), to, (counts, rows, columns, weights) = images.shape[-2:], images.device, taps
     order = np.argsort(-counts, kind="stable")  # those with the most taps first
-    given = rows, columns, weights, ends[order], counts[order], order
+    begins = counts.cumsum() - counts
+    given = rows, columns, weights, begins[order], counts[order], order
     down, right, weight, first, count, own = (torch.from_numpy(v).to(to) for v in given)
     down = (down[:, None] + torch.arange(height, device=to)).clamp_(0, height - 1) * width
     right = (right[:, None] + torch.arange(width, device=to)).clamp_(0, width - 1)

@@ -3,15 +3,18 @@
 With the same seed both have the same noise; only the order of float32 arithmetic differs.
 """
 
+import pathlib
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers.vector import ArrayConversion
 
+from simulator.capture.blurred_frames import BLUR
+from simulator.capture.device_frames import tap_columns
+from simulator.optics.motion import Path, path_taps
 from tests.ae_env.environments import SMALL, make_env, make_envs
 
 SAME = {"autoreset_mode": "SAME_STEP"}
@@ -79,6 +82,19 @@ def test_every_option_has_the_same_episodes(arguments, monkeypatch) -> None:
                 assert apart.max() <= (name == "raw")
 
 
+def test_threads_make_taps_in_order() -> None:
+    paths = np.random.default_rng(0).uniform((0, 0, -1, -5, -5), (9, 6, 1, 5, 5), (300, 5))
+    blurs = np.zeros(300, BLUR)
+    for name, values in zip(Path._fields, paths.T, strict=True):
+        blurs[name] = values
+    torch.set_num_threads(2)
+    counts, *taps = tap_columns(blurs, True, 30, 40)
+    parts = [np.split(values, counts.cumsum()[:-1]) for values in taps]
+    for path, *found in zip(paths, *parts, strict=True):
+        for own, wanted in zip(found, path_taps(Path(*path), 30, 40), strict=True):
+            np.testing.assert_array_equal(own, wanted)
+
+
 @pytest.mark.parametrize("device", [None, "cpu"])
 def test_torchs_default_dtype_changes_nothing(device) -> None:
     found = []
@@ -96,7 +112,7 @@ def test_torchs_default_dtype_changes_nothing(device) -> None:
 
 def test_on_another_device() -> None:
     """In a process of its own: from then on torch knows the stand-in for a device."""
-    checks = Path(__file__).parents[1] / "on_other_device.py"
+    checks = pathlib.Path(__file__).parents[1] / "on_other_device.py"
     command = [sys.executable, "-m", "pytest", "-q", "-n0", str(checks)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-4000:]
