@@ -151,8 +151,8 @@ class AutoExposure(Task):
         found: dict[str, Any] = {}
         first = episodes.previous[env_indices] < 0
         if means is not None:
-            found["flicker"] = abs(means - episodes.image_mean[env_indices])
-            found["flicker"][np.flatnonzero(first)] = 0.0
+            change = abs(means - episodes.image_mean[env_indices])  # NaN where no frame was before
+            found["flicker"] = (torch if torch.is_tensor(change) else np).nan_to_num(change)
             episodes.image_mean[env_indices] = means
         if "switch" in costs:
             now = episodes.grid.controls(episodes.state[env_indices])
@@ -324,6 +324,9 @@ class AutoExposureBase(SpecProperty):
         self.render_mode, self._last = render_mode, None
         self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs, self._make_task)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_last": None}  # the same frames are made again
+
     @property
     def grid(self) -> ExposureGrid:
         """The states that actions choose from."""
@@ -390,7 +393,8 @@ class AutoExposureBase(SpecProperty):
             )
             return None
         if self._last is None:
-            raise gym.error.ResetNeeded("call reset() before render()")
+            self.core.check_begun(envs := np.arange(num_envs))
+            self._last = self.core.observe(envs)
         info, scores = self._last.info, self._last.info["rewards.score"]
         return tuple(
             render_frame(

@@ -85,7 +85,7 @@ def tensor_statistics(codes: torch.Tensor) -> dict[str, torch.Tensor]:
     flat = codes.flatten(1).long()
     counts = flat.new_zeros(len(flat), 256).scatter_add_(1, flat, torch.ones_like(flat))
     shares = counts.float() / flat.shape[1]
-    found = {"raw": encode_observation(means), "clipped": shares[:, [255, 0]]}
+    found = {"raw": encode_observation(means.clip(0.0, 1.0)), "clipped": shares[:, [255, 0]]}
     return found | {"histogram": shares.view(len(flat), HISTOGRAM_BINS, -1).sum(dim=2)}
 
 

@@ -37,6 +37,7 @@ from simulator.capture.columns import MOVES
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import CodeMeans, Transitions
 from simulator.noise.generator import Noise, single_normals
+from simulator.utils.checks import check_integer
 from simulator.utils.compute import outside_inference_mode
 
 #: Samples that are recorded and scored together, at most.
@@ -243,8 +244,10 @@ class EpisodeCore:
         own = env_indices[self.episodes.light_index[env_indices] >= len(self.scenes)]
         if len(own):
             self._forget(own)
+        self.episodes.begun[env_indices] = False  # whatever interrupts what follows
         self.episodes.begin(env_indices, drawn)
         self.task.initial(env_indices, options)
+        self.episodes.begun[env_indices] = True
 
     def _forget(self, env_indices: np.ndarray) -> None:
         """Drops what was worked out for the scenes of `env_indices` in motion or in their light."""
@@ -418,6 +421,8 @@ class EpisodeCore:
     def check_begun(self, env_indices: np.ndarray | int) -> None:
         """Raises `gymnasium.error.ResetNeeded` unless these episodes have begun."""
         begun = self.episodes.begun
+        if not isinstance(env_indices, np.ndarray):
+            check_integer("env_index", env_indices, 0, len(begun) - 1)
         if np.count_nonzero(begun) < len(begun) and not begun[env_indices].all():
             raise gym.error.ResetNeeded("call reset() before step(), render() or scores")
 

@@ -252,7 +252,6 @@ class Episodes:
         self.previous[env_indices] = -1
         self.pending[env_indices] = self.state[env_indices, None]
         self.image_mean[env_indices] = np.nan
-        self.begun[env_indices] = True
         self._show_recorded(env_indices)
         self._set_light_index(env_indices)
 

@@ -360,8 +360,8 @@ def check_device(device: str | torch.device) -> torch.device:
             raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
         if found.type != "meta":  # which holds no numbers
             torch.zeros(1, device=found).item()
-    except (RuntimeError, TypeError, AssertionError) as error:
-        why = str(error).partition("\n")[0]
+    except (RuntimeError, TypeError, AssertionError, ImportError) as error:
+        why = str(error).partition("\n")[0].partition(". ")[0]
         raise ValueError(f"`device` (={device!r}) cannot be used by torch: {why}") from None
     return found
 

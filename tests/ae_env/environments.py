@@ -4,6 +4,7 @@ import functools
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 ID = "ae_env/AutoExposure-v0"
@@ -29,6 +30,8 @@ def rollout(seed, **arguments):
 def assert_equal(first, second, where="", **tolerance):
     """Equal values in equal shapes, whatever the order of the keys."""
     assert type(first) is type(second), where
+    if torch.is_tensor(first):
+        first, second = first.numpy(), second.numpy()
     if isinstance(first, dict):
         assert set(first) == set(second), f"{where}: {set(first) ^ set(second)}"
         for key in first:

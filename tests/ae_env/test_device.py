@@ -142,7 +142,10 @@ def test_actions_may_be_tensors_and_a_wrapper_gives_arrays() -> None:
 @pytest.mark.parametrize(
     ("make", "arguments", "named"),
     [
-        *((make_envs, {"device": name}, "device") for name in ("gpu9", "mps", "meta")),
+        *(
+            (make_envs, {"device": name}, "device")
+            for name in ("gpu9", "mps", "meta", "privateuseone")
+        ),
         (make_env, {"device": "cpu"}, "make_vec"),
         (make_envs, {"task": "ae_env/ExposureBracket-v0", "device": "cpu"}, "device"),
     ],

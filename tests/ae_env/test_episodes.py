@@ -1,10 +1,12 @@
 """Running episodes: frames of the simulator, rewards, copies; one and many are the same."""
 
+import contextlib
 import copy
 import math
 import pickle
 import signal
 from dataclasses import replace
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +15,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NumpyToTorch
 
+from ae_env.episodes.state import Episodes
 from ae_env.observation import encode_observation
 from ae_env.scenes.load import _LOADED
 from ae_env.scorers import make_scorer
@@ -136,7 +139,12 @@ def test_expected_rewards_are_those_of_the_running_episodes(arguments):
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
 @pytest.mark.parametrize(
-    "given", [{"motion": 0.5, "depth": 2.0, "delay": 1}, {"task": "ae_env/ExposureBracket-v0"}]
+    "given",
+    [
+        {"motion": 0.5, "depth": 2.0, "delay": 1},
+        {"task": "ae_env/ExposureBracket-v0"},
+        {"device": "cpu", "observation": "dn", "autoreset_mode": "DISABLED"},
+    ],
 )
 def test_a_copy_goes_on_like_the_original(given, copied):
     envs = make_envs(3, **given)
@@ -147,6 +155,36 @@ def test_a_copy_goes_on_like_the_original(given, copied):
         assert_equal(envs.step(actions), other.step(actions))
     light = sum(scene.light.nbytes for scene in envs.scenes)
     assert len(pickle.dumps(envs)) < 0.5 * light  # no scenes that have a name
+
+
+class _Interrupted:
+    """A scorer that is interrupted in the batch of its `number`."""
+
+    domain, number, calls = "raw", 5, 0
+
+    def __call__(self, images, captures):
+        self.calls += 1
+        if self.calls == self.number:
+            raise KeyboardInterrupt
+        return images.mean(dim=(1, 2, 3)).clamp(0.0, 1.0)
+
+
+def test_an_interrupt_leaves_rewards_that_are_numbers():
+    """In the first frames of new episodes, whose change is a cost, and where these are set up."""
+    given = {"costs": {"flicker": 1.0}, "max_episode_steps": 3}
+    envs = make_envs(2, scorer=_Interrupted(), **given)
+    envs.reset(seed=0)
+    for step in range(6):
+        with pytest.raises(KeyboardInterrupt) if step == 3 else contextlib.nullcontext():
+            assert np.isfinite(envs.step(np.array([5, 6]))[1]).all()
+    envs = make_envs(2, autoreset_mode="SAME_STEP", max_episode_steps=1)
+    envs.reset(seed=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Episodes, "_set_light_index", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            envs.step(np.array([5, 6]))
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step(np.array([5, 6]))
 
 
 def _scene(allowed, scene_id="holes"):

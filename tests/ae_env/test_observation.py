@@ -66,8 +66,10 @@ def test_sensors_are_decoded_as_they_read(speed, defocus, first, second):
 def test_statistics_are_means_and_shares_of_the_frame():
     """Against sums over the decoded frame; 36 rows are 12 zones of 3, 36 columns 16 of 2 or 3."""
     codes = np.random.default_rng(0).integers(0, 256, (2, 4, 36, 36), dtype=np.uint8)
-    codes[0, :, :3, :2] = 255
+    codes[0, :, :3, :2], codes[0, 0, 5:] = 255, codes[0, 0, 5:] % 9  # most of these below black
     found = obs.frame_statistics(codes)
+    for name, values in obs.tensor_statistics(torch.from_numpy(codes)).items():
+        np.testing.assert_allclose(values, found[name], rtol=1e-6, err_msg=name)
     assert {k: (v.shape, v.dtype.name) for k, v in found.items()} == {
         "raw": ((2, 4, 12, 16), "uint8"),
         "histogram": ((2, 128), "float32"),
