@@ -496,7 +496,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | name | default | meaning |
     |---|---|---|
     | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"recorded:FOLDER"` (every state is a real capture), `"package.module:name"` or list of `Scene`; `"polyhaven"`: views of real places, `"polyhaven:unknown"`: without their metered light, `"mixed"`: as many real as procedural ones |
-    | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
+    | `split` | `"train"` | `"train"`, `"validation"`, `"test"` or `"all"`, by source group |
     | `grid` | `None`: `"default"`, or of recorded scenes that of their captures | `"default"`, `"third_stop"`, `"video"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
     | `costs` | `None` | mapping to the weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |

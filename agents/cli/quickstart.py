@@ -38,7 +38,7 @@ def quickstart(
     seed: console.Seed = 0,
     device: console.Device = "cpu",
 ) -> None:
-    """Train two agents, compare them with light meters on unseen scenes: about 5 minutes.
+    """Train two agents, compare them with light meters on unseen scenes: 5 to 10 minutes.
 
     Example: `ae-env quickstart --scenes ~/my_raws --out my_raws_result`
     """
