@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from simulator.capture.blurred_frames import BlurredFrames, Passes, frame_at
@@ -215,28 +216,25 @@ def _taps(blurs, own, height, width):  # type: ignore[no-untyped-def]
 def moved_sums(images: Tensor, samples: int, taps: tuple[np.ndarray, ...]) -> Tensor:
     """Sums of shifts of `images` (K, C, H, W) by the taps of each; the borders are replicated.
 
-    So many `samples` are read at once as are stated. The `taps` are those of `tap_columns`.
+    About so many `samples` are looked at at once. The `taps` are those of `tap_columns`.
     """
-    (height, width), to, (counts, rows, columns, weights) = images.shape[-2:], images.device, taps
-    order = np.argsort(-counts, kind="stable")  # those with the most taps first
-    begins = counts.cumsum() - counts
-    given = rows, columns, weights, begins[order], counts[order], order
-    down, right, weight, first, count, own = (torch.from_numpy(v).to(to) for v in given)
-    down = (down[:, None] + torch.arange(height, device=to)).clamp_(0, height - 1) * width
-    right = (right[:, None] + torch.arange(width, device=to)).clamp_(0, width - 1)
-    light, total = images.flatten(2)[own], torch.zeros_like(images).flatten(2)
-    done, most = 0, int(counts.max(initial=0))
-    while done < most:
-        active = int((counts > done).sum())
-        end = min(most, done + max(1, samples // (active * images[0].numel())))
-        steps = torch.arange(done, end, device=to)
-        chosen = (first[:active, None] + steps).clamp_(max=len(weight) - 1)
-        looks_at = (down[chosen][..., None] + right[chosen][:, :, None]).flatten(1)  # (K, taps H W)
-        read = light[:active].gather(2, looks_at[:, None].expand(-1, images.shape[1], -1))
-        read = read.view(active, images.shape[1], end - done, -1)
-        shares = weight[chosen] * (steps < count[:active, None])
-        total[:active] += (read * shares[:, None, :, None]).sum(dim=2)
-        done = end
-    out = torch.empty_like(total)
-    out[own] = total
-    return out.view_as(images)
+    (planes, height, width), to, (counts, *values) = images.shape[1:], images.device, taps
+    begins, out = counts.cumsum() - counts, torch.empty_like(images)
+    down, right, weight = (torch.from_numpy(v).to(to) for v in values)
+    y, x = torch.arange(height, device=to)[:, None, None], torch.arange(width, device=to)[:, None]
+    for count in np.unique(counts).tolist():
+        alike, size = np.flatnonzero(counts == count), max(1, samples // (count * height * width))
+        for some in np.split(alike, range(size, len(alike), size)):
+            own, at = (torch.from_numpy(v).to(to) for v in (some, begins[some, None]))
+            at = (at + torch.arange(count, device=to))[:, None, None]  # (k, 1, 1, taps)
+            first = torch.arange(len(some), device=to)[:, None, None, None] * height
+            rows = first + (y + down[at]).clamp_(0, height - 1)
+            pixels = rows * width + (x + right[at]).clamp_(0, width - 1)  # (k, H, W, taps)
+            shares = weight[at].expand(pixels.shape).reshape(-1, count)
+            light = images[own].permute(0, 2, 3, 1).reshape(-1, planes)
+            # A bag for each pixel: nothing is held for each of its taps but where it looks.
+            sums = F.embedding_bag(
+                pixels.view(-1, count), light, mode="sum", per_sample_weights=shares
+            )
+            out[own] = sums.view(-1, height, width, planes).permute(0, 3, 1, 2)
+    return out

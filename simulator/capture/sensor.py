@@ -347,10 +347,10 @@ def record_stepwise(
             bright = (numbers - (black - PEDESTAL * span)).clamp_(min=0.0)
             codes = bright.sqrt_().mul_(255.0 / (span * (1.0 + PEDESTAL)).sqrt()).add_(0.5)
             outputs["codes"][part] = codes.to(torch.uint8)
-        signals = numbers.sub_(black).div_(span)
-        for name, least in LEAST_SIGNALS.items():
-            if name in outputs:
-                outputs[name][part] = signals.clamp(float(least), 1.0)
+        if shown := LEAST_SIGNALS.keys() & outputs:
+            signals = numbers.sub_(black).div_(span)
+            for name in shown:
+                outputs[name][part] = signals.clamp(float(LEAST_SIGNALS[name]), 1.0)
     return counts
 
 
