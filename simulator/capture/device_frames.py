@@ -228,13 +228,15 @@ def moved_sums(images: Tensor, samples: int, taps: tuple[np.ndarray, ...]) -> Te
             own, at = (torch.from_numpy(v).to(to) for v in (some, begins[some, None]))
             at = (at + torch.arange(count, device=to))[:, None, None]  # (k, 1, 1, taps)
             first = torch.arange(len(some), device=to)[:, None, None, None] * height
-            rows = first + (y + down[at]).clamp_(0, height - 1)
-            pixels = rows * width + (x + right[at]).clamp_(0, width - 1)  # (k, H, W, taps)
-            shares = weight[at].expand(pixels.shape).reshape(-1, count)
             light = images[own].permute(0, 2, 3, 1).reshape(-1, planes)
-            # A bag for each pixel: nothing is held for each of its taps but where it looks.
-            sums = F.embedding_bag(
-                pixels.view(-1, count), light, mode="sum", per_sample_weights=shares
-            )
-            out[own] = sums.view(-1, height, width, planes).permute(0, 3, 1, 2)
+            band = max(1, samples // (len(some) * count * width))  # rows of a large frame
+            for top in range(0, height, band):
+                rows = first + (y[top : top + band] + down[at]).clamp_(0, height - 1)
+                pixels = rows * width + (x + right[at]).clamp_(0, width - 1)  # (k, rows, W, taps)
+                shares = weight[at].expand(pixels.shape).reshape(-1, count)
+                # A bag for each pixel: nothing is held for each of its taps but where it looks.
+                sums = F.embedding_bag(
+                    pixels.view(-1, count), light, mode="sum", per_sample_weights=shares
+                ).view(*pixels.shape[:3], planes)
+                out[own, :, top : top + band] = sums.permute(0, 3, 1, 2)
     return out

@@ -13,8 +13,8 @@ import torch
 from gymnasium.wrappers.vector import ArrayConversion
 
 from simulator.capture.blurred_frames import BLUR
-from simulator.capture.device_frames import tap_columns
-from simulator.optics.motion import Path, path_taps
+from simulator.capture.device_frames import moved_sums, tap_columns
+from simulator.optics.motion import Path, path_blur, path_taps
 from tests.ae_env.environments import SMALL, make_env, make_envs
 
 SAME = {"autoreset_mode": "SAME_STEP"}
@@ -82,7 +82,7 @@ def test_every_option_has_the_same_episodes(arguments, monkeypatch) -> None:
                 assert apart.max() <= (name == "raw")
 
 
-def test_threads_make_taps_in_order() -> None:
+def test_paths_by_hand_and_on_threads() -> None:
     paths = np.random.default_rng(0).uniform((0, 0, -1, -5, -5), (9, 6, 1, 5, 5), (300, 5))
     blurs = np.zeros(300, BLUR)
     for name, values in zip(Path._fields, paths.T, strict=True):
@@ -93,6 +93,12 @@ def test_threads_make_taps_in_order() -> None:
     for path, *found in zip(paths, *parts, strict=True):
         for own, wanted in zip(found, path_taps(Path(*path), 30, 40), strict=True):
             np.testing.assert_array_equal(own, wanted)
+    images = torch.from_numpy(np.random.default_rng(1).random((300, 2, 30, 40), np.float32))
+    for samples in (2**30, 2**13, 1):  # at once, some frames, and rows
+        some = [values[: counts[:5].sum()] for values in taps]
+        sums = moved_sums(images[:5], samples, (counts[:5], *some))
+        for path, image, found in zip(paths[:5], images[:5], sums, strict=True):
+            torch.testing.assert_close(found, path_blur(image, path_taps(Path(*path), 30, 40)))
 
 
 @pytest.mark.parametrize("device", [None, "cpu"])
