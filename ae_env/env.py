@@ -325,7 +325,8 @@ class AutoExposureBase(SpecProperty):
         self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs, self._make_task)
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_last": None}  # the same frames are made again
+        # Torch does not unpickle uint16: the same frames are made again.
+        return vars(self) | ({} if self.core.options.device is None else {"_last": None})
 
     @property
     def grid(self) -> ExposureGrid:

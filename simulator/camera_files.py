@@ -60,9 +60,8 @@ _TUNED_BITS = 16
 _ROUNDING = 1 / 12 / 2.0**28
 #: Fields of a profile by option.
 _FIELDS = {"black": "black_level", "white": "white_level", "bits": "bit_depth", "cfa": "cfa"}
-#: Options of every camera, which are fields: what photosites differ by, and collect in the dark, at
-#: most.
-_PIXEL = {"prnu": 0.2, "dark_current": 1e12}
+#: Options of every camera, which are fields: what photosites differ by, and collect in the dark.
+_PIXEL = ("prnu", "dark_current")
 
 
 def normalised_model(make: str, model: str) -> str:
@@ -112,8 +111,7 @@ def read_camera_file(name: str) -> dict[str, Any] | None:
 def pixel_fields(query: str, known: tuple[str, ...] = ()) -> dict[str, Any]:
     """``prnu`` and ``dark_current`` of options, which may also be those that are `known`."""
     options = parse_options("camera", query, (*known, *_PIXEL))
-    found = {key: parse_number(options[key], f"camera?{key}") for key in _PIXEL if key in options}
-    return {key: check_number(f"camera?{key}", n, 0.0, _PIXEL[key]) for key, n in found.items()}
+    return {key: parse_number(options[key], f"camera?{key}") for key in _PIXEL if key in options}
 
 
 def _read(path: Path) -> Any:

@@ -419,7 +419,7 @@ class EpisodeCore:
         return self.task.score_table(env_index)
 
     def check_begun(self, env_indices: np.ndarray | int) -> None:
-        """Raises `gymnasium.error.ResetNeeded` unless these episodes have begun."""
+        """Raises `ResetNeeded` unless these have begun, a `ValueError` for a wrong index."""
         begun = self.episodes.begun
         if not isinstance(env_indices, np.ndarray):
             check_integer("env_index", env_indices, 0, len(begun) - 1)

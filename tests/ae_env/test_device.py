@@ -82,7 +82,7 @@ def test_every_option_has_the_same_episodes(arguments, monkeypatch) -> None:
                 assert apart.max() <= (name == "raw")
 
 
-def test_paths_by_hand_and_on_threads() -> None:
+def test_paths_are_those_of_the_loops_on_threads_too() -> None:
     paths = np.random.default_rng(0).uniform((0, 0, -1, -5, -5), (9, 6, 1, 5, 5), (300, 5))
     blurs = np.zeros(300, BLUR)
     for name, values in zip(Path._fields, paths.T, strict=True):
@@ -93,11 +93,11 @@ def test_paths_by_hand_and_on_threads() -> None:
     for path, *found in zip(paths, *parts, strict=True):
         for own, wanted in zip(found, path_taps(Path(*path), 30, 40), strict=True):
             np.testing.assert_array_equal(own, wanted)
-    images = torch.from_numpy(np.random.default_rng(1).random((300, 2, 30, 40), np.float32))
-    for samples in (2**30, 2**13, 1):  # at once, some frames, and rows
-        some = [values[: counts[:5].sum()] for values in taps]
-        sums = moved_sums(images[:5], samples, (counts[:5], *some))
-        for path, image, found in zip(paths[:5], images[:5], sums, strict=True):
+    images = torch.from_numpy(np.random.default_rng(1).random((9, 2, 30, 40), np.float32))
+    some = counts[:9], *(values[: counts[:9].sum()] for values in taps)
+    for samples in (2**30, 2**16, 2**13, 1):  # all at once, some frames, some rows, one
+        sums = moved_sums(images, samples, some)
+        for path, image, found in zip(paths[:9], images, sums, strict=True):
             torch.testing.assert_close(found, path_blur(image, path_taps(Path(*path), 30, 40)))
 
 
