@@ -378,6 +378,8 @@ class EpisodeCore:
         for i in np.flatnonzero(rest >= 0).tolist():
             if self.task.displaced(env_indices.item(i)) is not None:
                 rest[i] = -1
+        # Opened apertures take too much memory to stay for long.
+        rest[self.episodes.has_map[self.episodes.scene[env_indices]]] = -1
         if self.options.lens == RANDOM_LENS:
             rest[:] = -1
         return rest, moves

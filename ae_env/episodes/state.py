@@ -128,7 +128,7 @@ class Episodes:
         count = len(self.scenes)
         self.allowed = np.ones((count, len(self.grid)), bool)
         self._median_speed, self._own_blur = np.zeros((2, count))
-        self._has_subject, self._has_map, self._known = np.zeros((3, count), bool)
+        self._has_subject, self.has_map, self._known = np.zeros((3, count), bool)
         self.illuminance_spread = np.zeros(count)
         self.box_factor = np.ones(count, np.int64)
         self.scene_ids = self.scenes.scene_ids
@@ -172,7 +172,7 @@ class Episodes:
             self.illuminance_spread[index] = scene.incident_light.spread
             layout = scene.layout
             self._has_subject[index] = layout is not None and layout.subject is not None
-            self._has_map[index] = scene.defocus_map is not None
+            self.has_map[index] = scene.defocus_map is not None
             self.box_factor[index] = scene.box_factor
             self._known[index] = True
 
@@ -297,7 +297,7 @@ class Episodes:
             moves = self.speed[env_indices] > 0.0
             moves |= self.subject_speed[env_indices] > 0.0
             moves |= self.defocus[env_indices] > 0.0
-            apart = moves | self._has_map[scenes] | (self.options.lens is not None)
+            apart = moves | self.has_map[scenes] | (self.options.lens is not None)
             own = np.where(apart, own, scenes)
         self.light_index[env_indices] = own
 

@@ -15,7 +15,12 @@ from simulator.camera import CameraProfile
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
+from simulator.capture.statistics import (
+    DenoisedLight,
+    LightStatistics,
+    Residual,
+    ResidualStatistics,
+)
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.incident_light import POSTERIOR, IncidentLight, known_light
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
@@ -111,13 +116,11 @@ class Scene:
     @property
     def prepared(self) -> PreparedScene:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        denoised: tuple[DenoisedLight, ...] = ()
-        if self.denoised is not None:
-            denoised = (DenoisedLight(self.denoised, residual=self.residual),)
         aperture_blur = None
         if self.defocus_map is not None:
             f_number = self.reference.effective_f_number
             aperture_blur = MapApertureBlur(self.light, self.defocus_map, f_number)
+        known = aperture_blur, *self._statistics
         return PreparedScene(
             light=self.light,
             reference=self.reference,
@@ -126,10 +129,10 @@ class Scene:
             saturated=self.saturated,
             white_balance=self.white_balance,
             box_factor=self.box_factor,
-            denoised_lights=denoised,
+            denoised_lights=self._denoised_lights,
             aperture_blur=aperture_blur,
             layout=self.layout,
-            blurred_light=BlurredLight(self.light, self.nlf, aperture_blur, self._statistics),
+            blurred_light=BlurredLight(self.light, self.nlf, *known),
         )
 
     @cached_property
@@ -149,8 +152,15 @@ class Scene:
         return np.maximum(np.cumsum(self.allowed) - 1, 0)
 
     @cached_property
-    def _statistics(self) -> LightStatistics:
-        return LightStatistics(self.light)  # computes each value when it is first asked for
+    def _denoised_lights(self) -> tuple[DenoisedLight, ...]:
+        if self.denoised is None:
+            return ()
+        return (DenoisedLight(self.denoised, residual=self.residual),)
+
+    @cached_property
+    def _statistics(self) -> tuple[LightStatistics, ResidualStatistics]:
+        # Each of their values is computed when it is first asked for.
+        return LightStatistics(self.light), ResidualStatistics(self.light, self.nlf)
 
     def own_blur(self, f_number: float) -> float:
         """Root mean square of the scene's own circle of confusion at an effective `f_number` [px].

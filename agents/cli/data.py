@@ -3,6 +3,7 @@
 import logging
 import tempfile
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -253,11 +254,13 @@ def warm_up() -> None:
 def _use_rest() -> None:
     """Compiles what those environments do not use: raw files, the viewer, blur along rows."""
     import numpy as np
+    import torch
 
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
     from simulator.capture.blurred_frames import BLUR, BlurredFrames
+    from simulator.capture.blurred_light import MapApertureBlur
     from simulator.capture.prepared_scene import PreparedScene
     from simulator.noise.generator import frame_normals
     from simulator.optics.discs import disc_blur
@@ -276,7 +279,10 @@ def _use_rest() -> None:
     disc_blur(motion_blur(light, 2.5), 2.5)
     frame_normals(0, (1, 1, 1))
     noise = raw.camera.nlf(raw.settings.iso)
-    PreparedScene(light, raw.settings, raw.camera, noise).expose([raw.settings] * 2)
+    scene = PreparedScene(light, raw.settings, raw.camera, noise, tolerance=0.0)
+    scene.expose([raw.settings] * 2)
+    opens = MapApertureBlur(light, torch.ones(light.shape[1:]), 32.0)
+    replace(scene, aperture_blur=opens).plan(raw.settings)
     vignetting = np.ones(light.shape[1:], np.float32)
     blurs = np.array([(0.0, 2.5, True, *[0] * 10, vignetting.ctypes.data)], BLUR)
     first = np.zeros(1, np.int64)

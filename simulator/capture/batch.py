@@ -18,11 +18,11 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.capture import blurred_frames, columns
 from simulator.capture.blurred_light import new_frames
-from simulator.capture.decision import Exposure, decide
-from simulator.capture.plan import noise_balance, predict_errors
+from simulator.capture.decision import disc_px
+from simulator.capture.plan import noise_balances, opening_errors
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import CodeMeans, Transitions, exposure_table, record, record_units
-from simulator.capture.statistics import BINS, LightStatistics
+from simulator.capture.sensor import CodeMeans, Transitions, record, record_units
+from simulator.capture.statistics import BINS
 from simulator.noise.generator import Noise, noise_keys
 from simulator.noise.noise_level_function import ReadNoises
 from simulator.settings import CameraSettings
@@ -39,7 +39,7 @@ _STEPS = (
 )
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
 _BLURRING = sum(_BIT[name] for name in _STEPS[1:5])  # those that change the light
-_DENOISING = _BIT["noise_reduction"]
+_DENOISING, _OPENING = _BIT["noise_reduction"], _BIT["aperture"]
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
 MODULES = tuple(
     "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
@@ -136,18 +136,18 @@ class CaptureBatch:
         self.camera, self.noise, self._light_bytes = camera, noise, light_bytes
         self._moved, self._device = moved, device
         self._columns = columns.state_columns(camera, states)
-        apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
-        self._frames = new_frames(num_scenes, len(apertures), light_bytes, device)
+        self._apertures, self._slots = np.unique(self._columns["f_number"], return_inverse=True)
+        self._frames = new_frames(num_scenes, len(self._apertures), light_bytes, device)
         # Noise of captures, (S, 2, 4) for each of the box factors.
         self._boxes, self._targets = list[int](), np.empty((0, len(states), 2, 4))
         self._read_noise: ReadNoises | None = None  # of captures: box by box, those of the states
-        # Scenes as columns, and at rest the one that each shows, whose light it has; -1 where its
-        # captures are planned alone (`columns.fits_columns`).
+        # Scenes as columns, and at rest the one that each shows, whose light it has.
         self._scenes: dict[int, PreparedScene] = {}
         self._known = np.zeros(num_scenes, bool)
         self._scene_columns = np.zeros(num_scenes, columns.SCENE)
         self._rest = np.full(num_scenes, -1)
-        self._size, self._widest = tuple[int, ...](), 0.0  # of all lights, and the largest defocus
+        self._size = tuple[int, ...]()  # of all lights
+        self._widest, self._any_wide = 0.0, False  # the largest defocus, and whether any is larger
         # Of scenes at rest, what those that show them in motion share: the light, as recorded and
         # denoised, and its places, the vignetting, the noise of the light if any scene's has some,
         # and the statistics, where they are known.
@@ -155,6 +155,7 @@ class CaptureBatch:
         self._place = np.zeros((num_scenes, 2), np.uintp)
         self._noises: np.ndarray | None = None
         self._vignetting = np.zeros((num_scenes, len(states)), np.uintp)
+        self._opening = np.zeros((num_scenes, len(states)))
         self._statistics, self._counted = np.zeros((num_scenes, 4, 4, BINS)), self._known.copy()
         # Row of the blurred light that each scene has at present.
         self._blurred_row = np.full(num_scenes, -1)
@@ -164,7 +165,7 @@ class CaptureBatch:
         self._gain = np.full(count, np.nan)  # light that it was planned for; NaN where it was not
         self._table = np.zeros((count, 5, 4), np.float32)  # of `exposure_table`
         self._blur = np.zeros(count, blurred_frames.BLUR)
-        # As in `FrameStatistics`; NaN where it depends on blurred light that is not made yet.
+        # As in `FrameStatistics`; NaN where it depends on light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
         self._modules = np.zeros(count, np.int64)
         # What is added to these for each step, and always; see `plan_frames`.
@@ -172,10 +173,11 @@ class CaptureBatch:
         more = np.array([always + response, always]) * (noise is not None)
         self._bits = np.array([*(_BIT[name] for name in columns.STEPS), *more])
         self._blurred = np.zeros(count, np.uintp)  # place of the light, blurred where it must be
-        # Of captures that are not planned in columns, the light (4, H, W) that they start from,
-        # `Exposure.remaining_variance` and the exposure.
-        self._source, self._remaining_variance, self._exposure = np.empty((3, count), object)
-        self._any_alone = False
+        # Addresses of `Exposure.remaining_variance`, and by row the maps that are not the lens's.
+        self._share, self._maps = np.zeros(count, np.uintp), np.empty(count, object)
+        # By scene the light (4, H, W) behind an open aperture, by its number and whether it is the
+        # denoised light.
+        self._opened: dict[int, dict[tuple[int, bool], torch.Tensor]] = {}
         # Blur of so many frames that are prepared, which is still to be done.
         self._pending: tuple[int, blurred_frames.Passes] | None = None
 
@@ -189,12 +191,12 @@ class CaptureBatch:
         pending, self._pending = self._pending, None
         if pending is not None:  # what its light is made of may be gone before
             indices = np.union1d(indices, pending[1].passes["scene"])
-        count, objects = len(self.states), (self._source, self._remaining_variance, self._exposure)
-        self._gain.reshape(-1, count)[indices] = np.nan
-        for column in objects if self._any_alone else ():
-            column.reshape(-1, count)[indices] = None
+        self._gain.reshape(-1, len(self.states))[indices] = np.nan
         for index in indices.tolist():
             self._scenes.pop(index, None)
+            self._opened.pop(index, None)
+        if self._noises is not None:
+            self._maps.reshape(-1, len(self.states))[indices] = None
         self._known[indices] = self._counted[indices] = False
         self._frames.release(indices)
         self._blurred_row[indices] = -1
@@ -232,7 +234,9 @@ class CaptureBatch:
 
     def _transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         rows = indices * len(self.states) + states
-        remaining = self._remaining_variance[rows] if self._any_alone else None
+        remaining = None
+        if self._noises is not None and (shares := self._share[rows]).any():
+            remaining = blurred_frames.FramesAt(shares, self._size)
         light = self._frames.at(self._blurred[rows])
         found = Transitions(light, self._table.take(rows, axis=0), remaining)
         if not self.camera.prnu or self.noise is None:
@@ -260,7 +264,7 @@ class CaptureBatch:
             run = partial(self._photograph, indices)
         keys, transitions = noise_keys(seeds, frames), self._transitions(indices, states)
         source_noise = None
-        if (self._any_alone or self._noises is not None) and transitions.table[:, 3:].any():
+        if self._noises is not None and transitions.table[:, 3:].any():
             source_noise, means = transitions.averaged_table()[:, 3:], None
         if read_noise is not None:
             boxes = self._scene_columns["targets"][indices]
@@ -344,18 +348,19 @@ class CaptureBatch:
                 self._read_noise = ReadNoises.of(each)
         self._scene_columns["targets"][index] = number = self._boxes.index(box)
         self._vignetting[index] = columns.vignetting_column(scene, self.states)
-        self._rest[index] = -1
-        if columns.fits_columns(scene, self._columns, noise=self.noise is not None):
-            self._rest[index] = index
-            self._scene_columns[index] = columns.scene_column(scene, number, index)
-            self._statistics[index] = found = columns.statistics_column(scene)
-            self._counted[index] = found.any()
-            if self._noises is None and not scene.nlf.is_zero:
-                self._noises = np.zeros(self.num_scenes, columns.NOISE)
-            if self._noises is not None:
-                self._noises[index] = columns.noise_column(scene)
-                for network in scene.denoised_lights:
-                    self._light[index] = light, network.light.contiguous()
+        self._opening[index] = columns.opening_column(scene, self._columns)
+        assert columns.fits_columns(scene)  # as those of environments do
+        self._rest[index] = index
+        self._any_wide |= scene.defocus > self._widest
+        self._scene_columns[index] = columns.scene_column(scene, number, index)
+        self._statistics[index] = found = columns.statistics_column(scene)
+        self._counted[index] = found.any()
+        if self._noises is None and not scene.nlf.is_zero:
+            self._noises = np.zeros(self.num_scenes, columns.NOISE)
+        if self._noises is not None:
+            self._noises[index] = columns.noise_column(scene)
+            for network in scene.denoised_lights:
+                self._light[index] = light, network.light.contiguous()
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -363,54 +368,68 @@ class CaptureBatch:
         unknown = ~self._known[indices]
         if np.count_nonzero(unknown):
             self._add(np.unique(indices[unknown]))
-        inside = self._rest[indices] >= 0
-        given, planned = (indices, rows, gains), rows
-        if np.count_nonzero(inside) < len(rows):
-            for i in np.flatnonzero(~inside).tolist():
-                self._plan_alone(self._scenes[indices[i]], int(rows[i]), float(gains[i]))
-            given, planned = (indices[inside], rows[inside], gains[inside]), rows[inside]
-        if len(planned):
-            known = self._scene_columns, self._statistics, self._vignetting
-            made = self._blur, self._table, self._predicted_error, self._excess_variance
-            camera = self._columns, self._targets, self._size, self._bits, columns.blur_tables()
-            fixed = known, self._noises, camera, given, (*made, self._modules)
-            parallel_ranges(
-                lambda first, last: columns.plan_frames(first, last, *fixed),
-                len(planned),
-                least=_WORTH_A_THREAD if self._noises is None else _NOISY_WORTH_A_THREAD,
-            )
-        self._gain[rows] = gains  # last: what is interrupted stays unknown
+        if self._any_wide:
+            defocus, numbers = self._scene_columns["defocus"][indices], self._columns["f_number"]
+            for i in np.flatnonzero(defocus > self._widest).tolist():  # where it is an error
+                f_number = numbers.item(rows[i] % len(self.states))
+                disc_px(self.prepared_scene(int(indices[i])), f_number)
+        self._gain[rows] = np.nan  # what is interrupted stays unknown
+        captures = self.noise is not None
+        self._plan_rows(indices, rows, gains, captures)
+        if self._noises is not None:
+            self._plan_noisy(indices, rows, gains, captures)
+        self._gain[rows] = gains
         self._blurred_row[indices] = -1
 
-    def _plan_alone(self, scene: PreparedScene, row: int, gain: float) -> None:
-        """Works out a row for a scene that does not fit columns."""
-        noisy, settings = self.noise is not None, self.states[row % len(self.states)]
-        exposure = decide(scene, settings, gain=gain)
-        self._exposure[row], self._any_alone = exposure, True
-        self._blur[row] = columns.blur_column(exposure)
-        self._remaining_variance[row] = exposure.remaining_variance
-        if exposure.opened_to is None:  # else the network runs when the light is made
-            self._source[row] = scene.blurred_light.source(exposure.origin).contiguous()
-        excess = _excess_variance(scene.blurred_light.statistics, exposure) if noisy else 0.0
-        self._excess_variance[row] = excess
-        error = exposure.left_out
-        if not scene.nlf.is_zero:
-            shown = exposure if noisy else decide(scene, settings, noise=False, gain=gain)
-            error = math.hypot(*predict_errors(scene, settings, shown).values())
-        self._predicted_error[row] = error
-        self._modules[row] = noisy * _BIT["noise"]
-        self._modules[row] += sum(_BIT[step.name] for step in exposure.steps if step.runs)
-        self._table[row] = exposure_table([exposure])[0]
+    def _plan_rows(self, *given: Any) -> None:
+        """`columns.plan_frames` of the frames `given`."""
+        known = self._scene_columns, self._statistics, self._vignetting, self._opening
+        camera = self._columns, self._targets, self._size, self._bits, columns.blur_tables()
+        made = self._blur, self._table, self._predicted_error, self._excess_variance
+        fixed = known, self._noises, camera, given, (*made, self._share, self._modules)
+        parallel_ranges(
+            lambda first, last: columns.plan_frames(first, last, *fixed),
+            len(given[0]),
+            least=_WORTH_A_THREAD if self._noises is None else _NOISY_WORTH_A_THREAD,
+        )
+
+    def _plan_noisy(
+        self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray, captures: bool
+    ) -> None:
+        """Completes what is planned where sources have noise, by what depends on the pixels."""
+        assert self._noises is not None
+        if not captures:  # frames are planned as captures; the error is that of light without noise
+            errors = self._predicted_error[rows]
+            self._plan_rows(indices, rows, gains, True)
+            self._predicted_error[rows], self._excess_variance[rows] = errors, 0.0
+        modules, rest = self._modules[rows], self._rest[indices]
+        for k in np.flatnonzero(self._share[rows] == columns.TO_BE_MADE).tolist():
+            row, f_number = rows.item(k), self._columns["f_number"].item(rows[k] % len(self.states))
+            given = self._scenes[rest.item(k)], self._blur[row], f_number
+            self._maps[row] = found = columns.remaining_map(*given, bool(modules[k] & _OPENING))
+            self._share[row] = 0 if found is None else found.data_ptr()
+        some = np.flatnonzero((modules & _OPENING > 0) & (self._noises["noisy"][rest] > 0))
+        if len(some):
+            opened, denoised = rows[some], (modules[some] & _DENOISING > 0).tolist()
+            places = zip(rest[some].tolist(), denoised, strict=True)
+            lights = [self._light[scene][second] for scene, second in places]
+            ratios, targets = self._table[opened, 0, 0].astype(float), self._target_noise(opened)
+            errors = opening_errors(lights, self._open(opened), ratios, targets, captures)
+            self._predicted_error[opened] = np.hypot(self._predicted_error[opened], errors)
+
+    def _target_noise(self, rows: np.ndarray) -> np.ndarray:
+        """(K, 2, 4) shot and read noise of captures `rows` (K,)."""
+        count = len(self.states)
+        return self._targets[self._scene_columns["targets"][rows // count], rows % count]
 
     def _make_light(self, indices: np.ndarray, rows: np.ndarray) -> None:
         """Finds the places of the light of `rows`, and makes what is not there."""
         shown, source = shown_at_rest(indices, self._rest), np.zeros(len(rows), np.uintp)
-        if len(shown):
-            for kind in range(1 if self._noises is None else 2):
-                lights = [self._light[i][kind] for i in shown.tolist()]
-                self._place[shown, kind] = self._frames.places(lights)
-        if self._any_alone and len(alone := np.flatnonzero(self._rest[indices] < 0)):
-            source[alone] = self._own_light(indices[alone], rows[alone])
+        for kind in range(1 if self._noises is None else 2):
+            lights = [self._light[i][kind] for i in shown.tolist()]
+            self._place[shown, kind] = self._frames.places(lights)
+        if len(opened := np.flatnonzero(self._modules[rows] & _OPENING)):
+            source[opened] = self._frames.places(self._open(rows[opened]))
         given = self._modules, self._rest, self._place
         missing = find_light(indices, rows, *given, self._blurred_row, self._blurred, source)
         if not len(missing):
@@ -421,28 +440,33 @@ class CaptureBatch:
         self._blurred_row[indices], self._pending = rows, (len(source), planned)
         if (planned.passes["kind"] == blurred_frames.WIDE).any():  # which no kernel does
             self._finish()
-        if self._any_alone and len(unknown := rows[np.isnan(self._excess_variance[rows])]):
-            self._finish()
-            for row in unknown.tolist():  # depends on the pixels
-                light = self._frames.at(self._blurred[[row]])[0].cpu()
-                self._excess_variance[row], _ = noise_balance(light, self._exposure[row])
+        if self._noises is not None:
+            rows = rows[np.isnan(self._excess_variance[rows])]
+            if len(rows):  # depends on the pixels
+                self._finish()
+                shares = blurred_frames.FramesAt(self._share[rows], self._size)
+                made = self._frames.at(self._blurred[rows]), shares, self._table[rows]
+                self._excess_variance[rows], _ = noise_balances(*made, self._target_noise(rows))
 
-    def _own_light(self, indices: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Places of the light that `rows` (K,) start from, which are planned alone."""
-        new = self._blurred_row[indices] != rows
-        opens = [row for row in {*rows[new].tolist()} if self._exposure[row].opened_to is not None]
-        if opens:
-            parallel_ranges(lambda a, b: [*map(self._open, opens[a:b])], len(opens))
-            # Light that was opened before may have had the same address.
-            self._frames.release(np.array(opens) // len(self.states))
-        return self._frames.places(self._source[rows])
+    def _open(self, rows: np.ndarray) -> list[torch.Tensor]:
+        """Light behind the open apertures of rows (K,); that of a scene stays until it goes."""
+        keys = []
+        for row in rows.tolist():
+            index, state = divmod(row, len(self.states))
+            keys.append((index, self._slots.item(state), bool(self._modules[row] & _DENOISING)))
+        new = [key for key in {*keys} if key[1:] not in self._opened.setdefault(key[0], {})]
 
-    def _open(self, row: int) -> None:
-        """Opens the aperture; the scene caches its result."""
-        exposure, lights = self._exposure[row], self._scenes[row // len(self.states)].blurred_light
-        self._source[row] = lights.source(exposure.origin).contiguous()
-        if self._frames.is_full and lights.aperture_blur is not None:
-            lights.aperture_blur.forget()
+        def make(first: int, last: int) -> None:
+            for index, slot, denoised in new[first:last]:
+                scene = self._scenes[index]
+                origin = scene.denoised_lights[0] if denoised else None, self._apertures.item(slot)
+                light = scene.blurred_light.source(origin).contiguous()
+                self._opened[index][slot, denoised] = light
+                if self._frames.is_full and scene.aperture_blur is not None:
+                    scene.aperture_blur.forget()
+
+        parallel_ranges(make, len(new))
+        return [self._opened[index][slot, denoised] for index, slot, denoised in keys]
 
 
 @kernel(fastmath={"contract"})
@@ -509,11 +533,11 @@ def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untype
 
 @kernel()
 def shown_at_rest(indices, rest):  # type: ignore[no-untyped-def]
-    """The different scenes that those of `indices` show, -1 apart."""
+    """The different scenes that those of `indices` show."""
     seen, found, count = np.zeros(len(rest), np.bool_), np.empty(len(indices), np.int64), 0
     for index in indices:
         scene = rest[index]
-        if scene >= 0 and not seen[scene]:
+        if not seen[scene]:
             found[count], seen[scene] = scene, True
             count += 1
     return found[:count]
@@ -526,11 +550,11 @@ def find_light(  # type: ignore[no-untyped-def]
     """The frames among `rows` (K,) of scenes `indices` whose light has to be blurred.
 
     See `CaptureBatch` for the columns. `source` (K,) become the places of the light that each frame
-    starts from, and `blurred` those of the frames that need no blur.
+    starts from, unless the aperture opens, and `blurred` those of the frames that need no blur.
     """
     found, count = np.empty(len(rows), np.int64), 0
     for k in range(len(rows)):
-        if rest[indices[k]] >= 0:
+        if not modules[rows[k]] & _OPENING:
             denoised = 1 if modules[rows[k]] & _DENOISING else 0
             source[k] = place[rest[indices[k]], denoised]
         if not modules[rows[k]] & _BLURRING:
@@ -539,14 +563,3 @@ def find_light(  # type: ignore[no-untyped-def]
             found[count] = k
             count += 1
     return found[:count]
-
-
-def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
-    """See `FrameStatistics`; NaN where it depends on the pixels."""
-    source, target = exposure.source_noise, exposure.target
-    pairs = zip((*source.shot, *source.read), (*target.shot, *target.read), strict=True)
-    if all(present <= wanted for present, wanted in pairs):
-        return 0.0
-    if exposure.remaining_variance is not None:
-        return math.nan
-    return statistics.relative_excess_variance(exposure.ratio, source, target)

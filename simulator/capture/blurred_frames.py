@@ -175,7 +175,7 @@ class Layout:
 
 
 class FramesAt(Sequence[torch.Tensor]):
-    """Contiguous float32 frames of one shape, known by their `addresses` (B,)."""
+    """Contiguous float32 frames of one shape, known by their `addresses` (B,); 0 is None."""
 
     def __init__(self, addresses: np.ndarray, shape: tuple[int, ...]) -> None:
         self.addresses, self.shape = addresses, (len(addresses), *shape)
@@ -184,7 +184,8 @@ class FramesAt(Sequence[torch.Tensor]):
         return len(self.addresses)
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return torch.from_numpy(frame_at(int(self.addresses[index]), self.shape[1:]))
+        address = int(self.addresses[index])
+        return torch.from_numpy(frame_at(address, self.shape[1:])) if address else None
 
 
 def frame_at(address: int, shape: tuple[int, ...]) -> np.ndarray:

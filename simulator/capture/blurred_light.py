@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from simulator.capture.blurred_frames import BLUR, BlurredFrames, Layout
-from simulator.capture.columns import blur_column
+from simulator.capture.columns import blur_column, blur_tables, remaining_energy
 from simulator.capture.decision import Exposure, Origin
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -34,6 +34,8 @@ from simulator.utils.tiles import TILE, Tile, make_tiles
 #: Memory that the cached blurred light of one scene may take, and that its cached opened light may
 #: [byte].
 CACHE_BYTES, OPENED_BYTES = 512 * 2**20, 256 * 2**20
+#: The numbers of a `Path` in `BLUR`.
+_PATH = ["extent", "direction", "turn", "drift_x", "drift_y"]
 
 
 class ApertureBlur:
@@ -185,10 +187,11 @@ class BlurredLight:
         nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
+        residuals: ResidualStatistics | None = None,
     ) -> None:
         self.light, self.aperture_blur = light, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
-        self.residuals = ResidualStatistics(light, nlf)
+        self.residuals = ResidualStatistics(light, nlf) if residuals is None else residuals
         self._cache: LruCache[Tensor] = LruCache(CACHE_BYTES)
 
     def copy(self, cache_bytes: int = CACHE_BYTES) -> BlurredLight:
@@ -264,34 +267,49 @@ class BlurredLight:
 
     def with_remaining_noise(self, exposure: Exposure) -> Exposure:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
-        left, energy = None, 1.0
-        path, motion_px, defocus_px = exposure.path, exposure.motion_px, exposure.defocus_px
-        unblurred = not motion_px and not defocus_px and exposure.opened_to is None
-        if unblurred and exposure.vignetting is None:
+        blur = np.array([blur_column(exposure)], BLUR)[0]
+        blurred = blur["motion_px"] or blur["defocus_px"] or exposure.opened_to is not None
+        if not blurred and exposure.vignetting is None:
             return exposure  # nothing averages it
-        if exposure.layout is not None:
-            path = Path(motion_px) if path is None and motion_px else path
-            left = _noise_map(exposure.layout, path, exposure.subject_path, defocus_px)
-            left = left.to(self.light.device)
-        elif path is not None:
-            taps = path_taps(path, *self.light.shape[-2:])
-            energy = discs.path_energy(tuple(taps), defocus_px, discs.disc_correlations())
-        else:
-            energy = discs.kernel_energy(motion_px, defocus_px, *discs.radius_table())
-        if exposure.opened_to is not None and self.aperture_blur is not None:
-            share = self.aperture_blur.remaining_variance(exposure.opened_to)
+        fixed = exposure.layout, exposure.opened_to, exposure.vignetting
+        energy = self.remaining_energy(blur, exposure.layout)
+        left = self.remaining_variance(blur, *fixed, energy)
+        return replace(exposure, energy=energy, remaining_variance=left)
+
+    def remaining_energy(self, blur: np.void, layout: Layout | None) -> float:
+        """`Exposure.energy` behind a `BLUR`, and the `layout` that it makes differ, if any."""
+        if layout is not None:
+            return 1.0
+        return float(remaining_energy(blur, tuple(self.light.shape[-2:]), blur_tables()))
+
+    def remaining_variance(
+        self,
+        blur: np.void,
+        layout: Layout | None,
+        opened_to: float | None,
+        vignetting: np.ndarray | None,
+        energy: float,
+    ) -> Tensor | None:
+        """`Exposure.remaining_variance` behind a `BLUR`; the others are of the exposure."""
+        left, device = None, self.light.device
+        if layout is not None:
+            moves, numbers = blur["motion_px"] > 0.0, blur[_PATH].item()
+            own = Path(*numbers) if moves and blur["mask"] else None
+            path = Path(*numbers[:3]) if moves else None
+            left = _noise_map(layout, path, own, float(blur["defocus_px"])).to(device)
+        if opened_to is not None and self.aperture_blur is not None:
+            share = self.aperture_blur.remaining_variance(opened_to)
             if share is not None:
                 # Noise that one blur has smeared is correlated: a second, smaller one hardly
                 # averages it further. Both together leave about what the larger leaves alone.
                 opened = (share / energy).clamp(max=1.0)
                 left = opened if left is None else torch.minimum(left, opened)
-        if exposure.vignetting is not None:
+        if vignetting is not None:
             # The variance goes with the square of the share r, its top-up with r: exact for shot
             # noise, and off by r (1 - r) of the source's read noise (`Transitions.in_bands`).
-            share = torch.from_numpy(exposure.vignetting).to(self.light.device)
+            share = torch.from_numpy(vignetting).to(device)
             left = share if left is None else left * share
-        left = None if left is None else left.float().contiguous()
-        return replace(exposure, energy=energy, remaining_variance=left)
+        return None if left is None else left.float().contiguous()
 
 
 def new_frames(

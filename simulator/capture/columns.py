@@ -16,17 +16,19 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.capture import decision
 from simulator.capture.blurred_frames import BLUR, LAYOUT, Layout
+from simulator.capture.plan import map_error
 from simulator.capture.sensor import exposure_table
 from simulator.capture.statistics import (
     BINS,
     LEVELS,
     ROUNDING,
+    blur_change,
     curvature,
     excess_error,
     hidden_highlights,
     network_error,
-    relative_excess_variance,
     relative_level,
+    variance_beyond,
 )
 from simulator.noise.noise_level_function import VARIANCE_LIMIT
 from simulator.optics import discs
@@ -57,12 +59,17 @@ NOISE = np.dtype(
         # `ResidualStatistics.columns`, 0 where its error was not measured.
         ("denoised", "f8", (4, 4, BINS)),
         ("residual", "f8", (4, 4, LEVELS)),
-        ("has_network", "i8"),  # no bool: every element is aligned
-        ("noisy", "i8"),  # whether there is any noise
+        # Of the `ApertureBlur`: its f-number, 0 for none, and the mean square of its diameters.
+        *((n, "f8") for n in ("f_number", "mean_square")),
+        # Whether there is a network, whether the aperture blur needs its light, and whether there
+        # is any noise; no bools: every element is aligned.
+        *((n, "i8") for n in ("has_network", "needs_network", "noisy")),
     ]
 )
 #: The steps that `plan_frames` decides on, in the order of their bits.
-STEPS = ("noise_reduction", "defocus", "motion_blur", "vignetting")
+STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "vignetting")
+#: In place of an address of `Exposure.remaining_variance`: that of `remaining_map`.
+TO_BE_MADE = 1
 #: How a scene is out of focus and moves: `PreparedScene.defocus`, `image_speed` and `movement`.
 MOVES = np.dtype([(name, "f8") for name in _MOVES])
 #: All of a state that the exposure of a capture depends on.
@@ -81,18 +88,14 @@ def noise_columns(camera: CameraProfile, states: Sequence[CameraSettings], box: 
     return np.array([(nlf.shot, nlf.read) for nlf in camera.nlfs(states)]) * (1.0 / box**2)
 
 
-def fits_columns(scene: PreparedScene, states: np.ndarray, *, noise: bool) -> bool:
-    """Whether `plan_frames` can plan captures of a scene at `STATE` (S,), with `noise`.
+def fits_columns(scene: PreparedScene) -> bool:
+    """Whether `plan_frames` can plan captures of a scene.
 
-    It has no aperture to open. Noise of its light is in captures, which neither a layout nor a lens
-    averages differently from pixel to pixel, and at most one network, which has run, removes it.
-    Discs that are too wide do not fit: `decide` raises an error for these.
+    At most one network, which has run, and in float32, takes the noise out of its light.
     """
-    if scene.aperture_blur is not None or scene.defocus > widest_defocus(scene, states):
-        return False
-    networks, alike = scene.denoised_lights, scene.layout is None and scene.lens is None
+    networks = scene.denoised_lights
     known = len(networks) < 2 and all(n.shape and n.rounding is None for n in networks)
-    return scene.nlf.is_zero or (noise and alike and known)
+    return scene.nlf.is_zero or known
 
 
 def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
@@ -103,9 +106,19 @@ def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
 
 def statistics_column(scene: PreparedScene) -> np.ndarray:
     """The `LightStatistics.columns` of a scene, which take a pass over its pixels; 0 if unused."""
-    if scene.defocus or scene.image_speed or scene.movement.subject_speed:
+    moves = scene.image_speed or scene.movement.subject_speed
+    if scene.defocus or moves or scene.aperture_blur is not None:
         return scene.statistics.columns
     return np.zeros((4, 4, BINS))
+
+
+def opening_column(scene: PreparedScene, states: np.ndarray) -> np.ndarray:
+    """(S,) diameters of the blur that opening the aperture adds at `STATE` (S,) [pixel]."""
+    blur = scene.aperture_blur
+    if blur is None:
+        return np.zeros(len(states))
+    numbers, which = np.unique(states["f_number"], return_inverse=True)
+    return np.array([blur.extent(f_number) for f_number in numbers.tolist()])[which]
 
 
 def noise_column(scene: PreparedScene) -> np.ndarray:
@@ -115,6 +128,9 @@ def noise_column(scene: PreparedScene) -> np.ndarray:
         return found
     found["source"], found["clipped"] = (scene.nlf.shot, scene.nlf.read), scene.clipped_light
     found["bins"], found["noisy"] = scene.statistics.noise_columns, True
+    if (blur := scene.aperture_blur) is not None:
+        found["f_number"], found["needs_network"] = blur.f_number, blur.needs_denoised
+        found["mean_square"] = blur.mean_square_diameter
     for network in scene.denoised_lights:
         found["denoised"], found["has_network"] = network.statistics.columns, True
         if network.residual is not None:
@@ -166,18 +182,22 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
 
     Args:
         first, last: Frames to plan.
-        known: `SCENE` of all scenes, `LightStatistics.columns` and `vignetting_column` of those at
-            rest.
+        known: `SCENE` of all scenes; of those at rest `LightStatistics.columns`,
+            `vignetting_column` and `opening_column`.
         noises: `NOISE` of scenes at rest; None where none has any.
         camera: `STATE`, (T, S, 2, 4) shot and read noise of its captures, height and width of the
-            frames [pixel], (6,) what each of `STEPS` that runs adds to the modules, and what is
+            frames [pixel], (7,) what each of `STEPS` that runs adds to the modules, and what is
             always added for clean and for noisy light, and the tables of `remaining_energy`.
-        given: (K,) scenes, rows of the columns, and light relative to the scene's own.
+        given: (K,) scenes, rows of the columns, and light relative to the scene's own; and whether
+            captures are wanted, or light without noise.
         made: The columns: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, (N,) error of all that is
-            left out or not known, (N,) excess variance, and (N,) modules, as sums.
+            left out or not known, but for `opening_errors`, (N,) excess variance, NaN where it
+            differs between pixels, (N,) addresses of `Exposure.remaining_variance`, 0 for none, and
+            (N,) modules, as sums.
     """
-    (scenes, statistics, vignetting), (states, targets, size, bits, tables) = known, camera
-    (indices, rows, gains), (blurs, table, error, excess, modules) = given, made
+    (scenes, statistics, vignetting, openings), states = known, camera[0]
+    targets, size, bits, tables = camera[1:]
+    (indices, rows, gains, wanted), (blurs, table, error, excess, shares, modules) = given, made
     extents, errors, runs = np.zeros(3), np.empty(3), np.empty(3, np.bool_)
     for k in range(first, last):
         row, at = rows[k], rows[k] % len(states)
@@ -186,15 +206,22 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
         ratio = 2.0 ** (state.log2_exposure - scene.log2_reference)
         ratio = min(scene.gain * gains[k] * ratio, decision.RATIO_LIMIT)
         _set_motion(scene, state.time, size[0], blur)
+        extents[0] = openings[scene.rest, at]
         extents[1], extents[2] = scene.defocus * 4.0 / state.f_number, blur.motion_px
         missing = square = 0.0
         denoises = False
         if noises is not None and noises[scene.rest].noisy:
             own = noises[scene.rest]
-            denoises, missing, square = _weigh_noise(own, ratio, target, scene.tolerance)
-            square += state.extrapolation_error**2
+            must = own.needs_network and extents[0] > 0.0
+            noise = own, ratio, target, scene.tolerance
+            denoises, missing, square = _weigh_noise(noise, wanted, must)
+            square += wanted * state.extrapolation_error**2
+            if own.f_number != 0.0 and own.f_number != state.f_number:
+                light = own.bins[0], own.bins[3], statistics[scene.rest, 2]
+                change = blur_change(*light, ratio, own.source, target, wanted)
+                square += map_error(change, own.f_number / state.f_number, own.mean_square) ** 2
         disc = line = math.inf
-        if scene.tolerance > 0.0 and extents[1] + extents[2] > 0.0:
+        if scene.tolerance > 0.0 and extents.sum() > 0.0:
             if noises is not None and denoises:
                 disc, line = curvature(noises[scene.rest].denoised, ratio, target)
             else:
@@ -206,22 +233,26 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
         blur.diameter, blur.sorts = scene.diameter, scene.sorts
         blur.num_sorts, blur.behind = scene.num_sorts, scene.behind
         blur.vignetting = vignetting[scene.rest, at]
-        modules[row] = bits[4] + runs[1] * bits[1] + runs[2] * bits[2]
-        modules[row] += (blur.vignetting > 0) * bits[3]
-        for i in range(1, 3):
+        modules[row] = bits[5] + (blur.vignetting > 0) * bits[4]
+        for i in range(3):
+            modules[row] += runs[i] * bits[1 + i]
             if not runs[i]:
                 square += errors[i] * errors[i]
-        error[row], excess[row] = math.sqrt(square), 0.0
+        error[row], excess[row], shares[row] = math.sqrt(square), 0.0, 0
         for plane in range(4):
             table[row, 0, plane] = ratio
             table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
             table[row, 3, plane] = table[row, 4, plane] = 0.0
         if noises is not None and noises[scene.rest].noisy:
-            modules[row] += bits[5] - bits[4] + denoises * bits[0]
+            modules[row] += bits[6] - bits[5] + denoises * bits[0]
             if not denoises:
-                energy = remaining_energy(blur, size, tables)
+                apart = blur.diameter > 0 and (runs[1] or (runs[2] and blur.mask > 0))
+                shares[row] = np.uintp(TO_BE_MADE) if apart or runs[0] else blur.vignetting
+                energy = 1.0 if apart else remaining_energy(blur, size, tables)
                 own = noises[scene.rest]
                 excess[row] = _add_source(own, ratio, energy, target, table[row])
+                if shares[row] and excess[row] > 0.0:
+                    excess[row] = math.nan  # it differs between pixels
 
 
 @kernel()
@@ -239,19 +270,25 @@ def _set_motion(scene, time, height, blur):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _weigh_noise(own, ratio, target, tolerance):  # type: ignore[no-untyped-def]
+def _weigh_noise(noise, wanted, must):  # type: ignore[no-untyped-def]
     """Whether a capture starts from denoised light; see `decision` and `plan.predict_errors`.
 
-    Also the error that counts where blurs are weighed, and the square of all errors that noise and
-    clipped highlights make.
+    It `must` where the aperture blur works on no other. Also the error that counts where blurs are
+    weighed, and the square of all errors that noise and clipped highlights make.
     """
+    own, ratio, target, tolerance = noise
     bins, network = own.bins, own.residual
-    left = excess_error(bins[0], bins[1:3], ratio, own.source, target)
+    if wanted:
+        left = excess_error(bins[0], bins[1:3], ratio, own.source, target)
+    else:
+        exposed = np.empty((2, 4))
+        _expose(own.source, ratio, 1.0, exposed)
+        left = math.sqrt(variance_beyond(bins[0], bins[3], ratio, exposed, target, 0.0))
     made = math.inf
     if own.has_network:
-        light = network[2], network[3], ratio, own.source, target
-        made = network_error(network[0], network[1], *light, True)
-    denoises = left > tolerance and not left <= made
+        levels = network[2], network[3], ratio, own.source, target
+        made = network_error(network[0], network[1], *levels, wanted)
+    denoises = must or (left > tolerance and not left <= made)
     error = made if denoises else left
     hidden = hidden_highlights(ratio, target, own.clipped[0], own.clipped[1])
     rounding = ROUNDING * relative_level(bins[0], bins[3], ratio, target)
@@ -277,16 +314,24 @@ def remaining_energy(blur, size, tables):  # type: ignore[no-untyped-def]
 def _add_source(own, ratio, energy, target, table):  # type: ignore[no-untyped-def]
     """Completes the `table` (5, 4) with a source's noise; the excess variance."""
     source, exceeds = np.empty((2, 4)), False
+    _expose(own.source, ratio, energy, source)
     for kind in range(2):
-        exposed = ratio if kind == 0 else ratio * ratio
         for plane in range(4):
-            source[kind, plane] = min(own.source[kind, plane] * exposed, VARIANCE_LIMIT) * energy
             exceeds |= source[kind, plane] > target[kind, plane]
             table[1 + kind, plane] = target[kind, plane] - source[kind, plane]
             table[3 + kind, plane] = source[kind, plane]
     if not exceeds:
         return 0.0
-    return relative_excess_variance(own.bins[0], own.bins[3], ratio, source, target)
+    return variance_beyond(own.bins[0], own.bins[3], ratio, source, target, 1.0)
+
+
+@kernel()
+def _expose(source, ratio, energy, out):  # type: ignore[no-untyped-def]
+    """A source's noise (2, 4) on the target's scale, of which blurs leave the share `energy`."""
+    for kind in range(2):
+        exposed = ratio if kind == 0 else ratio * ratio
+        for plane in range(4):
+            out[kind, plane] = min(source[kind, plane] * exposed, VARIANCE_LIMIT) * energy
 
 
 def blur_tables() -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -304,10 +349,9 @@ def plan_sweep(
         `Exposure.remaining_variance`, None in place of all where the source has no noise.
     """
     # One state alone is decided on in less time than it takes to call a kernel.
-    known = len(states) > 1 and fits_columns(
-        scene, columns := state_columns(scene.camera, states), noise=noise
-    )
-    if not known:
+    columns = state_columns(scene.camera, states)
+    inside = len(states) > 1 and scene.defocus <= widest_defocus(scene, columns)
+    if not inside or not fits_columns(scene):
         pairs = zip(states, gains.tolist(), strict=True)
         exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
         blurs = np.array([*map(blur_column, exposures)], BLUR)
@@ -315,13 +359,31 @@ def plan_sweep(
         return [e.origin for e in exposures], blurs, exposure_table(exposures), shares
     count, rows = len(states), np.arange(len(states))
     blurs, table, modules = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), 0 * rows
-    made = blurs, table, *np.empty((2, count)), modules
+    made = blurs, table, *np.empty((2, count)), np.zeros(count, np.uintp), modules
     own = np.array([scene_column(scene, 0, 0)], SCENE), statistics_column(scene)[None]
-    light = *own, vignetting_column(scene, states)[None]
+    known = *own, vignetting_column(scene, states)[None], opening_column(scene, columns)[None]
     noises = None if scene.nlf.is_zero else noise_column(scene)[None]
     targets = noise_columns(scene.camera, states, scene.box_factor)[None]
-    bits = np.arange(6) == 0  # of noise reduction alone
-    camera = columns, targets, tuple(scene.light.shape[-2:]), 1 * bits, blur_tables()
-    plan_frames(0, count, light, noises, camera, (0 * rows, rows, gains.astype(float)), made)
-    origins = [(network, None) for network in (None, *scene.denoised_lights)]
-    return [origins[denoises] for denoises in modules.tolist()], blurs, table, None
+    bits = np.array([1, 2, 0, 0, 0, 0, 0])  # of noise reduction and aperture alone
+    camera = columns, targets, tuple(scene.light.shape[-2:]), bits, blur_tables()
+    given = 0 * rows, rows, gains.astype(float), noise
+    plan_frames(0, count, known, noises, camera, given, made)
+    networks, numbers = (None, *scene.denoised_lights), columns["f_number"].tolist()
+    each = [*zip(modules.tolist(), numbers, strict=True)]
+    origins = [(networks[m & 1], f_number if m & 2 else None) for m, f_number in each]
+    if scene.nlf.is_zero:
+        return origins, blurs, table, None
+    left: list[torch.Tensor | None] = [None] * count
+    for i in np.flatnonzero(made[4]).tolist():
+        left[i] = remaining_map(scene, blurs[i], numbers[i], origins[i][1] is not None)
+    return origins, blurs, table, left
+
+
+def remaining_map(
+    scene: PreparedScene, blur: np.void, f_number: float, opens: bool
+) -> torch.Tensor | None:
+    """`Exposure.remaining_variance` at an `f_number` behind a `BLUR`; the aperture may open."""
+    light, moves = scene.blurred_light, blur["motion_px"] > 0.0 and blur["mask"]
+    layout = scene.layout if blur["defocus_px"] or moves else None
+    opened_to, energy = f_number if opens else None, light.remaining_energy(blur, layout)
+    return light.remaining_variance(blur, layout, opened_to, scene.vignetting(f_number), energy)

@@ -5,20 +5,21 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numba
 import numpy as np
 import torch
 
 from simulator.camera import get_camera
 from simulator.capture.decision import EXTRAPOLATION_ERROR, SIGNAL_LIMIT, Exposure, Step
-from simulator.capture.sensor import Transitions, exposure_table, missing_variance, record
-from simulator.capture.statistics import ROUNDING, hidden_highlights, noise_numbers
-from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction, noise_variance
+from simulator.capture.sensor import Transitions, exposure_table, record
+from simulator.capture.statistics import ROUNDING, SUMS, hidden_highlights, noise_numbers
+from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.compute import parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 if TYPE_CHECKING:
     from simulator.capture.prepared_scene import PreparedScene
@@ -53,7 +54,7 @@ _OPERATIONS = {
 #: when it is blurred again understates what it would change if it were sharpened.
 DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
 _TINY = torch.finfo(torch.float32).tiny
-#: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
+#: Samples that are worth a thread where noise is balanced.
 _BALANCED = 2**15
 
 
@@ -249,29 +250,48 @@ def predict_errors(
 
 
 def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Exposure) -> float:
-    """Error due to a depth that is not known, in units of the target's noise.
-
-    Where noise is wanted it is that of a capture, in which white is white.
-    """
+    """Error due to a depth that is not known, in units of the target's noise."""
     blur, noise, ratio = scene.aperture_blur, exposure.noise, exposure.ratio
     if blur is None or settings.effective_f_number == blur.f_number:  # no map is needed
         return 0.0
-    wider = (blur.f_number / settings.effective_f_number) ** 2
     disc = scene.statistics.blur_change(ratio, scene.nlf, exposure.target, noise=noise)
-    if wider <= 1.0:  # what a smaller aperture would sharpen stays blurred
-        return KEPT_BLUR_ERROR * disc * blur.mean_square_diameter * (1.0 - wider)
-    added = 0.0
-    if exposure.opened_to is not None:
-        light = scene.light if exposure.denoised is None else exposure.denoised.light
-        lights = light, scene.blurred_light.source(exposure.origin)
-        white = 1.0 if noise else math.inf
-        rows = max(1, _BALANCED // light.shape[-1])
-        for top in range(0, light.shape[-2], rows):
-            sharp, opened = ((x[:, top : top + rows] * ratio).clamp_(max=white) for x in lights)
-            wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
-            added += float(((opened - sharp).square_() / wanted).sum(dtype=torch.float64))
-        added = math.sqrt(added / light.numel())
-    return math.hypot(disc * MISSED_BLUR**2 * (wider - 1.0), DEPTH_ERROR * added)
+    wide, mean_square = blur.f_number / settings.effective_f_number, blur.mean_square_diameter
+    error = map_error(disc, wide, mean_square)
+    if exposure.opened_to is None:
+        return error
+    light = scene.light if exposure.denoised is None else exposure.denoised.light
+    lights = [light], [scene.blurred_light.source(exposure.origin)]
+    targets = noise_numbers(exposure.target)[None]
+    return math.hypot(error, *opening_errors(*lights, np.array([ratio]), targets, noise))
+
+
+@kernel()
+def map_error(disc, wide, mean_square):  # type: ignore[no-untyped-def]
+    """Error of a map of defocus where the aperture is so many times as `wide` as the source's.
+
+    `disc` is `LightStatistics.blur_change`; the `mean_square` of the map's diameters counts at
+    smaller apertures only: what they would sharpen stays blurred.
+    """
+    if wide <= 1.0:
+        return KEPT_BLUR_ERROR * disc * mean_square * (1.0 - wide * wide)
+    return disc * MISSED_BLUR**2 * (wide * wide - 1.0)
+
+
+def opening_errors(
+    lights: Sequence[torch.Tensor],
+    opened: Sequence[torch.Tensor],
+    ratios: np.ndarray,
+    targets: np.ndarray,
+    noise: bool,
+) -> np.ndarray:
+    """(B,) errors of what opening the aperture adds to lights (4, H, W), as far as maps are wrong.
+
+    `ratios` (B,) and `targets` (B, 2, 4) are of the captures. Where `noise` is wanted, white is
+    white in them.
+    """
+    white = 1.0 if noise else math.inf
+    squares = _sums(_add_changes, lights, opened, ratios, targets, white)[:, 0]
+    return DEPTH_ERROR * np.sqrt(squares / lights[0].numel())
 
 
 def noise_balance(light: torch.Tensor, exposure: Exposure) -> tuple[float, bool]:
@@ -279,28 +299,83 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> tuple[float, bool]
 
     Neither the ratio of the exposure nor its noise are in `light` yet.
     """
-    target, remaining = exposure.target, exposure.remaining_variance
+    target = exposure.target
     if exposure.source_noise.is_zero:
         return 0.0, not target.is_zero
-    table = exposure_table([exposure])[0, 1:]
-    rows = max(1, _BALANCED // light.shape[-1])
-    parts = [slice(top, top + rows) for top in range(0, light.shape[-2], rows)]
-    relative, lacks = np.zeros(4), np.zeros(4, bool)
+    shares, table = [exposure.remaining_variance], exposure_table([exposure])
+    excess, lacks = noise_balances([light], shares, table, noise_numbers(target)[None])
+    return excess.item(), lacks.item()
 
-    def balance(first: int, last: int) -> None:
-        for plane in range(first, last):
-            if table[0, plane] >= 0.0 and table[1, plane] > 0.0:
-                lacks[plane] = True  # at every pixel, whatever its light
-                continue
-            for part in parts:
-                signal = (light[plane, part] * exposure.ratio).clamp_(0.0, SIGNAL_LIMIT)
-                share = None if remaining is None else remaining[part]
-                missing = missing_variance(signal, table[:, plane], share)
-                lacks[plane] |= bool((missing > 0).any())
-                wanted = signal.mul_(target.shot[plane]).add_(target.read[plane])
-                missing.clamp_(max=0.0)
-                relative[plane] -= float((missing / wanted.clamp_(min=_TINY)).sum())
 
-    parallel_ranges(balance, 4, threads=None if len(parts) > 4 else 1)
-    share = abs(float(relative.sum())) / light.numel()
-    return min(share, VARIANCE_LIMIT), bool(lacks.any())  # finite over no noise, too
+def noise_balances(
+    lights: Sequence[torch.Tensor],
+    shares: Sequence[torch.Tensor | None],
+    table: np.ndarray,
+    targets: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`noise_balance` (B,) each of lights (4, H, W).
+
+    `shares` are their `Exposure.remaining_variance`, `table` that of the exposures, `targets`
+    (B, 2, 4) shot and read noise.
+    """
+    excess, lacks = _sums(_balance, lights, shares, table, targets).T
+    return np.minimum(excess / lights[0].numel(), VARIANCE_LIMIT), lacks > 0.0
+
+
+def _sums(task: Any, lights: Sequence[Any], others: Sequence[Any], *fixed: Any) -> np.ndarray:
+    """(B, 2) sums over the planes of frames, of what `task` finds for each of these."""
+    pairs: list[Any] = [lights, others]
+    for i, some in enumerate(pairs):
+        if not hasattr(some, "addresses"):
+            on_cpu = (None if x is None else x.float().cpu().contiguous() for x in some)
+            pairs[i] = [*on_cpu]
+    samples, found = lights[0][0].numel(), np.zeros((4 * len(lights), 2))
+    whole = *map(addresses, pairs), *fixed, samples, found
+    least = max(1, _BALANCED // samples)
+    parallel_ranges(lambda a, b: task(a, b, *whole), len(found), least=least)
+    return found.reshape(-1, 4, 2).sum(axis=1)
+
+
+@kernel()
+def _plane(address, plane, samples):  # type: ignore[no-untyped-def]
+    """A plane of the frame (4, samples) at an address."""
+    frame = numba.carray(as_pointer(address), (4 * samples,))  # type: ignore[attr-defined, call-arg]
+    return frame[plane * samples : (plane + 1) * samples]
+
+
+@kernel(fastmath=SUMS)
+def _add_changes(first, last, lights, opened, ratios, targets, white, samples, found):  # type: ignore[no-untyped-def]
+    """Sums of the squared changes of planes `first` to `last`, in units of the target's noise."""
+    for unit in range(first, last):
+        frame, plane = unit // 4, unit % 4
+        ratio, shot, read = ratios[frame], targets[frame, 0, plane], targets[frame, 1, plane]
+        before, after = _plane(lights[frame], plane, samples), _plane(opened[frame], plane, samples)
+        total = 0.0
+        for i in range(samples):
+            sharp = min(before[i] * ratio, white)
+            change = min(after[i] * ratio, white) - sharp
+            total += change * change / max(read + shot * max(sharp, 0.0), 1e-30)
+        found[unit, 0] = total
+
+
+@kernel(fastmath=SUMS)
+def _balance(first, last, lights, shares, table, targets, samples, found):  # type: ignore[no-untyped-def]
+    """Sums of the relative excess of planes `first` to `last`, and whether any pixel lacks noise.
+
+    Over no noise the excess is large, but finite.
+    """
+    for unit in range(first, last):
+        frame, plane = unit // 4, unit % 4
+        ratio, shot, read, source_shot, source_read = table[frame, :, plane]
+        total, lacks = 0.0, shot >= 0.0 and read > 0.0  # at every pixel, whatever its light
+        light, target = _plane(lights[frame], plane, samples), targets[frame, :, plane]
+        size = samples if shares[frame] else 0
+        left = numba.carray(as_pointer(shares[frame]), (size,))  # type: ignore[attr-defined, call-arg]
+        for i in range(0 if lacks else samples):
+            signal = min(max(light[i] * ratio, 0.0), SIGNAL_LIMIT)
+            missing = signal * shot + read
+            if size:
+                missing += (1.0 - left[i]) * (signal * source_shot + source_read)
+            lacks |= missing > 0.0
+            total += max(-missing, 0.0) / max(signal * target[0] + target[1], _TINY)
+        found[unit, 0], found[unit, 1] = total, lacks

@@ -58,7 +58,7 @@ ROUNDING = 2.0**-20
 #: Points between white in the source and in a darker capture at which its light is integrated.
 _NODES = 1024
 #: Floating-point rules of sums over bins.
-_SUMS = {"reassoc", "nnan", "nsz", "contract"}
+SUMS = {"reassoc", "nnan", "nsz", "contract"}
 
 
 # -- sums over pixels, and over bins of pixels ------------------------------------------------
@@ -110,7 +110,7 @@ def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyp
                 found[5] = max(found[5], level)
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
+@kernel(fastmath=SUMS, boundscheck=False)
 def excess_error(share, edges, ratio, source, target):  # type: ignore[no-untyped-def]
     """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
     total = 0.0
@@ -130,7 +130,7 @@ def excess_error(share, edges, ratio, source, target):  # type: ignore[no-untype
     return np.sqrt(total / 2.0)
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
+@kernel(fastmath=SUMS, boundscheck=False)
 def curvature(columns, ratio, target):  # type: ignore[no-untyped-def]
     """`LightStatistics.curvature` of its `columns`; `target` is (2, P) shot and read noise."""
     discs, rows = 0.0, 0.0
@@ -147,7 +147,7 @@ def curvature(columns, ratio, target):  # type: ignore[no-untyped-def]
     return abs(ratio) / 32.0 * np.sqrt(discs), abs(ratio) / 24.0 * np.sqrt(rows)
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
+@kernel(fastmath=SUMS, boundscheck=False)
 def relative_level(share, light, ratio, target):  # type: ignore[no-untyped-def]
     """`LightStatistics.relative_level` of bins; `target` is (2, P) shot and read noise."""
     total = 0.0
@@ -159,17 +159,35 @@ def relative_level(share, light, ratio, target):  # type: ignore[no-untyped-def]
     return np.sqrt(total)
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
-def relative_excess_variance(share, light, ratio, source, target):  # type: ignore[no-untyped-def]
-    """`LightStatistics.relative_excess_variance` of bins; noises are (2, P) shot and read."""
+@kernel(fastmath=SUMS, boundscheck=False)
+def variance_beyond(share, light, ratio, source, target, least):  # type: ignore[no-untyped-def]
+    """Mean of the variance of `source`, relative to the target's, beyond the `least`.
+
+    Over bins; noises are (2, P) shot and read, on the target's scale.
+    """
     total = 0.0
     for plane in range(share.shape[0]):
         for index in range(share.shape[1]):
             signal = light[plane, index] * ratio
             wanted = max(target[1, plane] + target[0, plane] * signal, _FLOOR)
-            beyond = (source[1, plane] + source[0, plane] * signal) / wanted - 1.0
+            beyond = (source[1, plane] + source[0, plane] * signal) / wanted - least
             total += share[plane, index] * max(beyond, 0.0)
     return total
+
+
+@kernel(fastmath=SUMS, boundscheck=False)
+def blur_change(share, light, disc, ratio, source, target, noise):  # type: ignore[no-untyped-def]
+    """`LightStatistics.blur_change` of bins; noises are (2, P) shot and read."""
+    total = 0.0
+    for plane in range(share.shape[0]):
+        for index in range(share.shape[1]):
+            level = light[plane, index]
+            own = source[1, plane] + source[0, plane] * level
+            wanted = max(target[1, plane] + target[0, plane] * level * ratio, _FLOOR)
+            shows = not noise or ratio * (level - SURE * np.sqrt(own)) <= 1.0
+            detail = max(disc[plane, index] - _LAPLACIAN * own, 0.0) if shows else 0.0
+            total += share[plane, index] * detail / wanted
+    return abs(ratio) / 32.0 * np.sqrt(total)
 
 
 @kernel()
@@ -257,13 +275,9 @@ class LightStatistics:
 
         With `noise` a capture is wanted, in which what is surely white shows no change.
         """
-        bins = self._bins
-        own = _variance(bins.light, source)
-        wanted = self._signal(ratio, target)[1]
-        detail = np.maximum(bins.disc - _LAPLACIAN * own, 0.0)
-        if noise:
-            detail = np.where(ratio * (bins.light - SURE * np.sqrt(own)) > 1.0, 0.0, detail)
-        return abs(ratio) / 32.0 * math.sqrt(np.vdot(bins.share, detail / wanted))
+        bins, noises = self._bins, (noise_numbers(source), noise_numbers(target))
+        light = bins.share, bins.light, bins.disc
+        return float(blur_change(*light, float(ratio), *noises, noise))
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
@@ -274,24 +288,9 @@ class LightStatistics:
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
         """Root mean square of the exposed source's noise in units of the target's."""
-        signal, wanted = self._signal(ratio, target)
-        relative = _variance(signal, source.exposed(ratio)) / wanted
-        return math.sqrt(np.vdot(self._bins.share, relative))
-
-    def relative_excess_variance(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
-    ) -> float:
-        """Mean over the pixels of the variance of `source` beyond the target's, relative to it.
-
-        Here `source` is on the target's scale, averaged by what blur there is.
-        """
-        bins, noises = self._bins, (noise_numbers(source), noise_numbers(target))
-        return float(relative_excess_variance(bins.share, bins.light, float(ratio), *noises))
-
-    def _signal(self, ratio: float, target: NoiseLevelFunction) -> tuple[np.ndarray, np.ndarray]:
-        """Signal of each bin in the capture, and the variance that it should have."""
-        signal = self._bins.light * ratio
-        return signal, np.maximum(_variance(signal, target), _FLOOR)
+        bins, exposed = self._bins, source.exposed(ratio)
+        noises = noise_numbers(exposed), noise_numbers(target)
+        return math.sqrt(variance_beyond(bins.share, bins.light, float(ratio), *noises, 0.0))
 
     @functools.cached_property
     def _bins(self) -> _Bins:
@@ -314,11 +313,6 @@ class LightStatistics:
         light, disc, row = found[1:4] / np.maximum(found[0], 1.0)  # equal light leaves bins empty
         edges = np.where(found[0] > 0, found[4:], 0.0)
         return _Bins(found[0] / (4.0 * samples), light, edges, disc, row)
-
-
-def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
-    shot, read = noise_numbers(nlf)[..., None]
-    return read + shot * signal
 
 
 @functools.lru_cache(maxsize=256)
@@ -409,7 +403,7 @@ class Residual:
         return np.interp(place, knots, self.bias), np.interp(place, knots, self.variance)
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
+@kernel(fastmath=SUMS, boundscheck=False)
 def network_error(bias, variance, level, share, ratio, source, target, noise):  # type: ignore[no-untyped-def]
     """`ResidualStatistics.error`, over levels of light; bias and variance are the network's."""
     total = 0.0
