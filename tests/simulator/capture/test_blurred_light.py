@@ -16,14 +16,16 @@ from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
+from simulator.capture.columns import plan_sweep
 from simulator.capture.decision import Exposure
 from simulator.capture.plan import noise_balance, predict_errors
-from simulator.capture.sensor import Transitions, record
+from simulator.capture.sensor import Transitions, exposure_table, record
 from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.noise.generator import noise_keys
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
 from simulator.optics.motion import Movement, motion_blur, motion_kernel, path_blur, path_taps
+from simulator.optics.vignetting import Vignetting
 from simulator.utils.tiles import make_tiles
 
 Z6 = get_camera("nikon_z6")
@@ -265,14 +267,14 @@ STATES += [CameraSettings(400, 1 / 30, 8), CameraSettings(204800, 1 / 30, 2)]
 LIGHTS = [
     torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(10)
 ]
-SCENES = np.arange(10)
+SCENES, LENS = np.arange(10), Vignetting("test", (2.0, 8.0), ((-0.75, 0.0, 0.0), (-0.2, 0.0, 0.0)))
 KEYS = noise_keys(SCENES, SCENES + 5)
 
 
 def prepared(index: int) -> PreparedScene:
-    """Two at rest, one that moves, one also out of focus, one whose aperture opens, two with a
-    layout and a subject that moves; three of these without noise, as are the first and third. A
-    network denoised the second, and parts of it are clipped."""
+    """Two at rest, one that moves, one also out of focus, one that moves and whose aperture opens,
+    two with a layout and a subject that moves; three of these without noise, as are the first and
+    third. A network denoised the second, and parts of it are clipped. Three are behind a lens."""
     light, noisy = LIGHTS[index], index not in (0, 2) and index < 7
     index = {7: 3, 8: 5, 9: 6}.get(index, index)
     changes = {"image_speed": 0.3} if index in (2, 3) else {}
@@ -284,7 +286,9 @@ def prepared(index: int) -> PreparedScene:
         changes |= {"defocus": 2.0, "movement": Movement(0.6, 2.0)}
     if index == 4:
         found = torch.full((24, 20), 1.0)
-        changes["aperture_blur"] = MapApertureBlur(light, found, 4.0)
+        changes |= {"aperture_blur": MapApertureBlur(light, found, 4.0), "image_speed": 0.1}
+    if index in (1, 4, 6):
+        changes["lens"] = LENS
     if index > 4:
         rows, columns = torch.arange(24)[:, None], torch.arange(20)
         subject = (abs(rows - 12) < 5) & (abs(columns - 8) < 5)
@@ -340,6 +344,7 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
             modules += ["aperture"] * (exposure.opened_to is not None)
             modules += ["defocus"] * (exposure.defocus_px > 0)
             modules += ["motion_blur"] * (exposure.motion_px > 0)
+            modules += ["vignetting"] * (exposure.vignetting is not None)
             modules += ["pixel_response"] * (noise is not None and shown[i].response is not None)
             modules += ["noise"] * bool(noise)
             assert MODULES[found.modules[i]] == "+".join(modules)
@@ -348,12 +353,35 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
             excess = balance[0] if noise else 0.0
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
-            if noise and not shown[i].nlf.is_zero:
+            if not shown[i].nlf.is_zero:
+                if noise is None:  # the error is that of the light alone
+                    exposure = shown[i].exposure(STATES[states[i]], noise=False, gain=gains[i])
                 errors = predict_errors(shown[i], STATES[states[i]], exposure)
                 assert found.predicted_error[i] == pytest.approx(math.hypot(*errors.values()))
-    assert seen >= {"noise_reduction", "aperture", "defocus", "motion_blur"}
+    assert seen >= {"noise_reduction", "aperture", "defocus", "motion_blur", "vignetting"}
     assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(10))
     assert noise is None or seen >= {"noise", "excess"}
+
+
+@pytest.mark.parametrize("noise", [True, False])
+def test_a_sweep_is_planned_as_each_state_alone(noise) -> None:
+    network = DenoisedLight(LIGHTS[1], residual=Residual.alike(0.4))
+    opens = NetworkApertureBlur(network, lambda image, *_: 0.9 * image, 4.0)
+    denoised = replace(prepared(1), denoised_lights=(network,), aperture_blur=opens)
+    for scene in (*map(prepared, range(10)), denoised):
+        origins, blurs, table, left = plan_sweep(scene, STATES, np.full(6, 0.5), noise=noise)
+        for i, state in enumerate(STATES):
+            exposure = scene.exposure(state, noise=noise, gain=0.5)
+            extents = blurs[i]["defocus_px"], blurs[i]["motion_px"]
+            assert (origins[i], *extents) == (
+                *[exposure.origin],
+                exposure.defocus_px,
+                exposure.motion_px,
+            )
+            np.testing.assert_allclose(table[i], exposure_table([exposure])[0], rtol=1e-6)
+            shares = None if left is None else left[i], exposure.remaining_variance
+            assert (shares[0] is None) == (shares[1] is None)
+            assert shares[0] is None or torch.equal(*shares)
 
 
 def test_wide_discs_and_frames_that_others_ask_for(monkeypatch) -> None:
@@ -391,7 +419,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     module = blurred_frames if stage == "plan_passes" else batch_module
     batch, calls, original = made(noise), [], getattr(module, stage)
     changed = 5 if stage == "opening_errors" else 1
-    photographed(batch, 0)
+    photographed(batch, 0), photographed(batch, changed)
 
     def fail(*args, **kwargs):
         calls.append(args)
@@ -402,7 +430,7 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     with monkeypatch.context() as patch:
         patch.setattr(module, stage, fail)
         with pytest.raises(KeyboardInterrupt):
-            photographed(batch, changed)
+            photographed(batch, changed, [3.0] * 10)
     for states in (changed, 0):
         expected, _ = photographed(made(noise), states)
         np.testing.assert_array_equal(photographed(batch, states)[0], expected)
