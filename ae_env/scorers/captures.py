@@ -17,8 +17,10 @@ import torch
 from ae_env.scenes.ladder import Ladder
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
+from simulator.capture.columns import plan_sweep
 from simulator.capture.decision import MAX_DISC_PX
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED, PreparedScene
+from simulator.capture.sensor import Transitions
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.discs import DIAMETERS
 from simulator.optics.motion import ALONG_ROWS, Movement, path_length
@@ -255,13 +257,11 @@ def source_noises(
     """`Captures.source_noise` of captures of `prepared` in the light `gain`, one or (S,)."""
     if prepared.nlf.is_zero:
         return None
-    found = []
-    for state, own in zip(states, np.broadcast_to(gain, len(states)).tolist(), strict=True):
-        exposure = prepared.exposure(state, gain=own)
-        left = exposure.remaining_variance
-        share = prepared.box_factor**2 * (1.0 if left is None else float(left.mean()))
-        found.append(exposure.source_noise.scaled(share))
-    return found
+    gains = np.broadcast_to(gain, len(states))
+    _, _, table, left = plan_sweep(prepared, states, gains, noise=True)
+    averaged = Transitions([prepared.light] * len(states), table, left).averaged_table()
+    noises = averaged[:, 3:].astype(float) * prepared.box_factor**2
+    return [NoiseLevelFunction(shot, read) for shot, read in noises.tolist()]
 
 
 @kernel()
