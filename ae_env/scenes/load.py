@@ -44,7 +44,6 @@ from ae_env.scenes.bundled import HARD, KINDS, Size, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
 from ae_env.scenes.ladder import KINDS as LADDERS
 from ae_env.scenes.ladder import check_size, with_ladder
-from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest, SceneSet, Split
 from ae_env.utils.user_files import UserCodeError, load_attribute
@@ -169,6 +168,9 @@ def has_frames(spec: object) -> bool:
 def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
     if spec in BUNDLED or spec in BUNDLED_PARTS:
         return _bundled(spec, request)
+    # Not above: what reads their list takes long to import.
+    from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
+
     if spec == "polyhaven":
         return polyhaven_scenes(request)
     if spec == VIEWS_OF_UNKNOWN_LIGHT:
