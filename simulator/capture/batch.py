@@ -349,7 +349,7 @@ class CaptureBatch:
         self._scene_columns["targets"][index] = number = self._boxes.index(box)
         self._vignetting[index] = columns.vignetting_column(scene, self.states)
         self._opening[index] = columns.opening_column(scene, self._columns)
-        assert columns.fits_columns(scene)  # as those of environments do
+        assert len(scene.denoised_lights) < 2  # as those of environments have
         self._rest[index] = index
         self._any_wide |= scene.defocus > self._widest
         self._scene_columns[index] = columns.scene_column(scene, number, index)
@@ -358,9 +358,11 @@ class CaptureBatch:
         if self._noises is None and not scene.nlf.is_zero:
             self._noises = np.zeros(self.num_scenes, columns.NOISE)
         if self._noises is not None:
-            self._noises[index] = columns.noise_column(scene)
+            self._noises[index] = columns.noise_column(scene, errors=True)
             for network in scene.denoised_lights:
                 self._light[index] = light, network.light.contiguous()
+                lacking = columns.LACKING, columns.LACKING - 1
+                columns.add_networks(self._noises[index], scene, lacking)
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:

@@ -7,7 +7,7 @@ of noise of `simulator.capture.plan`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,27 +49,33 @@ SCENE = np.dtype(
         *LAYOUT,  # with the subject, whether it moves or not
     ]
 )
+#: Networks of a scene, at most.
+NETWORKS = 3
 #: The noise of a light, and what errors depend on that it makes; see `PreparedScene`.
 NOISE = np.dtype(
     [
         ("source", "f8", (2, 4)),  # shot and read noise
         ("clipped", "f8", 2),  # `PreparedScene.clipped_light`
         ("bins", "f8", (4, 4, BINS)),  # `LightStatistics.noise_columns`
-        # Of the light that a network has denoised, if any: `LightStatistics.columns` and
-        # `ResidualStatistics.columns`, 0 where its error was not measured.
-        ("denoised", "f8", (4, 4, BINS)),
-        ("residual", "f8", (4, 4, LEVELS)),
+        # Of the networks: `LightStatistics.columns` of what they have denoised, and
+        # `ResidualStatistics.columns`, 0 where the error was not measured.
+        ("denoised", "f8", (NETWORKS, 4, 4, BINS)),
+        ("residuals", "f8", (NETWORKS, 4, 4, LEVELS)),
         # Of the `ApertureBlur`: its f-number, 0 for none, and the mean square of its diameters.
         *((n, "f8") for n in ("f_number", "mean_square")),
-        # Whether there is a network, whether the aperture blur needs its light, and whether there
-        # is any noise; no bools: every element is aligned.
-        *((n, "i8") for n in ("has_network", "needs_network", "noisy")),
+        # How many networks there are, whether the aperture blur needs one, whether there is any
+        # noise, and which of the above is known; no bools: every element is aligned.
+        *((n, "i8") for n in ("networks", "needs_network", "noisy", "knows_residuals")),
+        ("knows_denoised", "i8", NETWORKS),
     ]
 )
 #: The steps that `plan_frames` decides on, in the order of their bits.
 STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "vignetting")
 #: In place of an address of `Exposure.remaining_variance`: that of `remaining_map`.
 TO_BE_MADE = 1
+#: In place of modules: what `add_networks` has to add before a capture can be planned, the
+#: residuals, or from the next lower number on what each of the networks has denoised.
+LACKING = -1
 #: How a scene is out of focus and moves: `PreparedScene.defocus`, `image_speed` and `movement`.
 MOVES = np.dtype([(name, "f8") for name in _MOVES])
 #: All of a state that the exposure of a capture depends on.
@@ -86,16 +92,6 @@ def state_columns(camera: CameraProfile, states: Sequence[CameraSettings]) -> np
 def noise_columns(camera: CameraProfile, states: Sequence[CameraSettings], box: int) -> np.ndarray:
     """(S, 2, 4) shot and read noise of captures, `box` squared sensor pixels averaged."""
     return np.array([(nlf.shot, nlf.read) for nlf in camera.nlfs(states)]) * (1.0 / box**2)
-
-
-def fits_columns(scene: PreparedScene) -> bool:
-    """Whether `plan_frames` can plan captures of a scene.
-
-    At most one network, which has run, and in float32, takes the noise out of its light.
-    """
-    networks = scene.denoised_lights
-    known = len(networks) < 2 and all(n.shape and n.rounding is None for n in networks)
-    return scene.nlf.is_zero or known
 
 
 def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
@@ -121,21 +117,42 @@ def opening_column(scene: PreparedScene, states: np.ndarray) -> np.ndarray:
     return np.array([blur.extent(f_number) for f_number in numbers.tolist()])[which]
 
 
-def noise_column(scene: PreparedScene) -> np.ndarray:
-    """The `NOISE` of a scene that `fits_columns`, which takes a pass over its pixels."""
+def noise_column(scene: PreparedScene, *, errors: bool) -> np.ndarray:
+    """The `NOISE` of a scene, which takes a pass over its pixels; `add_networks` adds to it.
+
+    Without `errors`, what does not decide on steps is left out.
+    """
     found = np.zeros((), NOISE)
     if scene.nlf.is_zero:
         return found
-    found["source"], found["clipped"] = (scene.nlf.shot, scene.nlf.read), scene.clipped_light
-    found["bins"], found["noisy"] = scene.statistics.noise_columns, True
-    if (blur := scene.aperture_blur) is not None:
-        found["f_number"], found["needs_network"] = blur.f_number, blur.needs_denoised
-        found["mean_square"] = blur.mean_square_diameter
-    for network in scene.denoised_lights:
-        found["denoised"], found["has_network"] = network.statistics.columns, True
-        if network.residual is not None:
-            found["residual"] = scene.blurred_light.residuals.columns(network.residual)
+    found["source"], found["bins"] = (
+        (scene.nlf.shot, scene.nlf.read),
+        scene.statistics.noise_columns,
+    )
+    found["noisy"], found["networks"] = True, len(scene.denoised_lights)
+    blur = scene.aperture_blur
+    if blur is not None:
+        found["needs_network"] = blur.needs_denoised
+    if errors:
+        found["clipped"] = scene.clipped_light
+    if errors and blur is not None:
+        found["f_number"], found["mean_square"] = blur.f_number, blur.mean_square_diameter
     return found
+
+
+def add_networks(found: np.ndarray, scene: PreparedScene, lacking: Iterable[int]) -> None:
+    """Adds what is `LACKING` to the `NOISE` of a scene; a network runs for it."""
+    for number in {*lacking}:
+        if number == LACKING:
+            found["knows_residuals"] = True
+            for place, network in enumerate(scene.denoised_lights):
+                if network.residual is not None:
+                    residuals = scene.blurred_light.residuals.columns(network.residual)
+                    found["residuals"][place] = residuals
+        else:
+            place = LACKING - number - 1
+            found["denoised"][place] = scene.denoised_lights[place].statistics.columns
+            found["knows_denoised"][place] = True
 
 
 def scene_column(scene: PreparedScene, targets: int, rest: int) -> tuple[Any, ...]:
@@ -193,7 +210,7 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
         made: The columns: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, (N,) error of all that is
             left out or not known, but for `opening_errors`, (N,) excess variance, NaN where it
             differs between pixels, (N,) addresses of `Exposure.remaining_variance`, 0 for none, and
-            (N,) modules, as sums.
+            (N,) modules, as sums, or what is `LACKING`.
     """
     (scenes, statistics, vignetting, openings), states = known, camera[0]
     targets, size, bits, tables = camera[1:]
@@ -208,13 +225,12 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
         _set_motion(scene, state.time, size[0], blur)
         extents[0] = openings[scene.rest, at]
         extents[1], extents[2] = scene.defocus * 4.0 / state.f_number, blur.motion_px
-        missing = square = 0.0
-        denoises = False
+        missing, square, network = 0.0, 0.0, 0
         if noises is not None and noises[scene.rest].noisy:
             own = noises[scene.rest]
             must = own.needs_network and extents[0] > 0.0
             noise = own, ratio, target, scene.tolerance
-            denoises, missing, square = _weigh_noise(noise, wanted, must)
+            network, missing, square = _weigh_noise(noise, wanted, must)
             square += wanted * state.extrapolation_error**2
             if own.f_number != 0.0 and own.f_number != state.f_number:
                 light = own.bins[0], own.bins[3], statistics[scene.rest, 2]
@@ -222,10 +238,8 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
                 square += map_error(change, own.f_number / state.f_number, own.mean_square) ** 2
         disc = line = math.inf
         if scene.tolerance > 0.0 and extents.sum() > 0.0:
-            if noises is not None and denoises:
-                disc, line = curvature(noises[scene.rest].denoised, ratio, target)
-            else:
-                disc, line = curvature(statistics[scene.rest], ratio, target)
+            starts = noises, network, scene.rest, statistics
+            disc, line, network = _bound_blurs(*starts, ratio, target)
             line = line if blur.streaks else decision.STREAK_TO_DISC * disc
         decision.weigh_blurs(extents, disc, line, missing, scene.tolerance, errors, runs)
         blur.defocus_px = extents[1] if runs[1] else 0.0
@@ -244,15 +258,28 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
             table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
             table[row, 3, plane] = table[row, 4, plane] = 0.0
         if noises is not None and noises[scene.rest].noisy:
-            modules[row] += bits[6] - bits[5] + denoises * bits[0]
-            if not denoises:
+            modules[row] += bits[6] - bits[5] + network * bits[0]
+            if network == 0:
                 apart = blur.diameter > 0 and (runs[1] or (runs[2] and blur.mask > 0))
                 shares[row] = np.uintp(TO_BE_MADE) if apart or runs[0] else blur.vignetting
                 energy = 1.0 if apart else remaining_energy(blur, size, tables)
-                own = noises[scene.rest]
-                excess[row] = _add_source(own, ratio, energy, target, table[row])
-                if shares[row] and excess[row] > 0.0:
-                    excess[row] = math.nan  # it differs between pixels
+                noise = noises[scene.rest], ratio, target, energy
+                excess[row] = _add_source(noise, shares[row] > 0, table[row])
+        if network < 0:
+            modules[row] = network
+
+
+@kernel()
+def _bound_blurs(noises, network, rest, statistics, ratio, target):  # type: ignore[no-untyped-def]
+    """`curvature` of the light that a capture starts from; its network, or what is `LACKING`."""
+    if noises is not None and network > 0:
+        own = noises[rest]
+        if not own.knows_denoised[network - 1]:
+            return math.inf, math.inf, LACKING - network
+        disc, line = curvature(own.denoised[network - 1], ratio, target)
+    else:
+        disc, line = curvature(statistics[rest], ratio, target)
+    return disc, line, network
 
 
 @kernel()
@@ -271,29 +298,37 @@ def _set_motion(scene, time, height, blur):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _weigh_noise(noise, wanted, must):  # type: ignore[no-untyped-def]
-    """Whether a capture starts from denoised light; see `decision` and `plan.predict_errors`.
+    """The network, from 1 on, whose light a capture starts from, 0 for none, or `LACKING`.
 
-    It `must` where the aperture blur works on no other. Also the error that counts where blurs are
-    weighed, and the square of all errors that noise and clipped highlights make.
+    There `must` be one where the aperture blur works on no other light. Also the error that counts
+    where blurs are weighed, and the square of all errors that noise and clipped highlights make.
+    See `decision` and `plan.predict_errors`.
     """
     own, ratio, target, tolerance = noise
-    bins, network = own.bins, own.residual
+    bins, network, error = own.bins, 0, math.inf
     if wanted:
         left = excess_error(bins[0], bins[1:3], ratio, own.source, target)
     else:
         exposed = np.empty((2, 4))
         _expose(own.source, ratio, 1.0, exposed)
         left = math.sqrt(variance_beyond(bins[0], bins[3], ratio, exposed, target, 0.0))
-    made = math.inf
-    if own.has_network:
-        levels = network[2], network[3], ratio, own.source, target
-        made = network_error(network[0], network[1], *levels, wanted)
-    denoises = must or (left > tolerance and not left <= made)
-    error = made if denoises else left
+    weighs = own.networks > 0 and (must or left > tolerance)
+    if weighs and not own.knows_residuals:
+        return LACKING, 0.0, 0.0
+    for number in range(own.networks if weighs else 0):
+        found = own.residuals[number]
+        light = found[2], found[3], ratio, own.source, target
+        made = network_error(found[0], found[1], *light, wanted)
+        if must or made < error:
+            network, error = number + 1, made
+        if made <= tolerance and not must:
+            break
+    if network == 0 or (left <= error and not must):
+        network, error = 0, left
     hidden = hidden_highlights(ratio, target, own.clipped[0], own.clipped[1])
     rounding = ROUNDING * relative_level(bins[0], bins[3], ratio, target)
-    missing = error if own.has_network and error <= tolerance else 0.0
-    return denoises, missing, error * error + hidden * hidden + rounding * rounding
+    missing = error if own.networks > 0 and error <= tolerance else 0.0
+    return network, missing, error * error + hidden * hidden + rounding * rounding
 
 
 @kernel()
@@ -311,8 +346,12 @@ def remaining_energy(blur, size, tables):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _add_source(own, ratio, energy, target, table):  # type: ignore[no-untyped-def]
-    """Completes the `table` (5, 4) with a source's noise; the excess variance."""
+def _add_source(noise, differs, table):  # type: ignore[no-untyped-def]
+    """Completes the `table` (5, 4) with a source's noise.
+
+    Returns the excess variance; NaN where that `differs` between pixels.
+    """
+    own, ratio, target, energy = noise
     source, exceeds = np.empty((2, 4)), False
     _expose(own.source, ratio, energy, source)
     for kind in range(2):
@@ -322,7 +361,8 @@ def _add_source(own, ratio, energy, target, table):  # type: ignore[no-untyped-d
             table[3 + kind, plane] = source[kind, plane]
     if not exceeds:
         return 0.0
-    return variance_beyond(own.bins[0], own.bins[3], ratio, source, target, 1.0)
+    excess = variance_beyond(own.bins[0], own.bins[3], ratio, source, target, 1.0)
+    return math.nan if differs and excess > 0.0 else excess
 
 
 @kernel()
@@ -351,7 +391,7 @@ def plan_sweep(
     # One state alone is decided on in less time than it takes to call a kernel.
     columns = state_columns(scene.camera, states)
     inside = len(states) > 1 and scene.defocus <= widest_defocus(scene, columns)
-    if not inside or not fits_columns(scene):
+    if not inside or len(scene.denoised_lights) > NETWORKS:
         pairs = zip(states, gains.tolist(), strict=True)
         exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
         blurs = np.array([*map(blur_column, exposures)], BLUR)
@@ -362,16 +402,21 @@ def plan_sweep(
     made = blurs, table, *np.empty((2, count)), np.zeros(count, np.uintp), modules
     own = np.array([scene_column(scene, 0, 0)], SCENE), statistics_column(scene)[None]
     known = *own, vignetting_column(scene, states)[None], opening_column(scene, columns)[None]
-    noises = None if scene.nlf.is_zero else noise_column(scene)[None]
+    noises = None if scene.nlf.is_zero else noise_column(scene, errors=False)[None]
     targets = noise_columns(scene.camera, states, scene.box_factor)[None]
-    bits = np.array([1, 2, 0, 0, 0, 0, 0])  # of noise reduction and aperture alone
+    bits = np.array([1, NETWORKS + 1, 0, 0, 0, 0, 0])  # of noise reduction and aperture alone
     camera = columns, targets, tuple(scene.light.shape[-2:]), bits, blur_tables()
     given = 0 * rows, rows, gains.astype(float), noise
     plan_frames(0, count, known, noises, camera, given, made)
+    while (modules < 0).any():
+        assert noises is not None
+        add_networks(noises[0], scene, modules[modules < 0].tolist())
+        plan_frames(0, count, known, noises, camera, given, made)
     networks, numbers = (None, *scene.denoised_lights), columns["f_number"].tolist()
-    each = [*zip(modules.tolist(), numbers, strict=True)]
-    origins = [(networks[m & 1], f_number if m & 2 else None) for m, f_number in each]
-    if scene.nlf.is_zero:
+    opens, which = (found.tolist() for found in np.divmod(modules, NETWORKS + 1))
+    each = zip(which, opens, numbers, strict=True)
+    origins = [(networks[network], number if opened else None) for network, opened, number in each]
+    if noises is None:
         return origins, blurs, table, None
     left: list[torch.Tensor | None] = [None] * count
     for i in np.flatnonzero(made[4]).tolist():

@@ -365,19 +365,22 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
 
 @pytest.mark.parametrize("noise", [True, False])
 def test_a_sweep_is_planned_as_each_state_alone(noise) -> None:
-    network = DenoisedLight(LIGHTS[1], residual=Residual.alike(0.4))
-    opens = NetworkApertureBlur(network, lambda image, *_: 0.9 * image, 4.0)
-    denoised = replace(prepared(1), denoised_lights=(network,), aperture_blur=opens)
-    for scene in (*map(prepared, range(10)), denoised):
+    family = tuple(
+        DenoisedLight(functools.partial(torch.clone, LIGHTS[i]), residual=Residual.alike(error))
+        for i, error in enumerate((0.4, 0.2, 0.05))
+    )
+    opens = NetworkApertureBlur(family[2], lambda image, *_: 0.9 * image, 4.0)
+    scenes = [replace(prepared(1), denoised_lights=family, tolerance=0.1 * i) for i in range(4)]
+    plan_sweep(scenes[3], STATES[-1:] * 2, np.ones(2), noise=True)
+    assert not any(network.shape for network in family)  # none has run: the target is noisier
+    scenes += [replace(scene, aperture_blur=opens) for scene in scenes]
+    for scene in (*map(prepared, range(10)), *scenes):
         origins, blurs, table, left = plan_sweep(scene, STATES, np.full(6, 0.5), noise=noise)
         for i, state in enumerate(STATES):
             exposure = scene.exposure(state, noise=noise, gain=0.5)
-            extents = blurs[i]["defocus_px"], blurs[i]["motion_px"]
-            assert (origins[i], *extents) == (
-                *[exposure.origin],
-                exposure.defocus_px,
-                exposure.motion_px,
-            )
+            assert origins[i] == exposure.origin
+            assert blurs[i]["defocus_px"] == exposure.defocus_px
+            assert blurs[i]["motion_px"] == exposure.motion_px
             np.testing.assert_allclose(table[i], exposure_table([exposure])[0], rtol=1e-6)
             shares = None if left is None else left[i], exposure.remaining_variance
             assert (shares[0] is None) == (shares[1] is None)
