@@ -31,6 +31,8 @@ _IN_FOCUS_SHARE = 0.95
 BAND_DIAMETERS = (0.0, 1.5, 3.0, 5.5, 10.0)
 #: Windows over which a band's energy is averaged, and the contrast that it is compared to.
 _ENERGY_WINDOW, _CONTRAST_WINDOW = 7, 25
+#: Dilations of the network's blocks.
+_DILATIONS = (1, 2, 4, 1)
 #: The network estimates log(diameter + this): its resolution is even where blur is visible.
 LOG_OFFSET = 0.3
 #: Largest diameter that is estimated [pixel].
@@ -152,13 +154,11 @@ class DefocusMap(nn.Module):
     exposure. The network works at half the resolution (pixel unshuffle).
     """
 
-    def __init__(self, width: int = 48, dilations: tuple[int, ...] = (1, 2, 4, 1)) -> None:
+    def __init__(self, width: int = 48) -> None:
         super().__init__()
         bands = len(BAND_DIAMETERS) - 1
         self.head = nn.Conv2d(4 * (2 * bands + 1), width, 3, padding=1)
-        self.blocks = nn.ModuleList(
-            ResidualBlock(width, dilation=dilation, bias=True) for dilation in dilations
-        )
+        self.blocks = nn.ModuleList(ResidualBlock(width, dilation=d) for d in _DILATIONS)
         self.tail = nn.Conv2d(width, 1, 3, padding=1)
         nn.init.zeros_(self.tail.bias)  # type: ignore[arg-type]
         with torch.no_grad():  # starts near a constant map
