@@ -285,12 +285,8 @@ def demosaic_half(packed: torch.Tensor) -> torch.Tensor:
 
     Nothing is interpolated, so noise stays white and no artefact can be mistaken for detail.
     """
-    rgb = packed.new_empty(packed.shape[0], 3, *packed.shape[2:])
-    rgb[:, RED] = packed[:, 0]
-    torch.add(packed[:, 1], packed[:, 2], out=rgb[:, GREEN])
-    rgb[:, GREEN] *= 0.5
-    rgb[:, BLUE] = packed[:, 3]
-    return rgb
+    red, green_1, green_2, blue = packed.unbind(dim=1)
+    return torch.stack([red, (green_1 + green_2).mul_(0.5), blue], dim=1)
 
 
 def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tensor:
