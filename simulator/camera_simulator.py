@@ -1,6 +1,6 @@
 """The camera simulator: plans which steps a change of settings needs, and runs those."""
 
-import time
+import timeit
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -385,13 +385,12 @@ class CameraSimulator:
         if noise.preset not in self._seconds:
             image = torch.zeros(1, 4, _TIMED, _TIMED, device=self.device)
             variance = torch.full((1, 4), 1e-4, device=self.device)
-            times = []
-            for _ in range(2):
-                start = time.perf_counter()
+
+            def run() -> None:
                 with self._autocast(self.precision):
                     noise(image, variance, variance).sum().item()
-                times.append(time.perf_counter() - start)
-            self._seconds[noise.preset] = min(times) / _TIMED**2
+
+            self._seconds[noise.preset] = min(timeit.repeat(run, number=1, repeat=2)) / _TIMED**2
         return self._seconds[noise.preset]
 
     def _cached(
