@@ -270,8 +270,6 @@ def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> n
 
     They are what `record` adds, as an array: for other devices and for tests.
     """
-    if noise != "bank":
-        return drawn_normals(key, shape)
     return batch_normals(np.array([key], np.uint64), shape, noise, torch.device("cpu"))[0].numpy()
 
 
