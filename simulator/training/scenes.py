@@ -427,27 +427,22 @@ def _real_pictures(
 def map_scenes(
     path: Path, group: str, camera: CameraProfile, size: int
 ) -> Iterator[ReferenceScene]:
-    """Views into a radiance map, see `reference_scenes`."""
-    about: Any = {"group": group, "kind": "radiance", "source": printable(path.name)}
-    for name, view in _views(printable(path.stem), read_radiance(path)):
-        yield from _cut_out(view, camera, size, scene_id=name, **about)
-
-
-def _views(name: str, image: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Other pictures as they are, and four square cuts out of a panorama's horizon, by name.
+    """Views into a radiance map, see `reference_scenes`: four square cuts of a panorama's horizon.
 
     A perspective view has its edges enlarged; this band of 45 degrees is stretched by up to 1.41.
     """
+    about: Any = {"group": group, "kind": "radiance", "source": printable(path.name)}
+    name, image = printable(path.stem), read_radiance(path)
     height, width = image.shape[1:]
-    if abs(width / height - 2.0) > 0.01:
-        yield name, _sharpened(image)
+    if abs(width / height - 2.0) > 0.01:  # no panorama
+        yield from _cut_out(_sharpened(image), camera, size, scene_id=name, **about)
         return
     side = width // 8 * 2
     top = (height - side) // 2
     for azimuth in AZIMUTHS:
         left = round((azimuth / 360.0 + 0.5) * width) - side // 2
-        columns = np.arange(left, left + side) % width
-        yield f"{name}-{azimuth:03.0f}", image[:, top : top + side, columns]
+        view = image[:, top : top + side, np.arange(left, left + side) % width]
+        yield from _cut_out(view, camera, size, scene_id=f"{name}-{azimuth:03.0f}", **about)
 
 
 def _sharpened(light: np.ndarray) -> np.ndarray:
