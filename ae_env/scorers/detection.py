@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from ae_env.scenes.ladder import tag_dictionary, zxing
-from ae_env.scorers.captures import Captures, DependsOn, Domain
+from ae_env.scorers.captures import Captures, Domain
 from ae_env.scorers.measures import luma_codes
 from simulator.utils.checks import import_extra
 
@@ -30,7 +30,6 @@ class _Ladder:
     """Base of scorers by codes; an `ImportError` where their reader is not installed."""
 
     domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
     #: Score tables are stored on the disk: reading takes long.
     stored = True
     kind = "codes"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ae_env.scorers.captures import Captures, DependsOn, Domain
+from ae_env.scorers.captures import Captures, Domain
 from ae_env.scorers.measures import luma_codes
 from ae_env.scorers.terms import developed
 from simulator.utils.checks import import_extra
@@ -44,7 +44,6 @@ class Fidelity:
     """
 
     domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
     version = 1
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
@@ -134,7 +133,6 @@ class _OrbScorer:
     """Base of scorers by ORB keypoints; an `ImportError` where OpenCV is not installed."""
 
     domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
     needs = "extra cv"
     version = 1
 

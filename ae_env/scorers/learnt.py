@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils import fuse_conv_bn_eval
 
-from ae_env.scorers.captures import Captures, DependsOn, Domain
+from ae_env.scorers.captures import Captures, Domain
 from ae_env.utils.user_files import UserCodeError
 from simulator.utils.cache import cache_dir
 from simulator.utils.checks import check_integer, check_type, onnx_session
@@ -171,7 +171,6 @@ class Nima:
     """
 
     domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
     version = 1
     #: Name of the scorer and of its weights.
     name: str
@@ -243,7 +242,6 @@ class Classifier:
     """
 
     domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
     needs = f"ONNX file: {VARIABLE}"
     version = 1
 
@@ -378,7 +376,6 @@ class PyiqaMetric:
     """
 
     domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
     needs = "pip install pyiqa"
 
     def __init__(self, metric: str) -> None:
