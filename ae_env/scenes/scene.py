@@ -22,11 +22,11 @@ from simulator.capture.statistics import (
     ResidualStatistics,
 )
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.radiance.incident_light import POSTERIOR, IncidentLight, known_light
+from simulator.radiance.incident_light import POSTERIOR, IncidentLight
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
-from simulator.settings import CameraSettings
+from simulator.settings import CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_integer, check_number, check_type, check_word
 
@@ -187,10 +187,10 @@ class Scene:
         except ValueError:
             if self.illuminance is None:
                 raise
-            return known_light(self.illuminance, None)
+            return IncidentLight(incident_ev100(self.illuminance), 0.0, None)
         reflected = -self.reference.log2_exposure - math.log2(factor)
         if self.illuminance is not None:
-            return known_light(self.illuminance, reflected)
+            return IncidentLight(incident_ev100(self.illuminance), 0.0, reflected)
         return POSTERIOR.infer(green * factor, reflected)
 
     @cached_property

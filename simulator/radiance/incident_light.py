@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from simulator.radiance.light import MEAN_SIGNAL
-from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, incident_ev100
+from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT
 
 #: C of a receptor with a dome [lux s ISO].
 DOME_CONSTANT = 340.0
@@ -106,11 +106,6 @@ class IncidentLight:
         """(1,) EV100 of the right exposure; (16,), equally likely, where the light is not known."""
         likely = np.array([0.0] if self.spread == 0.0 else _LIKELY)
         return np.asarray(bounded(self.ev100 + self.spread * likely, self.reflected_ev100))
-
-
-def known_light(illuminance: float, reflected_ev100: float | None) -> IncidentLight:
-    """Incident light that was read, [lux] of a flat receptor."""
-    return IncidentLight(incident_ev100(illuminance), 0.0, reflected_ev100)
 
 
 @dataclass(frozen=True)
