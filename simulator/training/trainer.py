@@ -398,7 +398,8 @@ def train_stage(
     parts: dict[str, Any] = {"module": trained, "optimizer": optimizer, "average": average}
     if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
         parts["scaler"] = accelerator.scaler
-    clock, writes = Clock(stage, on_cpu=device.type == "cpu"), accelerator.is_main_process
+    now = time.process_time if device.type == "cpu" else time.monotonic
+    clock, writes = Clock(stage, now), accelerator.is_main_process
     state = _resume(checkpoint, [name, identity], clock, parts, writes=writes)
     wrapped, stepper = accelerator.prepare(loss, optimizer)
     means: dict[str, float] = {}
@@ -448,23 +449,23 @@ def _resume(
 class Clock:
     """Steps and seconds that a stage has used of its budget.
 
-    On a CPU, minutes are processor minutes of this process, else wall-clock minutes.
+    On a CPU, `now` tells the processor time of this process, else wall-clock time.
     """
 
     stage: StageConfig
-    on_cpu: bool
+    now: Callable[[], float]
     step: int = 0
     seconds: float = 0.0
     _started: float = 0.0
 
     def start(self) -> None:
         """Starts to count time, from the seconds so far."""
-        self._started = self._now() - self.seconds
+        self._started = self.now() - self.seconds
 
     def tick(self) -> None:
         """Counts a step."""
         self.step += 1
-        self.seconds = self._now() - self._started
+        self.seconds = self.now() - self._started
 
     @property
     def share(self) -> float:
@@ -473,9 +474,6 @@ class Clock:
             return min(self.step / self.stage.steps, 1.0)
         assert self.stage.minutes is not None
         return min(self.seconds / (60.0 * self.stage.minutes), 1.0)
-
-    def _now(self) -> float:
-        return time.process_time() if self.on_cpu else time.monotonic()
 
 
 def learning_rate(share: float, peak: float) -> float:
