@@ -16,7 +16,7 @@ from ae_env.lighting import Lighting, MovingLighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, SceneSpec
 from ae_env.scenes.load import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
-from ae_env.scenes.load import check_weights, environment_scenes, has_frames
+from ae_env.scenes.load import check_weights, environment_scenes
 from ae_env.scenes.recorded import RecordedOptions
 from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import SceneSet
@@ -260,7 +260,8 @@ class EnvOptions:
     @property
     def in_sequences(self) -> bool:
         """Whether the scenes are frames of sequences, which follow each other in an episode."""
-        return has_frames(self.scenes)
+        named = isinstance(self.scenes, Mapping) and "sequence" in self.scenes
+        return named or self.recorded is not None
 
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; of sequences, all frames."""

@@ -159,12 +159,6 @@ def load_scenes(
     return list(scenes)
 
 
-def has_frames(spec: object) -> bool:
-    """Whether the scenes of `spec` may be frames that follow each other."""
-    sequence = isinstance(spec, Mapping) and "sequence" in spec
-    return sequence or RecordedOptions.of(spec) is not None
-
-
 def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
     if spec in BUNDLED or spec in BUNDLED_PARTS:
         return _bundled(spec, request)
