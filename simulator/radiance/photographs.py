@@ -100,7 +100,7 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def read_photograph(name: str) -> np.ndarray:
-    """The pixels of a photograph of `PHOTOGRAPHS`, by its file name: uint8, (H, W, 3) or (H, W)."""
+    """The pixels of a picture in ``skimage/data``, by its file name: uint8, (H, W, 3) or (H, W)."""
     file = resources.files("skimage.data").joinpath(name)
     if not file.is_file():
         raise FileNotFoundError(

@@ -544,10 +544,9 @@ def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> lis
     at f/11 reaches 6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is
     the larger). One is inside scikit-image's wheel, the other in ``depth_cones`` of `data`.
     """
-    wheel = resources.files("skimage.data")
-    with wheel.joinpath("motorcycle_left.png").open("rb") as stream, Image.open(stream) as picture:
-        image = np.asarray(picture)
-    with wheel.joinpath("motorcycle_disp.npz").open("rb") as stream, np.load(stream) as arrays:
+    image = read_photograph("motorcycle_left.png")
+    measured = resources.files("skimage.data").joinpath("motorcycle_disp.npz")
+    with measured.open("rb") as stream, np.load(stream) as arrays:
         disparity = fill_from_nearest(arrays["arr_0"])
     # Calibration as scikit-image states it: z = baseline * focal length / (disparity + offset).
     inverse = (disparity + 31.086) * (1.0 / (0.193001 * 994.978))
