@@ -137,18 +137,6 @@ INPUT_SIZE = 224
 _CHUNK = 8
 
 
-def mean_rating(network: nn.Module, images: Tensor) -> Tensor:
-    """Mean rating (B,) in [1, 10] of sRGB (B, 3, H, W) in [0, 1], whatever their shape."""
-    ratings = torch.arange(1.0, RATINGS + 1.0, dtype=torch.float64)
-    means = []
-    with torch.no_grad():
-        for part in images.split(_CHUNK):  # type: ignore[no-untyped-call]
-            part = _of_size(part, INPUT_SIZE)
-            part = (2.0 * part.clamp(0.0, 1.0) - 1.0).to(memory_format=torch.channels_last)
-            means.append(network(part).double() @ ratings)
-    return torch.cat(means)
-
-
 def _of_size(pictures: Tensor, side: int) -> Tensor:
     if pictures.shape[2:] == (side, side):
         return pictures
@@ -183,7 +171,14 @@ class Nima:
         _network(self.file, self.digest)  # raises now, not at the first score
 
     def __call__(self, images: Tensor, captures: Captures) -> Tensor:
-        return (mean_rating(_network(self.file, self.digest), images.cpu()) - 1.0) / (RATINGS - 1.0)
+        network, means = _network(self.file, self.digest), []
+        ratings = torch.arange(1.0, RATINGS + 1.0, dtype=torch.float64)
+        with torch.no_grad():
+            for part in images.cpu().split(_CHUNK):  # type: ignore[no-untyped-call]
+                part = _of_size(part, INPUT_SIZE)
+                part = (2.0 * part.clamp(0.0, 1.0) - 1.0).to(memory_format=torch.channels_last)
+                means.append(network(part).double() @ ratings)
+        return (torch.cat(means) - 1.0) / (RATINGS - 1.0)
 
 
 class NimaAesthetic(Nima):
