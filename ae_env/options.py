@@ -227,7 +227,17 @@ class EnvOptions:
             grid = self.recorded.grid
         else:
             grid = ExposureGrid.from_spec("default" if self.grid is None else self.grid)
-        _check_shown(grid)
+        aperture, time, speed = SETTINGS_RANGES.tolist()
+        bounds = {
+            "isos": [3.125 * 2.0**value for value in speed],
+            "exposure_times": [2.0**-value for value in reversed(time)],
+            "f_numbers": [2.0 ** (value / 2.0) for value in aperture],
+        }
+        for name, (low, high) in bounds.items():
+            for value in getattr(grid, name):
+                if not low * (1.0 - _ROUNDED) <= value <= high * (1.0 + _ROUNDED):
+                    rule = f"must be in [{low:g}, {high:g}]: the `settings` of an observation show"
+                    raise ValueError(f"`grid[{name!r}]` (={value:g}) {rule} no others")
         return grid
 
     def make_camera(self) -> CameraProfile:
@@ -338,20 +348,3 @@ def checked_delay(delay: Any) -> int | dict[str, int]:
     }
     alike = {given.get(name, 0) for name in CONTROLS}
     return alike.pop() if len(alike) == 1 else given
-
-
-def _check_shown(grid: ExposureGrid) -> None:
-    """Raises a `ValueError` where an observation's ``settings`` cannot show a value of `grid`."""
-    aperture, time, speed = SETTINGS_RANGES.tolist()
-    bounds = {
-        "isos": [3.125 * 2.0**value for value in speed],
-        "exposure_times": [2.0**-value for value in reversed(time)],
-        "f_numbers": [2.0 ** (value / 2.0) for value in aperture],
-    }
-    for name, (low, high) in bounds.items():
-        for value in getattr(grid, name):
-            if not low * (1.0 - _ROUNDED) <= value <= high * (1.0 + _ROUNDED):
-                raise ValueError(
-                    f"`grid[{name!r}]` (={value:g}) must be in [{low:g}, {high:g}]: the `settings` "
-                    "of an observation show no others"
-                )

@@ -146,8 +146,10 @@ class ExposureAugmentation:
                 frame.copy_(self._raw(image.float(), seed, drawn, source))
                 continue
             light = _in_pieces(lambda piece: develop_inverse(piece[None])[0], image)
-            if "exposure" in self.modules:
-                light = light * _raised(image, drawn.highlights)
+            if "exposure" in self.modules:  # at white raised, fading in from just below it
+                peak = image.amax(dim=0).float() / (1.0 if image.is_floating_point() else 255.0)
+                blown = ((peak - _CLIPPED) / (1.0 - _CLIPPED)).clamp_(0.0, 1.0)
+                light = light * (1.0 + blown.square_() * (2.0**drawn.highlights - 1.0))
             raw = self._raw(light, seed, drawn, source)
             frame.copy_(_in_pieces(lambda piece: develop(piece[None])[0], raw))
         return out
@@ -176,13 +178,6 @@ class ExposureAugmentation:
         if "noise" in self.modules:
             return prepared.expose([settings], seed=seed)[0]
         return clip_and_quantise(prepared.expected(settings), self.profile)
-
-
-def _raised(image: torch.Tensor, stops: float) -> torch.Tensor:
-    """(1, H, W) factor of the light: 2**`stops` at white, fading in from just below it."""
-    peak = image.amax(dim=0, keepdim=True).float() / (1.0 if image.is_floating_point() else 255.0)
-    blown = ((peak - _CLIPPED) / (1.0 - _CLIPPED)).clamp_(0.0, 1.0)
-    return 1.0 + blown.square_() * (2.0**stops - 1.0)
 
 
 def _in_pieces(
