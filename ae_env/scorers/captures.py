@@ -60,11 +60,6 @@ class Scorer(Protocol):
         """Scores (B,) of the images."""
 
 
-def reads_pixels(scorer: Scorer) -> bool:
-    """Whether `scorer` looks at images or light: unless it has ``reads_pixels = False``."""
-    return bool(getattr(scorer, "reads_pixels", True))
-
-
 class PixelBlur(NamedTuple):
     """Blur of B captures whose pixels differ in it, (B, K) float64 each."""
 

@@ -17,7 +17,7 @@ import torch
 
 from ae_env.observation import PEDESTAL, encode_array
 from ae_env.scenes.scene import Scene
-from ae_env.scorers.captures import Captures, DependsOn, SceneCaptures, reads_pixels
+from ae_env.scorers.captures import Captures, DependsOn, SceneCaptures
 from ae_env.scorers.terms import (
     Banding,
     Brightness,
@@ -126,13 +126,14 @@ class TermScores:
 
         `prepared` is the scene as it is in the episode; for the gains see `ScoreTables.table`.
         """
-        names = [] if self.torch_terms is None else self.torch_terms.names(*kinds)
-        if self.torch_terms is None or not names:
+        if self.torch_terms is None or not (names := self.torch_terms.names(*kinds)):
             return {}
         if names == self.only_sharpness:
             return dict.fromkeys(names, self.captures.sharpness(scene, prepared))
         terms, chunks = [self.torch_terms.parts[name] for name in names], []
-        for part in slices(len(self.states), CHUNK if any(map(reads_pixels, terms)) else None):
+        # Without ``reads_pixels = False``, a scorer may look at the light.
+        chunk = CHUNK if any(getattr(term, "reads_pixels", True) for term in terms) else None
+        for part in slices(len(self.states), chunk):
             captures = self.captures.describe(scene, prepared, part, gain, row_gain)
             chunks.append(self.torch_scores(None, captures, *kinds))
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}

@@ -534,8 +534,11 @@ def _from_libraw(
         raise RawFileError(
             "must be a Bayer raw, but has every colour at every pixel (linear or Foveon)"
         )
-    indices = _tile_indices(raw, _letters(raw, directories))
-    cfa = BayerPattern("".join(_letters(raw, directories)[i] for i in indices))
+    # Of LibRaw's colour indices, which are the planes of a DNG, in any order.
+    letters = plane_letters(directories)
+    letters = raw.color_desc.decode() if letters == "RGB" else letters + letters[1]
+    indices = _tile_indices(raw, letters)
+    cfa = BayerPattern("".join(letters[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
     black = [float(raw.black_level_per_channel[i]) for i in order]
     mosaic, libraw_white = raw.raw_image_visible, float(raw.white_level)
@@ -582,12 +585,6 @@ def _from_libraw(
         ),
         origin=margins,
     )
-
-
-def _letters(raw: rawpy.RawPy, directories: Sequence[Directory]) -> str:
-    """Letters of LibRaw's colour indices, which are the planes of a DNG, in any order."""
-    letters = plane_letters(directories)
-    return raw.color_desc.decode() if letters == "RGB" else letters + letters[1]
 
 
 def _tile_indices(raw: rawpy.RawPy, description: str) -> list[int]:
