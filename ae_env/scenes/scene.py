@@ -168,12 +168,10 @@ class Scene:
         It grows as the aperture opens; a smaller aperture than the reference's leaves its blur. 0
         without a `defocus_map`.
         """
-        return self._blur_at_reference * max(1.0, self.reference.effective_f_number / f_number)
-
-    @cached_property
-    def _blur_at_reference(self) -> float:
-        found = self.defocus_map
-        return 0.0 if found is None else float(found.double().square().mean().sqrt())
+        if self.defocus_map is None:
+            return 0.0
+        own = float(self.defocus_map.double().square().mean().sqrt())
+        return own * max(1.0, self.reference.effective_f_number / f_number)
 
     @cached_property
     def incident_light(self) -> IncidentLight:
